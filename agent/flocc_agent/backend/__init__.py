@@ -1,0 +1,1 @@
+"""Pose graph to optimised poses and scales; GTSAM lives here only."""

@@ -1,0 +1,187 @@
+"""SE(3) on numpy.
+
+Poses are (4, 4) float64; `T_a_b` is the pose of frame b in frame a, so `p_a = T_a_b @ p_b`. Tangent vectors are
+ordered as GTSAM's: rotation (rad), then translation (m).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+SMALL_ANGLE_RAD = 1e-9
+RIGID_TOLERANCE = 1e-3
+
+
+def pose(R: Float, t: Float) -> Float:
+    """Put a rotation (3, 3) and a translation (3,) into a (4, 4) pose."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def inverse(T: Float) -> Float:
+    """Invert poses (..., 4, 4)."""
+    R_transposed = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R_transposed
+    out[..., :3, 3] = -(R_transposed @ T[..., :3, 3:4])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def between(T_a_b: Float, T_a_c: Float) -> Float:
+    """Pose of c in b, `T_b_c`, from both in a."""
+    return inverse(T_a_b) @ T_a_c
+
+
+def is_rigid(T: Float, tolerance: float = RIGID_TOLERANCE) -> bool:
+    """Whether a (4, 4) array is finite, with an orthonormal right-handed rotation and last row 0 0 0 1."""
+    if T.shape != (4, 4) or not np.all(np.isfinite(T)):
+        return False
+    R = T[:3, :3]
+    orthonormal = np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0
+    return bool(orthonormal and np.allclose(T[3], [0, 0, 0, 1], atol=tolerance))
+
+
+def nearest_rotation(M: Float) -> Float:
+    """Closest rotation (3, 3) to a matrix in the Frobenius norm, by SVD."""
+    U, _, Vt = np.linalg.svd(M)
+    D = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
+    return np.asarray(U @ D @ Vt)
+
+
+def hat(v: Float) -> Float:
+    """Skew-symmetric matrix of (3,), so that `hat(v) @ w == cross(v, w)`."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def so3_exp(omega_rad: Float) -> Float:
+    """Rotation (3, 3) of a rotation vector (3,)."""
+    theta = float(np.linalg.norm(omega_rad))
+    W = hat(omega_rad)
+    if theta < SMALL_ANGLE_RAD:
+        return np.eye(3) + W
+    return np.asarray(np.eye(3) + np.sin(theta) / theta * W + (1 - np.cos(theta)) / theta**2 * (W @ W))
+
+
+def so3_log(R: Float) -> Float:
+    """Rotation vector (3,) of a rotation, norm in [0, pi]; by way of the quaternion, stable near pi."""
+    q = q_wxyz_from_R(R)
+    w, v = q[0], q[1:]
+    n = float(np.linalg.norm(v))
+    if n < SMALL_ANGLE_RAD:
+        return np.asarray(2.0 * v)
+    return np.asarray(2.0 * np.arctan2(n, w) / n * v)
+
+
+def se3_exp(xi: Float) -> Float:
+    """Pose of a tangent vector (6,), rotation first."""
+    omega, v = xi[:3], xi[3:]
+    theta = float(np.linalg.norm(omega))
+    W = hat(omega)
+    if theta < 1e-6:
+        V = np.eye(3) + 0.5 * W + W @ W / 6.0
+    else:
+        V = np.eye(3) + (1 - np.cos(theta)) / theta**2 * W + (theta - np.sin(theta)) / theta**3 * (W @ W)
+    return pose(so3_exp(omega), V @ v)
+
+
+def se3_log(T: Float) -> Float:
+    """Tangent vector (6,) of a pose, rotation first."""
+    omega = so3_log(T[:3, :3])
+    theta = float(np.linalg.norm(omega))
+    W = hat(omega)
+    if theta < 1e-6:
+        V_inverse = np.eye(3) - 0.5 * W + W @ W / 12.0
+    else:
+        half = theta / 2.0
+        V_inverse = np.eye(3) - 0.5 * W + (1 / theta**2) * (1 - half * np.cos(half) / np.sin(half)) * (W @ W)
+    return np.concatenate([omega, V_inverse @ T[:3, 3]])
+
+
+def angle_rad(R: Float) -> float:
+    """Angle of a rotation, in [0, pi]."""
+    return float(np.linalg.norm(so3_log(R)))
+
+
+def q_wxyz_from_R(R: Float) -> Float:
+    """Unit quaternion (4,), w first and not negative."""
+    m = np.asarray(R, dtype=float)
+    candidates = np.array(
+        [
+            1 + m[0, 0] + m[1, 1] + m[2, 2],
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+        ]
+    )
+    k = int(np.argmax(candidates))
+    s = 2.0 * np.sqrt(candidates[k])
+    if k == 0:
+        q = np.array([s / 4, (m[2, 1] - m[1, 2]) / s, (m[0, 2] - m[2, 0]) / s, (m[1, 0] - m[0, 1]) / s])
+    elif k == 1:
+        q = np.array([(m[2, 1] - m[1, 2]) / s, s / 4, (m[0, 1] + m[1, 0]) / s, (m[0, 2] + m[2, 0]) / s])
+    elif k == 2:
+        q = np.array([(m[0, 2] - m[2, 0]) / s, (m[0, 1] + m[1, 0]) / s, s / 4, (m[1, 2] + m[2, 1]) / s])
+    else:
+        q = np.array([(m[1, 0] - m[0, 1]) / s, (m[0, 2] + m[2, 0]) / s, (m[1, 2] + m[2, 1]) / s, s / 4])
+    q = q if q[0] >= 0 else -q
+    return np.asarray(q / np.linalg.norm(q))
+
+
+def R_from_q_wxyz(q_wxyz: Float) -> Float:
+    """Rotation (3, 3) of a quaternion (4,), which is normalised first.
+
+    Raises:
+        ValueError: The quaternion is zero or not finite.
+    """
+    norm = float(np.linalg.norm(q_wxyz))
+    if not np.isfinite(norm) or norm < 1e-12:
+        raise ValueError(f"quaternion {q_wxyz} has no direction")
+    w, x, y, z = np.asarray(q_wxyz, dtype=float) / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def pose_from_tq(tq: Float) -> Float:
+    """Pose of seven numbers: translation x y z, quaternion w x y z."""
+    return pose(R_from_q_wxyz(tq[3:7]), tq[:3])
+
+
+def tq_from_pose(T: Float) -> Float:
+    """Seven numbers of a pose: translation x y z, quaternion w x y z."""
+    return np.concatenate([T[:3, 3], q_wxyz_from_R(T[:3, :3])])
+
+
+def umeyama(source: Float, target: Float, with_scale: bool = False) -> tuple[float, Float]:
+    """Least-squares similarity that moves source points onto target points (Umeyama 1991).
+
+    Args:
+        source: (N, 3), metres.
+        target: (N, 3), metres.
+        with_scale: Whether a common scale is estimated as well.
+
+    Returns:
+        The scale (1.0 without `with_scale`) and `T_target_source`, with `target ~ scale * R @ source + t`.
+
+    Raises:
+        ValueError: Fewer than one point, or shapes that differ.
+    """
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 1:
+        raise ValueError(f"need two (N, 3) arrays, got {source.shape} and {target.shape}")
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    covariance = (target - mean_target).T @ (source - mean_source) / len(source)
+    U, singular_values, Vt = np.linalg.svd(covariance)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0])
+    R = U @ np.diag(signs) @ Vt
+    variance = float(((source - mean_source) ** 2).sum() / len(source))
+    scale = float(singular_values @ signs / variance) if with_scale and variance > 0 else 1.0
+    return scale, pose(R, mean_target - scale * R @ mean_source)

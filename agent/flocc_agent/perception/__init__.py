@@ -1,0 +1,1 @@
+"""Images to descriptors, latents and relative poses; OpenCV and torch live here only."""

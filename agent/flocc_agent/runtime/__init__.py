@@ -1,0 +1,1 @@
+"""asyncio and zenoh live here only: driver, transports, workers, store, keyframe sources."""

@@ -1,0 +1,1 @@
+"""What travels between robots: identifiers, key expressions, messages, log records, arrays, codec."""

@@ -1,0 +1,100 @@
+"""Who and what: swarms, robots, their logs, keyframes and leadership terms.
+
+A robot that lost its disk comes back with a new incarnation and so with a new log; the old log stays valid for
+the others. Everything sorts the same way on every robot: ties are broken by identifiers, never by arrival.
+"""
+
+import re
+from dataclasses import dataclass
+
+from flocc_protocol.errors import FloccError
+
+NAME_PATTERN = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+INCARNATION_MAX = 2**53 - 1
+INDEX_MAX = 2**31 - 1
+TERM_COUNTER_MAX = 2**48
+
+
+class BadName(FloccError):
+    """A swarm or robot name that cannot be a chunk of a key expression."""
+
+
+def checked_name(name: str, what: str = "robot name") -> str:
+    """Return the name, or say why it cannot be one.
+
+    Raises:
+        BadName: Not 1 to 32 of a-z, 0-9, '-', '_', starting with a letter or digit.
+    """
+    if not NAME_PATTERN.fullmatch(name):
+        raise BadName(f"{what} {name!r} must be 1 to 32 of a-z, 0-9, '-' and '_', and start with a letter or digit")
+    return name
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class LogId:
+    """One robot's append-only log: its name and the incarnation that writes it.
+
+    Incarnation 0 is a robot's first life in a swarm whose start the launcher controls; elsewhere it is drawn from
+    the wall clock when a robot starts without a disk.
+    """
+
+    robot: str
+    incarnation: int = 0
+
+    def __post_init__(self) -> None:
+        checked_name(self.robot)
+        if not 0 <= self.incarnation <= INCARNATION_MAX:
+            raise ValueError(f"incarnation {self.incarnation} is out of range")
+
+    def __str__(self) -> str:
+        return self.robot if self.incarnation == 0 else f"{self.robot}~{self.incarnation:x}"
+
+    @classmethod
+    def parse(cls, text: str) -> "LogId":
+        """Read what `str()` wrote.
+
+        Raises:
+            ValueError: The text is not a log identifier.
+        """
+        robot, separator, incarnation = text.partition("~")
+        return cls(robot, int(incarnation, 16) if separator else 0)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class KeyframeId:
+    """One keyframe: its robot's log and its number there, counted from 0 without gaps."""
+
+    log: LogId
+    index: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.index <= INDEX_MAX:
+            raise ValueError(f"keyframe index {self.index} is out of range")
+
+    def __str__(self) -> str:
+        return f"{self.log}/{self.index}"
+
+    @classmethod
+    def parse(cls, text: str) -> "KeyframeId":
+        """Read what `str()` wrote.
+
+        Raises:
+            ValueError: The text is not a keyframe identifier.
+        """
+        log, _, index = text.rpartition("/")
+        return cls(LogId.parse(log), int(index))
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Term:
+    """A leadership term: a counter and the one log whose robot may claim it. Terms are totally ordered."""
+
+    counter: int
+    leader: LogId
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.counter <= TERM_COUNTER_MAX:
+            raise ValueError(f"term counter {self.counter} is out of range")
+
+    def __str__(self) -> str:
+        return f"{self.counter}:{self.leader}"
