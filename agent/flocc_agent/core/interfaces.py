@@ -1,0 +1,112 @@
+"""What the runtime asks of a perception back-end: Describer, Encoder, Registrar.
+
+A latent travels as `bytes`: a back-end's own header (format version, model identity, sizes, intrinsics), then its
+arrays. Only the back-end that wrote a latent reads it, and it refuses another model's.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.registration import Registration, RegistrationFailed
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Pinhole intrinsics with radial-tangential distortion (OpenCV's k1 k2 p1 p2), in pixels of the full image."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera size {self.width}x{self.height} must be positive")
+        values = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        if not np.all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
+            raise ValueError("camera intrinsics must be finite and focal lengths positive")
+
+    def K(self) -> Float:
+        """Calibration matrix (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """Pixels (H, W, 3) uint8 in RGB order, with the camera that took them."""
+
+    pixels: NDArray[np.uint8]
+    camera: Camera
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width, 3)
+        if self.pixels.shape != expected or self.pixels.dtype != np.uint8:
+            raise ValueError(f"image is {self.pixels.shape} {self.pixels.dtype}, its camera says {expected} uint8")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryPair:
+    """A consecutive keyframe of the query's own robot, with what odometry says of the pair.
+
+    Attributes:
+        latent: Latent of the neighbouring keyframe (i-1, or i+1 for a robot's first keyframe).
+        T_neighbour_query: (4, 4) metric pose of the query camera in the neighbour's camera, from odometry.
+        key: Identifies the (neighbour, query) pair, for a cache of odometry-pair results.
+    """
+
+    latent: bytes
+    T_neighbour_query: Float
+    key: str
+
+
+class Describer(Protocol):
+    """Image to global place descriptor."""
+
+    @property
+    def dimension(self) -> int:
+        """Length of a descriptor."""
+        ...
+
+    def describe(self, image: Image) -> NDArray[np.float32]:
+        """Compute a (D,) float32 descriptor of unit length; cosine similarity compares two of them."""
+        ...
+
+
+class Encoder(Protocol):
+    """Image to latent."""
+
+    @property
+    def model(self) -> str:
+        """Identity of the method and its weights; latents of one identity can be registered with each other."""
+        ...
+
+    def encode(self, image: Image) -> bytes:
+        """Compute the latent of an image."""
+        ...
+
+
+class Registrar(Protocol):
+    """Two latents to correspondences and a relative pose up to scale."""
+
+    def register(
+        self, query: bytes, match: bytes, odometry: OdometryPair | None
+    ) -> Registration | RegistrationFailed:
+        """Register the match's latent with the query's.
+
+        Args:
+            query: Latent of this robot's keyframe i.
+            match: Latent of the other robot's keyframe j.
+            odometry: The query's odometry pair for Eqs. (1) and (6); None where the robot has one keyframe only.
+
+        Returns:
+            The relative pose up to scale, or why there is none. Raises nothing for bad latents of a peer.
+        """
+        ...

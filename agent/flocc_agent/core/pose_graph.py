@@ -1,0 +1,197 @@
+"""The pose graph: odometry of every log, loop closures between keyframes, absolute fixes, and its solution.
+
+Nodes are keyframe *camera* poses. A log's poses are given in its own `odom` frame; a component's solution is in
+one `map` frame that is named after the component's anchor, its lowest log.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Odometry of one log.
+
+    Attributes:
+        T_odom_keyframe: (N, 4, 4) camera poses in the log's odom frame, metric.
+        edge_covariances: (N-1, 6, 6) covariance of each consecutive edge (tangent of the later pose, rotation
+            first), or None for the back end's configured model.
+    """
+
+    T_odom_keyframe: Float
+    edge_covariances: Float | None = None
+
+    def __len__(self) -> int:
+        return len(self.T_odom_keyframe)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """A registered pair of keyframes.
+
+    Attributes:
+        query: Keyframe i of robot alpha.
+        match: Keyframe j of robot beta; the same robot for an intra-robot closure.
+        T_query_match_unscaled: (4, 4); translation in network units, or metres where `metric`.
+        match_ratio: Eq. (1).
+        scale_initial: Metres per network unit by Eq. (6), None if unknown.
+        covariance: (6, 6) of the measurement in its own units, or None for the back end's configured model.
+        metric: The translation is in metres and no scale is estimated.
+    """
+
+    query: KeyframeId
+    match: KeyframeId
+    T_query_match_unscaled: Float
+    match_ratio: float = 1.0
+    scale_initial: float | None = None
+    covariance: Float | None = None
+    metric: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AbsoluteFix:
+    """A keyframe's position (or whole pose) in a world frame, such as GNSS in local ENU or a known start.
+
+    Attributes:
+        keyframe: The keyframe that was there.
+        position_m: (3,) of the camera in the world frame.
+        covariance_m2: (3, 3) of the position.
+        R_world_keyframe: (3, 3), or None where only the position is known.
+        rotation_sigma_rad: Standard deviation of the rotation, where it is given.
+    """
+
+    keyframe: KeyframeId
+    position_m: Float
+    covariance_m2: Float
+    R_world_keyframe: Float | None = None
+    rotation_sigma_rad: float = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseGraph:
+    """Everything the optimiser needs, for all components at once."""
+
+    trajectories: Mapping[LogId, Trajectory]
+    closures: Sequence[LoopClosure] = ()
+    fixes: Sequence[AbsoluteFix] = ()
+
+
+class ClosureState(Enum):
+    """What the solver made of a closure."""
+
+    USED = "used"
+    REJECTED = "rejected as an outlier"
+    EXCLUDED = "excluded before solving"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosureResult:
+    """One closure after optimisation.
+
+    Attributes:
+        query: As in the closure.
+        match: As in the closure.
+        state: Used, rejected or excluded.
+        weight: Robust weight in [0, 1]; 0 where not used.
+        scale: Metres per network unit, None where not estimated or not used.
+        residual: Mahalanobis norm of the residual at the solution, NaN-free; 0 where excluded.
+        reason: Why it was excluded, else empty.
+    """
+
+    query: KeyframeId
+    match: KeyframeId
+    state: ClosureState
+    weight: float
+    scale: float | None
+    residual: float
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Component:
+    """One connected part of the graph, solved in one map frame.
+
+    Attributes:
+        logs: Its logs, sorted; the first is the anchor.
+        T_map_keyframe: (N, 4, 4) corrected camera poses of each log.
+        T_map_odom: (4, 4) of each log: `T_map_keyframe[-1] @ inverse(T_odom_keyframe[-1])`.
+        covariance_map_odom: (6, 6) marginal covariance of each log's `T_map_odom`, or None where not computed.
+        cost: Sum of half squared weighted residuals at the solution.
+    """
+
+    logs: tuple[LogId, ...]
+    T_map_keyframe: Mapping[LogId, Float]
+    T_map_odom: Mapping[LogId, Float]
+    covariance_map_odom: Mapping[LogId, Float | None]
+    cost: float = 0.0
+
+    @property
+    def anchor(self) -> LogId:
+        """The log whose start fixes the map frame."""
+        return self.logs[0]
+
+    @property
+    def map_frame(self) -> str:
+        """Name of the map frame, from the anchor."""
+        return map_frame(self.anchor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphSolution:
+    """The optimised pose graph.
+
+    Attributes:
+        components: Every connected part, sorted by anchor; every log is in exactly one.
+        closures: One result per closure of the graph, in its order.
+        warnings: Sentences: scale unobservable or collapsed, exclusions, ill-conditioned parts.
+        iterations: Linear solves that were done.
+        solve_s: Wall time of the solve (0 on virtual time).
+    """
+
+    components: tuple[Component, ...]
+    closures: tuple[ClosureResult, ...]
+    warnings: tuple[str, ...] = ()
+    iterations: int = 0
+    solve_s: float = 0.0
+    timings_s: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class OptimisationFailed:
+    """The back end could not solve; the last good solution stands."""
+
+    reason: str
+
+
+def map_frame(anchor: LogId) -> str:
+    """Name of the map frame of the component whose lowest log is the anchor."""
+    return f"map/{anchor}"
+
+
+def components_of(logs: Sequence[LogId], closures: Sequence[LoopClosure]) -> tuple[tuple[LogId, ...], ...]:
+    """Group logs that closures connect; each group sorted, groups sorted by their lowest log."""
+    parent = {log: log for log in logs}
+
+    def root(log: LogId) -> LogId:
+        while parent[log] != log:
+            parent[log] = parent[parent[log]]
+            log = parent[log]
+        return log
+
+    for closure in closures:
+        a, b = closure.query.log, closure.match.log
+        if a in parent and b in parent:
+            low, high = sorted((root(a), root(b)))
+            parent[high] = low
+    groups: dict[LogId, list[LogId]] = {}
+    for log in sorted(logs):
+        groups.setdefault(root(log), []).append(log)
+    return tuple(tuple(groups[anchor]) for anchor in sorted(groups))

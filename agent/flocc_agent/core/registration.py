@@ -1,0 +1,122 @@
+"""Registration of a candidate pair: its result, and the paper's Eqs. (1), (2) and (6)."""
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+ODOMETRY_CORRESPONDENCES_MIN = 20
+ODOMETRY_TRANSLATION_UNSCALED_MIN = 1e-6
+
+
+def match_ratio(
+    loop_correspondences: int, odometry_correspondences: int, denominator_min: int = ODOMETRY_CORRESPONDENCES_MIN
+) -> float:
+    """Correspondences of the loop pair over those of the odometry pair, Eq. (1).
+
+    Args:
+        loop_correspondences: Count for (query i, match j); >= 0.
+        odometry_correspondences: Count for (query i-1, query i); >= 0.
+        denominator_min: A smaller odometry count is raised to this, so that a blurred odometry pair does not
+            make every loop look certain.
+
+    Returns:
+        The ratio, >= 0.
+
+    Raises:
+        ValueError: A count is negative or the minimum is not positive.
+    """
+    if loop_correspondences < 0 or odometry_correspondences < 0 or denominator_min <= 0:
+        raise ValueError("counts must not be negative and the denominator's minimum must be positive")
+    return loop_correspondences / max(odometry_correspondences, denominator_min)
+
+
+def closure_probability(ratio: float, steepness: float) -> float:
+    """Map a match ratio to the probability that a loop closure is correct, Eq. (2).
+
+    Args:
+        ratio: Loop-pair matches over odometry-pair matches, Eq. (1); >= 0.
+        steepness: k of the logistic; larger trusts good ratios more.
+
+    Returns:
+        Probability in (0, 1); 0.5 at a ratio of 1.
+
+    Raises:
+        ValueError: The ratio is negative or not finite.
+    """
+    if not math.isfinite(ratio) or ratio < 0:
+        raise ValueError(f"match ratio {ratio} must be finite and not negative")
+    x = min(max(steepness * (ratio - 1.0), -60.0), 60.0)
+    return 1.0 / (1.0 + math.exp(-x))
+
+
+def odometry_scale(t_odometry_m: Float, t_odometry_unscaled: Float) -> float | None:
+    """Metres per network unit from the odometry pair, the factor of Eq. (6).
+
+    Args:
+        t_odometry_m: (3,) translation of the odometry pair from odometry, metres.
+        t_odometry_unscaled: (3,) the same translation from registration, network units.
+
+    Returns:
+        The factor, > 0, or None where the pair gives no scale (no motion, or nothing measured).
+    """
+    measured = float(np.linalg.norm(t_odometry_unscaled))
+    metric = float(np.linalg.norm(t_odometry_m))
+    if not (math.isfinite(measured) and math.isfinite(metric)):
+        return None
+    if measured < ODOMETRY_TRANSLATION_UNSCALED_MIN or metric <= 0.0:
+        return None
+    return metric / measured
+
+
+class RegistrationFailure(Enum):
+    """Why a pair of latents gave no relative pose."""
+
+    FEW_CORRESPONDENCES = "few correspondences"
+    NO_MODEL = "no relative pose fits the correspondences"
+    DEGENERATE = "the correspondences do not fix a relative pose"
+    BAD_LATENT = "a latent is damaged or of another model"
+    OUT_OF_MEMORY = "out of memory"
+    CRASHED = "the registration failed with an internal error"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """What registering (query, match) gave.
+
+    Attributes:
+        T_query_match_unscaled: (4, 4) pose of the match camera in the query camera; its translation is in
+            network units (for a two-view method: any length, made comparable with `scale_initial`).
+        correspondences: Verified correspondences of the loop pair, the numerator of Eq. (1).
+        odometry_correspondences: The same count for the odometry pair of the query, the denominator of Eq. (1).
+        scale_initial: Metres per network unit by Eq. (6); None where the odometry pair gave none.
+        covariance: (6, 6) covariance (rotation rad, translation in network units) in the tangent space of the
+            match, or None where the method gives none.
+    """
+
+    T_query_match_unscaled: Float
+    correspondences: int
+    odometry_correspondences: int
+    scale_initial: float | None
+    covariance: Float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationFailed:
+    """Registration came to an end without a relative pose.
+
+    Attributes:
+        failure: The kind of failure.
+        detail: One sentence for people.
+        correspondences: How many there were.
+        odometry_correspondences: Count of the odometry pair where it was computed.
+    """
+
+    failure: RegistrationFailure
+    detail: str = ""
+    correspondences: int = 0
+    odometry_correspondences: int = 0
