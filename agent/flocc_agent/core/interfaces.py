@@ -96,9 +96,7 @@ class Encoder(Protocol):
 class Registrar(Protocol):
     """Two latents to correspondences and a relative pose up to scale."""
 
-    def register(
-        self, query: bytes, match: bytes, odometry: OdometryPair | None
-    ) -> Registration | RegistrationFailed:
+    def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's.
 
         Args:

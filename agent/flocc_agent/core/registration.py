@@ -14,7 +14,9 @@ ODOMETRY_TRANSLATION_UNSCALED_MIN = 1e-6
 
 
 def match_ratio(
-    loop_correspondences: int, odometry_correspondences: int, denominator_min: int = ODOMETRY_CORRESPONDENCES_MIN
+    loop_correspondences: int,
+    odometry_correspondences: int,
+    denominator_min: int = ODOMETRY_CORRESPONDENCES_MIN,
 ) -> float:
     """Correspondences of the loop pair over those of the odometry pair, Eq. (1).
 

@@ -1,0 +1,204 @@
+"""Small field codecs that turn values into msgpack objects and back, checking everything on the way in.
+
+A codec is a pair of functions. `struct` lists a dataclass's fields once; nothing is decoded that it does not name.
+"""
+
+import math
+import struct as binary
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import msgpack
+
+from flocc_protocol.arrays import Array
+from flocc_protocol.errors import DecodeError
+from flocc_protocol.ids import (
+    INCARNATION_MAX,
+    INDEX_MAX,
+    NAME_PATTERN,
+    TERM_COUNTER_MAX,
+    KeyframeId,
+    LogId,
+    Term,
+)
+
+T = TypeVar("T")
+
+Pose7 = tuple[float, float, float, float, float, float, float]
+"""A pose as seven numbers: translation x y z, quaternion w x y z."""
+
+QUATERNION_NORM_TOLERANCE = 1e-3
+COORDINATE_MAX = 1e7
+
+
+@dataclass(frozen=True, slots=True)
+class Codec(Generic[T]):
+    """How one kind of value is packed and unpacked; `unpack` raises DecodeError for anything else."""
+
+    pack: Callable[[T], Any]
+    unpack: Callable[[Any], T]
+
+
+def integer(low: int, high: int) -> Codec[int]:
+    """An integer in [low, high]."""
+
+    def unpack(value: Any) -> int:
+        if type(value) is not int or not low <= value <= high:
+            raise DecodeError(f"expected an integer in [{low}, {high}]")
+        return value
+
+    return Codec(lambda value: value, unpack)
+
+
+def real(low: float = -math.inf, high: float = math.inf) -> Codec[float]:
+    """A finite float in [low, high]."""
+
+    def unpack(value: Any) -> float:
+        if type(value) is not float or not math.isfinite(value) or not low <= value <= high:
+            raise DecodeError(f"expected a finite number in [{low}, {high}]")
+        return value
+
+    return Codec(float, unpack)
+
+
+def text(length_max: int) -> Codec[str]:
+    """A string of at most `length_max` characters."""
+
+    def unpack(value: Any) -> str:
+        if type(value) is not str or len(value) > length_max:
+            raise DecodeError(f"expected text of at most {length_max} characters")
+        return value
+
+    return Codec(lambda value: value[:length_max], unpack)
+
+
+def blob(bytes_max: int) -> Codec[bytes]:
+    """Bytes, at most `bytes_max`."""
+
+    def unpack(value: Any) -> bytes:
+        if type(value) is not bytes or len(value) > bytes_max:
+            raise DecodeError(f"expected at most {bytes_max} bytes")
+        return value
+
+    return Codec(lambda value: value, unpack)
+
+
+def boolean() -> Codec[bool]:
+    """True or false."""
+
+    def unpack(value: Any) -> bool:
+        if type(value) is not bool:
+            raise DecodeError("expected true or false")
+        return value
+
+    return Codec(lambda value: value, unpack)
+
+
+def optional(inner: Codec[T]) -> Codec[T | None]:
+    """The inner value or nil."""
+    return Codec(
+        lambda value: None if value is None else inner.pack(value),
+        lambda value: None if value is None else inner.unpack(value),
+    )
+
+
+def sequence(inner: Codec[T], items_max: int) -> Codec[tuple[T, ...]]:
+    """At most `items_max` inner values."""
+
+    def unpack(value: Any) -> tuple[T, ...]:
+        if type(value) is not list or len(value) > items_max:
+            raise DecodeError(f"expected a list of at most {items_max}")
+        return tuple([inner.unpack(item) for item in value])
+
+    return Codec(lambda values: [inner.pack(value) for value in values], unpack)
+
+
+def struct(build: Callable[..., T], **fields: Codec[Any]) -> Codec[T]:
+    """A dataclass as a list of its fields in the order given here."""
+    names = tuple(fields)
+    codecs = tuple(fields.values())
+
+    def pack(value: T) -> list[Any]:
+        return [codec.pack(getattr(value, name)) for name, codec in zip(names, codecs, strict=True)]
+
+    def unpack(value: Any) -> T:
+        if type(value) is not list or len(value) != len(codecs):
+            raise DecodeError(f"expected {len(codecs)} fields")
+        values = [codec.unpack(item) for codec, item in zip(codecs, value, strict=True)]
+        try:
+            return build(**dict(zip(names, values, strict=True)))
+        except ValueError as error:
+            raise DecodeError(str(error)) from error
+
+    return Codec(pack, unpack)
+
+
+def _unpack_name(value: Any) -> str:
+    if type(value) is not str or not NAME_PATTERN.fullmatch(value):
+        raise DecodeError("expected a robot name")
+    return value
+
+
+_POSE = binary.Struct("<7d")
+
+
+def _unpack_pose(value: Any) -> Pose7:
+    if type(value) is not bytes or len(value) != _POSE.size:
+        raise DecodeError("expected a pose of seven doubles")
+    numbers = _POSE.unpack(value)
+    if not all(math.isfinite(number) for number in numbers) or max(map(abs, numbers[:3])) > COORDINATE_MAX:
+        raise DecodeError("a pose must be finite and within the map")
+    if abs(math.sqrt(sum(q * q for q in numbers[3:])) - 1.0) > QUATERNION_NORM_TOLERANCE:
+        raise DecodeError("a pose must have a unit quaternion")
+    return numbers
+
+
+def _unpack_array(value: Any) -> Array:
+    if type(value) is not list or len(value) != 4:
+        raise DecodeError("expected an array of dtype, shape, bytes and scale")
+    dtype, shape, data, scale = value
+    sizes_ok = type(shape) is list and all(type(size) is int for size in shape)
+    if type(dtype) is not str or not sizes_ok or type(data) is not bytes or type(scale) is not float:
+        raise DecodeError("expected an array of dtype, shape, bytes and scale")
+    array = Array(dtype, tuple(shape), data, scale)
+    if not array.is_finite():
+        raise DecodeError("an array must be finite")
+    return array
+
+
+NAME: Codec[str] = Codec(lambda value: value, _unpack_name)
+POSE: Codec[Pose7] = Codec(lambda value: _POSE.pack(*value), _unpack_pose)
+ARRAY: Codec[Array] = Codec(lambda a: [a.dtype, list(a.shape), a.data, float(a.scale)], _unpack_array)
+COUNT = integer(0, INDEX_MAX)
+LOG_ID = struct(LogId, robot=NAME, incarnation=integer(0, INCARNATION_MAX))
+KEYFRAME_ID = struct(KeyframeId, log=LOG_ID, index=COUNT)
+TERM = struct(Term, counter=integer(0, TERM_COUNTER_MAX), leader=LOG_ID)
+
+
+def to_bytes(value: Any) -> bytes:
+    """Serialise a msgpack object."""
+    packed: bytes = msgpack.packb(value, use_bin_type=True)
+    return packed
+
+
+def from_bytes(data: bytes, bytes_max: int) -> Any:
+    """Parse exactly one msgpack object.
+
+    Raises:
+        DecodeError: Too long, not msgpack, or bytes left over.
+    """
+    if len(data) > bytes_max:
+        raise DecodeError(f"{len(data)} bytes are more than {bytes_max}")
+    try:
+        return msgpack.unpackb(
+            data, raw=False, strict_map_key=True, max_map_len=0, max_ext_len=0, max_array_len=bytes_max
+        )
+    except (
+        ValueError,
+        TypeError,
+        RecursionError,
+        OverflowError,
+        msgpack.exceptions.UnpackException,
+    ) as error:
+        raise DecodeError(f"not msgpack: {type(error).__name__}") from error

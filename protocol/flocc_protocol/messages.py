@@ -1,0 +1,356 @@
+"""Messages between robots, versioned and checked on decode.
+
+Everything but latents is a message. Latents are fetched by key (see `keys`), in chunks, for candidates only.
+Every message but a heartbeat may be lost: heartbeats repeat, and what they say repairs the rest.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import (
+    ARRAY,
+    COUNT,
+    KEYFRAME_ID,
+    LOG_ID,
+    POSE,
+    TERM,
+    Codec,
+    Pose7,
+    blob,
+    boolean,
+    from_bytes,
+    integer,
+    optional,
+    sequence,
+    struct,
+    to_bytes,
+)
+from flocc_protocol.errors import DecodeError
+from flocc_protocol.ids import INCARNATION_MAX, KeyframeId, LogId, Term
+from flocc_protocol.records import RECORD_BYTES_MAX
+
+PROTOCOL_VERSION = 1
+MESSAGE_BYTES_MAX = 64 * 1024
+LOGS_MAX = 256
+WANTS_MAX = 16
+OFFERS_MAX = 64
+RECORDS_BATCH_MAX = 64
+RECORDS_BATCH_BYTES_MAX = 32 * 1024
+CORRECTION_KEYFRAMES_MAX = 1500
+COMPUTE_CLASS_MAX = 9
+HOPS_MAX = 255
+COUNTER_MAX = 2**53 - 1
+
+
+class UnknownVersion(DecodeError):
+    """The sender speaks another version of this protocol."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogDigest:
+    """How much of one log the sender holds, with the chained checksum of those records."""
+
+    log: LogId
+    count: int
+    checksum: int
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionVersion:
+    """Which correction of one log the sender holds."""
+
+    log: LogId
+    term: Term
+    round: int
+
+
+@dataclass(frozen=True, slots=True)
+class LeaderAdvert:
+    """The leader that the sender follows, as far as the sender knows.
+
+    Attributes:
+        term: Term of that leader.
+        compute_class: The leader's compute class.
+        beat: The leader's own counter; a leader is alive as long as this grows.
+        hops: Robots between the leader and the sender; 0 when the sender leads.
+    """
+
+    term: Term
+    compute_class: int
+    beat: int
+    hops: int
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """Who is there, what it holds, whom it follows.
+
+    Attributes:
+        sequence: Counts this boot's heartbeats.
+        boot: Random per start; two boots that are heard alternately share one name by mistake.
+        compute_class: 0 (small) to 9 (server with a GPU).
+        leader: The followed leader, None while there is none.
+        term_counter_max: Highest term counter the sender knows of.
+        load: Registrations waiting at the sender.
+        digests: What the sender holds of each log.
+        corrections: Which corrections the sender holds.
+        wants: Latents the sender needs and cannot reach, for relays.
+        holds: Latents the sender holds for a neighbour that wanted them.
+    """
+
+    sequence: int
+    boot: int
+    compute_class: int
+    leader: LeaderAdvert | None
+    term_counter_max: int
+    load: int
+    digests: tuple[LogDigest, ...]
+    corrections: tuple[CorrectionVersion, ...] = ()
+    wants: tuple[KeyframeId, ...] = ()
+    holds: tuple[KeyframeId, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Election:
+    """ELECTION of the bully algorithm (Garcia-Molina 1982), to robots that outrank the sender."""
+
+    counter: int
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """ANSWER: a robot that outranks the asker is alive and takes over the election."""
+
+    counter: int
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinator:
+    """COORDINATOR: the sender claims a term."""
+
+    advert: LeaderAdvert
+
+
+@dataclass(frozen=True, slots=True)
+class Handover:
+    """The leader leaves in order; nobody needs to wait for its silence."""
+
+    term: Term
+
+
+@dataclass(frozen=True, slots=True)
+class RecordBatch:
+    """Records of one log from number `first` on.
+
+    Attributes:
+        log: Whose log.
+        first: Number of the first record.
+        checksum_before: The sender's chained checksum of the records before `first`.
+        records: Encoded records, in order.
+    """
+
+    log: LogId
+    first: int
+    checksum_before: int
+    records: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordRequest:
+    """Please send records of one log from number `first` on."""
+
+    log: LogId
+    first: int
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionMessage:
+    """A leader's correction of one log, which anyone may pass on.
+
+    Attributes:
+        log: Whose trajectory is corrected.
+        term: Term of the leader that made it.
+        round: Number of its optimisation round; (term, round) only grows.
+        anchor: The component's anchor, after which the map frame is named.
+        T_map_odom: Where the log's odom frame lies in the map.
+        covariance: Upper triangle (21) of T_map_odom's covariance, or None.
+        first: Number of the first corrected keyframe.
+        step: Every `step`-th keyframe is listed; those between are interpolated.
+        T_map_camera: (N, 7) float32 poses, translation and quaternion w x y z.
+    """
+
+    log: LogId
+    term: Term
+    round: int
+    anchor: LogId
+    T_map_odom: Pose7
+    covariance: Array | None
+    first: int
+    step: int
+    T_map_camera: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionRequest:
+    """Please send your correction of this log."""
+
+    log: LogId
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateOffer:
+    """Candidate pairs that the sender found and that the receiver is to register.
+
+    Attributes:
+        pairs: (query of the receiver, match of the sender) and so on, each pair sorted.
+        transferred: The sender gives up a pair that was its own; it waits for the receiver's record.
+    """
+
+    pairs: tuple["CandidatePair", ...]
+    transferred: bool = False
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class CandidatePair:
+    """Two keyframes of different robots that may show one place; `low < high`."""
+
+    low: KeyframeId
+    high: KeyframeId
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError("a candidate pair is sorted and joins two keyframes")
+
+    @classmethod
+    def of(cls, a: KeyframeId, b: KeyframeId) -> "CandidatePair":
+        """Sort two keyframes into a pair."""
+        return cls(min(a, b), max(a, b))
+
+
+Message = (
+    Heartbeat
+    | Election
+    | Answer
+    | Coordinator
+    | Handover
+    | RecordBatch
+    | RecordRequest
+    | CorrectionMessage
+    | CorrectionRequest
+    | CandidateOffer
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """A message with its sender's log."""
+
+    sender: LogId
+    message: Message
+
+
+def _correction(**fields: Any) -> CorrectionMessage:
+    correction = CorrectionMessage(**fields)
+    poses, covariance = correction.T_map_camera, correction.covariance
+    if len(poses.shape) != 2 or poses.shape[1] != 7 or poses.shape[0] > CORRECTION_KEYFRAMES_MAX:
+        raise DecodeError(f"a correction has (N, 7) poses, N at most {CORRECTION_KEYFRAMES_MAX}")
+    if covariance is not None and covariance.shape != (21,):
+        raise DecodeError("a covariance is an upper triangle of 21")
+    return correction
+
+
+_BEAT = integer(0, COUNTER_MAX)
+_CHECKSUM = integer(0, 2**32 - 1)
+_COMPUTE_CLASS = integer(0, COMPUTE_CLASS_MAX)
+_ADVERT = struct(LeaderAdvert, term=TERM, compute_class=_COMPUTE_CLASS, beat=_BEAT, hops=integer(0, HOPS_MAX))
+_DIGEST = struct(LogDigest, log=LOG_ID, count=COUNT, checksum=_CHECKSUM)
+_VERSION = struct(CorrectionVersion, log=LOG_ID, term=TERM, round=COUNT)
+_PAIR = struct(CandidatePair, low=KEYFRAME_ID, high=KEYFRAME_ID)
+
+_CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
+    "heartbeat": (
+        Heartbeat,
+        struct(
+            Heartbeat,
+            sequence=_BEAT,
+            boot=integer(0, INCARNATION_MAX),
+            compute_class=_COMPUTE_CLASS,
+            leader=optional(_ADVERT),
+            term_counter_max=_BEAT,
+            load=COUNT,
+            digests=sequence(_DIGEST, LOGS_MAX),
+            corrections=sequence(_VERSION, LOGS_MAX),
+            wants=sequence(KEYFRAME_ID, WANTS_MAX),
+            holds=sequence(KEYFRAME_ID, WANTS_MAX),
+        ),
+    ),
+    "election": (Election, struct(Election, counter=_BEAT)),
+    "answer": (Answer, struct(Answer, counter=_BEAT)),
+    "coordinator": (Coordinator, struct(Coordinator, advert=_ADVERT)),
+    "handover": (Handover, struct(Handover, term=TERM)),
+    "records": (
+        RecordBatch,
+        struct(
+            RecordBatch,
+            log=LOG_ID,
+            first=COUNT,
+            checksum_before=_CHECKSUM,
+            records=sequence(blob(RECORD_BYTES_MAX), RECORDS_BATCH_MAX),
+        ),
+    ),
+    "record-request": (RecordRequest, struct(RecordRequest, log=LOG_ID, first=COUNT)),
+    "correction": (
+        CorrectionMessage,
+        struct(
+            _correction,
+            log=LOG_ID,
+            term=TERM,
+            round=COUNT,
+            anchor=LOG_ID,
+            T_map_odom=POSE,
+            covariance=optional(ARRAY),
+            first=COUNT,
+            step=integer(1, 2**31 - 1),
+            T_map_camera=ARRAY,
+        ),
+    ),
+    "correction-request": (CorrectionRequest, struct(CorrectionRequest, log=LOG_ID)),
+    "candidates": (
+        CandidateOffer,
+        struct(CandidateOffer, pairs=sequence(_PAIR, OFFERS_MAX), transferred=boolean()),
+    ),
+}
+_KINDS: dict[type[Message], str] = {cls: kind for kind, (cls, _) in _CODECS.items()}
+MESSAGE_KINDS: tuple[str, ...] = tuple(_CODECS)
+
+
+def kind_of(message: Message) -> str:
+    """Name of a message's kind, as accounting and key expressions use it."""
+    return _KINDS[type(message)]
+
+
+def encode(envelope: Envelope) -> bytes:
+    """Serialise a message: version, kind, sender, fields."""
+    kind = kind_of(envelope.message)
+    body = _CODECS[kind][1].pack(envelope.message)
+    data = to_bytes([PROTOCOL_VERSION, kind, LOG_ID.pack(envelope.sender), body])
+    assert len(data) <= MESSAGE_BYTES_MAX, f"{kind} of {len(data)} bytes is larger than a message may be"
+    return data
+
+
+def decode(data: bytes) -> Envelope:
+    """Parse and check a message.
+
+    Raises:
+        UnknownVersion: The sender speaks another version.
+        DecodeError: The bytes are anything else.
+    """
+    value = from_bytes(data, MESSAGE_BYTES_MAX)
+    if type(value) is not list or not value or type(value[0]) is not int:
+        raise DecodeError("a message starts with its version")
+    if value[0] != PROTOCOL_VERSION:
+        raise UnknownVersion(f"protocol version {value[0]}, this robot speaks {PROTOCOL_VERSION}")
+    if len(value) != 4 or type(value[1]) is not str or value[1] not in _CODECS:
+        raise DecodeError("a message is version, kind, sender and fields")
+    return Envelope(LOG_ID.unpack(value[2]), _CODECS[value[1]][1].unpack(value[3]))
