@@ -1,0 +1,69 @@
+"""Local features: where they are (rays, free of distortion and of the camera's size) and what they look like.
+
+OpenCV's SIFT with RootSIFT normalisation (Arandjelovic and Zisserman 2012), quantised to one byte per component.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.config import ClassicalConfig
+from flocc_agent.core.interfaces import Camera, Image
+
+DESCRIPTOR_LENGTH = 128
+QUANTISATION = 512.0
+"""A RootSIFT component times this fits a byte; the few above 255/512 are clipped."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Local features of one image.
+
+    Attributes:
+        points: (N, 2) float32, x/z and y/z in the camera frame, free of distortion.
+        descriptors: (N, 128) uint8, RootSIFT times 512.
+        focal_px: Mean focal length; turns distances between points into pixels.
+    """
+
+    points: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    focal_px: float
+
+
+class FeatureExtractor:
+    """SIFT on the grey image, strongest first, at most `features_max`."""
+
+    def __init__(self, config: ClassicalConfig) -> None:
+        cv2.setNumThreads(1)  # global in OpenCV: one worker, one core
+        self._features_max = config.features_max
+        self._sift = cv2.SIFT_create(nfeatures=config.features_max, contrastThreshold=config.contrast_threshold)
+
+    def extract(self, image: Image) -> Features:
+        """Find and describe the features of an image; an image of one colour has none."""
+        grey = cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
+        keypoints, sift = self._sift.detectAndCompute(grey, None)
+        focal_px = (image.camera.fx + image.camera.fy) / 2.0
+        if sift is None or len(keypoints) == 0:
+            empty = np.zeros((0, DESCRIPTOR_LENGTH), np.uint8)
+            return Features(np.zeros((0, 2), np.float32), empty, focal_px)
+        pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64)[: self._features_max]
+        points = undistorted(pixels, image.camera)
+        return Features(points.astype(np.float32), root_sift(sift[: self._features_max]), focal_px)
+
+
+def undistorted(pixels: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Turn pixels (N, 2) into x/z and y/z (N, 2) in the camera frame, without distortion."""
+    distortion = np.array(camera.distortion)
+    if not np.any(distortion):
+        return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    points = cv2.undistortPoints(pixels[:, None, :], camera.K(), distortion)
+    return np.asarray(points, np.float64).reshape(-1, 2)
+
+
+def root_sift(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Normalise SIFT descriptors (N, 128) to RootSIFT and quantise them to bytes."""
+    total = np.maximum(sift.sum(axis=1, keepdims=True), 1e-6)
+    quantised = np.sqrt(sift / total) * QUANTISATION
+    return np.minimum(np.rint(quantised), 255.0).astype(np.uint8)
