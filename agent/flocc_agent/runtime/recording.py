@@ -1,0 +1,222 @@
+"""A robot's recording as a plain folder: images with stamps, odometry, intrinsics, optional ground truth.
+
+    RECORDING/images.txt        lines `stamp_s relative/path`, sorted by time
+    RECORDING/images/*.jpg|png
+    RECORDING/odometry.tum      T_odom_body at the images' stamps or denser
+    RECORDING/groundtruth.tum   T_world_body, optional
+    RECORDING/camera.toml       [camera] width height fx fy cx cy distortion T_body_camera
+
+Odometry is interpolated to the images' stamps. Images outside of the odometry's time are left out. Pixels are read
+when they are asked for.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.config import ConfigError, read_toml
+from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.runtime.trajectory import RecordingError, Trajectory, checked_pose, read_tum, text_lines
+
+__all__ = ["Frame", "Recording", "RecordingError", "read_camera", "read_image_list", "write_camera"]
+
+logger = logging.getLogger(__name__)
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image and where odometry says it was taken.
+
+    Attributes:
+        stamp_s: When, seconds.
+        image_path: The image file.
+        T_odom_body: (4, 4) pose of the body in the robot's odometry frame, metres.
+    """
+
+    stamp_s: float
+    image_path: Path
+    T_odom_body: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """One robot's images and odometry.
+
+    Attributes:
+        path: The folder.
+        camera: Intrinsics of every image.
+        T_body_camera: (4, 4) pose of the camera in the body, metres.
+        frames: Images that odometry covers, in order of time; at least one.
+        truth: Ground truth `T_world_body` where the recording has one.
+    """
+
+    path: Path
+    camera: Camera
+    T_body_camera: Float
+    frames: tuple[Frame, ...]
+    truth: Trajectory | None
+
+    @classmethod
+    def open(cls, path: Path) -> "Recording":
+        """Read everything but the pixels, of which only the first image's are checked.
+
+        Raises:
+            RecordingError: A file is missing or broken, an image does not exist or has another size than the
+                intrinsics, or no image lies within the odometry's time.
+        """
+        if not path.is_dir():
+            raise RecordingError(f"{path}: is not a folder")
+        camera, T_body_camera = read_camera(path / "camera.toml")
+        frames = _frames(path, read_tum(path / "odometry.tum"))
+        truth_path = path / "groundtruth.tum"
+        truth = read_tum(truth_path) if truth_path.exists() else None
+        recording = cls(path, camera, T_body_camera, frames, truth)
+        recording.load_image(frames[0])
+        return recording
+
+    def ground_truth(self, stamp_s: float) -> Float | None:
+        """True (4, 4) pose `T_world_body` at a time, or None where there is none."""
+        return None if self.truth is None else self.truth.at(stamp_s)
+
+    def load_image(self, frame: Frame) -> Image:
+        """Read a frame's pixels, (H, W, 3) uint8 RGB.
+
+        Raises:
+            RecordingError: The image cannot be read, or its size is not that of the intrinsics.
+        """
+        pixels = _read_rgb(frame.image_path)
+        height, width = pixels.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise RecordingError(
+                f"{frame.image_path}: the image is {width}x{height}, but the intrinsics in "
+                f"{self.path / 'camera.toml'} are for {self.camera.width}x{self.camera.height}"
+            )
+        return Image(pixels, self.camera)
+
+
+def read_image_list(path: Path) -> list[tuple[float, Path]]:
+    """Read `images.txt`: stamps and paths, which are relative to its folder.
+
+    Raises:
+        RecordingError: Unreadable, empty, a malformed line, time going backwards, or an image that is missing.
+    """
+    images: list[tuple[float, Path]] = []
+    for line, text in text_lines(path):
+        stamp, _, name = text.partition(" ")
+        try:
+            stamp_s = float(stamp)
+        except ValueError:
+            stamp_s = float("nan")
+        if not np.isfinite(stamp_s) or not name.strip():
+            raise RecordingError(f"{path}:{line}: must be 'stamp_s relative/path', not {text[:80]!r}")
+        if images and stamp_s <= images[-1][0]:
+            raise RecordingError(f"{path}:{line}: time goes backwards, from {images[-1][0]:.6f} s to {stamp_s:.6f} s")
+        image = path.parent / name.strip()
+        if not image.is_file():
+            raise RecordingError(f"{path}:{line}: the image {image} does not exist")
+        images.append((stamp_s, image))
+    if not images:
+        raise RecordingError(f"{path}: lists no image")
+    return images
+
+
+def read_camera(path: Path) -> tuple[Camera, Float]:
+    """Read `camera.toml`: intrinsics, and `T_body_camera` (identity where it is missing).
+
+    Raises:
+        RecordingError: Unreadable, a key is missing or unknown, or a value cannot be.
+    """
+    try:
+        table = read_toml(path)
+    except ConfigError as error:
+        raise RecordingError(str(error)) from error
+    camera = table.get("camera")
+    if not isinstance(camera, dict):
+        raise RecordingError(f"{path}: the table [camera] is missing")
+    values = {**camera, **{key: value for key, value in table.items() if key != "camera"}}
+    T_body_camera = values.pop("T_body_camera", None)
+    return _camera(values, path), _extrinsics(T_body_camera, path)
+
+
+def write_camera(path: Path, camera: Camera, T_body_camera: Float) -> None:
+    """Write `camera.toml`."""
+    rows = ",\n    ".join("[" + ", ".join(f"{value:.12g}" for value in row) + "]" for row in T_body_camera)
+    distortion = ", ".join(f"{value:.12g}" for value in camera.distortion)
+    path.write_text(
+        "# Pinhole, pixels; distortion k1 k2 p1 p2.\n"
+        "# T_body_camera: camera (x right, y down, z forward) in the body, metres.\n"
+        f"[camera]\nwidth = {camera.width}\nheight = {camera.height}\n"
+        f"fx = {camera.fx:.12g}\nfy = {camera.fy:.12g}\ncx = {camera.cx:.12g}\ncy = {camera.cy:.12g}\n"
+        f"distortion = [{distortion}]\nT_body_camera = [\n    {rows},\n]\n",
+        encoding="utf-8",
+    )
+
+
+def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
+    images = read_image_list(path / "images.txt")
+    posed = [(stamp_s, image, odometry.at(stamp_s)) for stamp_s, image in images]
+    frames = tuple(Frame(stamp_s, image, T) for stamp_s, image, T in posed if T is not None)
+    if not frames:
+        raise RecordingError(
+            f"{path / 'odometry.tum'}: is from {odometry.stamps_s[0]:.3f} s to {odometry.stamps_s[-1]:.3f} s, but "
+            f"the images of {path / 'images.txt'} are from {images[0][0]:.3f} s to {images[-1][0]:.3f} s"
+        )
+    if len(frames) < len(images):
+        logger.warning("%s: %d of %d images lie outside of the odometry", path, len(images) - len(frames), len(images))
+    return frames
+
+
+def _camera(values: dict[str, object], path: Path) -> Camera:
+    sizes = {key: _number(values, key, path) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    distortion = values.pop("distortion", [0.0, 0.0, 0.0, 0.0])
+    if values:
+        raise RecordingError(f"{path}: the key 'camera.{next(iter(values))}' does not exist")
+    if not isinstance(distortion, list) or len(distortion) != 4:
+        raise RecordingError(f"{path}: camera.distortion must be [k1, k2, p1, p2]")
+    try:
+        k1, k2, p1, p2 = (float(value) for value in distortion)
+        return Camera(
+            int(sizes["width"]), int(sizes["height"]), sizes["fx"], sizes["fy"], sizes["cx"], sizes["cy"],
+            (k1, k2, p1, p2),
+        )  # fmt: skip
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def _number(values: dict[str, object], key: str, path: Path) -> float:
+    if key not in values:
+        raise RecordingError(f"{path}: the key 'camera.{key}' is missing")
+    value = values.pop(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise RecordingError(f"{path}: camera.{key} must be a number, not {value!r}")
+    return value
+
+
+def _extrinsics(rows: object, path: Path) -> Float:
+    if rows is None:
+        return np.eye(4)
+    try:
+        T = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        T = np.empty(0)
+    if T.shape != (4, 4):
+        raise RecordingError(f"{path}: camera.T_body_camera must be four rows of four numbers")
+    return checked_pose(T, f"{path}: camera.T_body_camera")
+
+
+def _read_rgb(path: Path) -> NDArray[np.uint8]:
+    import cv2
+
+    try:
+        encoded = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise RecordingError(f"{path}: the image cannot be read: {error.strerror or error}") from error
+    bgr = cv2.imdecode(encoded, cv2.IMREAD_COLOR) if encoded.size else None
+    if bgr is None:
+        raise RecordingError(f"{path}: the image cannot be read: it is damaged or of an unknown format")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
