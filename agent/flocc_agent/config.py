@@ -3,14 +3,19 @@
 Parameters of the core are plain dataclasses in `core/parameters.py`; pydantic checks them here like the rest.
 """
 
+import re
 import tomllib
 from enum import Enum
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import NAME_PATTERN
+
+if TYPE_CHECKING:
+    from flocc_agent.radio import LinkParameters, RadioParameters
 
 
 class ConfigError(FloccError):
@@ -112,12 +117,258 @@ class ClassicalConfig(Section):
     """Odometry-pair results kept in memory."""
 
 
+class SyntheticConfig(Section):
+    """The synthetic front end: ground truth plus a seeded noise, outlier and scale model."""
+
+    dimension: int = Field(128, ge=8, le=4096)
+    """Length of a descriptor; a longer one has less accidental similarity, about 1/sqrt(dimension)."""
+    place_distance_m: float = Field(3.0, gt=0)
+    """Distance at which the similarity of two descriptors has fallen to 0.6."""
+    place_angle_rad: float = Field(0.7, gt=0)
+    """Angle between viewing directions at which the similarity of two descriptors has fallen to about 0.6."""
+    descriptor_noise_ratio: float = Field(0.2, ge=0)
+    """Length of a descriptor's own noise relative to the place's signature."""
+    alias_probability: float = Field(0.05, ge=0, le=1)
+    """Share of places that look like one of a few others."""
+    alias_places: int = Field(4, ge=1)
+    """Number of looks that aliased places share; fewer means more mistaken candidates."""
+    alias_cell_m: float = Field(10.0, gt=0)
+    """Edge of the cubes that are aliased as a whole."""
+    visibility_distance_m: float = Field(4.0, gt=0)
+    """Distance at which the correspondences have fallen to 0.6 of the typical number."""
+    visibility_angle_rad: float = Field(0.6, gt=0)
+    """Angle between viewing directions at which the correspondences have fallen to 0.6 of the typical number."""
+    correspondences_typical: int = Field(400, ge=20)
+    """Correspondences of two images of one place."""
+    correspondences_min: int = Field(20, ge=1)
+    """Fewer correspondences are no registration."""
+    rotation_sigma_rad: float = Field(0.01, ge=0)
+    """Rotation noise at the typical number of correspondences; grows as they become few."""
+    translation_sigma_ratio: float = Field(0.05, ge=0)
+    """Translation noise per distance, at the typical number of correspondences."""
+    outlier_probability: float = Field(0.05, ge=0, le=1)
+    """Share of registrations that give a wrong pose, with fewer correspondences than a right one."""
+    outlier_distance_m: float = Field(10.0, gt=0)
+    """Typical length of a wrong translation."""
+    scale_sigma_ratio: float = Field(0.3, ge=0)
+    """Spread of metres per network unit between registrations (log-normal)."""
+    scale_drift_sigma_ratio: float = Field(0.1, ge=0)
+    """How much the odometry pair's metres per network unit differ from the loop pair's (log-normal)."""
+    latent_bytes: int = Field(0, ge=0, le=64 * 1024 * 1024)
+    """Latents are padded to this size, to load links like another method's; MASt3R's are 1.5 MB."""
+
+
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
     method: Literal["classical", "synthetic", "mast3r"] = "classical"
     """classical: OpenCV, no weights; synthetic: ground truth plus noise; mast3r: CosPlace and MASt3R checkpoints."""
     classical: ClassicalConfig = ClassicalConfig()
+    synthetic: SyntheticConfig = SyntheticConfig()
+
+
+ENDPOINT_PATTERN = re.compile(r"(tcp|tls|quic|udp)/(\[[0-9a-fA-F:.]+\]|[^/:#?\s]+):[0-9]{1,5}([#?]\S*)?")
+
+
+def checked_endpoint(text: str) -> str:
+    """Return the endpoint, or say how one looks.
+
+    Raises:
+        ValueError: Not PROTOCOL/HOST:PORT.
+    """
+    if not ENDPOINT_PATTERN.fullmatch(text):
+        raise ValueError(f"{text!r} is no endpoint; one looks like tcp/10.0.0.7:7447 or tls/[::]:0#iface=wlan0")
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(checked_endpoint)]
+
+
+class PeerEndpoints(Section):
+    """Where one known robot listens."""
+
+    control: tuple[Endpoint, ...] = ()
+    """Its control session: heartbeats, records, elections, corrections."""
+    bulk: tuple[Endpoint, ...] = ()
+    """Its bulk session: latents."""
+
+
+class TlsConfig(Section):
+    """Mutual TLS: the files that `flocc keys` wrote for this robot."""
+
+    ca: Path
+    """Certificate of the swarm's authority; whoever it did not certify is refused."""
+    certificate: Path
+    """This robot's certificate; its common name is the robot's name."""
+    key: Path
+    """This robot's private key."""
+    names_verified: bool = False
+    """True also demands that the dialled address stands in the peer's certificate."""
+    members: tuple[str, ...] = ()
+    """Robots that may write, each under its own name only; empty: those of the roster."""
+    operators: tuple[str, ...] = ("operator",)
+    """Certificate names that may ask for status and inject faults."""
+
+
+class TransportConfig(Section):
+    """How a robot reaches others over zenoh. Latents have their own session, so that they never delay heartbeats."""
+
+    control_listen: tuple[Endpoint, ...] = ("tcp/0.0.0.0:0",)
+    """Where this robot listens for control; port 0 takes a free one, for which scouting must be on."""
+    bulk_listen: tuple[Endpoint, ...] = ("tcp/0.0.0.0:0",)
+    """Where this robot listens for latents."""
+    roster: dict[str, PeerEndpoints] = Field(default_factory=dict)
+    """Known robots by name. Of each pair the higher name dials, for ever, also after a partition."""
+    multicast: bool = True
+    """Find robots of the same network by multicast; needs no roster, but many Wi-Fi access points drop it."""
+    multicast_control: str = "224.0.0.224:7446"
+    """Group and port for finding control sessions; swarms that share a network may take different ones."""
+    multicast_bulk: str = "224.0.0.224:7447"
+    """Group and port for finding bulk sessions; must differ from the one for control."""
+    interface: str = "auto"
+    """Network interface of multicast: auto, or one such as wlan0 (lo on a single machine)."""
+    gossip: bool = True
+    """Learn robots from robots; such links are not dialled again after a cut, the roster's are."""
+    lease_s: float = Field(3.0, ge=1.0)
+    """A silent TCP link is given up after this; at least twice the outage to ride through, more under load."""
+    open_timeout_s: float = Field(2.0, gt=0)
+    """Time for one attempt to open a link; longer leaves pairs apart for longer under heavy loss."""
+    retry_max_s: float = Field(1.0, gt=0)
+    """Longest pause between two attempts to dial a robot of the roster."""
+    bulk_send_buffer_bytes: int = Field(65536, ge=4096)
+    """Kernel buffer of the bulk session; larger is faster on long links and delays control more on slow ones."""
+    message_bytes_max: int = Field(1024 * 1024, ge=1024)
+    """Larger messages are neither sent nor accepted; latents have their own limit."""
+    latent_bytes_max: int = Field(8 * 1024 * 1024, ge=1024)
+    """Larger latents are neither served nor fetched."""
+    chunk_bytes: int = Field(256 * 1024, ge=1024, le=4 * 1024 * 1024)
+    """A latent travels in pieces of this size; a fetch that was cut goes on with the piece that is missing."""
+    chunk_timeout_s: float = Field(5.0, gt=0)
+    """One piece that takes longer is asked for again."""
+    fetches_max: int = Field(2, ge=1, le=8)
+    """Latents in flight at once; more share the same link and make each later."""
+    inbox_messages_max: int = Field(4096, ge=16)
+    """Messages of one kind that wait for the robot; the oldest is dropped for a new one."""
+    inbox_bytes_max: int = Field(32 * 1024 * 1024, ge=1024 * 1024)
+    """Bytes of one kind that wait for the robot."""
+    peers_max: int = Field(256, ge=1)
+    """Different senders; messages of any further one are dropped."""
+    peer_messages_per_s: float = Field(2000.0, gt=0)
+    """What one sender may sustain, with bursts of two seconds' worth; the rest is dropped and counted."""
+    peer_bytes_per_s: float = Field(16.0 * 1024 * 1024, gt=0)
+    """The same in bytes."""
+    tls: TlsConfig | None = None
+    """Mutual TLS and one writer per key; None is for trusted networks and emulation."""
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "TransportConfig":
+        misnamed = [name for name in self.roster if not NAME_PATTERN.fullmatch(name)]
+        if misnamed:
+            raise ValueError(f"the roster's {misnamed[0]!r} cannot be a robot's name")
+        endpoints = [*self.control_listen, *self.bulk_listen]
+        endpoints += [e for peer in self.roster.values() for e in (*peer.control, *peer.bulk)]
+        wrong = [e for e in endpoints if not e.startswith("tls/")] if self.tls else []
+        if wrong:
+            raise ValueError(f"with tls every endpoint begins with tls/, but there is {wrong[0]!r}")
+        if self.multicast_control == self.multicast_bulk:
+            raise ValueError("multicast_control and multicast_bulk must differ")
+        return self
+
+
+class StoreConfig(Section):
+    """What a robot keeps on disk."""
+
+    latent_bytes_max: int = Field(2 * 1024**3, ge=1024 * 1024)
+    """Latents kept, bytes; beyond it the oldest go first and can no longer be fetched."""
+    record_bytes_max: int = Field(1024**3, ge=1024 * 1024)
+    """Records of other robots kept, bytes; more are held in memory only. Own records are always written."""
+
+
+class LinkConfig(Section):
+    """The emulated quality of a link; the default is perfect. `flocc_agent.radio` says what each one does."""
+
+    loss_ratio: float = Field(0.0, ge=0, le=1)
+    """Probability that a message is lost, independently of others."""
+    burst_ratio: float = Field(0.0, ge=0, le=1)
+    """Share of messages that fall into bursts of loss."""
+    burst_messages_mean: float = Field(5.0, ge=1)
+    """Mean length of such a burst, messages."""
+    latency_s: float = Field(0.0, ge=0)
+    """Least delay of a message."""
+    jitter_s: float = Field(0.0, ge=0)
+    """Further delay, uniform between 0 and this."""
+    duplicate_ratio: float = Field(0.0, ge=0, le=1)
+    """Probability that a message arrives twice."""
+    reorder_ratio: float = Field(0.0, ge=0, le=1)
+    """Probability that a message may be overtaken."""
+    reorder_delay_s: float = Field(0.2, ge=0)
+    """How long such a message is held back."""
+    bandwidth_bytes_s: float | None = Field(None, gt=0)
+    """Capacity of each directed link; None is unlimited."""
+    queue_bytes_max: int = Field(4 * 1024 * 1024, ge=0)
+    """What may wait for a link before messages are lost."""
+
+    def link(self) -> "LinkParameters":
+        """The same as the link model takes it."""
+        from flocc_agent.radio import LinkParameters
+
+        return LinkParameters(**{name: getattr(self, name) for name in LinkConfig.model_fields})
+
+
+class LinkOverrideConfig(LinkConfig):
+    """Another quality for links of one direction."""
+
+    sender: str = "*"
+    """Robot that speaks, '*' for any."""
+    receiver: str = "*"
+    """Robot that hears, '*' for any."""
+
+
+class PartitionConfig(Section):
+    """Groups that do not hear each other for a while; robots that no group names are one more group."""
+
+    groups: tuple[tuple[str, ...], ...]
+    """Names, group by group."""
+    from_s: float = Field(0.0, ge=0)
+    """Begin, seconds after the start of the run."""
+    to_s: float = Field(float("inf"), gt=0)
+    """End, seconds after the start of the run."""
+
+
+class BlackoutConfig(Section):
+    """Robots whose radio is dead for a while."""
+
+    robots: tuple[str, ...]
+    """Their names."""
+    from_s: float = Field(0.0, ge=0)
+    """Begin, seconds after the start of the run."""
+    to_s: float = Field(float("inf"), gt=0)
+    """End, seconds after the start of the run."""
+
+
+class RadioConfig(LinkConfig):
+    """The emulated radio: the quality of every link, exceptions, range, and scheduled outages."""
+
+    range_m: float | None = Field(None, gt=0)
+    """Robots whose true positions are further apart do not hear each other; None is unlimited."""
+    overrides: tuple[LinkOverrideConfig, ...] = ()
+    """Links of another quality; the first match counts."""
+    partitions: tuple[PartitionConfig, ...] = ()
+    """Scheduled separations."""
+    blackouts: tuple[BlackoutConfig, ...] = ()
+    """Scheduled silences."""
+
+    def parameters(self) -> "RadioParameters":
+        """The same as the link model takes it."""
+        from flocc_agent.radio import Blackout, LinkOverride, Partition, RadioParameters
+
+        return RadioParameters(
+            link=self.link(),
+            overrides=tuple(LinkOverride(o.sender, o.receiver, o.link()) for o in self.overrides),
+            range_m=self.range_m,
+            partitions=tuple(Partition(p.groups, p.from_s, p.to_s) for p in self.partitions),
+            blackouts=tuple(Blackout(b.robots, b.from_s, b.to_s) for b in self.blackouts),
+        )
 
 
 def read_toml(path: Path) -> dict[str, object]:
