@@ -1,0 +1,1 @@
+"""Data sets as recordings of robots: `flocc dataset info | convert | split`."""

@@ -1,0 +1,175 @@
+"""What `flocc dataset info | convert | split` do: look at a data set, turn it into recordings, cut it into robots."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_launch.datasets.cut import cut
+from flocc_launch.datasets.detect import read_source
+from flocc_launch.datasets.drift import DriftSpec, drifted
+from flocc_launch.datasets.names import robot_names
+from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.writer import Progress, write_source
+
+
+@dataclass(frozen=True, slots=True)
+class Info:
+    """What a data set holds; values not known are None.
+
+    Attributes:
+        path: The folder.
+        format: Which reader read it.
+        images: How many.
+        from_s: Stamp of the first image.
+        to_s: Stamp of the last image.
+        camera: Intrinsics.
+        odometry_poses: Poses that odometry has.
+        truth_poses: Poses that the ground truth has.
+        length_m: Distance travelled, by ground truth or else by odometry.
+        faults: What is wrong with it, one sentence each.
+    """
+
+    path: Path
+    format: str
+    images: int
+    from_s: float
+    to_s: float
+    camera: Camera | None
+    odometry_poses: int | None
+    truth_poses: int | None
+    length_m: float | None
+    faults: tuple[str, ...]
+
+
+def info(path: Path, format_name: str | None = None) -> Info:
+    """Look at a data set without writing anything.
+
+    Raises:
+        DatasetError: Unknown, or nothing in it can be used.
+    """
+    source = read_source(path, format_name)
+    travelled = source.truth or source.odometry
+    return Info(
+        path=path,
+        format=source.format,
+        images=len(source.images),
+        from_s=source.images[0][0],
+        to_s=source.images[-1][0],
+        camera=source.lens.camera if source.lens else None,
+        odometry_poses=len(source.odometry) if source.odometry else None,
+        truth_poses=len(source.truth) if source.truth else None,
+        length_m=travelled.length_m() if travelled else None,
+        faults=source.faults if source.lens else (*source.faults, f"{path}: intrinsics are missing"),
+    )
+
+
+def convert(
+    path: Path,
+    out: Path,
+    *,
+    format_name: str | None = None,
+    camera: Path | None = None,
+    odometry: Path | None = None,
+    drift: DriftSpec | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Path:
+    """Write a data set as one recording; a conversion that was cut short goes on where it ended.
+
+    Args:
+        path: The data set.
+        out: The recording's folder.
+        format_name: One of `READERS`; None detects it.
+        camera: Intrinsics, TOML or YAML, in place of the folder's.
+        odometry: TUM trajectory of the robot's odometry, in place of the folder's.
+        drift: Makes odometry from the ground truth; None takes the folder's odometry, else the truth itself.
+        seed: Of the drift.
+        progress: Called with images done and images in all.
+
+    Returns:
+        The recording's folder.
+
+    Raises:
+        DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
+    """
+    source = read_source(path, format_name, camera)
+    identity = _identity("convert", path, source, drift, seed)
+    moved = _odometry(source, odometry, drift, np.random.default_rng([seed, 0]))
+    write_source(source, out, moved, identity, progress)
+    _complain(source, out, len(source.images))
+    return out
+
+
+def split(
+    path: Path,
+    out: Path,
+    robots: int = 3,
+    *,
+    seed: int = 0,
+    drift: DriftSpec | None = None,
+    overlap_s: float = 0.0,
+    format_name: str | None = None,
+    camera: Path | None = None,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Cut one data set by time into recordings of several robots, which then run at the same time.
+
+    Every part starts at 0 s, with its odometry at the identity. Where the data set has ground truth, odometry is made
+    from it with seeded drift.
+
+    Args:
+        path: The data set, or a recording.
+        out: Gets one folder per robot: alpha, bravo, charlie.
+        robots: How many parts.
+        seed: Of the drift; each robot has its own.
+        drift: How odometry departs from the truth; None takes the default of `DriftSpec`.
+        overlap_s: How much longer each part is than its share, at its end.
+        format_name: One of `READERS`; None detects it.
+        camera: Intrinsics in place of the folder's.
+        progress: Called with images done and images in all.
+
+    Returns:
+        The recordings' folders, in order of time.
+
+    Raises:
+        DatasetError: Nothing can be used, there are fewer images than robots, or a part was bad; the good one is kept.
+    """
+    source = read_source(path, format_name, camera)
+    if not 1 <= robots <= len(source.images) // 2:
+        raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
+    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift, seed)
+    folders = []
+    for index, name in enumerate(robot_names(robots)):
+        part = cut(source, index, robots, overlap_s)
+        rng = np.random.default_rng([seed, index])
+        moved = _odometry(part, None, (drift or DriftSpec()) if part.truth else None, rng)
+        write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
+        folders.append(out / name)
+    _complain(source, out, len(source.images))
+    return folders
+
+
+def _odometry(source: Source, odometry: Path | None, drift: DriftSpec | None, rng: np.random.Generator) -> Trajectory:
+    if odometry is not None:
+        return read_tum(odometry).relative_to_first()
+    if drift is not None:
+        if source.truth is None:
+            raise DatasetError(f"{source.path}: has no ground truth to make drifting odometry from")
+        return drifted(source.truth, drift, rng, source.up_world)
+    found = source.odometry or source.truth
+    if found is None:
+        raise DatasetError(f"{source.path}: has neither odometry nor ground truth; name a TUM file with --odometry")
+    return found.relative_to_first()
+
+
+def _complain(source: Source, out: Path, count: int) -> None:
+    if source.faults:
+        raise DatasetError(f"{source.faults[0]}; the {count} images that are good were kept in {out}")
+
+
+def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None, seed: int) -> str:
+    errors = drift.model_dump_json() if drift is not None else "default"
+    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}"

@@ -1,0 +1,57 @@
+"""A data set as its reader found it, before it is written as recordings."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_protocol.errors import FloccError
+
+Float = NDArray[np.float64]
+
+
+class DatasetError(FloccError):
+    """A data set that cannot be used; the message names the file or topic, and what was found instead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lens:
+    """A camera with its mounting; distortion may have more coefficients than an agent's camera takes.
+
+    Attributes:
+        camera: Intrinsics.
+        T_body_camera: (4, 4) pose of the camera in the body, metres.
+        k3: OpenCV's third radial coefficient; where it is not zero, images are undistorted when they are written.
+    """
+
+    camera: Camera
+    T_body_camera: Float = field(default_factory=lambda: np.eye(4))
+    k3: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """One robot's images and trajectories on disk.
+
+    Attributes:
+        path: The folder.
+        format: Which reader read it.
+        images: Stamps in seconds and files, in order of time.
+        lens: Intrinsics, or None where the folder has none.
+        odometry: `T_odom_body`, or None where the data set brings none.
+        truth: `T_world_body`, or None.
+        up_world: (3,) direction against gravity in the truth's world.
+        faults: What is wrong with the rest, one sentence each; what is above is good.
+    """
+
+    path: Path
+    format: str
+    images: tuple[tuple[float, Path], ...]
+    lens: Lens | None
+    odometry: Trajectory | None = None
+    truth: Trajectory | None = None
+    up_world: Float = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    faults: tuple[str, ...] = ()

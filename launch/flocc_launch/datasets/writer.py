@@ -1,0 +1,156 @@
+"""Writes a recording (the plain folder that an agent reads) image by image, and takes up one that was cut short.
+
+An image is complete before its line stands in `images.txt`, so whatever ends the work leaves a recording of what was
+written so far.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.runtime.recording import write_camera
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_launch.datasets.pixels import image_size, written_image, written_lens
+from flocc_launch.datasets.source import DatasetError, Lens, Source
+
+Float = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+class RecordingWriter:
+    """Appends images to a recording; the trajectories and the camera are written whole."""
+
+    def __init__(self, path: Path, identity: str) -> None:
+        """Open a recording for writing, or go on with it.
+
+        Args:
+            path: The folder; made where it is missing.
+            identity: What is written, one line; a folder with another identity is not touched.
+
+        Raises:
+            DatasetError: The folder holds another recording.
+        """
+        self.path = path
+        (path / "images").mkdir(parents=True, exist_ok=True)
+        _claim(path / "source.txt", identity)
+        self._listing = path / "images.txt"
+        self._lines = self._complete_lines()
+        self._listing.write_text("".join(self._lines), encoding="utf-8")
+        self._file = self._listing.open("a", encoding="utf-8")
+
+    def __enter__(self) -> "RecordingWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    @property
+    def count(self) -> int:
+        """Images that the recording holds."""
+        return len(self._lines)
+
+    @property
+    def last_stamp_s(self) -> float | None:
+        """Stamp of the last image, or None where there is none yet; a resumed conversion goes on after it."""
+        return float(self._lines[-1].split(" ", 1)[0]) if self._lines else None
+
+    def add(self, stamp_s: float, encoded: bytes, suffix: str) -> None:
+        """Append one encoded image; stamps must increase.
+
+        Args:
+            stamp_s: When it was taken, seconds.
+            encoded: The image file's bytes.
+            suffix: Of its name, with the dot.
+
+        Raises:
+            ValueError: The stamp is not after the last one.
+        """
+        if self.last_stamp_s is not None and stamp_s <= self.last_stamp_s:
+            raise ValueError(f"stamp {stamp_s} is not after {self.last_stamp_s}")
+        name = f"images/{self.count:06d}{suffix}"
+        partial = self.path / (name + ".part")
+        partial.write_bytes(encoded)
+        os.replace(partial, self.path / name)
+        line = f"{stamp_s:.9f} {name}\n"
+        self._file.write(line)
+        self._file.flush()
+        self._lines.append(line)
+
+    def write_camera(self, camera: Camera, T_body_camera: Float) -> None:
+        """Write `camera.toml`."""
+        write_camera(self.path / "camera.toml", camera, T_body_camera)
+
+    def write_trajectories(self, odometry: Trajectory | None, truth: Trajectory | None) -> None:
+        """Write `odometry.tum` and `groundtruth.tum`, as far as there are any."""
+        if odometry is not None:
+            write_tum(self.path / "odometry.tum", odometry)
+        if truth is not None:
+            write_tum(self.path / "groundtruth.tum", truth)
+
+    def _complete_lines(self) -> list[str]:
+        if not self._listing.exists():
+            return []
+        lines = self._listing.read_text(encoding="utf-8").splitlines(keepends=True)
+        return [line for line in lines if line.endswith("\n") and (self.path / line.split(" ", 1)[1].strip()).is_file()]
+
+
+def _claim(path: Path, identity: str) -> None:
+    if not path.exists():
+        if (path.parent / "images.txt").exists():
+            raise DatasetError(
+                f"{path.parent}: holds a recording that this command did not write; choose another folder"
+            )
+        path.write_text(identity + "\n", encoding="utf-8")
+    elif (found := path.read_text(encoding="utf-8").strip()) != identity:
+        raise DatasetError(f"{path.parent}: holds another recording ({found}); remove it or choose another folder")
+
+
+def write_source(
+    source: Source, out: Path, odometry: Trajectory, identity: str, progress: Progress | None = None
+) -> None:
+    """Write a recording from a source's image files; images that it has already are not written again.
+
+    Args:
+        source: Images, lens and ground truth.
+        out: The recording's folder.
+        odometry: `T_odom_body`.
+        identity: See `RecordingWriter`.
+        progress: Called with images done and images in all.
+
+    Raises:
+        DatasetError: Intrinsics are missing or of another size, or an image cannot be read.
+    """
+    lens = _checked_lens(source)
+    kept = written_lens(lens)
+    with RecordingWriter(out, identity) as writer:
+        writer.write_camera(kept.camera, kept.T_body_camera)
+        writer.write_trajectories(odometry, source.truth)
+        done_s = writer.last_stamp_s
+        for number, (stamp_s, file) in enumerate(source.images, start=1):
+            if done_s is None or stamp_s > done_s + 1e-9:
+                writer.add(stamp_s, *written_image(file, lens))
+            if progress is not None:
+                progress(number, len(source.images))
+
+
+def _checked_lens(source: Source) -> Lens:
+    if source.lens is None:
+        raise DatasetError(
+            f"{source.path}: intrinsics are missing; put a camera.toml or camera.yaml with width, height, fx, fy, cx, "
+            "cy and distortion there, or name such a file with --camera"
+        )
+    camera = source.lens.camera
+    width, height = image_size(source.images[0][1])
+    if (width, height) != (camera.width, camera.height):
+        raise DatasetError(
+            f"{source.images[0][1]}: the image is {width}x{height}, "
+            f"but the intrinsics are for {camera.width}x{camera.height}"
+        )
+    return source.lens
