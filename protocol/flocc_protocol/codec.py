@@ -1,9 +1,11 @@
-"""Small field codecs that turn values into msgpack objects and back, checking everything on the way in.
+"""Small field codecs that turn values into msgpack objects and back, checking everything both ways.
 
 A codec is a pair of functions. `struct` lists a dataclass's fields once; nothing is decoded that it does not name.
+The checks on the way out are those on the way in: a robot cannot send what every other robot would refuse.
 """
 
 import math
+import operator
 import struct as binary
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,11 +32,13 @@ Pose7 = tuple[float, float, float, float, float, float, float]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 COORDINATE_MAX = 1e7
+ITEMS_MAX = 256
+"""No list on the wire is longer; msgpack reserves memory for what a list's header announces."""
 
 
 @dataclass(frozen=True, slots=True)
 class Codec(Generic[T]):
-    """How one kind of value is packed and unpacked; `unpack` raises DecodeError for anything else."""
+    """How one kind of value is packed and unpacked; both raise DecodeError for anything else."""
 
     pack: Callable[[T], Any]
     unpack: Callable[[Any], T]
@@ -43,56 +47,56 @@ class Codec(Generic[T]):
 def integer(low: int, high: int) -> Codec[int]:
     """An integer in [low, high]."""
 
-    def unpack(value: Any) -> int:
+    def check(value: Any) -> int:
         if type(value) is not int or not low <= value <= high:
             raise DecodeError(f"expected an integer in [{low}, {high}]")
         return value
 
-    return Codec(lambda value: value, unpack)
+    return Codec(lambda value: check(operator.index(value)), check)
 
 
 def real(low: float = -math.inf, high: float = math.inf) -> Codec[float]:
     """A finite float in [low, high]."""
 
-    def unpack(value: Any) -> float:
+    def check(value: Any) -> float:
         if type(value) is not float or not math.isfinite(value) or not low <= value <= high:
             raise DecodeError(f"expected a finite number in [{low}, {high}]")
         return value
 
-    return Codec(float, unpack)
+    return Codec(lambda value: check(float(value)), check)
 
 
 def text(length_max: int) -> Codec[str]:
-    """A string of at most `length_max` characters."""
+    """A string of at most `length_max` characters; longer ones are cut before they are sent."""
 
-    def unpack(value: Any) -> str:
+    def check(value: Any) -> str:
         if type(value) is not str or len(value) > length_max:
             raise DecodeError(f"expected text of at most {length_max} characters")
         return value
 
-    return Codec(lambda value: value[:length_max], unpack)
+    return Codec(lambda value: check(value[:length_max]), check)
 
 
 def blob(bytes_max: int) -> Codec[bytes]:
     """Bytes, at most `bytes_max`."""
 
-    def unpack(value: Any) -> bytes:
+    def check(value: Any) -> bytes:
         if type(value) is not bytes or len(value) > bytes_max:
             raise DecodeError(f"expected at most {bytes_max} bytes")
         return value
 
-    return Codec(lambda value: value, unpack)
+    return Codec(check, check)
 
 
 def boolean() -> Codec[bool]:
     """True or false."""
 
-    def unpack(value: Any) -> bool:
+    def check(value: Any) -> bool:
         if type(value) is not bool:
             raise DecodeError("expected true or false")
         return value
 
-    return Codec(lambda value: value, unpack)
+    return Codec(check, check)
 
 
 def optional(inner: Codec[T]) -> Codec[T | None]:
@@ -105,17 +109,23 @@ def optional(inner: Codec[T]) -> Codec[T | None]:
 
 def sequence(inner: Codec[T], items_max: int) -> Codec[tuple[T, ...]]:
     """At most `items_max` inner values."""
+    assert items_max <= ITEMS_MAX
+
+    def pack(values: tuple[T, ...]) -> list[Any]:
+        if len(values) > items_max:
+            raise DecodeError(f"expected a list of at most {items_max}, not {len(values)}")
+        return [inner.pack(value) for value in values]
 
     def unpack(value: Any) -> tuple[T, ...]:
         if type(value) is not list or len(value) > items_max:
             raise DecodeError(f"expected a list of at most {items_max}")
         return tuple([inner.unpack(item) for item in value])
 
-    return Codec(lambda values: [inner.pack(value) for value in values], unpack)
+    return Codec(pack, unpack)
 
 
 def struct(build: Callable[..., T], **fields: Codec[Any]) -> Codec[T]:
-    """A dataclass as a list of its fields in the order given here."""
+    """A dataclass as a list of its fields in the order given here; `build` raises ValueError for what cannot be."""
     names = tuple(fields)
     codecs = tuple(fields.values())
 
@@ -134,7 +144,7 @@ def struct(build: Callable[..., T], **fields: Codec[Any]) -> Codec[T]:
     return Codec(pack, unpack)
 
 
-def _unpack_name(value: Any) -> str:
+def _checked_name(value: Any) -> str:
     if type(value) is not str or not NAME_PATTERN.fullmatch(value):
         raise DecodeError("expected a robot name")
     return value
@@ -143,10 +153,17 @@ def _unpack_name(value: Any) -> str:
 _POSE = binary.Struct("<7d")
 
 
+def _pack_pose(value: Pose7) -> bytes:
+    return _POSE.pack(*_checked_pose(value))
+
+
 def _unpack_pose(value: Any) -> Pose7:
     if type(value) is not bytes or len(value) != _POSE.size:
         raise DecodeError("expected a pose of seven doubles")
-    numbers = _POSE.unpack(value)
+    return _checked_pose(_POSE.unpack(value))
+
+
+def _checked_pose(numbers: Pose7) -> Pose7:
     if not all(math.isfinite(number) for number in numbers) or max(map(abs, numbers[:3])) > COORDINATE_MAX:
         raise DecodeError("a pose must be finite and within the map")
     if abs(math.sqrt(sum(q * q for q in numbers[3:])) - 1.0) > QUATERNION_NORM_TOLERANCE:
@@ -161,14 +178,14 @@ def _unpack_array(value: Any) -> Array:
     sizes_ok = type(shape) is list and all(type(size) is int for size in shape)
     if type(dtype) is not str or not sizes_ok or type(data) is not bytes or type(scale) is not float:
         raise DecodeError("expected an array of dtype, shape, bytes and scale")
-    array = Array(dtype, tuple(shape), data, scale)
-    if not array.is_finite():
-        raise DecodeError("an array must be finite")
-    return array
+    try:
+        return Array(dtype, tuple(shape), data, scale)
+    except ValueError as error:
+        raise DecodeError(str(error)) from error
 
 
-NAME: Codec[str] = Codec(lambda value: value, _unpack_name)
-POSE: Codec[Pose7] = Codec(lambda value: _POSE.pack(*value), _unpack_pose)
+NAME: Codec[str] = Codec(_checked_name, _checked_name)
+POSE: Codec[Pose7] = Codec(_pack_pose, _unpack_pose)
 ARRAY: Codec[Array] = Codec(lambda a: [a.dtype, list(a.shape), a.data, float(a.scale)], _unpack_array)
 COUNT = integer(0, INDEX_MAX)
 LOG_ID = struct(LogId, robot=NAME, incarnation=integer(0, INCARNATION_MAX))
@@ -191,14 +208,6 @@ def from_bytes(data: bytes, bytes_max: int) -> Any:
     if len(data) > bytes_max:
         raise DecodeError(f"{len(data)} bytes are more than {bytes_max}")
     try:
-        return msgpack.unpackb(
-            data, raw=False, strict_map_key=True, max_map_len=0, max_ext_len=0, max_array_len=bytes_max
-        )
-    except (
-        ValueError,
-        TypeError,
-        RecursionError,
-        OverflowError,
-        msgpack.exceptions.UnpackException,
-    ) as error:
+        return msgpack.unpackb(data, raw=False, max_map_len=0, max_ext_len=0, max_array_len=ITEMS_MAX)
+    except (ValueError, TypeError, RecursionError, OverflowError, msgpack.exceptions.UnpackException) as error:
         raise DecodeError(f"not msgpack: {type(error).__name__}") from error

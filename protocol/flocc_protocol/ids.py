@@ -6,6 +6,7 @@ the others. Everything sorts the same way on every robot: ties are broken by ide
 
 import re
 from dataclasses import dataclass
+from typing import TypeVar
 
 from flocc_protocol.errors import FloccError
 
@@ -14,8 +15,10 @@ INCARNATION_MAX = 2**53 - 1
 INDEX_MAX = 2**31 - 1
 TERM_COUNTER_MAX = 2**48
 
+Identifier = TypeVar("Identifier", "LogId", "KeyframeId")
 
-class BadName(FloccError):
+
+class BadName(FloccError, ValueError):
     """A swarm or robot name that cannot be a chunk of a key expression."""
 
 
@@ -57,7 +60,7 @@ class LogId:
             ValueError: The text is not a log identifier.
         """
         robot, separator, incarnation = text.partition("~")
-        return cls(robot, int(incarnation, 16) if separator else 0)
+        return _as_written(cls(robot, int(incarnation, 16) if separator else 0), text)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -82,7 +85,7 @@ class KeyframeId:
             ValueError: The text is not a keyframe identifier.
         """
         log, _, index = text.rpartition("/")
-        return cls(LogId.parse(log), int(index))
+        return _as_written(cls(LogId.parse(log), int(index)), text)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -98,3 +101,10 @@ class Term:
 
     def __str__(self) -> str:
         return f"{self.counter}:{self.leader}"
+
+
+def _as_written(identifier: Identifier, text: str) -> Identifier:
+    """Refuse other spellings (`a~0`, `a/+1`, `a/1_0`): one identifier, one text."""
+    if str(identifier) != text:
+        raise ValueError(f"{text[:80]!r} is not how {identifier} is written")
+    return identifier

@@ -4,16 +4,22 @@ Everything but latents is a message. Latents are fetched by key (see `keys`), in
 Every message but a heartbeat may be lost: heartbeats repeat, and what they say repairs the rest.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import (
     ARRAY,
+    COORDINATE_MAX,
     COUNT,
     KEYFRAME_ID,
     LOG_ID,
     POSE,
+    QUATERNION_NORM_TOLERANCE,
     TERM,
     Codec,
     Pose7,
@@ -27,10 +33,11 @@ from flocc_protocol.codec import (
     to_bytes,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import INCARNATION_MAX, KeyframeId, LogId, Term
-from flocc_protocol.records import RECORD_BYTES_MAX
+from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
+from flocc_protocol.records import RECORD_BYTES_MAX, UPPER_TRIANGLE
 
 PROTOCOL_VERSION = 1
+VERSION_MAX = 127
 MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
 WANTS_MAX = 16
@@ -155,6 +162,25 @@ class RecordBatch:
     checksum_before: int
     records: tuple[bytes, ...]
 
+    def __post_init__(self) -> None:
+        bytes_total = sum(map(len, self.records))
+        if len(self.records) > RECORDS_BATCH_MAX or bytes_total > RECORDS_BATCH_BYTES_MAX:
+            raise ValueError(f"{len(self.records)} records of {bytes_total} bytes are more than a batch may hold")
+        if self.first + len(self.records) > INDEX_MAX:
+            raise ValueError(f"a log does not hold {self.first + len(self.records)} records")
+
+    @classmethod
+    def of(cls, log: LogId, first: int, checksum_before: int, records: Iterable[bytes]) -> "RecordBatch":
+        """Build a batch from as many of the records, in order, as one message holds; at least one."""
+        taken: list[bytes] = []
+        room = RECORDS_BATCH_BYTES_MAX
+        for record in records:
+            room -= len(record)
+            if room < 0 or len(taken) == RECORDS_BATCH_MAX:
+                break
+            taken.append(record)
+        return cls(log, first, checksum_before, tuple(taken))
+
 
 @dataclass(frozen=True, slots=True)
 class RecordRequest:
@@ -189,6 +215,16 @@ class CorrectionMessage:
     first: int
     step: int
     T_map_camera: Array
+
+    def __post_init__(self) -> None:
+        shape = self.T_map_camera.shape
+        if self.T_map_camera.dtype != "f4" or len(shape) != 2 or shape[1] != 7 or shape[0] > CORRECTION_KEYFRAMES_MAX:
+            raise ValueError(f"a correction has (N, 7) float32 poses, N at most {CORRECTION_KEYFRAMES_MAX}")
+        if self.first + self.step * (shape[0] - 1) > INDEX_MAX:
+            raise ValueError("a correction ends within its log")
+        if self.covariance is not None and self.covariance.shape != (UPPER_TRIANGLE,):
+            raise ValueError(f"a covariance is an upper triangle of {UPPER_TRIANGLE}")
+        _check_poses(self.T_map_camera.numpy())
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,17 +286,15 @@ class Envelope:
     message: Message
 
 
-def _correction(**fields: Any) -> CorrectionMessage:
-    correction = CorrectionMessage(**fields)
-    poses, covariance = correction.T_map_camera, correction.covariance
-    if len(poses.shape) != 2 or poses.shape[1] != 7 or poses.shape[0] > CORRECTION_KEYFRAMES_MAX:
-        raise DecodeError(f"a correction has (N, 7) poses, N at most {CORRECTION_KEYFRAMES_MAX}")
-    if covariance is not None and covariance.shape != (21,):
-        raise DecodeError("a covariance is an upper triangle of 21")
-    return correction
+def _check_poses(poses: NDArray[np.float64]) -> None:
+    """Refuse (N, 7) poses that leave the map or whose quaternions are not of unit length."""
+    norms = np.linalg.norm(poses[:, 3:], axis=1)
+    if np.any(np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE) or np.any(np.abs(poses[:, :3]) > COORDINATE_MAX):
+        raise ValueError("a correction's poses lie within the map and have unit quaternions")
 
 
 _BEAT = integer(0, COUNTER_MAX)
+_TERM_COUNTER = integer(0, TERM_COUNTER_MAX)
 _CHECKSUM = integer(0, 2**32 - 1)
 _COMPUTE_CLASS = integer(0, COMPUTE_CLASS_MAX)
 _ADVERT = struct(LeaderAdvert, term=TERM, compute_class=_COMPUTE_CLASS, beat=_BEAT, hops=integer(0, HOPS_MAX))
@@ -277,7 +311,7 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             boot=integer(0, INCARNATION_MAX),
             compute_class=_COMPUTE_CLASS,
             leader=optional(_ADVERT),
-            term_counter_max=_BEAT,
+            term_counter_max=_TERM_COUNTER,
             load=COUNT,
             digests=sequence(_DIGEST, LOGS_MAX),
             corrections=sequence(_VERSION, LOGS_MAX),
@@ -285,8 +319,8 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             holds=sequence(KEYFRAME_ID, WANTS_MAX),
         ),
     ),
-    "election": (Election, struct(Election, counter=_BEAT)),
-    "answer": (Answer, struct(Answer, counter=_BEAT)),
+    "election": (Election, struct(Election, counter=_TERM_COUNTER)),
+    "answer": (Answer, struct(Answer, counter=_TERM_COUNTER)),
     "coordinator": (Coordinator, struct(Coordinator, advert=_ADVERT)),
     "handover": (Handover, struct(Handover, term=TERM)),
     "records": (
@@ -299,11 +333,11 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             records=sequence(blob(RECORD_BYTES_MAX), RECORDS_BATCH_MAX),
         ),
     ),
-    "record-request": (RecordRequest, struct(RecordRequest, log=LOG_ID, first=COUNT)),
+    "want-records": (RecordRequest, struct(RecordRequest, log=LOG_ID, first=COUNT)),
     "correction": (
         CorrectionMessage,
         struct(
-            _correction,
+            CorrectionMessage,
             log=LOG_ID,
             term=TERM,
             round=COUNT,
@@ -315,7 +349,7 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             T_map_camera=ARRAY,
         ),
     ),
-    "correction-request": (CorrectionRequest, struct(CorrectionRequest, log=LOG_ID)),
+    "want-correction": (CorrectionRequest, struct(CorrectionRequest, log=LOG_ID)),
     "candidates": (
         CandidateOffer,
         struct(CandidateOffer, pairs=sequence(_PAIR, OFFERS_MAX), transferred=boolean()),
@@ -331,12 +365,30 @@ def kind_of(message: Message) -> str:
 
 
 def encode(envelope: Envelope) -> bytes:
-    """Serialise a message: version, kind, sender, fields."""
+    """Serialise a message: version, kind, sender, fields.
+
+    Raises:
+        ValueError: A field is outside its limits, so that every receiver would refuse the message.
+    """
     kind = kind_of(envelope.message)
-    body = _CODECS[kind][1].pack(envelope.message)
+    try:
+        body = _CODECS[kind][1].pack(envelope.message)
+    except DecodeError as error:
+        raise ValueError(f"{kind}: {error}") from error
     data = to_bytes([PROTOCOL_VERSION, kind, LOG_ID.pack(envelope.sender), body])
     assert len(data) <= MESSAGE_BYTES_MAX, f"{kind} of {len(data)} bytes is larger than a message may be"
     return data
+
+
+def version_of(data: bytes) -> int:
+    """Read the protocol version of a message, whatever else that version changed: its second byte.
+
+    Raises:
+        DecodeError: Not a message of any version: a short msgpack array that starts with 0 to 127.
+    """
+    if len(data) < 2 or data[0] & 0xF0 != 0x90 or data[1] > VERSION_MAX:
+        raise DecodeError("a message starts with its version")
+    return data[1]
 
 
 def decode(data: bytes) -> Envelope:
@@ -346,11 +398,10 @@ def decode(data: bytes) -> Envelope:
         UnknownVersion: The sender speaks another version.
         DecodeError: The bytes are anything else.
     """
+    version = version_of(data)
+    if version != PROTOCOL_VERSION:
+        raise UnknownVersion(f"protocol version {version}, this robot speaks {PROTOCOL_VERSION}")
     value = from_bytes(data, MESSAGE_BYTES_MAX)
-    if type(value) is not list or not value or type(value[0]) is not int:
-        raise DecodeError("a message starts with its version")
-    if value[0] != PROTOCOL_VERSION:
-        raise UnknownVersion(f"protocol version {value[0]}, this robot speaks {PROTOCOL_VERSION}")
-    if len(value) != 4 or type(value[1]) is not str or value[1] not in _CODECS:
+    if type(value) is not list or len(value) != 4 or type(value[1]) is not str or value[1] not in _CODECS:
         raise DecodeError("a message is version, kind, sender and fields")
     return Envelope(LOG_ID.unpack(value[2]), _CODECS[value[1]][1].unpack(value[3]))

@@ -48,6 +48,11 @@ class KeyframeRecord:
     T_odom_camera: Pose7
     descriptor: Array | None
 
+    def __post_init__(self) -> None:
+        shape = (1,) if self.descriptor is None else self.descriptor.shape
+        if len(shape) != 1 or not 1 <= shape[0] <= DESCRIPTOR_DIMENSION_MAX:
+            raise ValueError(f"a descriptor is a vector of 1 to {DESCRIPTOR_DIMENSION_MAX}, not {shape}")
+
 
 @dataclass(frozen=True, slots=True)
 class ClosureRecord:
@@ -73,6 +78,12 @@ class ClosureRecord:
     scale_initial: float | None = None
     covariance: Array | None = None
 
+    def __post_init__(self) -> None:
+        if self.query == self.match:
+            raise ValueError(f"a closure joins two different keyframes, not {self.query} with itself")
+        if self.covariance is not None and self.covariance.shape != (UPPER_TRIANGLE,):
+            raise ValueError(f"a covariance is an upper triangle of {UPPER_TRIANGLE}")
+
 
 @dataclass(frozen=True, slots=True)
 class RejectionRecord:
@@ -93,55 +104,19 @@ class FixRecord:
     position_m: Array
     covariance_m2: Array
 
+    def __post_init__(self) -> None:
+        if self.position_m.shape != (3,) or self.covariance_m2.shape != (9,):
+            raise ValueError("a fix has a position of 3 and a covariance of 9")
+
 
 Record = KeyframeRecord | ClosureRecord | RejectionRecord | FixRecord
 
 
-def _keyframe(index: int, stamp_s: float, T_odom_camera: Pose7, descriptor: Array | None) -> KeyframeRecord:
-    if descriptor is not None and (
-        len(descriptor.shape) != 1 or not 1 <= descriptor.shape[0] <= DESCRIPTOR_DIMENSION_MAX
-    ):
-        raise DecodeError(f"a descriptor is a vector of 1 to {DESCRIPTOR_DIMENSION_MAX}")
-    return KeyframeRecord(index, stamp_s, T_odom_camera, descriptor)
-
-
-def _closure(
-    query: KeyframeId,
-    match: KeyframeId,
-    T_query_match_unscaled: Pose7,
-    correspondences: int,
-    odometry_correspondences: int,
-    match_ratio: float,
-    scale_initial: float | None,
-    covariance: Array | None,
-) -> ClosureRecord:
-    if query == match:
-        raise DecodeError("a closure joins two different keyframes")
-    if covariance is not None and covariance.shape != (UPPER_TRIANGLE,):
-        raise DecodeError("a covariance is an upper triangle of 21")
-    return ClosureRecord(
-        query,
-        match,
-        T_query_match_unscaled,
-        correspondences,
-        odometry_correspondences,
-        match_ratio,
-        scale_initial,
-        covariance,
-    )
-
-
-def _fix(index: int, position_m: Array, covariance_m2: Array) -> FixRecord:
-    if position_m.shape != (3,) or covariance_m2.shape != (9,):
-        raise DecodeError("a fix has a position of 3 and a covariance of 9")
-    return FixRecord(index, position_m, covariance_m2)
-
-
 _STAMP = real(-1e12, 1e12)
 _BY_CODE: dict[int, Codec[Record]] = {
-    1: struct(_keyframe, index=COUNT, stamp_s=_STAMP, T_odom_camera=POSE, descriptor=optional(ARRAY)),
+    1: struct(KeyframeRecord, index=COUNT, stamp_s=_STAMP, T_odom_camera=POSE, descriptor=optional(ARRAY)),
     2: struct(
-        _closure,
+        ClosureRecord,
         query=KEYFRAME_ID,
         match=KEYFRAME_ID,
         T_query_match_unscaled=POSE,
@@ -159,16 +134,26 @@ _BY_CODE: dict[int, Codec[Record]] = {
         correspondences=COUNT,
         odometry_correspondences=COUNT,
     ),
-    4: struct(_fix, index=COUNT, position_m=ARRAY, covariance_m2=ARRAY),
+    4: struct(FixRecord, index=COUNT, position_m=ARRAY, covariance_m2=ARRAY),
 }
 _CODES: dict[type[Record], int] = {KeyframeRecord: 1, ClosureRecord: 2, RejectionRecord: 3, FixRecord: 4}
 _CODE = integer(1, max(_BY_CODE))
 
 
 def encode_record(record: Record) -> bytes:
-    """Serialise a record; the same record gives the same bytes on every robot."""
+    """Serialise a record; the same record gives the same bytes on every robot.
+
+    Raises:
+        ValueError: The other robots would refuse it; a log must never hold such a record.
+    """
     code = _CODES[type(record)]
-    return to_bytes([code, _BY_CODE[code].pack(record)])
+    try:
+        data = to_bytes([code, _BY_CODE[code].pack(record)])
+    except DecodeError as error:
+        raise ValueError(f"{type(record).__name__}: {error}") from error
+    if len(data) > RECORD_BYTES_MAX:
+        raise ValueError(f"{type(record).__name__} of {len(data)} bytes is larger than {RECORD_BYTES_MAX}")
+    return data
 
 
 def decode_record(data: bytes) -> Record:

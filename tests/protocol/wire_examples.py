@@ -1,0 +1,266 @@
+"""One plain example of everything that travels, the largest legal ones, and hypothesis strategies for all of it."""
+
+import numpy as np
+from hypothesis import strategies as st
+
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import COORDINATE_MAX, Pose7
+from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
+from flocc_protocol.messages import (
+    COMPUTE_CLASS_MAX,
+    CORRECTION_KEYFRAMES_MAX,
+    COUNTER_MAX,
+    HOPS_MAX,
+    LOGS_MAX,
+    OFFERS_MAX,
+    RECORDS_BATCH_BYTES_MAX,
+    RECORDS_BATCH_MAX,
+    WANTS_MAX,
+    Answer,
+    CandidateOffer,
+    CandidatePair,
+    Coordinator,
+    CorrectionMessage,
+    CorrectionRequest,
+    CorrectionVersion,
+    Election,
+    Envelope,
+    Handover,
+    Heartbeat,
+    LeaderAdvert,
+    LogDigest,
+    Message,
+    RecordBatch,
+    RecordRequest,
+)
+from flocc_protocol.records import (
+    REASON_LENGTH_MAX,
+    RECORD_BYTES_MAX,
+    ClosureRecord,
+    FixRecord,
+    KeyframeRecord,
+    Record,
+    RejectionRecord,
+    encode_record,
+)
+
+IDENTITY: Pose7 = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def poses_array(count: int, seed: int = 0) -> Array:
+    """(count, 7) float32 poses with unit quaternions."""
+    poses = np.random.default_rng(seed).normal(size=(count, 7))
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    return Array.of(poses, "f4")
+
+
+def descriptor(dimension: int = 512, seed: int = 0) -> Array:
+    """A unit vector as int8."""
+    values = np.random.default_rng(seed).normal(size=dimension)
+    return Array.int8(values / np.linalg.norm(values))
+
+
+ALICE, BOB = LogId("alice"), LogId("bob-2", 0x18F0A1B2C3D)
+TERM = Term(7, ALICE)
+ADVERT = LeaderAdvert(TERM, 5, 123_456, 2)
+
+RECORDS: tuple[Record, ...] = (
+    KeyframeRecord(12, 1_700_000_000.25, (1.5, -2.0, 0.25, 0.5, 0.5, -0.5, 0.5), descriptor()),
+    KeyframeRecord(13, 0.0, IDENTITY, None),
+    ClosureRecord(
+        KeyframeId(ALICE, 3), KeyframeId(BOB, 8), IDENTITY, 480, 510, 480 / 510, 1.7, Array.of(np.arange(21.0))
+    ),
+    ClosureRecord(KeyframeId(ALICE, 3), KeyframeId(BOB, 9), IDENTITY, 48, 51, 48 / 51),
+    RejectionRecord(KeyframeId(ALICE, 4), KeyframeId(BOB, 1), "few correspondences: 12 < 30", 12, 530),
+    FixRecord(5, Array.of(np.array([1.0, 2.0, 3.0]), "f8"), Array.of(np.eye(3).ravel())),
+)
+ENCODED = tuple(encode_record(record) for record in RECORDS)
+
+MESSAGES: tuple[Message, ...] = (
+    Heartbeat(
+        812,
+        0xBEEF,
+        3,
+        ADVERT,
+        7,
+        2,
+        (LogDigest(ALICE, 13, 0xDEADBEEF), LogDigest(BOB, 40, 17)),
+        (CorrectionVersion(ALICE, TERM, 4), CorrectionVersion(BOB, TERM, 4)),
+        (KeyframeId(BOB, 8),),
+        (KeyframeId(ALICE, 3),),
+    ),
+    Heartbeat(0, 0, 0, None, 0, 0, ()),
+    Election(8),
+    Answer(8),
+    Coordinator(ADVERT),
+    Handover(TERM),
+    RecordBatch(ALICE, 12, 0x1234, ENCODED),
+    RecordRequest(BOB, 41),
+    CorrectionMessage(
+        ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), Array.of(np.ones(21)), 3, 2, poses_array(6)
+    ),
+    CorrectionMessage(BOB, TERM, 0, ALICE, IDENTITY, None, 0, 1, poses_array(0)),
+    CorrectionRequest(BOB),
+    CandidateOffer((CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),), True),
+)
+ENVELOPES = tuple(Envelope(BOB, message) for message in MESSAGES)
+
+
+def _long(number: int) -> LogId:
+    return LogId(f"{number:032d}", INCARNATION_MAX)
+
+
+def largest_messages() -> list[Message]:
+    """Of every kind, a message that no limit allows to be longer: long names, full lists, large numbers."""
+    leader = Term(TERM_COUNTER_MAX, _long(0))
+    advert = LeaderAdvert(leader, COMPUTE_CLASS_MAX, COUNTER_MAX, HOPS_MAX)
+    keyframe = KeyframeId(_long(0), INDEX_MAX)
+    other = KeyframeId(_long(1), INDEX_MAX)
+    covariance = Array.of(np.ones(21), "f8")
+    return [
+        Heartbeat(
+            COUNTER_MAX,
+            INCARNATION_MAX,
+            COMPUTE_CLASS_MAX,
+            advert,
+            TERM_COUNTER_MAX,
+            INDEX_MAX,
+            tuple(LogDigest(_long(k), INDEX_MAX, 2**32 - 1) for k in range(LOGS_MAX)),
+            tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(LOGS_MAX)),
+            (keyframe,) * WANTS_MAX,
+            (keyframe,) * WANTS_MAX,
+        ),
+        Election(TERM_COUNTER_MAX),
+        Answer(TERM_COUNTER_MAX),
+        Coordinator(advert),
+        Handover(leader),
+        RecordBatch(_long(0), INDEX_MAX - 4, 2**32 - 1, (bytes(RECORD_BYTES_MAX),) * 4),
+        RecordBatch(
+            _long(0),
+            INDEX_MAX - RECORDS_BATCH_MAX,
+            2**32 - 1,
+            (bytes(RECORDS_BATCH_BYTES_MAX // RECORDS_BATCH_MAX),) * RECORDS_BATCH_MAX,
+        ),
+        RecordRequest(_long(0), INDEX_MAX),
+        CorrectionMessage(
+            _long(0),
+            leader,
+            INDEX_MAX,
+            _long(1),
+            IDENTITY,
+            covariance,
+            INDEX_MAX - CORRECTION_KEYFRAMES_MAX + 1,
+            1,
+            poses_array(CORRECTION_KEYFRAMES_MAX),
+        ),
+        CorrectionRequest(_long(0)),
+        CandidateOffer((CandidatePair(keyframe, other),) * OFFERS_MAX, True),
+    ]
+
+
+# --- hypothesis strategies -------------------------------------------------------------------------------------------
+
+_counts = st.integers(0, INDEX_MAX)
+_counters = st.integers(0, COUNTER_MAX)
+_term_counters = st.integers(0, TERM_COUNTER_MAX)
+log_ids = st.builds(LogId, st.from_regex(r"\A[a-z0-9][a-z0-9_-]{0,31}\Z"), st.integers(0, INCARNATION_MAX))
+keyframe_ids = st.builds(KeyframeId, log_ids, _counts)
+terms = st.builds(Term, _term_counters, log_ids)
+
+
+def reals(low: float, high: float) -> st.SearchStrategy[float]:
+    """Finite floats in [low, high]."""
+    return st.floats(low, high, allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> Pose7:
+    """Poses within the map, any rotation."""
+    x, y, z = (draw(reals(-COORDINATE_MAX, COORDINATE_MAX)) for _ in range(3))
+    q = np.random.default_rng(draw(st.integers(0, 2**32 - 1))).normal(size=4)
+    qw, qx, qy, qz = (float(value) for value in q / np.linalg.norm(q))
+    return (x, y, z, qw, qx, qy, qz)
+
+
+@st.composite
+def arrays(draw: st.DrawFn, shape: tuple[int, ...] | None = None, dtypes: str = "f8 f4 f2 i1 u1") -> Array:
+    """Arrays of any dtype, up to three short dimensions unless a shape is given."""
+    sizes = draw(st.lists(st.integers(0, 9), max_size=3).map(tuple)) if shape is None else shape
+    dtype = draw(st.sampled_from(dtypes.split()))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    if dtype == "i1":
+        return Array.int8(rng.normal(size=sizes) * draw(reals(1e-6, 1e6)))
+    return Array.of(rng.uniform(0, 255, size=sizes), dtype)
+
+
+def optional_arrays(shape: tuple[int, ...]) -> st.SearchStrategy[Array | None]:
+    """An array of that shape, or None."""
+    return st.none() | arrays(shape)
+
+
+adverts = st.builds(LeaderAdvert, terms, st.integers(0, COMPUTE_CLASS_MAX), _counters, st.integers(0, HOPS_MAX))
+pairs = (
+    st.tuples(keyframe_ids, keyframe_ids).filter(lambda both: both[0] != both[1]).map(lambda b: CandidatePair.of(*b))
+)
+records: st.SearchStrategy[Record] = st.one_of(
+    st.builds(KeyframeRecord, _counts, reals(-1e12, 1e12), poses(), optional_arrays((32,))),
+    pairs.flatmap(
+        lambda pair: st.builds(
+            ClosureRecord,
+            st.just(pair.low),
+            st.just(pair.high),
+            poses(),
+            _counts,
+            _counts,
+            reals(0, 1e6),
+            st.none() | reals(1e-9, 1e9),
+            optional_arrays((21,)),
+        )
+    ),
+    st.builds(RejectionRecord, keyframe_ids, keyframe_ids, st.text(max_size=REASON_LENGTH_MAX), _counts, _counts),
+    st.builds(FixRecord, _counts, arrays((3,)), arrays((9,))),
+)
+
+
+def _tuples(items: st.SearchStrategy[object], longest: int) -> st.SearchStrategy[tuple[object, ...]]:
+    return st.lists(items, max_size=min(longest, 5)).map(tuple)
+
+
+_starts = st.integers(0, 2**30)
+messages: st.SearchStrategy[Message] = st.one_of(
+    st.builds(
+        Heartbeat,
+        _counters,
+        st.integers(0, INCARNATION_MAX),
+        st.integers(0, COMPUTE_CLASS_MAX),
+        st.none() | adverts,
+        _term_counters,
+        _counts,
+        _tuples(st.builds(LogDigest, log_ids, _counts, st.integers(0, 2**32 - 1)), LOGS_MAX),
+        _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), LOGS_MAX),
+        _tuples(keyframe_ids, WANTS_MAX),
+        _tuples(keyframe_ids, WANTS_MAX),
+    ),
+    st.builds(Election, _term_counters),
+    st.builds(Answer, _term_counters),
+    st.builds(Coordinator, adverts),
+    st.builds(Handover, terms),
+    st.builds(
+        RecordBatch, log_ids, _starts, st.integers(0, 2**32 - 1), _tuples(st.binary(max_size=64), RECORDS_BATCH_MAX)
+    ),
+    st.builds(RecordRequest, log_ids, _counts),
+    st.builds(
+        CorrectionMessage,
+        log_ids,
+        terms,
+        _counts,
+        log_ids,
+        poses(),
+        optional_arrays((21,)),
+        _starts,
+        st.integers(1, 1000),
+        st.builds(poses_array, st.integers(0, 20), st.integers(0, 2**32 - 1)),
+    ),
+    st.builds(CorrectionRequest, log_ids),
+    st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
+)
