@@ -13,13 +13,11 @@ from shutil import which
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import between, inverse, se3_exp, se3_log, umeyama
+from flocc_agent.geometry import between, inverse, so3_log, umeyama
+from flocc_agent.runtime.trajectory import Trajectory
 from flocc_protocol.errors import FloccError
 
 Float = NDArray[np.float64]
-
-STAMP_TOLERANCE_S = 1e-6
-GROUND_TRUTH_GAP_S_MAX = 0.5
 
 
 class EvaluationError(FloccError):
@@ -34,39 +32,19 @@ class RelativePoseError:
     rotation_rmse_deg: float
 
 
-def associate(stamps_s: Float, truth_stamps_s: Float, T_world_body: Float) -> tuple[NDArray[np.bool_], Float]:
-    """Bring ground truth to the keyframes' stamps.
-
-    A sample within `STAMP_TOLERANCE_S` is taken as it is; else the pose is interpolated on SE(3) between its
-    two neighbours, where they are no more than `GROUND_TRUTH_GAP_S_MAX` apart.
+def associate(stamps_s: Float, truth: Trajectory) -> tuple[NDArray[np.bool_], Float]:
+    """Bring ground truth to the keyframes' stamps, interpolated where no sample is at a stamp.
 
     Args:
         stamps_s: (N,) of the keyframes.
-        truth_stamps_s: (M,) of the ground truth, ascending.
-        T_world_body: (M, 4, 4).
+        truth: `T_world_body`.
 
     Returns:
-        Which keyframes have ground truth, (N,), and their (K, 4, 4) true poses.
+        Which keyframes have ground truth, (N,), and the true poses of those, (K, 4, 4).
     """
-    found = [true_pose_at(float(stamp_s), truth_stamps_s, T_world_body) for stamp_s in stamps_s]
+    found = [truth.at(float(stamp_s)) for stamp_s in stamps_s]
     known = np.array([T is not None for T in found], dtype=bool)
     return known, np.array([T for T in found if T is not None]).reshape(-1, 4, 4)
-
-
-def true_pose_at(stamp_s: float, truth_stamps_s: Float, T_world_body: Float) -> Float | None:
-    """Ground truth (4, 4) at one stamp, or None where there is none near it."""
-    after = int(np.searchsorted(truth_stamps_s, stamp_s))
-    for k in (after - 1, after):
-        if 0 <= k < len(truth_stamps_s) and abs(truth_stamps_s[k] - stamp_s) <= STAMP_TOLERANCE_S:
-            return np.asarray(T_world_body[k])
-    if not 0 < after < len(truth_stamps_s):
-        return None
-    gap_s = float(truth_stamps_s[after] - truth_stamps_s[after - 1])
-    if gap_s > GROUND_TRUTH_GAP_S_MAX:
-        return None
-    part = (stamp_s - float(truth_stamps_s[after - 1])) / gap_s
-    step = se3_log(between(T_world_body[after - 1], T_world_body[after]))
-    return np.asarray(T_world_body[after - 1] @ se3_exp(part * step))
 
 
 def rmse_m(errors_m: Float) -> float:
@@ -132,7 +110,7 @@ def relative_pose_error(estimate: Float, truth: Float, delta: int = 1) -> Relati
     moved = between(estimate[ends[:-1]], estimate[ends[1:]])
     true_moved = between(truth[ends[:-1]], truth[ends[1:]])
     errors = between(true_moved, moved)
-    angles_rad = np.array([np.linalg.norm(se3_log(T)[:3]) for T in errors])
+    angles_rad = np.array([np.linalg.norm(so3_log(T[:3, :3])) for T in errors])
     rotation_rmse_rad = float(np.sqrt((angles_rad**2).mean()))
     return RelativePoseError(rmse_m(errors[:, :3, 3]), float(np.rad2deg(rotation_rmse_rad)))
 

@@ -20,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from flocc_agent.geometry import pose_from_tq
 from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
 
@@ -31,7 +32,15 @@ def with_direction(pose7: list[float]) -> list[float]:
     return pose7
 
 
+def checked_keyframe(text: str) -> str:
+    """Return the text of a keyframe identifier, or say that it is none."""
+    KeyframeId.parse(text)
+    return text
+
+
 QUATERNION_TOLERANCE = 1e-3
+Keyframe = Annotated[str, AfterValidator(checked_keyframe)]
+"""A keyframe as text, such as `r1/12`."""
 Pose7 = Annotated[list[float], Field(min_length=7, max_length=7), AfterValidator(with_direction)]
 """Seven finite numbers: translation x y z in metres, quaternion w x y z."""
 
@@ -91,7 +100,7 @@ class Event(Record):
 class KeyframeCaptured(Event):
     """`keyframe`: a robot took a keyframe."""
 
-    keyframe: str
+    keyframe: Keyframe
     stamp_s: float
     T_odom_body: Pose7
 
@@ -99,16 +108,16 @@ class KeyframeCaptured(Event):
 class CandidateFound(Event):
     """`candidate`: two keyframes look alike."""
 
-    query: str
-    match: str
+    query: Keyframe
+    match: Keyframe
     similarity: float
 
 
 class ClosureAccepted(Event):
     """`closure_accepted`: a candidate was registered and passed R_thr."""
 
-    query: str
-    match: str
+    query: Keyframe
+    match: Keyframe
     ratio: float
     probability: float
     correspondences: int
@@ -120,8 +129,8 @@ class ClosureAccepted(Event):
 class ClosureRejected(Event):
     """`closure_rejected`: a candidate was not made a closure."""
 
-    query: str
-    match: str
+    query: Keyframe
+    match: Keyframe
     ratio: float | None = None
     reason: str
 
@@ -223,12 +232,14 @@ class KeyframeResult(Record):
 class ClosureKnown(Record):
     """One closure in a robot's logs at the end of the run."""
 
-    query: str
-    match: str
+    query: Keyframe
+    match: Keyframe
     T_query_match_unscaled: Pose7 | None = None
     """Pose of the match camera in the query camera; the translation in network units."""
     match_ratio: float | None = None
     scale_initial: float | None = None
+    metric: bool = False
+    """The translation is in metres already."""
     scale: float | None = None
     """Metres per network unit after optimisation; null where the back end estimated none."""
 
@@ -296,9 +307,7 @@ class RunFolder:
         folder = cls(path)
         version = folder.run().version
         if version != RUN_VERSION:
-            raise RunFolderError(
-                f"{path / 'run.json'}: is of version {version}, this flocc reads {RUN_VERSION}"
-            )
+            raise RunFolderError(f"{path / 'run.json'}: is of version {version}, this flocc reads {RUN_VERSION}")
         return folder
 
     def write_run(self, run: Run) -> None:
@@ -401,9 +410,7 @@ def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise RunFolderError(
-            f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
-        ) from error
+        raise RunFolderError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
 def read_record(path: Path, record: type[R]) -> R:

@@ -7,9 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, se3_exp
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch import evaluation
-from flocc_launch.report.tum import read_tum, write_tum
-from flocc_launch.run_folder import RunFolderError
 
 Float = NDArray[np.float64]
 
@@ -92,46 +91,20 @@ def test_ate_without_ground_truth_is_unknown() -> None:
     assert evaluation.relative_pose_error(empty, empty) is None
 
 
-def test_ground_truth_is_interpolated_on_se3() -> None:
-    step = np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0])
-    truth = np.array([se3_exp(k * step) for k in range(4)])
-    stamps = np.linspace(0.0, 0.3, 4)
-    known, poses = evaluation.associate(np.array([0.05, 0.1, 0.27]), stamps, truth)
-    assert known.all()
-    for part, pose in zip((0.5, 1.0, 2.7), poses, strict=True):
-        np.testing.assert_allclose(pose, se3_exp(part * step), atol=1e-12)
-
-
-def test_no_ground_truth_is_invented_outside_its_span_or_in_a_gap() -> None:
-    truth = np.array([np.eye(4)] * 4)
-    stamps = np.array([1.0, 1.1, 5.0, 5.1])
-    known, poses = evaluation.associate(np.array([0.9, 1.05, 3.0, 5.1, 5.2]), stamps, truth)
-    assert known.tolist() == [False, True, False, True, False]
-    assert poses.shape == (2, 4, 4)
-
-
-def test_tum_gives_back_what_was_written(tmp_path: Path) -> None:
-    stamps, poses = np.linspace(1403636579.763555, 1403636599.1, 60), random_walk(5)
-    write_tum(tmp_path / "r1.tum", stamps, poses)
-    stamps_back, poses_back = read_tum(tmp_path / "r1.tum")
-    np.testing.assert_array_equal(stamps_back, stamps)
-    np.testing.assert_allclose(poses_back, poses, atol=1e-12)
+def test_ground_truth_is_brought_to_the_keyframes_stamps() -> None:
+    truth = np.array([se3_exp(np.array([0.0, 0.0, 0.0, k, 0.0, 0.0])) for k in range(4)])
+    trajectory = Trajectory(np.linspace(0.0, 0.3, 4), truth)
+    known, poses = evaluation.associate(np.array([-1.0, 0.05, 0.1, 0.27, 9.0]), trajectory)
+    assert known.tolist() == [False, True, True, True, False]
+    np.testing.assert_allclose(poses[:, 0, 3], [0.5, 1.0, 2.7], atol=1e-12)
 
 
 def test_evo_opens_our_tum_files(tmp_path: Path) -> None:
     file_interface = pytest.importorskip("evo.tools.file_interface")
     poses = random_walk(6)
-    write_tum(tmp_path / "r1.tum", np.arange(60.0), poses)
+    write_tum(tmp_path / "r1.tum", Trajectory(np.arange(60.0), poses))
     read = file_interface.read_tum_trajectory_file(tmp_path / "r1.tum")
     np.testing.assert_allclose(np.array(read.poses_se3), poses, atol=1e-9)
-
-
-@pytest.mark.parametrize("line", ["1 2 3", "1 2 3 4 0 0 0 x", "1 nan 0 0 0 0 0 1", "1 0 0 0 0 0 0 0"])
-def test_a_bad_tum_line_is_named(tmp_path: Path, line: str) -> None:
-    path = tmp_path / "r1.tum"
-    path.write_text(f"# stamp tx ty tz qx qy qz qw\n{line}\n")
-    with pytest.raises(RunFolderError, match=r"r1\.tum:2: is not"):
-        read_tum(path)
 
 
 def test_evo_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,1 +1,6 @@
 """What a run came to: report.json, report.html, trajectories and the pose graph."""
+
+from flocc_launch.report.finish import finish, read_report
+from flocc_launch.report.model import SCHEMA_VERSION, Report
+
+__all__ = ["finish", "read_report", "Report", "SCHEMA_VERSION"]

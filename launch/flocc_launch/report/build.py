@@ -1,0 +1,243 @@
+"""From a loaded run to its report: the numbers of report.json."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_launch.evaluation import ate_m, relative_pose_error, unaligned_ate_m
+from flocc_launch.report.load import LoadedRun
+from flocc_launch.report.model import (
+    Closures,
+    Expectation,
+    LeaderSpan,
+    Optimisations,
+    Report,
+    Robot,
+    RobotBytes,
+    TrackError,
+)
+from flocc_launch.report.timeline import corrections_of, ends, leader_changes, merged_after_s, terms_led
+from flocc_launch.report.tracks import Track
+from flocc_launch.run_folder import AgentDied, BytesCounted, GraphOptimised, PeerRefused, of_kind
+
+Float = NDArray[np.float64]
+
+
+def build(loaded: LoadedRun) -> Report:
+    """Compute the report of a run."""
+    run, tracks = loaded.run, loaded.tracks
+    frames = sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
+    robots = [robot_part(loaded, robot) for robot in loaded.robots]
+    by_robot = bytes_by_robot(loaded)
+    report = Report(
+        flocc_version=flocc_version(),
+        scenario=run.scenario,
+        driver=run.driver,
+        seed=run.seed,
+        start=run.start,
+        duration_s=loaded.end_s,
+        wall_s=run.wall_s,
+        robots=list(loaded.robots),
+        map_frames=frames,
+        merged_after_s=merged_after_s(loaded.events, loaded.robots),
+        closures=closures_part(loaded),
+        ate_joint_m=ate_joint_m(tracks),
+        ate_joint_odometry_m=ate_joint_odometry_m(tracks, aligned=False),
+        ate_joint_odometry_aligned_m=ate_joint_odometry_m(tracks, aligned=True),
+        ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames},
+        ate_m={robot.robot: robot.corrected.ate_m for robot in robots},
+        ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
+        bytes=total_bytes(by_robot),
+        bytes_by_robot=by_robot,
+        leaders=[
+            LeaderSpan(term=span.term, leader=span.leader, from_s=span.from_s, to_s=span.to_s)
+            for span in terms_led(loaded.followings)
+        ],
+        leader_changes=leader_changes(loaded.followings),
+        optimisations=optimisations_part(loaded),
+        expectations=[],
+        robot_details=robots,
+        warnings=warnings_of(loaded),
+    )
+    return report.model_copy(update={"expectations": judged(run.expectations, report)})
+
+
+def flocc_version() -> str:
+    """Version of the installed distribution, or 'unknown' when run from a source tree alone."""
+    try:
+        return version("flocc")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def with_keyframes(tracks: Iterable[Track]) -> list[Track]:
+    """The tracks that have keyframes at all."""
+    return [track for track in tracks if len(track)]
+
+
+def ate_joint_m(tracks: Mapping[str, Track]) -> float | None:
+    """Joint ATE, or None unless every robot with keyframes is in one map frame and has ground truth."""
+    moved = with_keyframes(tracks.values())
+    frames = {track.map_frame for track in moved}
+    if len(frames) != 1 or None in frames or not all(len(track.corrected_and_true()[1]) for track in moved):
+        return None
+    return ate_in_frame_m(moved, frames.pop() or "")
+
+
+def ate_in_frame_m(tracks: Iterable[Track], frame: str) -> float | None:
+    """Joint ATE of the robots in one map frame."""
+    pairs = [track.corrected_and_true() for track in tracks if track.map_frame == frame]
+    return ate_m([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
+
+
+def ate_joint_odometry_m(tracks: Mapping[str, Track], aligned: bool) -> float | None:
+    """Joint ATE of odometry placed at its true starts, or None unless every robot has ground truth."""
+    moved = with_keyframes(tracks.values())
+    pairs = [track.odometry_and_true() for track in moved]
+    if not all(len(truth) for _, truth in pairs):
+        return None
+    error = ate_m if aligned else unaligned_ate_m
+    return error([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
+
+
+def track_error(estimate: Float, truth: Float) -> TrackError:
+    """Errors of one robot's own trajectory."""
+    rpe = relative_pose_error(estimate, truth)
+    return TrackError(
+        ate_m=ate_m([estimate], [truth]),
+        rpe_translation_m=None if rpe is None else rpe.translation_rmse_m,
+        rpe_rotation_deg=None if rpe is None else rpe.rotation_rmse_deg,
+    )
+
+
+def robot_part(loaded: LoadedRun, robot: str) -> Robot:
+    """One robot's part of the report."""
+    track, result = loaded.tracks[robot], loaded.results.get(robot)
+    corrections = corrections_of(loaded.events, robot)
+    end = ends(loaded.events).get(robot)
+    return Robot(
+        robot=robot,
+        incarnation=None if result is None else result.incarnation,
+        end=None if end is None else "died" if isinstance(end, AgentDied) else "stopped",
+        ended_s=None if end is None else end.t,
+        keyframes=len(track),
+        keyframes_with_ground_truth=int(track.true.sum()),
+        path_length_m=track.path_length_m(),
+        map_frame=track.map_frame,
+        corrections=len(corrections),
+        frame_changes=sum(correction.frame_changed for correction in corrections),
+        logs={} if result is None else dict(sorted(result.logs.items())),
+        corrected=track_error(*track.corrected_and_true()),
+        odometry=track_error(*track.odometry_and_true()),
+    )
+
+
+def closures_part(loaded: LoadedRun) -> Closures:
+    """Count pairs by what became of them."""
+    pairs = loaded.pairs
+    rejected = Counter(pair.reason for pair in pairs if pair.rejected and pair.reason is not None)
+    rounds = of_kind(loaded.events, GraphOptimised)
+    return Closures(
+        accepted=sum(pair.accepted for pair in pairs),
+        rejected=sum(pair.rejected for pair in pairs),
+        accepted_inter_robot=sum(pair.accepted and pair.inter_robot for pair in pairs),
+        candidates=sum(pair.similarity is not None for pair in pairs),
+        rejected_by_reason=dict(sorted(rejected.items())),
+        used=rounds[-1].closures_used if rounds else None,
+        rejected_by_solver=rounds[-1].closures_rejected if rounds else None,
+    )
+
+
+def optimisations_part(loaded: LoadedRun) -> Optimisations:
+    """What the leaders' solvers did."""
+    rounds = of_kind(loaded.events, GraphOptimised)
+    times_s = [event.solve_s for event in rounds if event.solve_s is not None]
+    return Optimisations(
+        rounds=len(rounds), cost=rounds[-1].cost if rounds else None, solve_s_max=max(times_s, default=None)
+    )
+
+
+def bytes_by_robot(loaded: LoadedRun) -> dict[str, RobotBytes]:
+    """Bytes of each robot by kind, over all its starts: a counter that falls began again at zero."""
+    sent: dict[str, Counter[str]] = {robot: Counter() for robot in loaded.robots}
+    received: dict[str, Counter[str]] = {robot: Counter() for robot in loaded.robots}
+    last: dict[str, BytesCounted] = {}
+    for event in of_kind(loaded.events, BytesCounted):
+        before = last.get(event.robot)
+        if before is not None and sum(event.sent.values()) < sum(before.sent.values()):
+            sent.setdefault(event.robot, Counter()).update(before.sent)
+            received.setdefault(event.robot, Counter()).update(before.received)
+        last[event.robot] = event
+    for robot, event in last.items():
+        sent.setdefault(robot, Counter()).update(event.sent)
+        received.setdefault(robot, Counter()).update(event.received)
+    return {
+        robot: RobotBytes(sent=dict(sorted(sent[robot].items())), received=dict(sorted(received[robot].items())))
+        for robot in sorted(sent)
+    }
+
+
+def total_bytes(by_robot: Mapping[str, RobotBytes]) -> dict[str, int]:
+    """Bytes sent by all robots, by kind."""
+    total: Counter[str] = Counter()
+    for robot in by_robot.values():
+        total.update(robot.sent)
+    return dict(sorted(total.items()))
+
+
+def warnings_of(loaded: LoadedRun) -> list[str]:
+    """Sentences that a reader should see: deaths, refusals, missing results, what the solver said last."""
+    events = loaded.events
+    found = [f"{e.robot} died after {e.t:.1f} s ({how_it_died(e)})." for e in of_kind(events, AgentDied)]
+    found += sorted({f"{e.robot} refused {e.peer}: {e.reason}." for e in of_kind(events, PeerRefused)})
+    for robot in loaded.robots:
+        if robot not in loaded.results:
+            found.append(f"{robot} left no result; its trajectory is odometry only.")
+    rounds = of_kind(events, GraphOptimised)
+    return found + ([f"Last optimisation: {text}" for text in rounds[-1].warnings] if rounds else [])
+
+
+def how_it_died(event: AgentDied) -> str:
+    """The signal or exit code of an agent's death."""
+    if event.signal is not None:
+        return f"signal {event.signal}"
+    return "no reason known" if event.exit_code is None else f"exit code {event.exit_code}"
+
+
+def judged(limits: Mapping[str, float], report: Report) -> list[Expectation]:
+    """Hold a scenario's expectations against a report.
+
+    `NAME_max` and `NAME_within_s` hold where the value is at most the limit, `NAME_min` where it is at least. What
+    never happened within the run misses its `_within_s`; any other value that is not known is not judged.
+    """
+    values = measured(report)
+    return [
+        Expectation(name=name, limit=limit, value=values.get(name), met=met(name, limit, values.get(name)))
+        for name, limit in sorted(limits.items())
+    ]
+
+
+def met(name: str, limit: float, value: float | None) -> bool | None:
+    """Whether a value keeps its limit; None where it cannot be said."""
+    if value is None:
+        return False if name.endswith("_within_s") else None
+    return value >= limit if name.endswith("_min") else value <= limit
+
+
+def measured(report: Report) -> dict[str, float | None]:
+    """The values that expectations can name."""
+    before, after = report.ate_joint_odometry_m, report.ate_joint_m
+    return {
+        "merged_within_s": report.merged_after_s,
+        "ate_max_m": after,
+        "ate_ratio_max": after / before if after is not None and before else None,
+        "leader_changes_max": report.leader_changes,
+        "closures_min": report.closures.accepted_inter_robot,
+        "closures_rejected_max": report.closures.rejected,
+        "map_frames_max": len(report.map_frames),
+        "bytes_max": sum(report.bytes.values()),
+        "wall_max_s": report.wall_s,
+    }

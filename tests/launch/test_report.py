@@ -1,0 +1,220 @@
+"""What `finish` makes of a run folder."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.launch import synthetic_run
+from tests.launch.synthetic_run import Synthetic
+
+from flocc_agent.runtime.trajectory import read_tum
+from flocc_launch.evaluation import ate_m
+from flocc_launch.report import finish, read_report
+from flocc_launch.report.build import judged
+from flocc_launch.report.timeline import merged_after_s
+from flocc_launch.run_folder import RunFolder, RunFolderError, event_from_line
+
+ROBOTS = ["r1", "r2", "r3"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    return synthetic_run.write(tmp_path / "run")
+
+
+def report_json(folder: RunFolder) -> dict[str, Any]:
+    finish(folder)
+    loaded: dict[str, Any] = json.loads((folder.path / "report.json").read_text())
+    return loaded
+
+
+def test_report_has_the_keys_that_other_programs_rely_on(folder: RunFolder) -> None:
+    report = report_json(folder)
+    assert report["schema_version"] == 1
+    assert report["robots"] == ROBOTS
+    assert report["map_frames"] == ["map/r1"]
+    assert report["closures"]["accepted"] > 20
+    assert report["closures"]["rejected"] == sum(report["closures"]["rejected_by_reason"].values()) > 0
+    assert report["ate_joint_m"] < 0.5 * report["ate_joint_odometry_m"]
+    assert sorted(report["ate_m"]) == ROBOTS
+    assert set(report["bytes"]) == {"corrections", "election", "heartbeat", "latents", "records"}
+    assert report["leaders"][-1] == {"term": 2, "leader": "r1", "from_s": 4.2, "to_s": report["duration_s"]}
+    assert report["merged_after_s"] == 41.3
+    assert (report["wall_s"], report["seed"]) == (121.4, 7)
+    assert [(e["name"], e["limit"], e["met"]) for e in report["expectations"]] == [
+        ("ate_max_m", 0.5, True),
+        ("merged_within_s", 60.0, True),
+    ]
+
+
+def test_read_report_gives_what_finish_returned(folder: RunFolder) -> None:
+    report = finish(folder)
+    assert read_report(folder.path / "report.json") == report
+
+
+def test_finishing_again_writes_the_same_files(folder: RunFolder) -> None:
+    finish(folder)
+    written = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+    finish(folder)
+    assert written == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_the_joint_ate_can_be_recomputed_from_the_tum_files(folder: RunFolder) -> None:
+    report = finish(folder)
+    estimates, truths = (
+        [read_tum(folder.path / kind / f"{robot}.tum").T_fixed_body for robot in ROBOTS]
+        for kind in ("trajectories", "groundtruth")
+    )
+    assert report.ate_joint_m == pytest.approx(ate_m(estimates, truths), abs=1e-8)
+
+
+def test_evo_ape_on_the_tum_files_gives_the_reports_ate(folder: RunFolder) -> None:
+    sync = pytest.importorskip("evo.core.sync")
+    metrics = pytest.importorskip("evo.core.metrics")
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    report = finish(folder)
+    for robot in ROBOTS:
+        truth = file_interface.read_tum_trajectory_file(folder.path / "groundtruth" / f"{robot}.tum")
+        estimate = file_interface.read_tum_trajectory_file(folder.path / "trajectories" / f"{robot}.tum")
+        truth, estimate = sync.associate_trajectories(truth, estimate)
+        estimate.align(truth)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data((truth, estimate))
+        rmse = ape.get_statistic(metrics.StatisticsType.rmse)
+        assert report.ate_m[robot] == pytest.approx(rmse, abs=1e-8)
+
+
+def test_a_keyframe_after_the_last_correction_moves_with_T_map_odom(folder: RunFolder) -> None:
+    finish(folder)
+    result = folder.result("r2")
+    assert result is not None
+    assert result.keyframes[-1].T_map_body is None
+    assert len(read_tum(folder.path / "trajectories" / "r2.tum")) == len(result.keyframes)
+
+
+def test_maps_that_did_not_merge_have_no_joint_ate_but_one_per_frame(tmp_path: Path) -> None:
+    report = finish(synthetic_run.write(tmp_path / "run", Synthetic(merged_s=None)))
+    assert report.map_frames == ["map/r1", "map/r2", "map/r3"]
+    assert report.ate_joint_m is None
+    assert report.merged_after_s is None
+    assert all(value is not None for value in report.ate_by_frame_m.values())
+    assert {e.name: e.met for e in report.expectations} == {"ate_max_m": None, "merged_within_s": False}
+
+
+def test_nothing_is_invented_without_ground_truth(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run", Synthetic(with_truth=False))
+    report = finish(folder)
+    assert (report.ate_joint_m, report.ate_joint_odometry_m) == (None, None)
+    assert report.ate_m == dict.fromkeys(ROBOTS)
+    assert not (folder.path / "groundtruth").exists()
+
+
+def test_a_killed_robot_is_reported_and_the_rest_go_on(tmp_path: Path) -> None:
+    report = finish(synthetic_run.write(tmp_path / "run", Synthetic(died=("r1", 50.0))))
+    assert report.warnings[0] == "r1 died after 50.0 s (signal 9)."
+    assert "r1 left no result; its trajectory is odometry only." in report.warnings
+    assert report.leaders[-1].leader == "r2"
+    assert [span.to_s for span in report.leaders if span.leader == "r1"][-1] >= 50.0
+    r1 = report.robot_details[0]
+    assert (r1.end, r1.ended_s, r1.map_frame) == ("died", 50.0, None)
+    assert r1.keyframes > 10
+    assert report.ate_joint_m is None
+    assert report.ate_by_frame_m["map/r1"] is not None
+
+
+def test_living_robots_count_as_merged_when_another_died() -> None:
+    correction = '"event": "correction", "term": 1, "round": 1, "T_map_odom": [0, 0, 0, 1, 0, 0, 0]'
+    lines = [
+        f'{{"t": 1, "robot": "r1", "map_frame": "map/r1", {correction}}}',
+        f'{{"t": 2, "robot": "r2", "map_frame": "map/r1", {correction}}}',
+        '{"t": 3, "robot": "r3", "event": "agent_died", "signal": 9}',
+    ]
+    events = [event_from_line(line, "events.jsonl") for line in lines]
+    assert merged_after_s(events, ["r1", "r2", "r3"]) == 3
+    assert merged_after_s(events, ["r1", "r2"]) == 2
+    assert merged_after_s(events[:2], ["r1", "r2", "r3"]) is None
+    assert merged_after_s(events[:1], ["r1"]) is None
+
+
+def test_bytes_of_a_restarted_robot_are_added(folder: RunFolder) -> None:
+    before = finish(folder).bytes_by_robot["r1"].sent["heartbeat"]
+    event = {"t": 1e3, "robot": "r1", "event": "bytes", "sent": {"heartbeat": 10}, "received": {}}
+    with (folder.path / "events.jsonl").open("a") as file:
+        file.write(json.dumps(event) + "\n")
+    assert finish(folder).bytes_by_robot["r1"].sent["heartbeat"] == before + 10
+
+
+def test_an_unknown_expectation_is_not_judged(folder: RunFolder) -> None:
+    (expectation,) = judged({"happiness_min": 1.0}, finish(folder))
+    assert (expectation.value, expectation.met) == (None, None)
+
+
+def test_gtsam_reads_the_pose_graph_and_its_closures_agree_with_the_poses(folder: RunFolder) -> None:
+    gtsam = pytest.importorskip("gtsam")
+    report = finish(folder)
+    graph, values = gtsam.readG2o(str(folder.path / "pose_graph.g2o"), True)
+    keyframes = sum(robot.keyframes for robot in report.robot_details)
+    assert values.size() == keyframes
+    assert graph.size() == keyframes - 3 + report.closures.accepted
+    closure = gtsam.BetweenFactorPose3
+    errors = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), closure)]
+    offsets = [
+        factor.measured().between(values.atPose3(factor.keys()[0]).between(values.atPose3(factor.keys()[1])))
+        for factor in errors
+        if abs(factor.keys()[0] - factor.keys()[1]) > 1
+    ]
+    assert len(offsets) == report.closures.accepted
+    assert max(float(np.linalg.norm(T.translation())) for T in offsets) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "sentence"),
+    [
+        ("run.json", "", r"run\.json: is cut off or not JSON"),
+        ("run.json", '{"version": 9, "scenario": "x", "robots": []}', r"run\.json: is of version 9"),
+        ("run.json", '{"scenario": "x"}', r"run\.json: robots: Field required"),
+        ("events.jsonl", '{"t": 1, "robot": "r1", "event": "keyf', r"events\.jsonl:1: is cut off or not JSON"),
+        ("events.jsonl", '{"t": 1, "robot": "r1"}', r"events\.jsonl:1: event: Field required"),
+        ("events.jsonl", "[]", r"events\.jsonl:1: \(top level\): "),
+        (
+            "events.jsonl",
+            '{"t": 1, "robot": "r1", "event": "candidate", "query": "r1/x", "match": "r2/1", "similarity": 1}',
+            r"events\.jsonl:1: query: ",
+        ),
+        ("robots/r1/result.json", '{"robot": "r1", "keyf', r"result\.json: is cut off or not JSON"),
+        ("robots/r1/result.json", '{"robot": "r1", "T_map_odom": [0,0,0,0,0,0,0]}', r"T_map_odom: .*unit length"),
+    ],
+)
+def test_a_damaged_folder_is_named_in_one_sentence(folder: RunFolder, name: str, damage: str, sentence: str) -> None:
+    (folder.path / name).write_text(damage)
+    with pytest.raises(RunFolderError, match=sentence) as caught:
+        finish(RunFolder.open(folder.path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match=r"has no run\.json"):
+        RunFolder.open(tmp_path)
+    with pytest.raises(RunFolderError, match="is not a folder"):
+        RunFolder.open(tmp_path / "nothing")
+
+
+def test_a_run_is_not_written_over_another(folder: RunFolder) -> None:
+    with pytest.raises(RunFolderError, match="holds a run already"):
+        RunFolder.create(folder.path)
+
+
+def test_an_event_of_a_later_version_is_kept_as_it_is() -> None:
+    event = event_from_line('{"t": 2.5, "robot": "r1", "event": "teleported", "where": "mars"}', "here")
+    assert (event.t, event.robot, event.event) == (2.5, "r1", "teleported")
+
+
+def test_a_run_without_any_event_has_a_report(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.write_run(synthetic_run.run_of(Synthetic(with_truth=False)))
+    folder.write_events([])
+    report = finish(folder)
+    assert (report.closures.accepted, report.leaders, report.bytes) == (0, [], {})
+    assert (report.ate_joint_m, report.merged_after_s, report.duration_s) == (None, None, 0.0)
