@@ -9,7 +9,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.trajectory import Trajectory, read_tum
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import read_source
-from flocc_launch.datasets.drift import DriftSpec, drifted
+from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.writer import Progress, write_source
@@ -125,7 +125,7 @@ def split(
         out: Gets one folder per robot: alpha, bravo, charlie.
         robots: How many parts.
         seed: Of the drift; each robot has its own.
-        drift: How odometry departs from the truth; None takes the default of `DriftSpec`.
+        drift: How odometry departs from the truth; None takes `HANDHELD_DRIFT`.
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
@@ -145,7 +145,7 @@ def split(
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, None, (drift or DriftSpec()) if part.truth else None, rng)
+        moved = _odometry(part, None, (drift or HANDHELD_DRIFT) if part.truth else None, rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
         folders.append(out / name)
     _complain(source, out, len(source.images))

@@ -32,6 +32,16 @@ class DriftSpec(Section):
     """Random walk of roll and pitch over that of the heading; small where an accelerometer shows gravity."""
 
 
+HANDHELD_DRIFT = DriftSpec(
+    scale_sigma_ratio=0.05,
+    translation_sigma_m_per_sqrt_m=0.05,
+    heading_rate_sigma_rad_per_m=0.03,
+    heading_sigma_rad_per_sqrt_m=0.04,
+    tilt_ratio=0.3,
+)
+"""A hand-held camera with a poor visual-inertial odometry in a small room: centimetres after a few metres."""
+
+
 def drifted(truth: Trajectory, spec: DriftSpec, rng: np.random.Generator, up_fixed: Float = UP_Z) -> Trajectory:
     """Integrate the true motion with errors.
 
