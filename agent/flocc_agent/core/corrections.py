@@ -1,0 +1,169 @@
+"""Corrections: made of a solution by the leader, kept by everybody, passed on, applied when newer.
+
+A robot holds the newest correction of each log. (term, round) only grows, so a late or repeated one changes
+nothing, and a robot that was away gets the newest from whoever it meets.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.parameters import GossipParameters, RoundParameters
+from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
+from flocc_agent.geometry import pose_from_tq, tq_from_pose
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import CorrectionMessage, CorrectionRequest, CorrectionVersion
+
+Float = NDArray[np.float64]
+
+_UPPER = np.triu_indices(6)
+
+
+class Corrections:
+    """The newest correction of every log, as one robot knows them."""
+
+    def __init__(self, own: LogId, gossip: GossipParameters, rounds: RoundParameters) -> None:
+        self._own = own
+        self._gossip = gossip
+        self._rounds = rounds
+        self._newest: dict[LogId, CorrectionMessage] = {}
+        self._asked_until_s: dict[LogId, float] = {}
+
+    @property
+    def applied(self) -> CorrectionMessage | None:
+        """The correction that this robot applied last."""
+        return self._newest.get(self._own)
+
+    def of(self, log: LogId) -> CorrectionMessage | None:
+        """The newest known correction of a log."""
+        return self._newest.get(log)
+
+    def restore(self, message: CorrectionMessage) -> None:
+        """Put back the correction that was applied before a restart."""
+        self._newest[message.log] = message
+
+    def versions(self) -> tuple[CorrectionVersion, ...]:
+        """What this robot holds, for its heartbeat."""
+        return tuple(CorrectionVersion(log, m.term, m.round) for log, m in sorted(self._newest.items()))
+
+    def on_versions(self, peer: str, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
+        """Ask a peer for corrections that are newer than this robot's."""
+        effects: list[Effect] = []
+        for version in versions:
+            held = self._newest.get(version.log)
+            newer = held is None or (version.term, version.round) > (held.term, held.round)
+            if newer and self._asked_until_s.get(version.log, now) <= now:
+                self._asked_until_s[version.log] = now + self._gossip.request_timeout_s
+                effects.append(Unicast(peer, CorrectionRequest(version.log)))
+        return effects
+
+    def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
+        """Pass a correction on."""
+        held = self._newest.get(request.log)
+        return [Unicast(peer, held)] if held else []
+
+    def on_message(self, message: CorrectionMessage) -> list[Effect]:
+        """Keep a newer correction; apply it when it is this robot's."""
+        held = self._newest.get(message.log)
+        if held is not None and (message.term, message.round) <= (held.term, held.round):
+            return []
+        if held is None and len(self._newest) >= self._gossip.logs_max:
+            return [Report("peer_refused", {"peer": message.term.leader.robot, "reason": "too many corrections"})]
+        self._newest[message.log] = message
+        self._asked_until_s.pop(message.log, None)
+        return self._apply(message, held) if message.log == self._own else []
+
+    def publish(self, term: Term, round_number: int, solution: GraphSolution) -> list[Effect]:
+        """Send what a round changed, as the leader."""
+        effects: list[Effect] = []
+        for component in solution.components:
+            for log in component.logs:
+                message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
+                if self._changed(message):
+                    effects += [Broadcast(message), *self.on_message(message)]
+        return effects
+
+    def _changed(self, message: CorrectionMessage) -> bool:
+        """Whether a follower would notice: another term, frame or thinning, or poses that moved."""
+        held = self._newest.get(message.log)
+        if held is None or (held.term, held.anchor, held.step) != (message.term, message.anchor, message.step):
+            return True
+        old, new = held.T_map_camera.numpy(), message.T_map_camera.numpy()
+        if len(old) > len(new):
+            return True
+        shift = np.abs(new[: len(old)] - old)
+        moved = shift[:, :3].max(initial=0.0) > self._rounds.translation_tolerance_m
+        turned = shift[:, 3:].max(initial=0.0) > self._rounds.rotation_tolerance_rad
+        return bool(moved or turned) or self._odom_moved(held, message)
+
+    def _odom_moved(self, held: CorrectionMessage, message: CorrectionMessage) -> bool:
+        shift = np.abs(np.array(held.T_map_odom) - np.array(message.T_map_odom))
+        return bool(shift.max() > self._rounds.translation_tolerance_m)
+
+    def _apply(self, message: CorrectionMessage, held: CorrectionMessage | None) -> list[Effect]:
+        correction = delivered(message, frame_changed=held is not None and held.anchor != message.anchor)
+        facts = {
+            "term": message.term.counter,
+            "leader": message.term.leader.robot,
+            "round": message.round,
+            "map_frame": correction.map_frame,
+            "frame_changed": correction.frame_changed,
+            "T_map_odom": [float(x) for x in message.T_map_odom],
+        }
+        return [PersistCorrection(message), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
+
+
+def correction_of(
+    component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int
+) -> CorrectionMessage:
+    """A log's part of a solution, thinned to at most `keyframes_max` keyframes; the last one is always listed."""
+    poses = component.T_map_keyframe[log]
+    step = max(1, -(-len(poses) // keyframes_max))
+    first = (len(poses) - 1) % step
+    covariance = component.covariance_map_odom.get(log)
+    return CorrectionMessage(
+        log=log,
+        term=term,
+        round=round_number,
+        anchor=component.anchor,
+        T_map_odom=pose7(component.T_map_odom[log]),
+        covariance=None if covariance is None else Array.of(covariance[_UPPER], "f4"),
+        first=first,
+        step=step,
+        T_map_camera=Array.of(np.array([tq_from_pose(T) for T in poses[first::step]]).reshape(-1, 7), "f4"),
+    )
+
+
+def delivered(message: CorrectionMessage, frame_changed: bool) -> Correction:
+    """A correction as consumers get it."""
+    return Correction(
+        term=message.term,
+        round=message.round,
+        map_frame=map_frame(message.anchor),
+        frame_changed=frame_changed,
+        T_map_odom=pose_from_tq(np.array(message.T_map_odom)),
+        covariance=None if message.covariance is None else symmetric(message.covariance.numpy()),
+        first=message.first,
+        step=message.step,
+        T_map_camera=np.array([pose_from_tq(row) for row in message.T_map_camera.numpy()]).reshape(-1, 4, 4),
+    )
+
+
+def symmetric(upper: Float) -> Float:
+    """Covariance (6, 6) of its upper triangle (21)."""
+    out = np.zeros((6, 6))
+    out[_UPPER] = upper
+    return out + np.triu(out, 1).T
+
+
+def upper_triangle(covariance: Float) -> Array:
+    """Upper triangle (21) of a covariance (6, 6), float32."""
+    return Array.of(covariance[_UPPER], "f4")
+
+
+def pose7(T: Float) -> Pose7:
+    """A pose as the wire has it."""
+    x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
+    return (x, y, z, qw, qx, qy, qz)

@@ -1,0 +1,156 @@
+"""What a robot wants done. The driver carries effects out in order: what is persisted comes before what is sent."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
+from flocc_protocol.codec import Pose7
+from flocc_protocol.ids import KeyframeId, LogId, Term
+from flocc_protocol.messages import CandidatePair, CorrectionMessage, Message
+
+Float = NDArray[np.float64]
+Fact = str | int | float | bool | None | list["Fact"] | dict[str, "Fact"]
+
+
+@dataclass(frozen=True, slots=True)
+class Encode:
+    """Describe and encode an image; answer KeyframeEncoded or KeyframeEncodingFailed."""
+
+    keyframe: KeyframeId
+    image: int
+
+
+@dataclass(frozen=True, slots=True)
+class Broadcast:
+    """Send to every robot in range; may be lost."""
+
+    message: Message
+
+
+@dataclass(frozen=True, slots=True)
+class Unicast:
+    """Send to one robot in range; may be lost."""
+
+    to: str
+    message: Message
+
+
+@dataclass(frozen=True, slots=True)
+class FetchLatent:
+    """Get a latent from a robot in range into the store; answer LatentFetched or LatentFetchFailed."""
+
+    keyframe: KeyframeId
+    holder: str
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """Register two latents of the store; answer PairRegistered or LatentMissing.
+
+    Attributes:
+        pair: The candidate.
+        query: Which of the two is the query.
+        match: The other one.
+        neighbour: The query's neighbour in its log, for the odometry pair of Eq. (1).
+        T_neighbour_query: Odometry between the two, metric.
+    """
+
+    pair: CandidatePair
+    query: KeyframeId
+    match: KeyframeId
+    neighbour: KeyframeId
+    T_neighbour_query: Pose7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimise:
+    """Optimise a pose graph; answer GraphOptimised or GraphOptimisationFailed."""
+
+    term: Term
+    round: int
+    graph: PoseGraph
+    initial: GraphSolution | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What a robot's consumer gets: its trajectory and odom frame in the map.
+
+    Attributes:
+        term: Term of the leader that made it.
+        round: Its optimisation round; (term, round) only grows.
+        map_frame: Name of the map frame.
+        frame_changed: The map frame differs from the last correction's: everything jumps.
+        T_map_odom: (4, 4) of the robot's odom frame.
+        covariance: (6, 6) of T_map_odom, rotation first, or None.
+        first: Number of the first corrected keyframe.
+        step: Every `step`-th keyframe is given.
+        T_map_camera: (N, 4, 4) corrected camera poses.
+    """
+
+    term: Term
+    round: int
+    map_frame: str
+    frame_changed: bool
+    T_map_odom: Float
+    covariance: Float | None
+    first: int
+    step: int
+    T_map_camera: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deliver:
+    """Hand a correction to the robot's consumers."""
+
+    correction: Correction
+
+
+@dataclass(frozen=True, slots=True)
+class PersistRecord:
+    """Put a record on disk; an own record must be there before it is sent."""
+
+    log: LogId
+    number: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PersistTerm:
+    """Remember the highest term counter that this robot claimed."""
+
+    counter: int
+
+
+@dataclass(frozen=True, slots=True)
+class PersistCorrection:
+    """Remember the correction that this robot applied."""
+
+    correction: CorrectionMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A fact for people and files: the run's events."""
+
+    event: str
+    fields: Mapping[str, Fact] = field(default_factory=dict)
+
+
+Effect = (
+    Encode
+    | Broadcast
+    | Unicast
+    | FetchLatent
+    | Register
+    | Optimise
+    | Deliver
+    | PersistRecord
+    | PersistTerm
+    | PersistCorrection
+    | Report
+)

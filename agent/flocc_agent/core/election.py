@@ -1,0 +1,269 @@
+"""Bully election (Garcia-Molina 1982) among robots in range, extended over chains of robots, with terms.
+
+Rules:
+- Rank is compute class first, then lowest log. The best-ranked robot of a connected group leads it.
+- A leader's own counter (`beat`) grows with each of its heartbeats. Followers pass the highest one on, with the
+  hops it travelled; a leader whose beat stands still is lost, however often its name is repeated.
+- A term is (counter, leader). Whoever claims one takes a counter above all it heard of, and a leader that hears of
+  a counter not below its own claims anew, so that what it says is never older than what its followers applied.
+"""
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
+from flocc_agent.core.parameters import ElectionParameters
+from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
+from flocc_protocol.messages import (
+    COUNTER_MAX,
+    Answer,
+    Coordinator,
+    Election,
+    Handover,
+    Heartbeat,
+    LeaderAdvert,
+)
+
+Rank = tuple[int, LogId]
+
+COUNTER_JUMP_MAX = 2**20
+LOST_MAX = 64
+
+
+class Role(Enum):
+    """What a robot is doing about leadership."""
+
+    LISTENING = "listening"
+    ELECTING = "electing"
+    WAITING = "waiting"
+    FOLLOWING = "following"
+    LEADING = "leading"
+
+
+def rank(compute_class: int, log: LogId) -> Rank:
+    """Order in which robots lead: smaller is better."""
+    return (-compute_class, log)
+
+
+@dataclass(frozen=True, slots=True)
+class _Peer:
+    """What the election needs to know of a robot in range."""
+
+    rank: Rank
+    name: str
+
+
+class LeaderElection:
+    """One robot's part in the election."""
+
+    def __init__(
+        self, own: LogId, compute_class: int, counter_max: int, parameters: ElectionParameters, now: float
+    ) -> None:
+        self._own = own
+        self._compute_class = compute_class
+        self._rank = rank(compute_class, own)
+        self._parameters = parameters
+        self._counter_max = counter_max
+        self._peers: dict[str, _Peer] = {}
+        self._lost: dict[Term, int] = {}
+        self._leader: LeaderAdvert | None = None
+        self._role = Role.LISTENING
+        self._due_s = now + parameters.startup_s
+
+    @property
+    def role(self) -> Role:
+        """What this robot is doing about leadership."""
+        return self._role
+
+    @property
+    def leading(self) -> bool:
+        """Whether this robot leads."""
+        return self._role is Role.LEADING
+
+    @property
+    def term(self) -> Term | None:
+        """The term this robot follows or leads, None while there is none."""
+        return self._leader.term if self._leader else None
+
+    @property
+    def counter_max(self) -> int:
+        """Highest term counter heard of."""
+        return self._counter_max
+
+    def advert(self) -> LeaderAdvert | None:
+        """What a heartbeat says of the leader; a leader's beat grows with each call."""
+        if self._leader is not None and self.leading:
+            self._leader = replace(self._leader, beat=self._leader.beat + 1)
+        return self._leader
+
+    def on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
+        """Learn of a robot in range and of the leader it follows."""
+        self._peers[sender.robot] = _Peer(rank(heartbeat.compute_class, sender), sender.robot)
+        refused = self._learn_counter(sender, heartbeat.term_counter_max)
+        if refused:
+            return refused
+        if heartbeat.leader is None:
+            return self._renew_if_overtaken(now)
+        return self._on_advert(heartbeat.leader, now) + self._renew_if_overtaken(now)
+
+    def on_election(self, sender: LogId, now: float) -> list[Effect]:
+        """Answer a robot that this one outranks, and take the election over."""
+        peer = self._peers.get(sender.robot)
+        if peer is None or peer.rank < self._rank:
+            return []
+        answer: list[Effect] = [Unicast(sender.robot, Answer(self._counter_max))]
+        if self.leading:
+            return [*answer, *self._announce()]
+        return answer if self._role is Role.ELECTING else [*answer, *self._start(now)]
+
+    def on_answer(self, sender: LogId, now: float) -> list[Effect]:
+        """A better-ranked robot is alive: wait for its claim."""
+        peer = self._peers.get(sender.robot)
+        if self._role is Role.ELECTING and peer is not None and peer.rank < self._rank:
+            self._role = Role.WAITING
+            self._due_s = now + self._parameters.coordinator_timeout_s
+        return []
+
+    def on_coordinator(self, sender: LogId, message: Coordinator, now: float) -> list[Effect]:
+        """Hear a claim from the claimer itself; nobody claims a term for another robot."""
+        advert = message.advert
+        if advert.term.leader != sender or advert.hops != 0:
+            return [_refused(sender, "claims a term for another robot")]
+        refused = self._learn_counter(sender, advert.term.counter)
+        return refused or self._on_advert(advert, now) + self._renew_if_overtaken(now)
+
+    def on_handover(self, sender: LogId, message: Handover, now: float) -> list[Effect]:
+        """The leader leaves in order: elect at once."""
+        self.on_lost(sender.robot)
+        if self._leader is None or self._leader.term != message.term or message.term.leader != sender:
+            return []
+        return self._lose_leader("handed over", now, beat=COUNTER_MAX)
+
+    def on_applied(self, term: Term) -> list[Effect]:
+        """Somebody applied a correction of this term; a leader whose own term is older claims anew."""
+        refused = self._learn_counter(term.leader, term.counter)
+        if refused or self._leader is None or not self.leading or term <= self._leader.term:
+            return refused
+        return self._claim()
+
+    def on_lost(self, name: str) -> None:
+        """A robot is out of range; it need not be asked."""
+        self._peers.pop(name, None)
+
+    def leave(self) -> list[Effect]:
+        """Hand over before an orderly stop."""
+        if self._leader is None or not self.leading:
+            return []
+        self._role = Role.LISTENING
+        self._due_s = float("inf")
+        return [Broadcast(Handover(self._leader.term))]
+
+    def tick(self, now: float) -> list[Effect]:
+        """Time passed: a leader stood still, an ANSWER or a claim did not come, listening is over."""
+        if self._due_s > now:
+            return []
+        match self._role:
+            case Role.FOLLOWING:
+                return self._lose_leader("silent", now)
+            case Role.ELECTING:
+                return self._claim()
+            case Role.LISTENING | Role.WAITING:
+                return self._start(now)
+            case Role.LEADING:
+                return []
+
+    def deadline(self) -> float:
+        """When `tick` is due next."""
+        return self._due_s
+
+    def _on_advert(self, advert: LeaderAdvert, now: float) -> list[Effect]:
+        heard = replace(advert, hops=advert.hops + 1)
+        if advert.term.leader == self._own or heard.hops > self._parameters.hops_max:
+            return []
+        if heard.beat <= self._lost.get(heard.term, -1):
+            return []
+        if self._leader is not None and heard.term == self._leader.term:
+            return self._refresh(heard, now)
+        if self._prefers(heard):
+            return self._follow(heard, now)
+        return []
+
+    def _refresh(self, heard: LeaderAdvert, now: float) -> list[Effect]:
+        assert self._leader is not None
+        if heard.beat > self._leader.beat:
+            self._leader = heard
+            self._due_s = now + self._parameters.leader_timeout_s
+        return []
+
+    def _prefers(self, heard: LeaderAdvert) -> bool:
+        """A better-ranked leader wins over a worse one; of one leader the later term; never one below oneself."""
+        heard_rank = rank(heard.compute_class, heard.term.leader)
+        if self._rank < heard_rank:
+            return False
+        if self._leader is None or self.leading:
+            return True
+        current = rank(self._leader.compute_class, self._leader.term.leader)
+        if heard_rank == current:
+            return heard.term.counter > self._leader.term.counter
+        return heard_rank < current
+
+    def _follow(self, heard: LeaderAdvert, now: float) -> list[Effect]:
+        self._leader = heard
+        self._role = Role.FOLLOWING
+        self._due_s = now + self._parameters.leader_timeout_s
+        return [_leader_report(heard.term)]
+
+    def _lose_leader(self, why: str, now: float, beat: int | None = None) -> list[Effect]:
+        """Forget the leader; its term counts again only if its beat grows beyond the given one."""
+        assert self._leader is not None
+        self._lost[self._leader.term] = self._leader.beat if beat is None else beat
+        while len(self._lost) > LOST_MAX:
+            del self._lost[min(self._lost)]
+        report = Report("leader_lost", {"term": str(self._leader.term), "reason": why})
+        self._leader = None
+        return [report, *self._start(now)]
+
+    def _start(self, now: float) -> list[Effect]:
+        """Ask those who outrank this robot; claim at once where there are none."""
+        better = [self._peers[name] for name in sorted(self._peers) if self._peers[name].rank < self._rank]
+        if not better:
+            return self._claim()
+        self._role = Role.ELECTING
+        self._due_s = now + self._parameters.answer_timeout_s
+        return [Unicast(peer.name, Election(self._counter_max)) for peer in better]
+
+    def _claim(self) -> list[Effect]:
+        self._counter_max = min(self._counter_max + 1, TERM_COUNTER_MAX)
+        term = Term(self._counter_max, self._own)
+        self._leader = LeaderAdvert(term, self._compute_class, beat=0, hops=0)
+        self._role = Role.LEADING
+        self._due_s = float("inf")
+        return [PersistTerm(term.counter), _leader_report(term), *self._announce()]
+
+    def _announce(self) -> list[Effect]:
+        advert = self.advert()
+        assert advert is not None
+        return [Broadcast(Coordinator(advert))]
+
+    def _renew_if_overtaken(self, now: float) -> list[Effect]:
+        """Claim a higher term when others knew a counter not below ours; bully from above a worse leader."""
+        if self._leader is None:
+            return []
+        if self.leading:
+            return self._claim() if self._counter_max > self._leader.term.counter else []
+        outranks = self._rank < rank(self._leader.compute_class, self._leader.term.leader)
+        return self._start(now) if outranks and self._role is Role.FOLLOWING else []
+
+    def _learn_counter(self, sender: LogId, counter: int) -> list[Effect]:
+        if counter > self._counter_max + COUNTER_JUMP_MAX:
+            return [_refused(sender, f"term counter {counter} is absurd")]
+        self._counter_max = max(self._counter_max, counter)
+        return []
+
+
+def _leader_report(term: Term) -> Report:
+    return Report("leader", {"term": term.counter, "leader": term.leader.robot, "leader_log": str(term.leader)})
+
+
+def _refused(sender: LogId, reason: str) -> Report:
+    return Report("peer_refused", {"peer": sender.robot, "reason": reason})

@@ -1,0 +1,128 @@
+"""What happens to a robot. Every event that can fail has its failure twin."""
+
+from dataclasses import dataclass
+
+from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
+from flocc_protocol.ids import KeyframeId, Term
+from flocc_protocol.messages import CandidatePair, Envelope
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeCaptured:
+    """The camera took a keyframe.
+
+    Attributes:
+        stamp_s: Time of the image on the robot's clock.
+        T_odom_camera: Camera pose in the robot's odom frame, metric.
+        image: Number under which the driver holds the pixels.
+    """
+
+    stamp_s: float
+    T_odom_camera: Pose7
+    image: int
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeEncoded:
+    """The latent is stored and the descriptor computed."""
+
+    keyframe: KeyframeId
+    descriptor: Array
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeEncodingFailed:
+    """No descriptor and no latent; the keyframe still carries odometry."""
+
+    keyframe: KeyframeId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class MessageReceived:
+    """A checked message of another robot."""
+
+    envelope: Envelope
+
+
+@dataclass(frozen=True, slots=True)
+class LatentFetched:
+    """The latent of another robot's keyframe is in this robot's store."""
+
+    keyframe: KeyframeId
+    holder: str
+
+
+@dataclass(frozen=True, slots=True)
+class LatentFetchFailed:
+    """The holder did not answer in time or does not have it."""
+
+    keyframe: KeyframeId
+    holder: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairRegistered:
+    """A registration came to an end, with a relative pose or with a reason."""
+
+    pair: CandidatePair
+    result: Registration | RegistrationFailed
+
+
+@dataclass(frozen=True, slots=True)
+class LatentMissing:
+    """A registration could not start: the store no longer holds this latent."""
+
+    pair: CandidatePair
+    keyframe: KeyframeId
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphOptimised:
+    """A round's solution."""
+
+    term: Term
+    round: int
+    solution: GraphSolution
+
+
+@dataclass(frozen=True, slots=True)
+class GraphOptimisationFailed:
+    """A round without a solution; the last good one stands."""
+
+    term: Term
+    round: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class FixMeasured:
+    """An absolute position of the last keyframe's camera in a world frame."""
+
+    position_m: tuple[float, float, float]
+    covariance_m2: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Leaving:
+    """The robot is about to stop in order."""
+
+
+Event = (
+    KeyframeCaptured
+    | KeyframeEncoded
+    | KeyframeEncodingFailed
+    | MessageReceived
+    | LatentFetched
+    | LatentFetchFailed
+    | PairRegistered
+    | LatentMissing
+    | GraphOptimised
+    | GraphOptimisationFailed
+    | FixMeasured
+    | Leaving
+)

@@ -1,0 +1,224 @@
+"""Replicated logs: every robot owns one, holds copies of all others, and pulls what its copies lack.
+
+Rules: a log only grows, at its end, by its owner. Copies are prefixes. Heartbeats carry how long each copy is and
+its chained checksum; whoever has less asks for the rest, of whomever it heard that from. There is no state per
+neighbour about what was sent, so a lost, doubled, late or reordered message can do no lasting harm.
+"""
+
+from dataclasses import dataclass, field
+
+from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
+from flocc_agent.core.parameters import GossipParameters
+from flocc_protocol.errors import DecodeError
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import (
+    RECORDS_BATCH_BYTES_MAX,
+    RECORDS_BATCH_MAX,
+    LogDigest,
+    RecordBatch,
+    RecordRequest,
+)
+from flocc_protocol.records import KeyframeRecord, Record, chain, decode_record, encode_record
+
+
+@dataclass(slots=True)
+class LogCopy:
+    """A prefix of one robot's log: records, their bytes, and the chained checksum before each."""
+
+    records: list[Record] = field(default_factory=list)
+    encoded: list[bytes] = field(default_factory=list)
+    checksums: list[int] = field(default_factory=lambda: [0])
+    keyframes: int = 0
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def append(self, record: Record, data: bytes) -> None:
+        """Add the next record."""
+        self.records.append(record)
+        self.encoded.append(data)
+        self.checksums.append(chain(self.checksums[-1], data))
+        self.keyframes += isinstance(record, KeyframeRecord)
+
+    def accepts(self, record: Record) -> bool:
+        """Whether the record can be next: keyframes are numbered without gaps."""
+        return not isinstance(record, KeyframeRecord) or record.index == self.keyframes
+
+
+@dataclass(frozen=True, slots=True)
+class NewRecord:
+    """A record that this robot did not hold before."""
+
+    log: LogId
+    number: int
+    record: Record
+
+
+@dataclass(slots=True)
+class _Asked:
+    """An open request for a missing range."""
+
+    peer: str
+    until_s: float
+
+
+class Gossip:
+    """All logs that one robot holds."""
+
+    def __init__(self, own: LogId, parameters: GossipParameters) -> None:
+        self._own = own
+        self._parameters = parameters
+        self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
+        self._asked: dict[LogId, _Asked] = {}
+        self._pauses_s: dict[tuple[LogId, str], float] = {}
+        self._not_before_s: dict[tuple[LogId, str], float] = {}
+        self._forked: set[tuple[LogId, str]] = set()
+        self._digests: tuple[LogDigest, ...] | None = None
+
+    def restore(self, log: LogId, data: bytes) -> NewRecord:
+        """Put back a record that was read from disk, in order."""
+        copy = self.logs.setdefault(log, LogCopy())
+        record = decode_record(data)
+        copy.append(record, data)
+        self._digests = None
+        return NewRecord(log, len(copy) - 1, record)
+
+    def append(self, record: Record) -> tuple[NewRecord, list[Effect], RecordBatch]:
+        """Add a record to the own log: persist it, then send the batch."""
+        copy = self.logs[self._own]
+        number, data, before = len(copy), encode_record(record), copy.checksums[-1]
+        assert copy.accepts(record), "own keyframes are numbered without gaps"
+        copy.append(record, data)
+        self._digests = None
+        batch = RecordBatch(self._own, number, before, (data,))
+        return NewRecord(self._own, number, record), [PersistRecord(self._own, number, data)], batch
+
+    def digests(self) -> tuple[LogDigest, ...]:
+        """What this robot holds, for its heartbeat."""
+        if self._digests is None:
+            self._digests = tuple(
+                LogDigest(log, len(copy), copy.checksums[-1]) for log, copy in sorted(self.logs.items()) if len(copy)
+            )
+        return self._digests
+
+    def on_digests(self, sender: LogId, digests: tuple[LogDigest, ...], now: float) -> list[Effect]:
+        """Ask the sender for what it has more of."""
+        effects: list[Effect] = []
+        for digest in digests:
+            copy = self.logs.get(digest.log)
+            held = len(copy) if copy else 0
+            if digest.count > held:
+                effects += self._ask(sender.robot, digest.log, held, now)
+            elif copy is not None and copy.checksums[digest.count] != digest.checksum:
+                effects += self._fork(sender.robot, digest.log)
+        return effects
+
+    def on_request(self, sender: LogId, request: RecordRequest) -> list[Effect]:
+        """Send what follows, as much as fits a message."""
+        copy = self.logs.get(request.log)
+        if copy is None or request.first >= len(copy):
+            return []
+        records = _fitting(copy.encoded, request.first)
+        batch = RecordBatch(request.log, request.first, copy.checksums[request.first], records)
+        return [Unicast(sender.robot, batch)]
+
+    def on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
+        """Take over what is new; ask on for what still lacks."""
+        if batch.log == self._own:
+            return [], self._own_log_elsewhere(sender, batch)
+        copy = self.logs.get(batch.log) or LogCopy()
+        if batch.first > len(copy):
+            return [], self._ask(sender.robot, batch.log, len(copy), now)
+        if copy.checksums[batch.first] != batch.checksum_before:
+            return [], self._fork(sender.robot, batch.log)
+        if batch.log not in self.logs and len(self.logs) >= self._parameters.logs_max:
+            return [], [_refused(sender.robot, "too many logs")]
+        new, effects = self._take(sender.robot, copy, batch)
+        if new:
+            self.logs[batch.log] = copy
+            self._digests = None
+        self._answered(sender.robot, batch, bool(new))
+        if new and len(batch.records) > 1:
+            effects += self._ask_on(sender, batch, now)
+        return new, effects
+
+    def _take(self, peer: str, copy: LogCopy, batch: RecordBatch) -> tuple[list[NewRecord], list[Effect]]:
+        new: list[NewRecord] = []
+        effects: list[Effect] = []
+        for data in batch.records[len(copy) - batch.first :]:
+            try:
+                record = decode_record(data)
+            except DecodeError as error:
+                return new, [*effects, _refused(peer, f"bad record of {batch.log}: {error}")]
+            if not copy.accepts(record) or len(copy) >= self._parameters.records_max:
+                return new, [*effects, _refused(peer, f"record of {batch.log} out of place")]
+            number = len(copy)
+            copy.append(record, data)
+            new.append(NewRecord(batch.log, number, record))
+            effects.append(PersistRecord(batch.log, number, data))
+        return new, effects
+
+    def _ask(self, peer: str, log: LogId, first: int, now: float) -> list[Effect]:
+        """Ask one peer at a time for one log; a peer that did not deliver waits longer each time."""
+        if log == self._own or (log, peer) in self._forked:
+            return []
+        asked = self._asked.get(log)
+        if asked is not None and now < asked.until_s:
+            return []
+        if asked is not None:
+            self._did_not_deliver(log, asked.peer, now)
+        if now < self._not_before_s.get((log, peer), now):
+            return []
+        self._asked[log] = _Asked(peer, now + self._parameters.request_timeout_s)
+        return [Unicast(peer, RecordRequest(log, first))]
+
+    def _ask_on(self, sender: LogId, batch: RecordBatch, now: float) -> list[Effect]:
+        """A full batch has a successor; ask for it without waiting for the next heartbeat."""
+        size = sum(map(len, batch.records))
+        if len(batch.records) < RECORDS_BATCH_MAX and size < RECORDS_BATCH_BYTES_MAX // 2:
+            return []
+        return self._ask(sender.robot, batch.log, len(self.logs[batch.log]), now)
+
+    def _answered(self, peer: str, batch: RecordBatch, helped: bool) -> None:
+        asked = self._asked.get(batch.log)
+        if asked is not None and asked.peer == peer:
+            del self._asked[batch.log]
+        if helped:
+            self._pauses_s.pop((batch.log, peer), None)
+            self._not_before_s.pop((batch.log, peer), None)
+
+    def _did_not_deliver(self, log: LogId, peer: str, now: float) -> None:
+        del self._asked[log]
+        pause = min(2 * self._pauses_s.get((log, peer), 0.125), self._parameters.backoff_max_s)
+        self._pauses_s[log, peer] = pause
+        self._not_before_s[log, peer] = now + pause
+
+    def _own_log_elsewhere(self, sender: LogId, batch: RecordBatch) -> list[Effect]:
+        """Only this robot writes its log; a copy that differs means a second writer."""
+        own = self.logs[self._own]
+        end = batch.first + len(batch.records)
+        if end <= len(own) and tuple(own.encoded[batch.first : end]) == batch.records:
+            return []
+        return self._fork(sender.robot, batch.log)
+
+    def _fork(self, peer: str, log: LogId) -> list[Effect]:
+        if (log, peer) in self._forked:
+            return []
+        self._forked.add((log, peer))
+        return [Report("log_forked", {"peer": peer, "log": str(log), "reason": "two writers of one log"})]
+
+
+def _fitting(encoded: list[bytes], first: int) -> tuple[bytes, ...]:
+    """Records from `first` on that fit one batch; at least one."""
+    records: list[bytes] = []
+    size = 0
+    for data in encoded[first : first + RECORDS_BATCH_MAX]:
+        size += len(data)
+        if records and size > RECORDS_BATCH_BYTES_MAX:
+            break
+        records.append(data)
+    return tuple(records)
+
+
+def _refused(peer: str, reason: str) -> Report:
+    return Report("peer_refused", {"peer": peer, "reason": reason})

@@ -1,0 +1,90 @@
+"""Who is in range: robots whose heartbeats were heard lately. Heartbeats, not the transport, are the truth."""
+
+from dataclasses import dataclass
+
+from flocc_agent.core.effects import Effect, Report
+from flocc_agent.core.parameters import NeighbourParameters
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import Heartbeat
+
+
+@dataclass(slots=True)
+class Neighbour:
+    """A robot in range: its log, its last heartbeat and when it came."""
+
+    log: LogId
+    heartbeat: Heartbeat
+    heard_s: float
+    previous_boot: int | None = None
+
+
+class Neighbours:
+    """The table of robots in range, by name."""
+
+    def __init__(self, own: LogId, boot: int, parameters: NeighbourParameters) -> None:
+        self._own = own
+        self._boot = boot
+        self._parameters = parameters
+        self._by_name: dict[str, Neighbour] = {}
+        self._duplicates: set[str] = set()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._by_name
+
+    def get(self, name: str) -> Neighbour | None:
+        """The neighbour of that name, or None where it is not in range."""
+        return self._by_name.get(name)
+
+    def names(self) -> list[str]:
+        """Names of all robots in range, sorted."""
+        return sorted(self._by_name)
+
+    def on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
+        """Note a heartbeat; report a new neighbour, a restarted one, or two robots that share a name."""
+        if sender.robot == self._own.robot:
+            return self._name_taken(sender, heartbeat)
+        known = self._by_name.get(sender.robot)
+        if known is None:
+            if len(self._by_name) >= self._parameters.neighbours_max:
+                return [Report("peer_refused", {"peer": sender.robot, "reason": "too many neighbours"})]
+            self._by_name[sender.robot] = Neighbour(sender, heartbeat, now)
+            return [Report("neighbour_up", {"peer": sender.robot, "log": str(sender)})]
+        effects = self._restarted(known, sender, heartbeat)
+        known.log, known.heartbeat, known.heard_s = sender, heartbeat, now
+        return effects
+
+    def tick(self, now: float) -> list[Effect]:
+        """Drop robots that were silent for too long."""
+        gone = [name for name in self.names() if self._expires_s(name) <= now]
+        for name in gone:
+            del self._by_name[name]
+            self._duplicates.discard(name)
+        return [Report("neighbour_down", {"peer": name}) for name in gone]
+
+    def deadline(self) -> float:
+        """When the next neighbour would be dropped."""
+        return min((self._expires_s(name) for name in self._by_name), default=float("inf"))
+
+    def _expires_s(self, name: str) -> float:
+        return self._by_name[name].heard_s + self._parameters.timeout_s
+
+    def _restarted(self, known: Neighbour, sender: LogId, heartbeat: Heartbeat) -> list[Effect]:
+        """A new boot is a restart; the old boot heard once more means that two robots share the name."""
+        if heartbeat.boot == known.heartbeat.boot:
+            return []
+        returns = heartbeat.boot == known.previous_boot
+        known.previous_boot = known.heartbeat.boot
+        if not returns:
+            return [Report("neighbour_restarted", {"peer": sender.robot, "log": str(sender)})]
+        return self._report_duplicate(sender, "two robots run with this name")
+
+    def _name_taken(self, sender: LogId, heartbeat: Heartbeat) -> list[Effect]:
+        if heartbeat.boot == self._boot:
+            return []
+        return self._report_duplicate(sender, "another robot runs with this robot's name")
+
+    def _report_duplicate(self, sender: LogId, sentence: str) -> list[Effect]:
+        if sender.robot in self._duplicates:
+            return []
+        self._duplicates.add(sender.robot)
+        return [Report("duplicate_name", {"peer": sender.robot, "log": str(sender), "reason": sentence})]

@@ -1,0 +1,172 @@
+"""The core's parameters: unit in the name, default, and what turning it does.
+
+They are plain dataclasses so that the core stays free of frameworks; `config.py` checks them with pydantic.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+_FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
+
+
+def _require(condition: bool, sentence: str) -> None:
+    if not condition:
+        raise ValueError(sentence)
+
+
+@dataclass(frozen=True, slots=True)
+class NeighbourParameters:
+    """Who is in range, by heartbeat."""
+
+    __pydantic_config__ = _FORBID
+
+    heartbeat_period_s: float = 0.5
+    """Time between heartbeats; shorter notices a lost robot sooner and costs more bytes."""
+    timeout_s: float = 3.0
+    """A robot that was silent for this long is out of range; six periods ride through 30 % loss."""
+    neighbours_max: int = 64
+    """Robots heard at once; further ones are refused and counted."""
+
+    def __post_init__(self) -> None:
+        _require(self.heartbeat_period_s > 0, "heartbeat_period_s must be positive")
+        _require(self.timeout_s > self.heartbeat_period_s, "timeout_s must exceed heartbeat_period_s")
+        _require(self.neighbours_max >= 1, "neighbours_max must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class ElectionParameters:
+    """The bully election."""
+
+    __pydantic_config__ = _FORBID
+
+    startup_s: float = 1.5
+    """A robot listens this long after its start before it asks for an election."""
+    answer_timeout_s: float = 0.6
+    """Without an ANSWER for this long the robot claims a term; more than a round trip with loss."""
+    coordinator_timeout_s: float = 2.0
+    """After an ANSWER the robot waits this long for a leader, then asks again."""
+    leader_timeout_s: float = 3.0
+    """A leader whose own counter stood still for this long is lost."""
+    hops_max: int = 8
+    """A leader is followed over at most this many robots; longer chains form several groups."""
+
+    def __post_init__(self) -> None:
+        positive = min(self.startup_s, self.answer_timeout_s, self.coordinator_timeout_s, self.leader_timeout_s)
+        _require(positive > 0, "election times must be positive")
+        _require(1 <= self.hops_max <= 64, "hops_max must be in [1, 64]")
+
+
+@dataclass(frozen=True, slots=True)
+class GossipParameters:
+    """Replication of logs."""
+
+    __pydantic_config__ = _FORBID
+
+    request_timeout_s: float = 1.0
+    """A missing range is asked for again, of anybody, after this time."""
+    backoff_max_s: float = 8.0
+    """A peer that does not deliver what it claims is asked at most this rarely."""
+    logs_max: int = 128
+    """Logs that are kept; further ones are refused and counted."""
+    records_max: int = 200_000
+    """Records that are kept of one log; further ones are refused and counted."""
+
+    def __post_init__(self) -> None:
+        _require(0 < self.request_timeout_s <= self.backoff_max_s, "request_timeout_s must be in (0, backoff_max_s]")
+        _require(1 <= self.logs_max <= 256, "logs_max must be in [1, 256]")
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceRecognitionParameters:
+    """Candidates from descriptors (Sec. III-A)."""
+
+    __pydantic_config__ = _FORBID
+
+    similarity_threshold: float = 0.1
+    """A best match of lower cosine similarity is no candidate; the paper's 0.1 is permissive."""
+    best_matches: int = 1
+    """Candidates per keyframe and other robot; the paper takes the nearest neighbour only."""
+
+    def __post_init__(self) -> None:
+        _require(-1 <= self.similarity_threshold <= 1, "similarity_threshold must be in [-1, 1]")
+        _require(1 <= self.best_matches <= 16, "best_matches must be in [1, 16]")
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosingParameters:
+    """Candidates to closures (Sec. III-B)."""
+
+    __pydantic_config__ = _FORBID
+
+    match_ratio_threshold: float = 0.3
+    """R_thr: a registration with a lower match ratio, Eq. (1), is refused."""
+    correspondences_min: int = 20
+    """A registration with fewer correspondences is refused whatever its ratio."""
+    fetches_max: int = 2
+    """Latents fetched at one time."""
+    fetch_timeout_s: float = 10.0
+    """A fetch that takes longer has failed and is tried again."""
+    retry_s: float = 1.0
+    """First pause after a failed fetch; doubles up to `retry_max_s`."""
+    retry_max_s: float = 16.0
+    """Longest pause between fetches of one latent."""
+    registrations_max: int = 1
+    """Pairs registered at one time; more than workers only fills their queue."""
+    registration_timeout_s: float = 120.0
+    """A registration that gave no answer for this long is tried again."""
+    offer_period_s: float = 2.0
+    """Candidates that another robot is to register are told to it this often until its record shows."""
+    takeover_s: float = 15.0
+    """A robot that was silent for this long loses the pairs it was to register, where the latents are at hand."""
+    candidates_max: int = 4000
+    """Open candidates; the least similar ones are dropped beyond this."""
+    wants_max: int = 8
+    """Latents out of reach that are asked of relays at one time."""
+    relays_max: int = 16
+    """Latents kept for others at one time."""
+
+    def __post_init__(self) -> None:
+        _require(self.match_ratio_threshold >= 0, "match_ratio_threshold must not be negative")
+        _require(self.fetches_max >= 1, "fetches_max must be at least 1")
+        _require(self.registrations_max >= 1, "registrations_max must be at least 1")
+        _require(0 < self.retry_s <= self.retry_max_s, "retry_s must be in (0, retry_max_s]")
+        _require(1 <= self.wants_max <= 16, "wants_max must be in [1, 16]")
+        _require(1 <= self.relays_max <= 16, "relays_max must be in [1, 16]")
+
+
+@dataclass(frozen=True, slots=True)
+class RoundParameters:
+    """The leader's optimisation rounds."""
+
+    __pydantic_config__ = _FORBID
+
+    period_s: float = 2.0
+    """Shortest time between two rounds."""
+    timeout_s: float = 60.0
+    """A round without a result by then is given up and the next one may start."""
+    keyframes_per_round: int = 20
+    """New keyframes that call for a round even without a new closure."""
+    correction_keyframes_max: int = 400
+    """Keyframes listed in a correction; a longer trajectory is thinned and interpolated."""
+    translation_tolerance_m: float = 1e-3
+    """A correction that moves no keyframe further than this is not sent again in one term."""
+    rotation_tolerance_rad: float = 1e-4
+    """The same for rotation."""
+
+    def __post_init__(self) -> None:
+        _require(self.period_s > 0 and self.timeout_s > 0, "round times must be positive")
+        _require(2 <= self.correction_keyframes_max <= 1500, "correction_keyframes_max must be in [2, 1500]")
+
+
+@dataclass(frozen=True, slots=True)
+class CoreParameters:
+    """All parameters of the core."""
+
+    __pydantic_config__ = _FORBID
+
+    neighbours: NeighbourParameters = field(default_factory=NeighbourParameters)
+    election: ElectionParameters = field(default_factory=ElectionParameters)
+    gossip: GossipParameters = field(default_factory=GossipParameters)
+    place_recognition: PlaceRecognitionParameters = field(default_factory=PlaceRecognitionParameters)
+    loop_closing: LoopClosingParameters = field(default_factory=LoopClosingParameters)
+    rounds: RoundParameters = field(default_factory=RoundParameters)

@@ -1,0 +1,376 @@
+"""The robot: composes the machines of the core, events in, effects out.
+
+The driver calls `handle` for each event and `tick` when `deadline` is due; both return effects to carry out in
+order. Same seed and same events give the same effects, on virtual time and on a robot.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.corrections import Corrections, pose7, upper_triangle
+from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
+from flocc_agent.core.election import LeaderElection
+from flocc_agent.core.events import (
+    Event,
+    FixMeasured,
+    GraphOptimisationFailed,
+    GraphOptimised,
+    KeyframeCaptured,
+    KeyframeEncoded,
+    KeyframeEncodingFailed,
+    LatentFetched,
+    LatentFetchFailed,
+    LatentMissing,
+    Leaving,
+    MessageReceived,
+    PairRegistered,
+)
+from flocc_agent.core.gossip import Gossip, NewRecord
+from flocc_agent.core.loop_closing import LoopClosing, Range
+from flocc_agent.core.neighbours import Neighbours
+from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.place_recognition import PlaceRecognition
+from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
+from flocc_agent.core.rounds import Rounds, solution_report
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import (
+    Answer,
+    CandidateOffer,
+    CandidatePair,
+    Coordinator,
+    CorrectionMessage,
+    CorrectionRequest,
+    Election,
+    Envelope,
+    Handover,
+    Heartbeat,
+    RecordBatch,
+    RecordRequest,
+)
+from flocc_protocol.records import (
+    ClosureRecord,
+    FixRecord,
+    KeyframeRecord,
+    Record,
+    RejectionRecord,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """What a robot finds on its disk when it starts.
+
+    Attributes:
+        records: (log, encoded records in order) of every log, the own one included.
+        latents: Keyframes whose latents are stored.
+        term_counter: Highest term counter the robot claimed.
+        correction: The correction it applied last.
+    """
+
+    records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
+    latents: tuple[KeyframeId, ...] = ()
+    term_counter: int = 0
+    correction: CorrectionMessage | None = None
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A keyframe between capture and its record; records are appended in the order of capture."""
+
+    index: int
+    stamp_s: float
+    T_odom_camera: Pose7
+    encoded: bool = False
+    descriptor: Array | None = None
+    fixes: list[FixMeasured] = field(default_factory=list)
+
+
+class Robot:
+    """One agent's whole behaviour."""
+
+    def __init__(
+        self,
+        log: LogId,
+        compute_class: int,
+        boot: int,
+        parameters: CoreParameters,
+        now: float,
+        restored: Restored | None = None,
+    ) -> None:
+        restored = restored or Restored()
+        self.log = log
+        self._compute_class = compute_class
+        self._boot = boot
+        self._parameters = parameters
+        self._sequence = 0
+        self._heartbeat_due_s = now
+        self._pending: list[_Pending] = []
+        self.neighbours = Neighbours(log, boot, parameters.neighbours)
+        self.gossip = Gossip(log, parameters.gossip)
+        self.assembly = GraphAssembly()
+        self.recognition = PlaceRecognition(log, parameters.place_recognition)
+        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing)
+        self.corrections = Corrections(log, parameters.gossip, parameters.rounds)
+        self.election = LeaderElection(log, compute_class, restored.term_counter, parameters.election, now)
+        self.rounds = Rounds(self.assembly, parameters.rounds)
+        self._restore(restored, now)
+
+    # The three entry points
+
+    def handle(self, event: Event, now: float) -> list[Effect]:
+        """Something happened."""
+        effects = self._dispatch(event, now)
+        return effects + self._settle(now)
+
+    def tick(self, now: float) -> list[Effect]:
+        """Time passed."""
+        effects = self._lose_silent(now)
+        effects += self.election.tick(now)
+        if self._heartbeat_due_s <= now:
+            effects += self._heartbeat(now)
+        return effects + self._settle(now)
+
+    def deadline(self) -> float:
+        """When `tick` is due next, in seconds of the driver's clock."""
+        return min(
+            self._heartbeat_due_s,
+            self.neighbours.deadline(),
+            self.election.deadline(),
+            self.closing.deadline(),
+            self.rounds.deadline(),
+        )
+
+    # Events
+
+    def _dispatch(self, event: Event, now: float) -> list[Effect]:
+        match event:
+            case MessageReceived(envelope):
+                return self._on_message(envelope, now)
+            case KeyframeCaptured():
+                return self._on_captured(event)
+            case KeyframeEncoded(keyframe, descriptor):
+                self.closing.on_held(keyframe)
+                return self._on_encoded(keyframe, descriptor, now)
+            case KeyframeEncodingFailed(keyframe, reason):
+                report = Report("encoding_failed", {"keyframe": str(keyframe), "reason": reason})
+                return [report, *self._on_encoded(keyframe, None, now)]
+            case LatentFetched(keyframe, holder):
+                self.closing.on_held(keyframe)
+                return [Report("latent_fetched", {"keyframe": str(keyframe), "holder": holder})]
+            case LatentFetchFailed(keyframe, holder, reason):
+                self.closing.on_fetch_failed(keyframe, now)
+                return [Report("latent_failed", {"keyframe": str(keyframe), "holder": holder, "reason": reason})]
+            case PairRegistered(pair, result):
+                return self._on_registered(pair, result, now)
+            case LatentMissing(pair, keyframe):
+                return self.closing.on_latent_missing(pair, keyframe)
+            case GraphOptimised():
+                return self._on_optimised(event)
+            case GraphOptimisationFailed(term, round_number, reason):
+                self.rounds.on_failed(term, round_number)
+                return [Report("optimisation_failed", {"term": str(term), "round": round_number, "reason": reason})]
+            case FixMeasured():
+                return self._on_fix(event, now)
+            case Leaving():
+                return self.election.leave()
+
+    def _on_message(self, envelope: Envelope, now: float) -> list[Effect]:
+        sender, message = envelope.sender, envelope.message
+        if sender.robot == self.log.robot and not isinstance(message, Heartbeat):
+            return []
+        match message:
+            case Heartbeat():
+                return self._on_heartbeat(sender, message, now)
+            case Election():
+                return self.election.on_election(sender, now)
+            case Answer():
+                return self.election.on_answer(sender, now)
+            case Coordinator():
+                return self.election.on_coordinator(sender, message, now)
+            case Handover():
+                return self.election.on_handover(sender, message, now)
+            case RecordBatch():
+                new, effects = self.gossip.on_batch(sender, message, now)
+                return effects + self._take(new, now)
+            case RecordRequest():
+                return self.gossip.on_request(sender, message)
+            case CorrectionMessage():
+                return self.election.on_applied(message.term) + self.corrections.on_message(message)
+            case CorrectionRequest():
+                return self.corrections.on_request(sender.robot, message)
+            case CandidateOffer():
+                self.closing.on_offer(message)
+                return []
+
+    def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
+        effects = self.neighbours.on_heartbeat(sender, heartbeat, now)
+        if sender.robot not in self.neighbours:
+            return effects
+        effects += self.election.on_heartbeat(sender, heartbeat, now)
+        effects += self.gossip.on_digests(sender, heartbeat.digests, now)
+        effects += self.corrections.on_versions(sender.robot, heartbeat.corrections, now)
+        self.closing.on_wants(heartbeat.wants)
+        return effects
+
+    def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
+        index = self.gossip.logs[self.log].keyframes + len(self._pending)
+        self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
+        return [Encode(KeyframeId(self.log, index), event.image)]
+
+    def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
+        """Append the records of all keyframes that are ready, in the order of capture."""
+        for pending in self._pending:
+            if pending.index == keyframe.index:
+                pending.encoded, pending.descriptor = True, descriptor
+        effects: list[Effect] = []
+        while self._pending and self._pending[0].encoded:
+            ready = self._pending.pop(0)
+            record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
+            effects += self._append(record, now)
+            effects.append(_keyframe_report(self.log, record))
+        return effects
+
+    def _on_fix(self, event: FixMeasured, now: float) -> list[Effect]:
+        keyframes = self.gossip.logs[self.log].keyframes
+        if keyframes == 0:
+            return []
+        position = Array.of(np.array(event.position_m), "f8")
+        return self._append(FixRecord(keyframes - 1, position, Array.of(np.array(event.covariance_m2), "f8")), now)
+
+    def _on_registered(
+        self, pair: CandidatePair, result: Registration | RegistrationFailed, now: float
+    ) -> list[Effect]:
+        """Accept by the ratio of Eq. (1), or refuse; either way a record says so to everybody."""
+        self.closing.on_registered(pair)
+        record = self._judge(pair, result)
+        return [*self._append(record, now), judgement_report(record, self.log)]
+
+    def _judge(self, pair: CandidatePair, result: Registration | RegistrationFailed) -> ClosureRecord | RejectionRecord:
+        query, match = (pair.high, pair.low) if pair.high.log == self.log else (pair.low, pair.high)
+        counts = (result.correspondences, result.odometry_correspondences)
+        if isinstance(result, RegistrationFailed):
+            return RejectionRecord(query, match, result.failure.value, *counts)
+        ratio = match_ratio(*counts)
+        limits = self._parameters.loop_closing
+        if result.correspondences < limits.correspondences_min:
+            return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
+        if ratio < limits.match_ratio_threshold:
+            return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
+        covariance = None if result.covariance is None else upper_triangle(result.covariance)
+        T_query_match = pose7(result.T_query_match_unscaled)
+        return ClosureRecord(query, match, T_query_match, *counts, ratio, result.scale_initial, covariance)
+
+    def _on_optimised(self, event: GraphOptimised) -> list[Effect]:
+        if not self.rounds.on_solution(event.term, event.round, event.solution):
+            return [Report("stale_solution", {"term": str(event.term), "round": event.round})]
+        report = solution_report(event.term, event.round, event.solution)
+        return [report, *self.corrections.publish(event.term, event.round, event.solution)]
+
+    # Records
+
+    def _append(self, record: Record, now: float) -> list[Effect]:
+        new, effects, batch = self.gossip.append(record)
+        return [*effects, Broadcast(batch), *self._take([new], now)]
+
+    def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
+        """Let everything that is derived from the logs know of new records."""
+        effects: list[Effect] = []
+        for new in new_records:
+            self.assembly.add(new)
+            match new.record:
+                case KeyframeRecord(index, _, _, descriptor) if descriptor is not None:
+                    found = self.recognition.on_keyframe(KeyframeId(new.log, index), descriptor.numpy())
+                    effects += self.closing.on_candidates(found, now)
+                case ClosureRecord(query, match) | RejectionRecord(query, match):
+                    self.closing.on_resolved(CandidatePair.of(query, match))
+                case _:
+                    pass
+        return effects
+
+    def _restore(self, restored: Restored, now: float) -> None:
+        """Resolved pairs first, so that no pair of the past is found again."""
+        news = [self.gossip.restore(log, data) for log, records in restored.records for data in records]
+        self._take([new for new in news if not isinstance(new.record, KeyframeRecord)], now)
+        self._take([new for new in news if isinstance(new.record, KeyframeRecord)], now)
+        for keyframe in restored.latents:
+            self.closing.on_held(keyframe)
+        if restored.correction is not None:
+            self.corrections.restore(restored.correction)
+
+    # Time
+
+    def _heartbeat(self, now: float) -> list[Effect]:
+        """Say who is here; a late tick does not make up for heartbeats it missed."""
+        period = self._parameters.neighbours.heartbeat_period_s
+        self._heartbeat_due_s += period
+        if self._heartbeat_due_s <= now:
+            self._heartbeat_due_s = now + period
+        self._sequence += 1
+        return [
+            Broadcast(
+                Heartbeat(
+                    sequence=self._sequence,
+                    boot=self._boot,
+                    compute_class=self._compute_class,
+                    leader=self.election.advert(),
+                    term_counter_max=self.election.counter_max,
+                    load=self.closing.load,
+                    digests=self.gossip.digests(),
+                    corrections=self.corrections.versions(),
+                    wants=self.closing.wants(),
+                    holds=self.closing.holds(),
+                )
+            )
+        ]
+
+    def _lose_silent(self, now: float) -> list[Effect]:
+        before = set(self.neighbours.names())
+        effects = self.neighbours.tick(now)
+        for name in sorted(before - set(self.neighbours.names())):
+            self.election.on_lost(name)
+        return effects
+
+    def _settle(self, now: float) -> list[Effect]:
+        """Let the machines act on what changed."""
+        self.closing.on_range(self._range())
+        self.rounds.on_term(self.election.term if self.election.leading else None)
+        return [*self.closing.tick(now), *self.rounds.tick(now)]
+
+    def _range(self) -> Range:
+        names = tuple(self.neighbours.names())
+        heartbeats = {name: known.heartbeat for name in names if (known := self.neighbours.get(name))}
+        return Range(
+            names=names,
+            compute_class={name: heartbeat.compute_class for name, heartbeat in heartbeats.items()},
+            holds={name: heartbeat.holds for name, heartbeat in heartbeats.items()},
+            load={name: heartbeat.load for name, heartbeat in heartbeats.items()},
+        )
+
+
+def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:
+    keyframe = str(KeyframeId(log, record.index))
+    pose_facts = [float(x) for x in record.T_odom_camera]
+    return Report(
+        "keyframe",
+        {"keyframe": keyframe, "stamp_s": record.stamp_s, "T_odom_camera": pose_facts},  # type: ignore[dict-item]
+    )
+
+
+def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
+    """An accepted or refused registration, for people."""
+    facts = {
+        "query": str(record.query),
+        "match": str(record.match),
+        "correspondences": record.correspondences,
+        "odometry_correspondences": record.odometry_correspondences,
+        "ratio": round(match_ratio(record.correspondences, record.odometry_correspondences), 4),
+        "by": by.robot,
+    }
+    if isinstance(record, RejectionRecord):
+        return Report("closure_rejected", {**facts, "reason": record.reason})  # type: ignore[dict-item]
+    return Report("closure_accepted", {**facts, "scale_initial": record.scale_initial})  # type: ignore[dict-item]

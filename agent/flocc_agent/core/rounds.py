@@ -1,0 +1,106 @@
+"""Optimisation rounds: the leader optimises what its logs hold; no robot is asked, none is waited for."""
+
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.effects import Effect, Optimise, Report
+from flocc_agent.core.parameters import RoundParameters
+from flocc_agent.core.pose_graph import ClosureState, GraphSolution
+from flocc_protocol.ids import Term
+
+Shape = tuple[int, int, int]
+
+
+class Rounds:
+    """When a leader optimises, and what it makes of the answer."""
+
+    def __init__(self, assembly: GraphAssembly, parameters: RoundParameters) -> None:
+        self._assembly = assembly
+        self._parameters = parameters
+        self._term: Term | None = None
+        self._round = 0
+        self._running_until_s: float | None = None
+        self._next_s = 0.0
+        self._started: tuple[Shape, int] | None = None
+        self._solution: GraphSolution | None = None
+
+    @property
+    def round(self) -> int:
+        """Number of the current term's last round; 0 before the first."""
+        return self._round
+
+    def on_term(self, term: Term | None) -> None:
+        """This robot leads in this term, or no longer leads (None); a new term starts with round 1."""
+        if term != self._term:
+            self._term = term
+            self._round = 0
+            self._running_until_s = None
+            self._started = None
+
+    def on_solution(self, term: Term, round_number: int, solution: GraphSolution) -> bool:
+        """Take an answer; False for one of an earlier round or term, which counts for nothing."""
+        if not self._awaits(term, round_number):
+            return False
+        self._running_until_s = None
+        self._solution = solution
+        return True
+
+    def on_failed(self, term: Term, round_number: int) -> None:
+        """A round without a solution: the last one stands, the next change tries again."""
+        if self._awaits(term, round_number):
+            self._running_until_s = None
+
+    def tick(self, now: float) -> list[Effect]:
+        """Give up a round that is overdue, start one that is wanted."""
+        effects: list[Effect] = []
+        if self._running_until_s is not None and self._running_until_s <= now:
+            self._running_until_s = None
+            effects.append(Report("round_timeout", {"term": str(self._term), "round": self._round}))
+        if self._term is None or self._running_until_s is not None or self._next_s > now or not self._stale():
+            return effects
+        return [*effects, self._start(self._term, now)]
+
+    def deadline(self) -> float:
+        """When `tick` is due next."""
+        if self._term is None:
+            return float("inf")
+        if self._running_until_s is not None:
+            return self._running_until_s
+        return self._next_s if self._stale() else float("inf")
+
+    def _start(self, term: Term, now: float) -> Effect:
+        self._round += 1
+        self._running_until_s = now + self._parameters.timeout_s
+        self._next_s = now + self._parameters.period_s
+        self._started = (self._assembly.shape, self._assembly.keyframes)
+        return Optimise(term, self._round, self._assembly.graph(), self._solution)
+
+    def _stale(self) -> bool:
+        """Whether the last started round of this term missed a log, a closure, a fix or many keyframes."""
+        if self._assembly.keyframes == 0:
+            return False
+        if self._started is None:
+            return True
+        shape, keyframes = self._started
+        grown = self._assembly.keyframes - keyframes
+        return shape != self._assembly.shape or grown >= self._parameters.keyframes_per_round
+
+    def _awaits(self, term: Term, round_number: int) -> bool:
+        return self._running_until_s is not None and (term, round_number) == (self._term, self._round)
+
+
+def solution_report(term: Term, round_number: int, solution: GraphSolution) -> Report:
+    """What a round did, for people."""
+    states = [result.state for result in solution.closures]
+    facts = {
+        "term": term.counter,
+        "leader": term.leader.robot,
+        "round": round_number,
+        "components": [[str(log) for log in component.logs] for component in solution.components],
+        "keyframes": sum(len(p) for c in solution.components for p in c.T_map_keyframe.values()),
+        "closures_used": states.count(ClosureState.USED),
+        "closures_rejected": states.count(ClosureState.REJECTED),
+        "closures_excluded": states.count(ClosureState.EXCLUDED),
+        "cost": sum(component.cost for component in solution.components),
+        "solve_s": solution.solve_s,
+        "warnings": list(solution.warnings),
+    }
+    return Report("optimised", facts)  # type: ignore[arg-type]
