@@ -5,7 +5,7 @@ Parameters of the core are plain dataclasses in `core/parameters.py`; pydantic c
 
 import re
 import tomllib
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -28,7 +28,7 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
-class Formulation(str, Enum):
+class Formulation(StrEnum):
     """Which unknowns the loop closures' scales are (Sec. III-C)."""
 
     BASE = "base"
@@ -37,7 +37,7 @@ class Formulation(str, Enum):
     SHARED = "shared"
 
 
-class Solver(str, Enum):
+class Solver(StrEnum):
     """How the nonlinear least-squares problem is solved."""
 
     LM = "lm"
@@ -47,7 +47,7 @@ class Solver(str, Enum):
     CAUCHY = "cauchy"
 
 
-class ScaleInitial(str, Enum):
+class ScaleInitial(StrEnum):
     """Where a closure's first scale comes from."""
 
     RAW = "raw"
@@ -58,7 +58,7 @@ class ScaleInitial(str, Enum):
 class BackendConfig(Section):
     """The pose-graph optimiser."""
 
-    formulation: Formulation = Formulation.SMOOTHED
+    formulation: Formulation = Formulation.INDEPENDENT
     """Scales of closures: fixed, one each, one each but linked within a cluster, or one for all."""
     solver: Solver = Solver.GNC_TLS
     """lm is fastest and trusts every closure; gnc-* find and reject outliers."""
@@ -82,6 +82,21 @@ class BackendConfig(Section):
     """Standard deviation of the difference of two linked scales, relative to their size."""
     scale_prior_sigma_ratio: float = Field(5.0, gt=0)
     """Weak prior on each scale around its initial value, relative to it; keeps unobservable scales finite."""
+    weight_by_probability: bool = True
+    """Multiply each closure's information by the probability of Eq. (2); off for measurements that carry a trusted
+    covariance of their own."""
+    inlier_probability: float = Field(0.99, gt=0, lt=1)
+    """Chi-square quantile below which a closure counts as right; larger rejects less."""
+    gnc_start_ratio: float = Field(1e-3, gt=0)
+    """Control parameter at which GNC starts at the latest; smaller starts more convex and takes more solves."""
+    gnc_step: float = Field(2.0, gt=1)
+    """Factor of the control parameter per GNC round; smaller is more careful and slower."""
+    relative_tolerance: float = Field(1e-5, gt=0)
+    """Stop when a step lowers the cost by less than this part of it."""
+    absolute_tolerance: float = Field(1e-9, ge=0)
+    """Stop when the cost is below this."""
+    covariances: bool = True
+    """Compute the marginal covariance of every robot's T_map_odom."""
     iterations_max: int = Field(100, ge=1)
     """Linear solves in one optimisation."""
 
@@ -371,6 +386,70 @@ class RadioConfig(LinkConfig):
         )
 
 
+class KeyframeConfig(Section):
+    """Which images become keyframes: the robot moved or turned enough since the last one."""
+
+    distance_m: float = Field(0.5, ge=0)
+    """Distance since the last keyframe that calls for a new one; smaller finds more closures and costs more."""
+    rotation_rad: float = Field(0.35, ge=0)
+    """Rotation since the last keyframe that calls for a new one."""
+
+
+class SourceConfig(Section):
+    """Where keyframes come from when no program feeds the agent."""
+
+    recording: Path | None = None
+    """Folder of images, odometry and camera (docs/data-sets.md), played by its stamps; None: the program's own."""
+    rate: float = Field(1.0, gt=0)
+    """Playback speed relative to the stamps."""
+    start_s: float = Field(0.0, ge=0)
+    """Pause before the first frame."""
+    hold_s: float = Field(0.0, ge=0)
+    """How long the agent goes on after its last frame; 0: until it is stopped."""
+
+
+class AgentConfig(Section):
+    """One robot's agent."""
+
+    name: Annotated[str, AfterValidator(checked_name)]
+    """Name of the robot, unique in its swarm: 1 to 32 of a-z, 0-9, '-' and '_'."""
+    swarm: Annotated[str, AfterValidator(checked_name)] = "swarm"
+    """Name of the swarm; robots of different swarms ignore each other."""
+    compute_class: int = Field(0, ge=0, le=9)
+    """0: small robot, 9: server with a GPU; the highest leads and registers for the others."""
+    incarnation: int | None = Field(None, ge=0)
+    """Number of this robot's life when it has no disk yet; None draws it from the wall clock."""
+    seed: int = Field(0, ge=0)
+    """Seed of emulated links and synthetic perception."""
+    folder: Path | None = None
+    """Where the robot's log, latents and events are kept; None keeps them in memory."""
+    core: CoreParameters = CoreParameters()
+    """Neighbours, election, gossip, place recognition, loop closing, rounds."""
+    keyframes: KeyframeConfig = KeyframeConfig()
+    """Keyframe selection."""
+    source: SourceConfig = SourceConfig()
+    """A recording to play."""
+    perception: PerceptionConfig = PerceptionConfig()
+    """Descriptors, latents, registration."""
+    backend: BackendConfig = BackendConfig()
+    """Pose-graph optimisation."""
+    transport: TransportConfig = TransportConfig()
+    """zenoh sessions."""
+    store: StoreConfig = StoreConfig()
+    """Bounds of what is kept on disk."""
+    radio: RadioConfig = RadioConfig()
+    """Emulated links, for tests on one machine."""
+
+    @classmethod
+    def read(cls, path: Path) -> "AgentConfig":
+        """Read and check a TOML file; paths in it are relative to the file.
+
+        Raises:
+            ConfigError: The file cannot be used; the message names it and the key.
+        """
+        return validated(cls, read_toml(path), str(path))
+
+
 def read_toml(path: Path) -> dict[str, object]:
     """Read a TOML file.
 
@@ -394,3 +473,18 @@ def first_error(error: ValidationError, source: str) -> str:
     if complaint["type"] in ("missing", "missing_argument"):
         return f"{source}: the key '{key}' is missing"
     return f"{source}: {key}: {complaint['msg']}"
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def validated(model: type[M], fields: Mapping[str, object], source: str) -> M:
+    """Check fields against a model.
+
+    Raises:
+        ConfigError: One sentence that names the source and the key.
+    """
+    try:
+        return model.model_validate(fields)
+    except (ValidationError, FloccError) as error:
+        raise ConfigError(first_error(error, source) if isinstance(error, ValidationError) else str(error)) from error

@@ -1,0 +1,244 @@
+"""First alignment of the robots' odom frames from several closures that are right up to scale, some of them wrong.
+
+For a pair of logs every closure k proposes the rotation `R_k = R_i R_hat R_j^T` of frame b in frame a, and, given a
+rotation R, a ray on which the translation lies: `t = (p_i - R p_j) + s u_k`, s >= 0, `u_k = R_i t_hat / |t_hat|`.
+A hypothesis is the rotation of one closure and the point of its ray nearest to another's. The hypothesis that the
+most probability agrees with wins; all closures that agree with it are then averaged. Tolerances grow with the
+distance that both robots travelled between two closures, because odometry drifts. Pairs are joined along the tree
+of greatest support, so that the first closure that happens to come decides nothing.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.pose_graph import LoopClosure, Trajectory
+from flocc_agent.core.registration import closure_probability
+from flocc_agent.geometry import Float, inverse, nearest_rotation, pose
+from flocc_protocol.ids import LogId
+
+Bool = NDArray[np.bool_]
+
+HYPOTHESES_MAX = 64
+SCORED_MAX = 400
+ROTATION_TOLERANCE_RAD = 0.25
+ROTATION_DRIFT_RAD_PER_M = 0.002
+TRANSLATION_TOLERANCE_M = 1.5
+TRANSLATION_DRIFT_RATIO = 0.02
+SCALE_RANGE_RATIO = 4.0
+AVERAGING_ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairAlignment:
+    """Pose of log b's odom frame in log a's.
+
+    Attributes:
+        T_a_b: (4, 4) pose of odom frame b in odom frame a.
+        support: Sum of the agreeing closures' probabilities.
+        agreeing: Index in the graph of each closure that agrees.
+    """
+
+    T_a_b: Float
+    support: float
+    agreeing: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rays:
+    """Closures of one pair of logs, both sides in their own odom frames.
+
+    Attributes:
+        ids: Index in the graph of each closure.
+        T_i: (K, 4, 4) keyframes in odom frame a.
+        T_j: (K, 4, 4) keyframes in odom frame b.
+        R_hat: (K, 3, 3) measured rotation of keyframe j in keyframe i.
+        u: (K, 3) unit direction from keyframe i to keyframe j, in frame a; zero for a zero translation.
+        length_m: (K,) expected distance, NaN where no scale is known.
+        exact: (K,) whether the distance is metric.
+        weight: (K,) probability of Eq. (2).
+        travelled_a_m: (K,) path length of robot a up to keyframe i.
+        travelled_b_m: (K,) path length of robot b up to keyframe j.
+    """
+
+    ids: tuple[int, ...]
+    T_i: Float
+    T_j: Float
+    R_hat: Float
+    u: Float
+    length_m: Float
+    exact: Bool
+    weight: Float
+    travelled_a_m: Float
+    travelled_b_m: Float
+
+    def rotations_a_b(self) -> Float:
+        """Rotation (K, 3, 3) of frame b in frame a that each closure proposes."""
+        return self.T_i[:, :3, :3] @ self.R_hat @ np.swapaxes(self.T_j[:, :3, :3], 1, 2)
+
+    def origins(self, R_a_b: Float) -> Float:
+        """Start (K, 3) of each ray, for a rotation of frame b in frame a."""
+        return np.asarray(self.T_i[:, :3, 3] - self.T_j[:, :3, 3] @ R_a_b.T)
+
+    def distances(self, t: Float, origins: Float) -> Float:
+        """Distance (..., K) of translations (..., 3) from each ray's allowed segment."""
+        offset = t[..., None, :] - origins
+        along = np.einsum("...ki,ki->...k", offset, self.u)
+        low = np.where(self.exact, self.length_m, np.nan_to_num(self.length_m / SCALE_RANGE_RATIO, nan=0.0))
+        high = np.where(self.exact, self.length_m, np.nan_to_num(self.length_m * SCALE_RANGE_RATIO, nan=np.inf))
+        nearest = np.clip(along, low, high)
+        return np.asarray(np.linalg.norm(offset - nearest[..., None] * self.u, axis=-1))
+
+
+def align(
+    trajectories: Mapping[LogId, Trajectory], closures: Mapping[int, LoopClosure], steepness: float
+) -> tuple[dict[LogId, Float], dict[tuple[LogId, LogId], PairAlignment]]:
+    """Place the odom frames of connected logs in the odom frame of the lowest one.
+
+    Args:
+        trajectories: Odometry of the logs of one component.
+        closures: Usable closures, by index in the graph.
+        steepness: k of Eq. (2).
+
+    Returns:
+        `T_map_odom` (4, 4) of every log that closures connect to the lowest, and every pair's alignment.
+    """
+    path_m = {log: travelled_m(trajectory) for log, trajectory in trajectories.items()}
+    pairs: dict[tuple[LogId, LogId], list[int]] = {}
+    for k in sorted(closures):
+        a, b = sorted((closures[k].query.log, closures[k].match.log))
+        if a != b:
+            pairs.setdefault((a, b), []).append(k)
+    aligned = {
+        (a, b): align_pair(rays_of(ids, closures, trajectories, path_m, steepness))
+        for (a, b), ids in sorted(pairs.items())
+    }
+    return _spanning_tree(sorted(trajectories), aligned), aligned
+
+
+def travelled_m(trajectory: Trajectory) -> Float:
+    """Path length (N,) up to each keyframe."""
+    steps = np.linalg.norm(np.diff(trajectory.T_odom_keyframe[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def rays_of(
+    ids: Sequence[int],
+    closures: Mapping[int, LoopClosure],
+    trajectories: Mapping[LogId, Trajectory],
+    path_m: Mapping[LogId, Float],
+    steepness: float,
+) -> Rays:
+    """Bring closures of one pair of logs into the order (lower log, higher log)."""
+    T_i, T_j, T_hat, known, exact, weight, path = [], [], [], [], [], [], []
+    for k in ids:
+        c = closures[k]
+        T = np.asarray(c.T_query_match_unscaled, dtype=float)
+        low, high = (c.query, c.match) if c.query.log <= c.match.log else (c.match, c.query)
+        T_hat.append(T if low == c.query else inverse(T))
+        T_i.append(trajectories[low.log].T_odom_keyframe[low.index])
+        T_j.append(trajectories[high.log].T_odom_keyframe[high.index])
+        known.append(1.0 if c.metric else (c.scale_initial or np.nan))
+        exact.append(c.metric)
+        weight.append(closure_probability(c.match_ratio, steepness))
+        path.append((path_m[low.log][low.index], path_m[high.log][high.index]))
+    T_hats, T_is = np.array(T_hat), np.array(T_i)
+    norms = np.linalg.norm(T_hats[:, :3, 3], axis=1)
+    u = np.einsum("kij,kj->ki", T_is[:, :3, :3], T_hats[:, :3, 3]) / np.maximum(norms, 1e-12)[:, None]
+    travelled = np.array(path)
+    return Rays(
+        tuple(ids), T_is, np.array(T_j), T_hats[:, :3, :3], u, norms * np.array(known), np.array(exact, dtype=bool),
+        np.array(weight), travelled[:, 0], travelled[:, 1],
+    )  # fmt: skip
+
+
+def align_pair(rays: Rays) -> PairAlignment:
+    """Find the pose of frame b in frame a with which the most closures agree, and average those."""
+    R_all = rays.rotations_a_b()
+    best_score, best_R, best_t, best_tolerance = -1.0, np.eye(3), np.zeros(3), np.ones(len(R_all))
+    for k in _strongest(rays, R_all):
+        apart_m = np.abs(rays.travelled_a_m - rays.travelled_a_m[k]) + np.abs(
+            rays.travelled_b_m - rays.travelled_b_m[k]
+        )
+        turned = _angles(R_all, R_all[k]) < ROTATION_TOLERANCE_RAD + ROTATION_DRIFT_RAD_PER_M * apart_m
+        tolerance_m = TRANSLATION_TOLERANCE_M + TRANSLATION_DRIFT_RATIO * apart_m
+        origins = rays.origins(R_all[k])
+        t = _translations(rays, origins, k, turned)
+        agreement = np.maximum(1.0 - (rays.distances(t, origins) / tolerance_m) ** 2, 0.0)
+        scores = agreement @ (rays.weight * turned)
+        top = int(np.argmax(scores))
+        if scores[top] > best_score:
+            best_score, best_R, best_t = float(scores[top]), R_all[k], t[top]
+            best_tolerance = np.where(turned, tolerance_m, 0.0)
+    return _averaged(rays, R_all, best_R, best_t, best_tolerance)
+
+
+def _strongest(rays: Rays, R_all: Float) -> list[int]:
+    """Closures that are tried as hypotheses: those whose rotation the most others share, then the first."""
+    if len(R_all) <= HYPOTHESES_MAX:
+        return list(range(len(R_all)))
+    voters = np.linspace(0, len(R_all) - 1, min(len(R_all), SCORED_MAX)).astype(int)
+    votes = np.array([rays.weight[voters] @ (_angles(R_all[voters], R) < ROTATION_TOLERANCE_RAD) for R in R_all])
+    ranked = np.lexsort((np.arange(len(votes)), -votes))
+    spread = ranked[: max(len(ranked) // 2, HYPOTHESES_MAX)]
+    return [int(k) for k in spread[np.linspace(0, len(spread) - 1, HYPOTHESES_MAX).astype(int)]]
+
+
+def _translations(rays: Rays, origins: Float, k: int, partners: Bool) -> Float:
+    """Points (M, 3) of ray k nearest to the rays of its partners, and at its expected length."""
+    others = np.flatnonzero(partners)[:SCORED_MAX]
+    v = origins[others] - origins[k]
+    cosine = rays.u[others] @ rays.u[k]
+    sine2 = np.maximum(1.0 - cosine**2, 1e-3)
+    s = (v @ rays.u[k] - cosine * np.einsum("ki,ki->k", v, rays.u[others])) / sine2
+    expected = rays.length_m[k] if np.isfinite(rays.length_m[k]) else 0.0
+    if rays.exact[k]:
+        s = np.array([expected])
+    elif expected > 0:
+        s = np.clip(np.append(s, expected), expected / SCALE_RANGE_RATIO, expected * SCALE_RANGE_RATIO)
+    else:
+        s = np.append(np.maximum(s, 0.0), 0.0)
+    return np.asarray(origins[k] + s[:, None] * rays.u[k])
+
+
+def _averaged(rays: Rays, R_all: Float, R: Float, t: Float, tolerance_m: Float) -> PairAlignment:
+    """Average the closures that agree: rotations by their chordal mean, rays by weighted least squares."""
+    near = (rays.distances(t, rays.origins(R)) < tolerance_m) & (tolerance_m > 0)
+    if not np.any(near):
+        return PairAlignment(pose(R, t), 0.0, ())
+    weight = rays.weight * near
+    R_mean = nearest_rotation(np.einsum("k,kij->ij", weight, R_all))
+    origins = rays.origins(R_mean)
+    for _ in range(AVERAGING_ROUNDS):
+        along = np.maximum(np.einsum("ki,ki->k", t - origins, rays.u), 0.0)
+        along = np.where(rays.exact, rays.length_m, along)
+        points = origins + along[:, None] * rays.u
+        robust = weight / (1.0 + (np.linalg.norm(t - points, axis=1) / np.maximum(tolerance_m, 1e-9)) ** 2)
+        t = robust @ points / robust.sum()
+    agreeing = tuple(rays.ids[k] for k in np.flatnonzero(near))
+    return PairAlignment(pose(R_mean, t), float(weight.sum()), agreeing)
+
+
+def _angles(R_all: Float, R: Float) -> Float:
+    """Angles (K,) between rotations (K, 3, 3) and one (3, 3)."""
+    cosine = 0.5 * (np.einsum("kij,ij->k", R_all, R) - 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _spanning_tree(logs: Sequence[LogId], aligned: Mapping[tuple[LogId, LogId], PairAlignment]) -> dict[LogId, Float]:
+    """Grow the map frame from the anchor along the pairs of greatest support."""
+    T_map_odom: dict[LogId, Float] = {logs[0]: np.eye(4)}
+    while True:
+        reachable = [
+            (-pair.support, a, b) for (a, b), pair in aligned.items() if (a in T_map_odom) != (b in T_map_odom)
+        ]
+        if not reachable:
+            return T_map_odom
+        _, a, b = min(reachable)
+        T_a_b = aligned[a, b].T_a_b
+        if a in T_map_odom:
+            T_map_odom[b] = T_map_odom[a] @ T_a_b
+        else:
+            T_map_odom[a] = T_map_odom[b] @ inverse(T_a_b)

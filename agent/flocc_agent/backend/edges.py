@@ -1,0 +1,195 @@
+"""All relative measurements of a component as arrays: residuals and Jacobians for every edge at once.
+
+An edge joins two poses. With `R_ij = R_i^T R_j`, `p = R_i^T (t_j - t_i)` and a relative scale gamma (1 at the
+initial scale) the residual is
+
+    e = [ 2 vec(q(R_hat^T R_ij)) ; R_hat^T p - gamma * d ],     d = scale_initial * R_hat^T t_hat
+
+Its rotation part agrees with the logarithm to third order (|2 sin(theta/2)| against theta), is bounded, and its
+squared norm is half the squared chordal distance of SE-Sync. Its translation part is linear in the scale, with
+derivative -R_hat^T t_hat (DESIGN.md section 7), so that Gaussian scales are eliminated exactly:
+
+- a scale `gamma ~ N(c, sigma^2)` of its own turns the covariance into `Sigma + sigma^2 d d^T` (widened edge);
+- what is left is the cluster's scale c: one variable for many closures, or the constant 1.
+
+A scale is kept above `GAMMA_MIN`: an edge whose best scale lies below is held there, and pays for the distance to c.
+Updates are on the right: `R <- R Exp(omega)`, `t <- t + R v`; the tangent order is rotation, translation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend import rotations
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+GAMMA_MIN = 1e-3
+NO_CLUSTER = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Poses and cluster scales of one component.
+
+    Attributes:
+        q: (N, 4) unit quaternions, w first.
+        t: (N, 3) metres.
+        scale: (C,) relative scales of clusters, around 1.
+    """
+
+    q: Float
+    t: Float
+    scale: Float
+
+    def retract(self, delta: Float) -> "State":
+        """Move by a tangent vector (6 N + C,): poses first, six numbers each, then cluster scales."""
+        n = len(self.q)
+        xi = delta[: 6 * n].reshape(n, 6)
+        q = rotations.multiply(self.q, rotations.exponential(xi[:, :3]))
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        t = self.t + np.einsum("nij,nj->ni", rotations.matrices(self.q), xi[:, 3:])
+        return State(q, t, self.scale + delta[6 * n :])
+
+    def poses(self) -> Float:
+        """The poses as (N, 4, 4)."""
+        T = np.zeros((len(self.q), 4, 4))
+        T[:, :3, :3] = rotations.matrices(self.q)
+        T[:, :3, 3] = self.t
+        T[:, 3, 3] = 1.0
+        return T
+
+
+def state_of(T: Float, clusters: int = 0) -> State:
+    """State of poses (N, 4, 4) with every cluster at its initial scale."""
+    return State(rotations.quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), np.ones(clusters))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edges:
+    """Relative measurements of one component.
+
+    Attributes:
+        i: (E,) index of the first pose.
+        j: (E,) index of the second pose.
+        q_hat: (E, 4) measured rotation `R_i_j`.
+        d: (E, 6) derivative of the measurement by gamma: zeros, then `scale_initial * R_hat^T t_hat`.
+        sqrt_information: (E, 6, 6) with `L^T L` the information of the measurement without its scale.
+        sqrt_information_wide: (E, 6, 6) the same with the edge's own scale eliminated; equal where it has none.
+        sigma: (E,) standard deviation of the own scale around c; 0 where it has none.
+        cluster: (E,) index of the cluster scale, or -1 for the constant 1.
+    """
+
+    i: Int
+    j: Int
+    q_hat: Float
+    d: Float
+    sqrt_information: Float
+    sqrt_information_wide: Float
+    sigma: Float
+    cluster: Int
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """What every edge says at a state.
+
+    Attributes:
+        e: (E, 6) whitened residuals.
+        held: (E,) whether the scale is held at its lower bound.
+        bound: (E,) whitened distance of a held scale to its cluster's scale, else 0.
+        q_error: (E, 4) rotation error, w not negative.
+        p: (E, 3) position of the second pose in the first.
+        L: (E, 6, 6) the square-root information that was used.
+    """
+
+    e: Float
+    held: Bool
+    bound: Float
+    q_error: Float
+    p: Float
+    L: Float
+
+    def squared(self) -> Float:
+        """Squared Mahalanobis norms (E,)."""
+        return np.asarray(np.einsum("ei,ei->e", self.e, self.e) + self.bound**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Jacobians:
+    """Whitened derivatives of the residuals: `A_i`, `A_j` (E, 6, 6) and `a_scale` (E, 6) by the cluster's scale."""
+
+    A_i: Float
+    A_j: Float
+    a_scale: Float
+
+
+def cluster_scales(edges: Edges, state: State) -> Float:
+    """Scale c (E,) around which each edge's own scale lies."""
+    if len(state.scale) == 0:
+        return np.ones(len(edges))
+    return np.where(edges.cluster >= 0, state.scale[np.maximum(edges.cluster, 0)], 1.0)
+
+
+def _unscaled(edges: Edges, state: State) -> tuple[Float, Float, Float]:
+    """Residuals (E, 6) at gamma = 0, rotation errors and relative positions."""
+    q_i_inverse = rotations.conjugate(state.q[edges.i])
+    q_ij = rotations.multiply(q_i_inverse, state.q[edges.j])
+    q_error = rotations.multiply(rotations.conjugate(edges.q_hat), q_ij)
+    q_error = np.where(q_error[:, :1] < 0, -q_error, q_error)
+    p = np.einsum("eij,ej->ei", rotations.matrices(q_i_inverse), state.t[edges.j] - state.t[edges.i])
+    R_hat_inverse = rotations.matrices(rotations.conjugate(edges.q_hat))
+    return np.concatenate([2.0 * q_error[:, 1:], np.einsum("eij,ej->ei", R_hat_inverse, p)], axis=1), q_error, p
+
+
+def residuals(edges: Edges, state: State) -> Residuals:
+    """Whitened residuals of all edges, own scales eliminated."""
+    e0, q_error, p = _unscaled(edges, state)
+    c = cluster_scales(edges, state)
+    e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
+    gamma = own_scales(edges, e, c)
+    held = (edges.sigma > 0) & (gamma < GAMMA_MIN)
+    bound = np.zeros(len(edges))
+    L = edges.sqrt_information_wide
+    if np.any(held):
+        L = np.where(held[:, None, None], edges.sqrt_information, L)
+        e[held] = np.einsum("eij,ej->ei", L[held], e0[held] - GAMMA_MIN * edges.d[held])
+        bound[held] = (GAMMA_MIN - c[held]) / edges.sigma[held]
+    return Residuals(e, held, bound, q_error, p, L)
+
+
+def own_scales(edges: Edges, e_wide: Float, c: Float) -> Float:
+    """Best scale (E,) of each edge, given residuals whitened with the wide information: the posterior mean."""
+    whitened_d = np.einsum("eij,ej->ei", edges.sqrt_information_wide, edges.d)
+    return np.asarray(c + edges.sigma**2 * np.einsum("ei,ei->e", whitened_d, e_wide))
+
+
+def scales_at(edges: Edges, state: State) -> Float:
+    """Relative scale (E,) of every edge at a state, not below `GAMMA_MIN`."""
+    e0, _, _ = _unscaled(edges, state)
+    c = cluster_scales(edges, state)
+    e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
+    return np.where(edges.sigma > 0, np.maximum(own_scales(edges, e, c), GAMMA_MIN), c)
+
+
+def jacobians(edges: Edges, at: Residuals) -> Jacobians:
+    """Derivatives of the whitened residuals, in the right tangent spaces of both poses."""
+    R_hat_inverse = rotations.matrices(rotations.conjugate(edges.q_hat))
+    R_error = rotations.matrices(at.q_error)
+    J_r = rotations.hats(at.q_error[:, 1:]) + at.q_error[:, 0, None, None] * np.eye(3)
+    J_i, J_j = np.zeros((2, len(edges), 6, 6))
+    J_j[:, :3, :3] = J_r
+    J_j[:, 3:, 3:] = R_error
+    # R_ij^T = R_error^T R_hat^T
+    J_i[:, :3, :3] = -J_r @ np.swapaxes(R_error, 1, 2) @ R_hat_inverse
+    J_i[:, 3:, :3] = R_hat_inverse @ rotations.hats(at.p)
+    J_i[:, 3:, 3:] = -R_hat_inverse
+    a_scale = -np.einsum("eij,ej->ei", at.L, edges.d)
+    a_scale[(edges.cluster < 0) | at.held] = 0.0
+    return Jacobians(at.L @ J_i, at.L @ J_j, a_scale)

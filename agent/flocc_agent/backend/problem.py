@@ -1,0 +1,205 @@
+"""One component of the pose graph as arrays: odometry edges, closure edges with scale model, fixes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend import rotations
+from flocc_agent.backend.clusters import cluster_labels
+from flocc_agent.backend.edges import NO_CLUSTER, Edges
+from flocc_agent.config import BackendConfig, Formulation, ScaleInitial
+from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, Trajectory
+from flocc_agent.core.registration import closure_probability
+from flocc_agent.geometry import inverse, pose
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A component, ready to be solved.
+
+    Attributes:
+        logs: Its logs, sorted; the first is the anchor, whose first keyframe is pose 0 and does not move.
+        offsets: Index of each log's first keyframe.
+        poses: Number of keyframes; a world frame, where there are fixes, is the pose after the last one.
+        edges: Odometry first, then closures, then fixes.
+        closure_rows: Slice of the closures in `edges`.
+        closure_ids: Index in the graph of each closure edge.
+        clusters: Number of cluster scales.
+        scale_initial: (L,) metres per network unit at gamma = 1, per closure edge.
+        has_world: Whether there is a world frame.
+    """
+
+    logs: tuple[LogId, ...]
+    offsets: Mapping[LogId, int]
+    poses: int
+    edges: Edges
+    closure_rows: slice
+    closure_ids: tuple[int, ...]
+    clusters: int
+    scale_initial: Float
+    has_world: bool
+
+    def index(self, keyframe: KeyframeId) -> int:
+        """Index of a keyframe's pose."""
+        return self.offsets[keyframe.log] + keyframe.index
+
+
+def build(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    fixes: Sequence[AbsoluteFix],
+    config: BackendConfig,
+    scale_guesses: Mapping[int, float] | None = None,
+) -> Problem:
+    """Turn a component into arrays.
+
+    Args:
+        trajectories: Usable odometry of the component's logs.
+        closures: Usable closures between them, by their index in the graph.
+        fixes: Usable fixes of them.
+        config: The formulation, the noise model and the scale priors.
+        scale_guesses: Metres per network unit for closures without `scale_initial`.
+    """
+    logs = tuple(sorted(trajectories))
+    lengths = [len(trajectories[log]) for log in logs]
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    offsets = {log: int(start) for log, start in zip(logs, starts[:-1], strict=True)}
+    ids = tuple(sorted(closures))
+    used = [closures[k] for k in ids]
+    scale_initial = np.array([initial_scale(closures[k], config, (scale_guesses or {}).get(k)) for k in ids])
+    odometry = [odometry_edges(trajectories[log], offsets[log], config) for log in logs]
+    closure_part, clusters = closure_edges(used, offsets, scale_initial, config)
+    parts = [*odometry, closure_part]
+    first = sum(len(part) for part in odometry)
+    if fixes:
+        parts.append(fix_edges(fixes, offsets, int(starts[-1])))
+    rows = slice(first, first + len(used))
+    return Problem(logs, offsets, int(starts[-1]), concatenate(parts), rows, ids, clusters, scale_initial, bool(fixes))
+
+
+def concatenate(parts: Sequence[Edges]) -> Edges:
+    """Put edges one after the other."""
+    names = ("i", "j", "q_hat", "d", "sqrt_information", "sqrt_information_wide", "sigma", "cluster")
+    return Edges(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def plain_edges(i: Int, j: Int, T_hat: Float, L: Float) -> Edges:
+    """Edges with a metric measurement (E, 4, 4) and square-root information (E, 6, 6)."""
+    d = np.zeros((len(i), 6))
+    d[:, 3:] = np.einsum("eji,ej->ei", T_hat[:, :3, :3], T_hat[:, :3, 3])
+    return Edges(i, j, rotations.quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(len(i)), np.full(len(i), NO_CLUSTER))
+
+
+def sqrt_informations(covariances: Float) -> Float:
+    """Lower factors L (E, 6, 6) with `L^T L` the inverse of each covariance."""
+    if len(covariances) == 0:
+        return np.zeros((0, 6, 6))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+def diagonal_covariance(rotation_sigma_rad: float, translation_sigma: float) -> Float:
+    """Covariance (6, 6) of isotropic rotation and translation noise."""
+    return np.diag([rotation_sigma_rad**2] * 3 + [translation_sigma**2] * 3)
+
+
+def odometry_edges(trajectory: Trajectory, offset: int, config: BackendConfig) -> Edges:
+    """Edges between consecutive keyframes of one log."""
+    T = np.asarray(trajectory.T_odom_keyframe, dtype=float)
+    i = np.arange(len(T) - 1) + offset
+    T_hat = inverse(T[:-1]) @ T[1:]
+    if trajectory.edge_covariances is not None:
+        L = sqrt_informations(np.asarray(trajectory.edge_covariances, dtype=float))
+    else:
+        S = diagonal_covariance(config.odometry_rotation_sigma_rad, config.odometry_translation_sigma_m)
+        L = np.broadcast_to(sqrt_informations(S[None])[0], (len(i), 6, 6)).copy()
+    return plain_edges(i, i + 1, T_hat, L)
+
+
+def initial_scale(closure: LoopClosure, config: BackendConfig, guess: float | None) -> float:
+    """Metres per network unit at which a closure starts."""
+    if closure.metric or config.scale_initial is ScaleInitial.RAW:
+        return 1.0
+    return closure.scale_initial or guess or 1.0
+
+
+def closure_edges(
+    closures: Sequence[LoopClosure], offsets: Mapping[LogId, int], scale_initial: Float, config: BackendConfig
+) -> tuple[Edges, int]:
+    """Edges of loop closures with their scale model, and the number of cluster scales."""
+    if not closures:
+        return plain_edges(
+            np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
+        ), 0
+    i = np.array([offsets[c.query.log] + c.query.index for c in closures])
+    j = np.array([offsets[c.match.log] + c.match.index for c in closures])
+    T_hat = np.array([c.T_query_match_unscaled for c in closures], dtype=float)
+    T_hat[:, :3, 3] *= scale_initial[:, None]
+    metric = plain_edges(i, j, T_hat, np.zeros((len(i), 6, 6)))
+    covariances = closure_covariances(closures, scale_initial, config)
+    labels, sigma, clusters = scale_model(closures, config)
+    L = sqrt_informations(covariances)
+    wide = sqrt_informations(covariances + sigma[:, None, None] ** 2 * metric.d[:, :, None] * metric.d[:, None, :])
+    return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels), clusters
+
+
+def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, config: BackendConfig) -> Float:
+    """Covariances (L, 6, 6) in metres, divided by the probability of Eq. (2): it multiplies the information."""
+    default = diagonal_covariance(config.closure_rotation_sigma_rad, config.closure_translation_sigma_m)
+    units = np.ones((len(closures), 6))
+    units[:, 3:] = scale_initial[:, None]
+    out = np.empty((len(closures), 6, 6))
+    for k, closure in enumerate(closures):
+        own = closure.covariance
+        out[k] = default if own is None else own * units[k] * units[k][:, None]
+        if config.weight_by_probability:
+            out[k] /= closure_probability(closure.match_ratio, config.steepness)
+    return out
+
+
+def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple[Int, Float, int]:
+    """Cluster index, own standard deviation and number of clusters for a formulation.
+
+    The prior on a scale is `gamma ~ N(1, scale_prior_sigma_ratio^2)`. Clusters of one closure need no variable:
+    prior and link widen the edge together.
+    """
+    n = len(closures)
+    free = np.array([not c.metric for c in closures], dtype=bool)
+    labels, sigma = np.full(n, NO_CLUSTER), np.zeros(n)
+    prior, link = config.scale_prior_sigma_ratio, config.scale_link_sigma_ratio
+    if config.formulation is Formulation.BASE or not np.any(free):
+        return labels, sigma, 0
+    if config.formulation is Formulation.INDEPENDENT:
+        sigma[free] = prior
+        return labels, sigma, 0
+    if config.formulation is Formulation.SHARED:
+        labels[free] = 0
+        return labels, sigma, 1
+    raw = cluster_labels(closures, config.cluster_keyframes_max)
+    raw[~free] = NO_CLUSTER
+    sizes = np.bincount(raw[raw >= 0], minlength=1)
+    renumbered = np.cumsum(sizes > 1) - 1
+    together = free & (sizes[np.maximum(raw, 0)] > 1)
+    labels[together] = renumbered[raw[together]]
+    sigma[free] = np.where(together[free], link, np.hypot(prior, link))
+    return labels, sigma, int(np.sum(sizes > 1))
+
+
+def fix_edges(fixes: Sequence[AbsoluteFix], offsets: Mapping[LogId, int], world: int) -> Edges:
+    """Edges from the world frame (a pose of its own) to the keyframes that were fixed."""
+    j = np.array([offsets[f.keyframe.log] + f.keyframe.index for f in fixes])
+    L = np.zeros((len(fixes), 6, 6))
+    T_hat = np.empty((len(fixes), 4, 4))
+    for k, fix in enumerate(fixes):
+        R = fix.R_world_keyframe
+        T_hat[k] = pose(np.eye(3) if R is None else R, fix.position_m)
+        R_hat = T_hat[k, :3, :3]
+        L[k, 3:, 3:] = np.linalg.inv(np.linalg.cholesky(fix.covariance_m2)) @ R_hat
+        if R is not None:
+            L[k, :3, :3] = np.eye(3) / fix.rotation_sigma_rad
+    return plain_edges(np.full(len(j), world), j, T_hat, L)

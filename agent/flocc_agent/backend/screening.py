@@ -1,0 +1,193 @@
+"""What must not reach the solver: broken odometry, closures that cannot be right, each with its reason."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.geometry import angle_rad, between, inverse, is_rigid
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+
+TRANSLATION_UNSCALED_MIN = 1e-9
+SAME_ROTATION_RAD = 0.02
+SAME_TRANSLATION_RATIO = 0.05
+CONDITION_MAX = 1e14
+
+
+@dataclass(frozen=True, slots=True)
+class Screened:
+    """What is left of a pose graph, and why the rest went.
+
+    Attributes:
+        trajectories: Logs with usable odometry, sorted.
+        excluded: Reason per closure index; closures that are not named may be used.
+        fixes: Usable fixes.
+        warnings: One sentence per exclusion that is not a closure's.
+    """
+
+    trajectories: dict[LogId, Trajectory]
+    excluded: dict[int, str]
+    fixes: tuple[AbsoluteFix, ...]
+    warnings: tuple[str, ...]
+
+
+def screen(graph: PoseGraph) -> Screened:
+    """Keep what can be solved and name what cannot, with its robot or keyframes."""
+    trajectories: dict[LogId, Trajectory] = {}
+    warnings: list[str] = []
+    for log in sorted(graph.trajectories):
+        usable, complaint = _usable_trajectory(log, graph.trajectories[log])
+        if complaint:
+            warnings.append(complaint)
+        if usable is not None:
+            trajectories[log] = usable
+    excluded: dict[int, str] = {}
+    for k, closure in enumerate(graph.closures):
+        complaint = closure_complaint(closure, trajectories)
+        if complaint:
+            excluded[k] = complaint
+    excluded.update(_duplicates(graph.closures, excluded))
+    fixes = []
+    for fix in graph.fixes:
+        complaint = _fix_complaint(fix, trajectories)
+        if complaint:
+            warnings.append(complaint)
+        else:
+            fixes.append(fix)
+    return Screened(trajectories, excluded, tuple(fixes), tuple(warnings))
+
+
+def is_covariance(matrix: Float, size: int) -> bool:
+    """Whether a matrix is finite, symmetric and positive definite, and not hopelessly conditioned."""
+    matrix = np.asarray(matrix, dtype=float)
+    if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
+        return False
+    if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12 * float(np.max(np.abs(matrix)))):
+        return False
+    eigenvalues = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
+    return bool(eigenvalues[0] > 0 and eigenvalues[-1] < CONDITION_MAX * eigenvalues[0])
+
+
+def _usable_trajectory(log: LogId, trajectory: Trajectory) -> tuple[Trajectory | None, str]:
+    T = np.asarray(trajectory.T_odom_keyframe, dtype=float)
+    if len(T) == 0:
+        return None, f"robot {log} has no odometry and is left out"
+    bad = first_not_rigid(T)
+    if bad is not None:
+        return None, f"odometry of robot {log} is not a rigid pose at keyframe {bad}; the robot is left out"
+    covariances = trajectory.edge_covariances
+    if covariances is None:
+        return trajectory, ""
+    if len(covariances) != len(T) - 1:
+        return Trajectory(T), f"robot {log} gives {len(covariances)} odometry covariances for {len(T) - 1} edges"
+    wrong = [k for k, S in enumerate(covariances) if not is_covariance(S, 6)]
+    if not wrong:
+        return trajectory, ""
+    return Trajectory(T), (
+        f"odometry covariance of robot {log} at edge {wrong[0]} is not positive definite; the configured one is used"
+    )
+
+
+def first_not_rigid(T: Float) -> int | None:
+    """Index of the first pose of (N, 4, 4) that is not finite and rigid, or None."""
+    if T.ndim != 3 or T.shape[1:] != (4, 4):
+        return 0
+    R = T[:, :3, :3]
+    with np.errstate(all="ignore"):
+        orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) < 2e-3
+        good = np.isfinite(T).all(axis=(1, 2)) & orthonormal & (np.linalg.det(R) > 0)
+        good &= np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) < 1e-3
+    return None if good.all() else int(np.argmin(good))
+
+
+def closure_complaint(closure: LoopClosure, trajectories: Mapping[LogId, Trajectory]) -> str:
+    """Why a closure cannot be used, in one sentence; empty where it can."""
+    name = f"closure {closure.query} - {closure.match}"
+    for keyframe in (closure.query, closure.match):
+        complaint = _missing(keyframe, trajectories)
+        if complaint:
+            return f"{name}: {complaint}"
+    if closure.query == closure.match:
+        return f"{name}: joins a keyframe with itself"
+    T = np.asarray(closure.T_query_match_unscaled, dtype=float)
+    if not np.all(np.isfinite(T)):
+        return f"{name}: the measurement is not finite"
+    if not is_rigid(T):
+        return f"{name}: the measurement is not a rigid pose"
+    if not np.isfinite(closure.match_ratio) or closure.match_ratio < 0:
+        return f"{name}: the match ratio {closure.match_ratio} is not a ratio"
+    if closure.covariance is not None and not is_covariance(closure.covariance, 6):
+        return f"{name}: the covariance is not positive definite"
+    if closure.scale_initial is not None and not (np.isfinite(closure.scale_initial) and closure.scale_initial > 0):
+        return f"{name}: the initial scale {closure.scale_initial} is not positive"
+    if not closure.metric and float(np.linalg.norm(T[:3, 3])) < TRANSLATION_UNSCALED_MIN:
+        return f"{name}: a translation of zero length has no direction to scale"
+    return ""
+
+
+def _missing(keyframe: KeyframeId, trajectories: Mapping[LogId, Trajectory]) -> str:
+    trajectory = trajectories.get(keyframe.log)
+    if trajectory is None:
+        return f"robot {keyframe.log} has no odometry"
+    if keyframe.index >= len(trajectory):
+        return f"keyframe {keyframe} is not there, robot {keyframe.log} has {len(trajectory)}"
+    return ""
+
+
+def _duplicates(closures: Sequence[LoopClosure], excluded: Mapping[int, str]) -> dict[int, str]:
+    """Exclude all but the best closure of each pair: the highest match ratio, then the first."""
+    best: dict[tuple[KeyframeId, KeyframeId], int] = {}
+    reasons: dict[int, str] = {}
+    for k, closure in enumerate(closures):
+        if k in excluded:
+            continue
+        low, high = sorted((closure.query, closure.match))
+        other = best.setdefault((low, high), k)
+        if other == k:
+            continue
+        keep, drop = (k, other) if closure.match_ratio > closures[other].match_ratio else (other, k)
+        best[low, high] = keep
+        verb = "repeats" if _agree(closures[keep], closures[drop]) else "contradicts"
+        reasons[drop] = (
+            f"closure {closures[drop].query} - {closures[drop].match}: {verb} another closure of the same keyframes"
+        )
+    return reasons
+
+
+def _agree(a: LoopClosure, b: LoopClosure) -> bool:
+    T_a, T_b = a.T_query_match_unscaled, b.T_query_match_unscaled
+    if a.query != b.query:
+        T_b = inverse(T_b)
+    if angle_rad(between(T_a, T_b)[:3, :3]) > SAME_ROTATION_RAD:
+        return False
+    u, v = T_a[:3, 3], T_b[:3, 3]
+    if not (a.metric and b.metric):
+        u, v = u / max(float(np.linalg.norm(u)), 1e-12), v / max(float(np.linalg.norm(v)), 1e-12)
+    return float(np.linalg.norm(u - v)) <= SAME_TRANSLATION_RATIO * max(float(np.linalg.norm(u)), 1e-3)
+
+
+def _fix_complaint(fix: AbsoluteFix, trajectories: Mapping[LogId, Trajectory]) -> str:
+    name = f"fix of {fix.keyframe}"
+    complaint = _missing(fix.keyframe, trajectories)
+    if complaint:
+        return f"{name}: {complaint}"
+    if not np.all(np.isfinite(fix.position_m)) or np.shape(fix.position_m) != (3,):
+        return f"{name}: the position is not finite"
+    if not is_covariance(fix.covariance_m2, 3):
+        return f"{name}: the covariance is not positive definite"
+    R = fix.R_world_keyframe
+    if R is not None and first_not_rigid(_with_rotation(R)) is not None:
+        return f"{name}: the rotation is not a rotation"
+    if R is not None and not (np.isfinite(fix.rotation_sigma_rad) and fix.rotation_sigma_rad > 0):
+        return f"{name}: the rotation's standard deviation is not positive"
+    return ""
+
+
+def _with_rotation(R: Float) -> Float:
+    T = np.eye(4)[None].copy()
+    T[0, :3, :3] = R
+    return T
