@@ -5,14 +5,15 @@ Parameters of the core are plain dataclasses in `core/parameters.py`; pydantic c
 
 import re
 import tomllib
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from flocc_protocol.errors import FloccError
-from flocc_protocol.ids import NAME_PATTERN
+from flocc_protocol.ids import NAME_PATTERN, checked_name
 
 if TYPE_CHECKING:
     from flocc_agent.radio import LinkParameters, RadioParameters
@@ -487,4 +488,6 @@ def validated(model: type[M], fields: Mapping[str, object], source: str) -> M:
     try:
         return model.model_validate(fields)
     except (ValidationError, FloccError) as error:
-        raise ConfigError(first_error(error, source) if isinstance(error, ValidationError) else str(error)) from error
+        raise ConfigError(
+            first_error(error, source) if isinstance(error, ValidationError) else f"{source}: {error}"
+        ) from error

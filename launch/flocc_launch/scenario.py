@@ -1,0 +1,249 @@
+"""Scenario files: robots, their data, radio, faults over time and expectations, in one TOML file.
+
+The same file runs under `flocc launch` (processes over zenoh) and `flocc simulate` (virtual time).
+"""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from flocc_agent.config import (
+    AgentConfig,
+    BackendConfig,
+    KeyframeConfig,
+    PerceptionConfig,
+    RadioConfig,
+    Section,
+    StoreConfig,
+    read_toml,
+    validated,
+)
+from flocc_agent.core.parameters import CoreParameters
+from flocc_protocol.ids import checked_name
+
+RobotName = Annotated[str, AfterValidator(checked_name)]
+
+
+class RobotScenario(Section):
+    """One robot of a scenario."""
+
+    recording: Path | None = None
+    """Its recording; None takes its part of [world], [dataset] or [tracks]."""
+    compute_class: int = Field(0, ge=0, le=9)
+    """0: small robot, 9: server with a GPU."""
+    start_s: float = Field(0.0, ge=0)
+    """When it is switched on, seconds after the start of the run."""
+
+
+class WorldScenario(Section):
+    """A generated world (docs/data-sets.md)."""
+
+    robots: int = Field(3, ge=1, le=8)
+    """Robots that walk through it."""
+    seed: int = Field(7, ge=0)
+    """Another seed is another world, other routes and other drift."""
+
+
+class DatasetScenario(Section):
+    """A recorded data set, cut into robots by time, with seeded odometry drift."""
+
+    source: Path
+    """Folder of the data set: 7-Scenes, TUM RGB-D, KITTI, EuRoC or plain."""
+    robots: int = Field(3, ge=1, le=16)
+    """Pieces it is cut into."""
+    seed: int = Field(7, ge=0)
+    """Seed of the odometry drift."""
+
+
+class TracksScenario(Section):
+    """Robots without images, for synthetic perception: closed walks in one area, with seeded odometry drift."""
+
+    robots: int = Field(10, ge=1, le=200)
+    """Robots that walk."""
+    seed: int = Field(7, ge=0)
+    """Seed of the walks and of the drift."""
+    area_m: float = Field(40.0, gt=0)
+    """Edge of the square area; smaller means more meetings."""
+    speed_m_s: float = Field(0.7, gt=0)
+    """Walking speed."""
+    length_m: float = Field(80.0, gt=0)
+    """Length of each walk."""
+
+
+class FaultKind(StrEnum):
+    """What goes wrong, or right again."""
+
+    KILL = "kill"
+    RESTART = "restart"
+    PARTITION = "partition"
+    BLACKOUT = "blackout"
+    HEAL = "heal"
+    LOSS = "loss"
+    LATENCY = "latency"
+    RANGE = "range"
+    SLOW = "slow"
+
+
+class Fault(Section):
+    """One entry of the timeline."""
+
+    at_s: float = Field(ge=0)
+    """When, seconds after the start of the run."""
+    kind: FaultKind
+    """What happens."""
+    robots: tuple[RobotName, ...] = ()
+    """Whom it concerns: kill, restart, blackout, slow."""
+    groups: tuple[tuple[RobotName, ...], ...] = ()
+    """Groups of a partition; robots that no group names are one more group."""
+    value: float | None = None
+    """Loss ratio, latency in seconds, range in metres, or the factor by which robots are slow."""
+    disk_lost: bool = False
+    """A restart comes without the disk, as a new incarnation."""
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Self:
+        needs_robots = {FaultKind.KILL, FaultKind.RESTART, FaultKind.BLACKOUT, FaultKind.SLOW}
+        needs_value = {FaultKind.LOSS, FaultKind.LATENCY, FaultKind.RANGE, FaultKind.SLOW}
+        if self.kind in needs_robots and not self.robots:
+            raise ValueError(f"a fault '{self.kind.value}' names its robots")
+        if self.kind in needs_value and self.value is None:
+            raise ValueError(f"a fault '{self.kind.value}' has a value")
+        if self.kind is FaultKind.PARTITION and not self.groups:
+            raise ValueError("a partition names its groups")
+        return self
+
+
+class Expectations(Section):
+    """What must come true; a run that misses one ends with exit code 1."""
+
+    merged_within_s: float | None = Field(None, gt=0)
+    """All robots share one map frame at the latest this long after the start."""
+    ate_max_m: float | None = Field(None, gt=0)
+    """Joint ATE, one SE(3) alignment for all robots."""
+    ate_ratio_max: float | None = Field(None, gt=0)
+    """Joint ATE over the odometry's."""
+    closures_min: int | None = Field(None, ge=0)
+    """Accepted closures between robots."""
+    leader_changes_max: int | None = Field(None, ge=0)
+    """Changes of the leader, as most robots saw them, after the first."""
+    frames_max: int | None = Field(None, ge=1)
+    """Map frames at the end."""
+
+
+class Scenario(Section):
+    """A whole scenario; exactly one of world, dataset, tracks and robots with recordings gives the data."""
+
+    name: RobotName = "scenario"
+    """Name of the scenario."""
+    seed: int = Field(1, ge=0)
+    """Seed of links, boots and worker answers."""
+    duration_s: float | None = Field(None, gt=0)
+    """When the run ends; None: when all recordings are played and everything has settled."""
+    settle_s: float = Field(8.0, ge=0)
+    """How long a run without a duration must be quiet after the last frame before it ends."""
+    rate: float = Field(1.0, gt=0)
+    """Playback speed of recordings."""
+    world: WorldScenario | None = None
+    """Data from a generated world."""
+    dataset: DatasetScenario | None = None
+    """Data from a recorded data set."""
+    tracks: TracksScenario | None = None
+    """Poses only, for synthetic perception."""
+    robots: dict[RobotName, RobotScenario] = Field(default_factory=dict)
+    """Robots by name; those of world, dataset and tracks are r1, r2, ... and may be listed to change them."""
+    radio: RadioConfig = RadioConfig()
+    """Emulated links."""
+    core: CoreParameters = CoreParameters()
+    """Parameters of all robots' cores."""
+    keyframes: KeyframeConfig = KeyframeConfig()
+    """Keyframe selection of all robots."""
+    perception: PerceptionConfig = PerceptionConfig()
+    """Perception of all robots."""
+    backend: BackendConfig = BackendConfig()
+    """Back end of all robots."""
+    store: StoreConfig = StoreConfig()
+    """Bounds of all robots' disks."""
+    faults: tuple[Fault, ...] = ()
+    """What goes wrong, and when."""
+    expectations: Expectations = Expectations()
+    """What must come true."""
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Self:
+        sources = [name for name in ("world", "dataset", "tracks") if getattr(self, name) is not None]
+        if len(sources) > 1:
+            raise ValueError(f"{' and '.join(sources)} exclude each other")
+        lacking = [name for name, robot in self.robots.items() if robot.recording is None and robot.compute_class == 0]
+        if not sources and (not self.robots or lacking):
+            who = f"robot '{lacking[0]}' has no recording" if lacking else "there is no robot"
+            raise ValueError(f"{who}; give [world], [dataset], [tracks] or recordings")
+        unknown = {robot for fault in self.faults for robot in fault.robots} - set(self.names())
+        if unknown:
+            raise ValueError(f"a fault names robot '{min(unknown)}', which is not in the scenario")
+        return self
+
+    def names(self) -> list[str]:
+        """Names of all robots, sorted."""
+        source = self.world or self.dataset or self.tracks
+        made = [f"r{i + 1}" for i in range(source.robots)] if source else []
+        return sorted({*made, *self.robots})
+
+    def robot(self, name: str) -> RobotScenario:
+        """What the scenario says of one robot."""
+        return self.robots.get(name, RobotScenario())
+
+    @classmethod
+    def read(cls, path: Path, changes: Mapping[str, object] | None = None) -> "Scenario":
+        """Read and check a scenario; paths in it are relative to the file.
+
+        Args:
+            path: The TOML file.
+            changes: Keys that the command line overrides, as `radio.loss_ratio`.
+
+        Raises:
+            ConfigError: The file cannot be used; the message names it and the key.
+        """
+        fields = read_toml(path)
+        for key, value in (changes or {}).items():
+            _put(fields, key.split("."), value)
+        return validated(cls, _resolved(fields, path.resolve().parent), str(path))
+
+
+def agent_config(scenario: Scenario, name: str, index: int, **changes: object) -> AgentConfig:
+    """The configuration of one robot of a scenario."""
+    return AgentConfig(
+        name=name,
+        swarm=scenario.name,
+        compute_class=scenario.robot(name).compute_class,
+        incarnation=0,
+        seed=scenario.seed * 1000 + index,
+        core=scenario.core,
+        keyframes=scenario.keyframes,
+        perception=scenario.perception,
+        backend=scenario.backend,
+        radio=scenario.radio,
+        store=scenario.store,
+        **changes,  # type: ignore[arg-type]
+    )
+
+
+def _put(fields: dict[str, object], keys: list[str], value: object) -> None:
+    for key in keys[:-1]:
+        inner = fields.setdefault(key, {})
+        assert isinstance(inner, dict), f"{key} is a table"
+        fields = inner
+    fields[keys[-1]] = value
+
+
+def _resolved(fields: dict[str, object], folder: Path) -> dict[str, object]:
+    """Make the paths of data relative to the scenario's folder."""
+    dataset, robots = fields.get("dataset"), fields.get("robots")
+    if isinstance(dataset, dict) and isinstance(dataset.get("source"), str):
+        dataset["source"] = str(folder / dataset["source"])
+    for robot in robots.values() if isinstance(robots, dict) else ():
+        if isinstance(robot, dict) and isinstance(robot.get("recording"), str):
+            robot["recording"] = str(folder / robot["recording"])
+    return fields
