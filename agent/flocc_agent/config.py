@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from flocc_agent.core.parameters import CoreParameters
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import NAME_PATTERN, checked_name
 

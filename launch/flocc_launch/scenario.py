@@ -226,7 +226,7 @@ def agent_config(scenario: Scenario, name: str, index: int, **changes: object) -
         backend=scenario.backend,
         radio=scenario.radio,
         store=scenario.store,
-        **changes,  # type: ignore[arg-type]
+        **changes,
     )
 
 
