@@ -1,0 +1,100 @@
+"""zenoh sessions as flocc needs them: peer mode, no shared memory, explicit endpoints beside scouting.
+
+Each choice is measured in facts/zenoh.md: two sessions per agent (control, bulk) because bulk on a shared link
+delays heartbeats; one link per pair (max_links 1, the higher name dials); short open_timeout because attempts that
+hang keep pairs apart under loss; shared memory off because it bypasses emulated links.
+"""
+
+import json
+import re
+from enum import Enum
+from typing import Any
+
+import zenoh
+
+from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.security import access_control, tls_settings
+from flocc_agent.runtime.transport import TransportError
+
+RX_MESSAGE_MARGIN_BYTES = 64 * 1024
+
+
+class Plane(Enum):
+    """Which of the two sessions of an agent."""
+
+    CONTROL = "control"
+    BULK = "bulk"
+
+
+def session_settings(config: TransportConfig, swarm: str, robot: str, plane: Plane) -> dict[str, Any]:
+    """Give zenoh's settings, by zenoh's path, for one session of one robot.
+
+    Robots with a higher name dial those with a lower one, so that each pair has one link.
+    """
+    control = plane is Plane.CONTROL
+    dialled = [
+        endpoint
+        for name, peer in sorted(config.roster.items())
+        if name < robot
+        for endpoint in (peer.control if control else peer.bulk)
+    ]
+    strategy = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+    message_bytes_max = config.message_bytes_max if control else config.chunk_bytes
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "listen/endpoints": list(config.control_listen if control else config.bulk_listen),
+        "connect/endpoints": dialled,
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": round(config.retry_max_s * 1000),
+            "period_increase_factor": 1.5,
+        },
+        "scouting/multicast/enabled": config.multicast,
+        "scouting/multicast/address": config.multicast_control if control else config.multicast_bulk,
+        "scouting/multicast/interface": config.interface,
+        "scouting/multicast/autoconnect_strategy": strategy,
+        "scouting/gossip/enabled": config.gossip,
+        "scouting/gossip/autoconnect_strategy": strategy,
+        "adminspace/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "transport/unicast/max_links": 1,
+        "transport/unicast/open_timeout": round(config.open_timeout_s * 1000),
+        "transport/unicast/accept_timeout": round(config.open_timeout_s * 1000),
+        "transport/link/tx/lease": round(config.lease_s * 1000),
+        "transport/link/rx/max_message_size": message_bytes_max + RX_MESSAGE_MARGIN_BYTES,
+    }
+    if not control:
+        settings["transport/link/tcp/so_sndbuf"] = config.bulk_send_buffer_bytes
+    if config.tls is not None:
+        settings |= tls_settings(config.tls)
+        members = sorted({*config.tls.members, *config.roster, robot})
+        settings["access_control"] = access_control(swarm, members, config.tls.operators)
+    return settings
+
+
+def open_session(settings: dict[str, Any], whose: str) -> zenoh.Session:
+    """Open a session; blocks for up to half a second.
+
+    Raises:
+        TransportError: A setting that zenoh refuses, a port in use, an address that is not this machine's.
+    """
+    zenoh.init_log_from_env_or("off")
+    zenoh_config = zenoh.Config()
+    for path, value in settings.items():
+        try:
+            zenoh_config.insert_json5(path, json.dumps(value))
+        except zenoh.ZError as error:
+            raise TransportError(f"{whose}: zenoh refuses the setting {path} = {value!r}") from error
+    try:
+        return zenoh.open(zenoh_config)
+    except zenoh.ZError as error:
+        raise TransportError(f"{whose}: {first_cause(str(error))}") from error
+
+
+def first_cause(text: str) -> str:
+    """Reduce zenoh's chain of causes to one sentence without source paths."""
+    if locator := re.search(r"\[?(\S+): Address already in use", text):
+        return f"the address {locator[1].lstrip('[')} is in use by another process"
+    if locator := re.search(r"\[?(\S+): Cannot assign requested address", text):
+        return f"the address {locator[1].lstrip('[')} is not one of this machine"
+    return "zenoh cannot open a session: " + re.sub(r"\s+at /\S+", "", text).rstrip(". ")
