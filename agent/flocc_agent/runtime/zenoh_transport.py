@@ -310,7 +310,7 @@ class ZenohTransport:
             seen = keys.parse_alive_key(str(sample.key_expr))
         except DecodeError:
             return self._counter.count_dropped("malformed-key")
-        if sample.kind is not zenoh.SampleKind.PUT or seen.boot == self.boot:
+        if sample.kind != zenoh.SampleKind.PUT or seen.boot == self.boot:
             return None
         if seen.version != keys.VERSION:
             return self._name_once(
