@@ -1,0 +1,133 @@
+"""What a robot's run leaves for people: lines of `events.jsonl` and `result.json`. The same for every driver.
+
+The core knows camera poses only; users know the body. Both files speak of the body.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.corrections import pose7
+from flocc_agent.core.effects import Report
+from flocc_agent.core.pose_graph import GraphSolution, map_frame
+from flocc_agent.core.registration import closure_probability
+from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import inverse, pose_from_tq, se3_exp, se3_log
+from flocc_protocol.messages import CandidatePair, CorrectionMessage
+from flocc_protocol.records import ClosureRecord, KeyframeRecord
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reporter:
+    """Turns the core's reports into lines of `events.jsonl`.
+
+    Attributes:
+        robot: Name of the robot.
+        T_body_camera: (4, 4) where the camera sits on the body.
+        steepness: k of Eq. (2), for the probability beside each accepted closure.
+    """
+
+    robot: str
+    T_body_camera: Float
+    steepness: float
+
+    def line(self, report: Report, t: float) -> dict[str, Any]:
+        """One event: time since the start of the run (s), robot, kind and facts."""
+        fields = dict(report.fields)
+        if report.event == "keyframe":
+            fields = self._with_body_pose(fields)
+        if report.event == "closure_accepted":
+            fields["probability"] = round(closure_probability(float(fields["ratio"]), self.steepness), 6)  # type: ignore[arg-type]
+        return {"t": round(t, 6), "robot": self.robot, "event": report.event, **fields}
+
+    def _with_body_pose(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        T_odom_camera = pose_from_tq(np.array(fields["T_odom_camera"]))
+        T_odom_body = T_odom_camera @ inverse(self.T_body_camera)
+        rest = {key: value for key, value in fields.items() if key != "T_odom_camera"}
+        return {**rest, "T_odom_body": list(pose7(T_odom_body))}
+
+
+def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None = None) -> dict[str, Any]:
+    """What a robot knows at its end: its trajectory before and after correction, closures, sizes of logs."""
+    records = [r for r in robot.gossip.logs[robot.log].records if isinstance(r, KeyframeRecord)]
+    T_odom_camera = np.array([pose_from_tq(np.array(r.T_odom_camera)) for r in records]).reshape(-1, 4, 4)
+    applied = robot.corrections.applied
+    T_camera_body = inverse(T_body_camera)
+    T_map_camera = None if applied is None else corrected(applied, T_odom_camera)
+    keyframes = [
+        {
+            "index": record.index,
+            "stamp_s": record.stamp_s,
+            "T_odom_body": list(pose7(T_odom_camera[i] @ T_camera_body)),
+            "T_map_body": None if T_map_camera is None else list(pose7(T_map_camera[i] @ T_camera_body)),
+        }
+        for i, record in enumerate(records)
+    ]
+    return {
+        "robot": robot.log.robot,
+        "incarnation": robot.log.incarnation,
+        "map_frame": None if applied is None else map_frame(applied.anchor),
+        "T_map_odom": None if applied is None else list(applied.T_map_odom),
+        "T_body_camera": list(pose7(T_body_camera)),
+        "keyframes": keyframes,
+        "closures": closures_known(robot, solution),
+        "logs": {str(digest.log): digest.count for digest in robot.gossip.digests()},
+    }
+
+
+def closures_known(robot: Robot, solution: GraphSolution | None) -> list[dict[str, Any]]:
+    """Every closure in a robot's logs, each pair once, with the scale of the last solution it made."""
+    scales = {} if solution is None else {CandidatePair.of(c.query, c.match): c.scale for c in solution.closures}
+    found: dict[CandidatePair, ClosureRecord] = {}
+    for _, copy in sorted(robot.gossip.logs.items()):
+        for record in copy.records:
+            if isinstance(record, ClosureRecord):
+                found.setdefault(CandidatePair.of(record.query, record.match), record)
+    return [
+        {
+            "query": str(record.query),
+            "match": str(record.match),
+            "T_query_match_unscaled": list(record.T_query_match_unscaled),
+            "match_ratio": record.match_ratio,
+            "scale_initial": record.scale_initial,
+            "scale": scales.get(pair),
+        }
+        for pair, record in sorted(found.items())
+    ]
+
+
+def corrected(message: CorrectionMessage, T_odom_camera: Float) -> Float:
+    """Apply a correction to every keyframe, also to those it does not list.
+
+    Between listed keyframes the correction is interpolated, after the last one it stays.
+
+    Args:
+        message: The correction, of every `step`-th keyframe.
+        T_odom_camera: (N, 4, 4) odometry of all keyframes.
+
+    Returns:
+        (N, 4, 4) camera poses in the map.
+    """
+    listed = message.first + message.step * np.arange(message.T_map_camera.shape[0])
+    known = listed < len(T_odom_camera)
+    poses = np.array([pose_from_tq(row) for row in message.T_map_camera.numpy()[known]]).reshape(-1, 4, 4)
+    if len(poses) == 0:
+        return np.asarray(pose_from_tq(np.array(message.T_map_odom)) @ T_odom_camera)
+    indices = listed[known]
+    T_map_odom = poses @ inverse(T_odom_camera[indices])
+    return np.array([_interpolated(k, indices, T_map_odom) @ T for k, T in enumerate(T_odom_camera)])
+
+
+def _interpolated(k: int, indices: NDArray[np.int_], T_map_odom: Float) -> Float:
+    after = int(np.searchsorted(indices, k))
+    if after == len(indices) or indices[after] == k or after == 0:
+        return np.asarray(T_map_odom[min(after, len(indices) - 1)])
+    before = after - 1
+    share = (k - indices[before]) / (indices[after] - indices[before])
+    step = se3_log(inverse(T_map_odom[before]) @ T_map_odom[after])
+    return np.asarray(T_map_odom[before] @ se3_exp(share * step))
