@@ -1,0 +1,69 @@
+# make demo    three robots in a generated world, one report: creates .venv and installs what that needs
+# make test    installs what tests need and runs all of them: ruff, mypy, import contracts, pytest
+# make check   the same without installing anything
+# make clean   removes .venv and everything that was generated
+
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV ?= .venv
+JOBS ?= 2
+DEMO_OUT ?= runs/demo
+TEST_EXTRAS := $(shell sed -n '/^\[project.optional-dependencies\]/,/^\[/s/^\([a-z0-9]*\) = \[.*/\1/p' pyproject.toml | paste -sd,)
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+DESCRIPTION := pyproject.toml constraints.txt
+
+.PHONY: demo test check lint types contracts tests constraints clean
+.DEFAULT_GOAL := check
+
+demo: $(VENV)/.demo
+	$(BIN)/flocc demo --out $(DEMO_OUT)
+	@echo "The report lies at $(abspath $(DEMO_OUT))/report.html, its numbers in report.json beside it."
+
+test: $(VENV)/.test
+	@$(MAKE) --no-print-directory check
+
+check: lint types contracts tests
+
+lint:
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types:
+	$(BIN)/mypy
+
+contracts:
+	$(BIN)/lint-imports
+
+# Two workers share two cores; tests of a live swarm measure time, so they get the machine to themselves.
+tests:
+	@mkdir -p build; set -o pipefail; status=0; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -m "not swarm" | tee build/pytest.txt || status=1; \
+	$(BIN)/python -m pytest -q -m swarm | tee build/pytest-swarm.txt || status=1; \
+	echo "pytest:              $$(tail -n 1 build/pytest.txt)"; \
+	echo "pytest, live swarms: $$(tail -n 1 build/pytest-swarm.txt)"; \
+	exit $$status
+
+constraints: $(VENV)/.test
+	$(BIN)/python .ci/constraints.py > constraints.new
+	mv constraints.new constraints.txt
+
+# A stamp per set of requirements: a second run installs nothing.
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' \
+		|| { echo "flocc needs Python 3.11 to 3.14: make PYTHON=python3.11 ..." >&2; exit 1; }
+	@$(PYTHON) -m venv $(VENV) \
+		|| { rm -rf $(VENV); echo "$(PYTHON) -m venv failed; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+
+$(VENV)/.demo: $(DESCRIPTION) | $(VENV)/bin/python
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.test: $(DESCRIPTION) | $(VENV)/bin/python
+	$(PIP) -e '.[$(TEST_EXTRAS)]'
+	@touch $@ $(VENV)/.demo
+
+clean:
+	rm -rf $(VENV) build dist runs .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find protocol agent launch tests -name __pycache__ -prune -exec rm -rf {} +
