@@ -1,0 +1,95 @@
+"""Claims on the project as a whole: who imports whom, what starts fast, what a wheel holds, what is pinned."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+HEAVY = ("torch", "gtsam", "cv2", "rerun", "zenoh")
+HELP_CPU_MAX_S = 0.3
+PACKAGES = {"flocc_protocol": "protocol", "flocc_agent": "agent", "flocc_launch": "launch"}
+SOURCES = os.pathsep.join(str(ROOT / root) for root in PACKAGES.values())
+
+
+def run(*command: str) -> subprocess.CompletedProcess[str]:
+    """Run a Python program from the sources; its error output is part of a failure's message."""
+    environment = os.environ | {"PYTHONPATH": SOURCES}
+    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command}: {done.stdout[-2000:]}{done.stderr[-2000:]}"
+    return done
+
+
+def cpu_s(*command: str) -> float:
+    """User and system time of one run of a Python program, in seconds."""
+    before = os.times()
+    run(*command)
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+def test_the_import_contracts_hold() -> None:
+    kept = run("-c", "from importlinter.cli import lint_imports_command; lint_imports_command()").stdout
+    assert f"Contracts: {len(PROJECT['tool']['importlinter']['contracts'])} kept, 0 broken" in kept
+
+
+@pytest.mark.parametrize("module", ["flocc_protocol", "flocc_agent", "flocc_agent.config", "flocc_launch.cli"])
+def test_an_import_pulls_in_nothing_heavy(module: str) -> None:
+    program = f"import {module}, sys; print([name for name in {HEAVY} if name in sys.modules])"
+    assert run("-c", program).stdout.strip() == "[]"
+
+
+def test_help_answers_at_once() -> None:
+    times_s = [cpu_s("-c", "from flocc_launch.cli import main; main()", "--help") for _ in range(4)]
+    assert min(times_s) < HELP_CPU_MAX_S, times_s
+
+
+@pytest.fixture(scope="module")
+def wheel_names(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """The names of all files of a freshly built wheel."""
+    folder = tmp_path_factory.mktemp("wheel")
+    run("-m", "hatchling", "build", "-t", "wheel", "-d", str(folder))
+    (wheel,) = folder.glob("flocc-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+def test_a_wheel_holds_the_three_packages_and_nothing_else(wheel_names: set[str]) -> None:
+    folders = {name.split("/")[0] for name in wheel_names}
+    assert {name for name in folders if not name.endswith(".dist-info")} == PACKAGES.keys()
+    assert {f"{package}/py.typed" for package in PACKAGES} <= wheel_names
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in wheel_names)
+
+
+def test_every_file_of_the_packages_is_in_the_wheel(wheel_names: set[str]) -> None:
+    files = {
+        str(path.relative_to(ROOT / root))
+        for package, root in PACKAGES.items()
+        for path in (ROOT / root / package).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert files <= wheel_names, sorted(files - wheel_names)
+
+
+def test_every_requirement_is_pinned_within_its_range() -> None:
+    pins = dict(
+        line.split("==")
+        for line in (ROOT / "constraints.txt").read_text().split("\n")
+        if re.fullmatch(r"\S+==\S+", line)
+    )
+    extras = PROJECT["project"]["optional-dependencies"].values()
+    required = [*PROJECT["project"]["dependencies"], *(line for extra in extras for line in extra)]
+    for requirement in map(Requirement, required):
+        name = canonicalize_name(requirement.name)
+        if name == "flocc":
+            continue
+        assert name in pins, f"{name} is not in constraints.txt; run `make constraints`"
+        assert requirement.specifier.contains(pins[name]), f"{name} {pins[name]} is outside {requirement.specifier}"
