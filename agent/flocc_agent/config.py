@@ -175,6 +175,69 @@ class SyntheticConfig(Section):
     """Latents are padded to this size, to load links like another method's; MASt3R's are 1.5 MB."""
 
 
+class Mast3rConfig(Section):
+    """The paper's front end: CosPlace and MASt3R on checkpoints that the user provides."""
+
+    weights: Path | None = None
+    """MASt3R checkpoint (.pth or .safetensors); `flocc weights` says which, and under which licence."""
+    place_weights: Path | None = None
+    """CosPlace checkpoint; backbone and dimension are read from it."""
+    network: Literal["full", "small", "tiny"] = "full"
+    """full: the official network; small and tiny: reduced ones that `flocc weights synthesize` writes for tests."""
+    encode_only: bool = False
+    """Load the encoder only (1.2 of 2.7 GB in fp32): this robot serves latents and others decode."""
+    device: Literal["auto", "cuda", "mps", "cpu"] = "auto"
+    """Where the networks run; auto takes the best that is there."""
+    dtype: Literal["auto", "fp32", "bf16", "fp16"] = "auto"
+    """Number format; auto: bf16 where the machine has it, fp16 on older GPUs and mps, else fp32."""
+    threads: int = Field(0, ge=0, le=256)
+    """CPU threads of the networks; fewer leave more to the rest of the robot; 0: torch's choice."""
+    compile: bool = False
+    """Compile the networks at start: half a minute once, then up to a third faster with bf16."""
+    warm_up: bool = False
+    """Run the networks once at start, so that the first keyframe is not slower."""
+    memory_check: bool = True
+    """Refuse to start where the networks will not fit in the memory that is free."""
+    image_size_px: Literal[512, 224] = 512
+    """Longer side of the network's input; 224 (square) is five times cheaper and less accurate."""
+    exchange: Literal["latent", "image", "auto"] = "latent"
+    """latent: others decode what this robot encoded; image: send a JPEG that the receiver encodes; auto: keep both."""
+    latent_dtype: Literal["fp16", "int8"] = "fp16"
+    """Number format of a sent latent; int8 (per channel) halves it to 0.8 MB."""
+    jpeg_quality: int = Field(90, ge=50, le=100)
+    """Quality of sent images; lower is smaller and less exact."""
+    place_input: Literal["native", "shorter-side", "swarm-slam"] = "swarm-slam"
+    """What CosPlace sees: the whole picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
+    subsample_px: int = Field(8, ge=1, le=64)
+    """Distance of the matcher's seeds; 16 is four times faster with a quarter of the matches; equal on all robots."""
+    border_px: int = Field(3, ge=0)
+    """Matches nearer to a border than this are dropped."""
+    match_confidence_min: float = Field(0.0, ge=0)
+    """Matches whose descriptor confidence is below this are dropped; the authors use 1.001 for localisation."""
+    match_both_directions: bool = False
+    """Match from both images' seeds; about twice the matches in twice the time."""
+    count: Literal["matches", "inliers"] = "matches"
+    """Correspondences of Eq. (1): all reciprocal matches as in the paper, or only those that agree with the pose."""
+    calibrated: bool = True
+    """Use the camera's calibration; false estimates focal lengths from the pointmaps, with a second decode."""
+    consistency_check: bool = False
+    """Decode (match, query) too and reject closures on which the two disagree; doubles the time."""
+    consistency_rotation_rad: float = Field(0.2, gt=0)
+    """How far the two decodes' rotations, and directions of translation, may differ."""
+    reprojection_px: float = Field(5.0, gt=0)
+    """Matches that reproject within this, at the network's resolution, agree with a pose."""
+    iterations: int = Field(2000, ge=1000)
+    """Samples of PnP's RANSAC; below 1000 it fails at 70 % outliers."""
+    inliers_min: int = Field(12, ge=6)
+    """Fewer agreeing matches are no pose."""
+    odometry_pairs_max: int = Field(256, ge=1)
+    """Odometry-pair results kept in memory."""
+    encoded_images_max: int = Field(8, ge=1)
+    """Latents of received images kept in memory, 1.5 to 3 MB each."""
+    batch_max: int = Field(1, ge=1, le=64)
+    """Images encoded, or pairs decoded, at once; more is faster on a GPU and takes about 1 GB each."""
+
+
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
@@ -182,6 +245,7 @@ class PerceptionConfig(Section):
     """classical: OpenCV, no weights; synthetic: ground truth plus noise; mast3r: CosPlace and MASt3R checkpoints."""
     classical: ClassicalConfig = ClassicalConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
+    mast3r: Mast3rConfig = Mast3rConfig()
 
 
 ENDPOINT_PATTERN = re.compile(r"(tcp|tls|quic|udp)/(\[[0-9a-fA-F:.]+\]|[^/:#?\s]+):[0-9]{1,5}([#?]\S*)?")
