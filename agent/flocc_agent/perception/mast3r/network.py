@@ -158,8 +158,17 @@ class Mast3r(nn.Module):
         self, tokens_1: Sequence[Tensor], grid_1: Grid, tokens_2: Sequence[Tensor], grid_2: Grid
     ) -> tuple[View, View]:
         """Dense outputs of both views from their token lists."""
-        view_1 = postprocess(*self.downstream_head1(tokens_1, grid_1))
-        return view_1, postprocess(*self.downstream_head2(tokens_2, grid_2))
+        dtype = self.downstream_head1.head_local_features.fc1.weight.dtype
+        raw_1 = self.downstream_head1([tokens.to(dtype) for tokens in tokens_1], grid_1)
+        raw_2 = self.downstream_head2([tokens.to(dtype) for tokens in tokens_2], grid_2)
+        return postprocess(*raw_1), postprocess(*raw_2)
+
+    def compile_parts(self) -> None:
+        """Run blocks and heads through torch.compile from now on; the first run of each size takes long."""
+        self.encode = torch.compile(self.encode)  # type: ignore[method-assign]
+        if self.with_decoder:
+            self.decoder_tokens = torch.compile(self.decoder_tokens)  # type: ignore[method-assign]
+            self.heads = torch.compile(self.heads)  # type: ignore[method-assign]
 
     def decode(
         self, latent_1: Tensor, size_1: tuple[int, int], latent_2: Tensor, size_2: tuple[int, int]
