@@ -77,13 +77,24 @@ class Run(Record):
     radio: dict[str, Any] = {}
     """Settings of the link model: loss, latency, bandwidth, range, as the scenario gave them."""
     settings: dict[str, Any] = {}
-    """Other settings worth reading beside the result, such as `similarity_min` and `match_ratio_min`."""
+    """Other settings worth reading beside the result, nested as in the configuration."""
     expectations: dict[str, float] = {}
     """Expectation -> limit, of the scenario."""
     duration_s: float | None = None
     """End of the run on the clock of `events.jsonl`; null where the last event is the end."""
     wall_s: float | None = None
     """Wall time that the run took; null where nobody measured it."""
+
+
+def setting_number(settings: Mapping[str, Any], name: str) -> float | None:
+    """The number that stands under a name at any depth of nested settings; None where there is none."""
+    for key, value in settings.items():
+        if key == name and isinstance(value, int | float):
+            return float(value)
+        found = setting_number(value, name) if isinstance(value, dict) else None
+        if found is not None:
+            return found
+    return None
 
 
 class Event(Record):
@@ -142,6 +153,13 @@ class LeaderFollowed(Event):
     leader: str | None
 
 
+class LeaderLost(Event):
+    """`leader_lost`: this robot's leader fell silent or left; it follows nobody until the next `leader`."""
+
+    term: int | str | None = None
+    reason: str | None = None
+
+
 class NeighbourUp(Event):
     """`neighbour_up`: heartbeats of a peer arrive."""
 
@@ -192,6 +210,43 @@ class PeerRefused(Event):
     reason: str
 
 
+class NameTaken(Event):
+    """`duplicate_name`: two robots run with one name."""
+
+    peer: str
+    reason: str
+
+
+class LatentFetched(Event):
+    """`latent_fetched`: a latent that a candidate needs has arrived."""
+
+    keyframe: Keyframe
+    holder: str | None = None
+
+
+class LatentFailed(Event):
+    """`latent_failed`: a latent that a candidate needs could not be fetched this time."""
+
+    keyframe: Keyframe
+    holder: str | None = None
+    reason: str
+
+
+class EncodingFailed(Event):
+    """`encoding_failed`: a keyframe has no descriptor or latent."""
+
+    keyframe: Keyframe
+    reason: str
+
+
+class OptimisationFailed(Event):
+    """`optimisation_failed`: the solver gave nothing; the last good solution stands."""
+
+    term: int | str
+    round: int
+    reason: str
+
+
 class AgentDied(Event):
     """`agent_died`: an agent ended without being asked to."""
 
@@ -209,12 +264,18 @@ EVENT_TYPES: Mapping[str, type[Event]] = {
     "closure_accepted": ClosureAccepted,
     "closure_rejected": ClosureRejected,
     "leader": LeaderFollowed,
+    "leader_lost": LeaderLost,
     "neighbour_up": NeighbourUp,
     "neighbour_down": NeighbourDown,
     "optimised": GraphOptimised,
     "correction": CorrectionApplied,
     "bytes": BytesCounted,
     "peer_refused": PeerRefused,
+    "duplicate_name": NameTaken,
+    "latent_fetched": LatentFetched,
+    "latent_failed": LatentFailed,
+    "encoding_failed": EncodingFailed,
+    "optimisation_failed": OptimisationFailed,
     "agent_died": AgentDied,
     "agent_stopped": AgentStopped,
 }

@@ -244,7 +244,7 @@ def run_of(made: Synthetic) -> Run:
         driver="launch",
         recordings={robot: f"recordings/{robot}" for robot in WAYPOINTS_M} if made.with_truth else {},
         radio={"loss_ratio": 0.1, "latency_s": 0.05, "range_m": 25.0},
-        settings={"match_ratio_min": 0.55, "similarity_min": 0.6},
+        settings={"core": {"closing": {"match_ratio_threshold": 0.55}, "places": {"similarity_threshold": 0.6}}},
         expectations={"merged_within_s": 60.0, "ate_max_m": 0.5},
         wall_s=121.4,
     )

@@ -237,7 +237,7 @@ def measured(report: Report) -> dict[str, float | None]:
         "leader_changes_max": report.leader_changes,
         "closures_min": report.closures.accepted_inter_robot,
         "closures_rejected_max": report.closures.rejected,
-        "map_frames_max": len(report.map_frames),
+        "frames_max": len(report.map_frames),
         "bytes_max": sum(report.bytes.values()),
         "wall_max_s": report.wall_s,
     }

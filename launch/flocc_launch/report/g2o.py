@@ -83,7 +83,9 @@ def closure_lines(loaded: LoadedRun, vertices: Mapping[KeyframeId, int]) -> Iter
     known: dict[tuple[str, str], ClosureKnown] = {}
     for robot in sorted(loaded.results):
         for closure in loaded.results[robot].closures:
-            known.setdefault((closure.query, closure.match), closure)
+            before = known.get((closure.query, closure.match))
+            if before is None or before.scale is None:
+                known[closure.query, closure.match] = closure
     for key in sorted(known):
         yield closure_line(known[key], loaded, vertices)
 

@@ -1,11 +1,39 @@
-"""report.html."""
+"""report.html: one file that explains a run to a person; no script, nothing fetched from elsewhere."""
 
+from importlib.resources import files
 from pathlib import Path
 
+from flocc_launch.report import sections
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report
+from flocc_launch.report.svg import element, text_of
+from flocc_launch.report.verdict import verdict
 
 
 def write_html(path: Path, report: Report, loaded: LoadedRun) -> None:
     """Write report.html."""
-    path.write_text(f"<!doctype html><title>{report.scenario}</title>{loaded.end_s}", encoding="utf-8")
+    path.write_text(page(report, loaded), encoding="utf-8")
+
+
+def page(report: Report, loaded: LoadedRun) -> str:
+    """The whole page: the verdict first, then what it rests on."""
+    body = element(
+        "main",
+        sections.kicker(report),
+        element("h1", text_of(verdict(report))),
+        sections.tiles(report),
+        sections.expectations(report),
+        sections.warnings(report),
+        sections.trajectories(report, loaded),
+        sections.over_time(report, loaded),
+        sections.closures(report, loaded),
+        sections.network(report),
+        sections.robots(report),
+        sections.settings(report, loaded),
+        sections.footer(report),
+    )
+    head = element("meta", charset="utf-8").removesuffix("</meta>")
+    head += '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    head += element("title", text_of(f"flocc: {report.scenario}"))
+    head += element("style", files("flocc_launch.report").joinpath("page.css").read_text(encoding="utf-8"))
+    return "<!doctype html>\n" + element("html", element("head", head), element("body", body), lang="en") + "\n"

@@ -132,7 +132,7 @@ class Report(Record):
     bytes_by_robot: dict[str, RobotBytes]
     leaders: list[LeaderSpan]
     leader_changes: int
-    """The most often that any one robot went from one leader to another."""
+    """How often the robots went from one leader to another, the upper median over the robots."""
     optimisations: Optimisations
     expectations: list[Expectation]
     robot_details: list[Robot]

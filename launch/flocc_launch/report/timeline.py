@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median_high
 
 from flocc_launch.run_folder import (
     AgentDied,
@@ -10,6 +11,7 @@ from flocc_launch.run_folder import (
     Event,
     KeyframeCaptured,
     LeaderFollowed,
+    LeaderLost,
     NeighbourDown,
     NeighbourUp,
     of_kind,
@@ -56,7 +58,7 @@ def followings(events: Iterable[Event], until_s: float) -> list[Following]:
         if isinstance(event, LeaderFollowed):
             close(event.robot, event.t)
             open_spans[event.robot] = event
-        elif isinstance(event, AgentDied | AgentStopped):
+        elif isinstance(event, AgentDied | AgentStopped | LeaderLost):
             close(event.robot, event.t)
     for robot in sorted(open_spans):
         close(robot, until_s)
@@ -75,14 +77,14 @@ def terms_led(spans: Iterable[Following]) -> list[Following]:
 
 
 def leader_changes(spans: Iterable[Following]) -> int:
-    """The most often that any one robot went from one leader to another."""
+    """How often the robots went from one leader to another, the upper median over the robots."""
     changes: dict[str, int] = {}
     last: dict[str, str] = {}
     for span in spans:
         changed = span.robot in last and last[span.robot] != span.leader
         changes[span.robot] = changes.get(span.robot, 0) + int(changed)
         last[span.robot] = span.leader
-    return max(changes.values(), default=0)
+    return median_high(changes.values()) if changes else 0
 
 
 def links(events: Iterable[Event], until_s: float) -> list[Link]:

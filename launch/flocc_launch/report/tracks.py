@@ -11,6 +11,7 @@ from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.trajectory import Trajectory, read_tum
 from flocc_launch.evaluation import associate, placed_at_true_start
 from flocc_launch.run_folder import Event, KeyframeCaptured, RobotResult, RunFolder, of_kind, stacked_poses
+from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -22,6 +23,7 @@ class Track:
 
     Attributes:
         robot: Its name.
+        incarnation: Of the log that these keyframes are in.
         map_frame: Frame of `T_map_body`, None where the robot was never corrected.
         stamps_s: (N,) on the recording's clock.
         T_odom_body: (N, 4, 4) odometry.
@@ -32,6 +34,7 @@ class Track:
     """
 
     robot: str
+    incarnation: int
     map_frame: str | None
     stamps_s: Float
     T_odom_body: Float
@@ -81,18 +84,20 @@ def track_of_result(result: RobotResult, truth: Trajectory | None) -> Track:
             T_map_body[k] = pose_from_tq(np.array(keyframe.T_map_body))
         elif result.T_map_odom is not None:
             T_map_body[k] = pose_from_tq(np.array(result.T_map_odom)) @ T_odom_body[k]
-    return completed(result.robot, result.map_frame, stamps_s, T_odom_body, T_map_body, truth)
+    return completed(result.robot, result.incarnation, result.map_frame, stamps_s, T_odom_body, T_map_body, truth)
 
 
 def track_of_events(events: list[KeyframeCaptured], robot: str, truth: Trajectory | None) -> Track:
     """Track of a robot that left no result: odometry only."""
     stamps_s = np.array([event.stamp_s for event in events])
     T_odom_body = stacked_poses([event.T_odom_body for event in events])
-    return completed(robot, None, stamps_s, T_odom_body, np.full_like(T_odom_body, np.nan), truth)
+    incarnation = KeyframeId.parse(events[-1].keyframe).log.incarnation if events else 0
+    return completed(robot, incarnation, None, stamps_s, T_odom_body, np.full_like(T_odom_body, np.nan), truth)
 
 
 def completed(
     robot: str,
+    incarnation: int,
     map_frame: str | None,
     stamps_s: Float,
     T_odom_body: Float,
@@ -106,7 +111,7 @@ def completed(
         true, poses = associate(stamps_s, truth)
         T_world_body[true] = poses
     corrected: Mask = np.asarray(np.isfinite(T_map_body).all(axis=(1, 2)))
-    return Track(robot, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
+    return Track(robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
 
 
 def ground_truth(folder: RunFolder, robot: str) -> Trajectory | None:

@@ -1,0 +1,61 @@
+"""The run in one or two sentences."""
+
+from flocc_launch.report.model import Report
+from flocc_launch.report.svg import number, seconds
+
+COUNT_WORDS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine"}
+
+
+def verdict(report: Report) -> str:
+    """Whether the maps merged, when, and what it did to the error."""
+    return " ".join(sentence for sentence in (map_sentence(report), error_sentence(report)) if sentence)
+
+
+def map_sentence(report: Report) -> str:
+    """Whether the robots that lived to the end share one map."""
+    died = [robot.robot for robot in report.robot_details if robot.end == "died"]
+    living = [robot for robot in report.robot_details if robot.end != "died"]
+    frames = {robot.map_frame for robot in living}
+    who = f"{listed(died)} died; " if died else ""
+    if len(report.robots) == 1:
+        return f"One robot ran, {'with' if report.map_frames else 'without'} corrections."
+    if not report.map_frames:
+        return f"{who}no robot was ever corrected.".capitalize() if not who else f"{who}no robot was ever corrected."
+    if len(living) > 1 and len(frames) == 1 and None not in frames:
+        everyone = f"the other {word(len(living))} robots" if died else f"all {word(len(living))} robots"
+        when = "" if report.merged_after_s is None else f" after {seconds(report.merged_after_s)}"
+        return sentence(f"{who}{everyone} found one common map{when}.")
+    apart = sum(frame is None for frame in (robot.map_frame for robot in living))
+    maps = len(frames - {None})
+    unplaced = f" and {word(apart)} without any" if apart else ""
+    return sentence(
+        f"{who}the robots did not merge: {word(maps)} separate map{'s' * (maps != 1)} at the end{unplaced}."
+    )
+
+
+def error_sentence(report: Report) -> str:
+    """What the joint error came to, against odometry alone."""
+    before, after = report.ate_joint_odometry_m, report.ate_joint_m
+    if before is None and not any(value is not None for value in report.ate_odometry_m.values()):
+        return "There is no ground truth, so the error is not known."
+    if after is None or before is None:
+        return ""
+    if after < before:
+        return f"The joint error fell from {number(before, 'm')} (odometry alone) to {number(after, 'm')}."
+    return f"The joint error is {number(after, 'm')}, not better than odometry alone ({number(before, 'm')})."
+
+
+def sentence(text: str) -> str:
+    """The text with its first letter as a sentence has it; names of robots stay as they are."""
+    first = text.split(" ", 1)[0]
+    return text if any(letter.isdigit() for letter in first) else text[:1].upper() + text[1:]
+
+
+def word(count: int) -> str:
+    """A small number in letters."""
+    return COUNT_WORDS.get(count, str(count))
+
+
+def listed(names: list[str]) -> str:
+    """Names as in a sentence."""
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

@@ -1,0 +1,136 @@
+"""report.html: what it says, that it needs nothing else, and that it is well formed."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from tests.launch import synthetic_run
+from tests.launch.synthetic_run import Synthetic
+
+from flocc_launch.report import Report, finish
+from flocc_launch.report.html import page
+from flocc_launch.report.load import load
+from flocc_launch.report.svg import Axis, number, seconds, size_of, thinned
+from flocc_launch.report.verdict import verdict
+
+VOID = {"meta", "input"}
+
+
+class Balance(HTMLParser):
+    """Fails on an end tag that closes something else."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def html_of(path: Path, options: Synthetic | None = None) -> tuple[str, Report]:
+    folder = synthetic_run.write(path / "run", options)
+    report = finish(folder)
+    return (folder.path / "report.html").read_text(), report
+
+
+@pytest.mark.parametrize(
+    "options",
+    [Synthetic(), Synthetic(died=("r1", 50.0)), Synthetic(merged_s=None), Synthetic(with_truth=False)],
+    ids=["merged", "died", "apart", "no truth"],
+)
+def test_the_page_is_well_formed_and_needs_nothing_else(tmp_path: Path, options: Synthetic) -> None:
+    html, _ = html_of(tmp_path, options)
+    parser = Balance()
+    parser.feed(html)
+    assert parser.open == []
+    assert not re.search(r"https?://|<script|<link|@import|url\(|src=", html)
+    drawings = re.findall(r"<svg.*?</svg>", html, re.DOTALL)
+    assert len(drawings) > 8
+    for drawing in drawings:
+        assert "nan" not in re.sub(r">[^<]*<", "><", drawing).lower()
+        ElementTree.fromstring(drawing)
+
+
+def test_the_page_shows_every_part(tmp_path: Path) -> None:
+    html, report = html_of(tmp_path)
+    for heading in ("Where the robots went", "What happened when", "Loop closures", "What travelled", "Settings"):
+        assert f"<h2>{heading}</h2>" in html
+    for text in ("63 accepted", "31 rejected", "few correspondences", "latents", "map/r1", "one map after 41.3 s"):
+        assert text in html
+    assert html.count('class="closure"') == report.closures.accepted + 1
+    assert ">seed</td><td><code>7</code>" in html
+
+
+def test_names_from_outside_are_escaped(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run")
+    run = folder.run().model_copy(update={"scenario": "<b onload='x'>&", "settings": {"<i>": "</code>"}})
+    folder.write_run(run)
+    report = finish(folder)
+    html = page(report, load(folder))
+    assert "<b onload" not in html
+    assert "<i>" not in html
+    assert "&lt;b onload=" in html
+
+
+def test_the_verdict_says_what_became_of_the_maps(tmp_path: Path) -> None:
+    said = {
+        "merged": Synthetic(),
+        "died": Synthetic(died=("r1", 50.0)),
+        "apart": Synthetic(merged_s=None),
+        "no truth": Synthetic(with_truth=False),
+    }
+    verdicts = {name: verdict(html_of(tmp_path / name, options)[1]) for name, options in said.items()}
+    assert verdicts == {
+        "merged": "All three robots found one common map after 41.3 s. "
+        "The joint error fell from 1.64 m (odometry alone) to 0.134 m.",
+        "died": "r1 died; the other two robots found one common map after 41.3 s.",
+        "apart": "The robots did not merge: three separate maps at the end.",
+        "no truth": "All three robots found one common map after 41.3 s. "
+        "There is no ground truth, so the error is not known.",
+    }
+
+
+def test_the_verdict_does_not_hide_a_correction_that_did_not_help(tmp_path: Path) -> None:
+    report = html_of(tmp_path)[1].model_copy(update={"ate_joint_m": 2.0})
+    assert verdict(report).endswith("The joint error is 2.00 m, not better than odometry alone (1.64 m).")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (number(0.13353), "0.134"),
+        (number(1.6371, "m"), "1.64 m"),
+        (number(0), "0"),
+        (number(None), "–"),
+        (number(12345.6), "12 346"),
+        (seconds(61), "61.0 s"),
+        (seconds(125), "2 min 5 s"),
+        (seconds(7300), "2 h 1 min"),
+        (size_of(12_263_100), "12.3 MB"),
+        (size_of(640), "640 B"),
+    ],
+)
+def test_numbers_are_written_for_people(text: str, expected: str) -> None:
+    assert text == expected
+
+
+def test_ticks_are_round_and_within_the_axis() -> None:
+    assert Axis(0.0, 101.7, 0, 1).ticks(5) == [0, 50, 100]
+    assert Axis(-0.35, 0.35, 0, 1).ticks(3) == pytest.approx([0.0], abs=1e-12)
+    assert Axis(3.0, 3.0, 0, 1).ticks() == [3.0]
+
+
+def test_a_long_line_keeps_its_end() -> None:
+    points = [(float(k), 0.0) for k in range(10_007)]
+    kept = thinned(points)
+    assert len(kept) <= 1501
+    assert (kept[0], kept[-1]) == (points[0], points[-1])
