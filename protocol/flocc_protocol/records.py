@@ -7,9 +7,12 @@ into a checksum, so that a fork (two writers of one log) is noticed and refused.
 import zlib
 from dataclasses import dataclass
 
+import numpy as np
+
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import (
     ARRAY,
+    COORDINATE_MAX,
     COUNT,
     KEYFRAME_ID,
     POSE,
@@ -95,6 +98,10 @@ class RejectionRecord:
     correspondences: int
     odometry_correspondences: int
 
+    def __post_init__(self) -> None:
+        if self.query == self.match:
+            raise ValueError(f"a rejection joins two different keyframes, not {self.query} with itself")
+
 
 @dataclass(frozen=True, slots=True)
 class FixRecord:
@@ -107,6 +114,8 @@ class FixRecord:
     def __post_init__(self) -> None:
         if self.position_m.shape != (3,) or self.covariance_m2.shape != (9,):
             raise ValueError("a fix has a position of 3 and a covariance of 9")
+        if np.max(np.abs(self.position_m.numpy())) > COORDINATE_MAX:
+            raise ValueError("a fix must be within the map")
 
 
 Record = KeyframeRecord | ClosureRecord | RejectionRecord | FixRecord

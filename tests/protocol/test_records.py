@@ -85,6 +85,8 @@ def test_a_record_that_others_would_refuse_is_a_value_error_here(record: Record)
         lambda: replace(KEYFRAME, descriptor=Array.of(np.zeros(0))),
         lambda: replace(KEYFRAME, descriptor=Array.of(np.zeros(DESCRIPTOR_DIMENSION_MAX + 1))),
         lambda: replace(CLOSURE, match=CLOSURE.query),
+        lambda: RejectionRecord(CLOSURE.query, CLOSURE.query, "", 0, 0),
+        lambda: FixRecord(0, Array.of(np.array([0, 0, 2e7]), "f8"), Array.of(np.zeros(9))),
         lambda: replace(CLOSURE, covariance=Array.of(np.eye(6))),
         lambda: FixRecord(0, Array.of(np.zeros(2)), Array.of(np.zeros(9))),
         lambda: FixRecord(0, Array.of(np.zeros(3)), Array.of(np.zeros((3, 3)))),

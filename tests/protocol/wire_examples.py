@@ -217,8 +217,17 @@ records: st.SearchStrategy[Record] = st.one_of(
             optional_arrays((21,)),
         )
     ),
-    st.builds(RejectionRecord, keyframe_ids, keyframe_ids, st.text(max_size=REASON_LENGTH_MAX), _counts, _counts),
-    st.builds(FixRecord, _counts, arrays((3,)), arrays((9,))),
+    pairs.flatmap(
+        lambda pair: st.builds(
+            RejectionRecord,
+            st.just(pair.low),
+            st.just(pair.high),
+            st.text(max_size=REASON_LENGTH_MAX),
+            _counts,
+            _counts,
+        )
+    ),
+    st.builds(FixRecord, _counts, arrays((3,), "f8 f4"), arrays((9,))),
 )
 
 
