@@ -207,7 +207,7 @@ class Mast3rConfig(Section):
     jpeg_quality: int = Field(90, ge=50, le=100)
     """Quality of sent images; lower is smaller and less exact."""
     place_input: Literal["native", "shorter-side", "swarm-slam"] = "swarm-slam"
-    """What CosPlace sees: the whole picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
+    """What CosPlace sees: the picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
     subsample_px: int = Field(8, ge=1, le=64)
     """Distance of the matcher's seeds; 16 is four times faster with a quarter of the matches; equal on all robots."""
     border_px: int = Field(3, ge=0)

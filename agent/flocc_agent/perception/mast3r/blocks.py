@@ -3,8 +3,8 @@
 from enum import Enum
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn import functional
 
 from flocc_agent.perception.mast3r.rope import Rotation, rotate
 
@@ -22,7 +22,7 @@ class AttentionKind(Enum):
 def attend(q: Tensor, k: Tensor, v: Tensor, kind: AttentionKind) -> Tensor:
     """Attention of (B, heads, S, d) queries over (B, heads, T, d) keys and values; gives (B, S, heads * d)."""
     if kind is AttentionKind.SDPA:
-        out = F.scaled_dot_product_attention(q, k, v)
+        out = functional.scaled_dot_product_attention(q, k, v)
     else:
         weights = (q @ k.transpose(-2, -1)) * q.shape[-1] ** -0.5
         out = weights.softmax(dim=-1) @ v
@@ -44,7 +44,7 @@ class Mlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., dim) to (..., out)."""
-        return self.fc2(F.gelu(self.fc1(x)))  # type: ignore[no-any-return]
+        return self.fc2(functional.gelu(self.fc1(x)))  # type: ignore[no-any-return]
 
 
 class SelfAttention(nn.Module):
@@ -59,8 +59,10 @@ class SelfAttention(nn.Module):
 
     def forward(self, x: Tensor, rotation: Rotation) -> Tensor:
         """Map (B, S, dim) to (B, S, dim)."""
-        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        return self.proj(attend(rotate(q, rotation), rotate(k, rotation), v, self.kind))  # type: ignore[no-any-return]
+        batch, count, _ = x.shape
+        q, k, v = self.qkv(x).view(batch, count, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+        out: Tensor = self.proj(attend(rotate(q, rotation), rotate(k, rotation), v, self.kind))
+        return out
 
 
 class CrossAttention(nn.Module):
@@ -76,7 +78,7 @@ class CrossAttention(nn.Module):
         self.proj = nn.Linear(dim, dim)
 
     def _split(self, x: Tensor) -> Tensor:
-        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        return x.view(x.shape[0], x.shape[1], self.heads, -1).transpose(1, 2)
 
     def forward(self, x: Tensor, y: Tensor, x_rotation: Rotation, y_rotation: Rotation) -> Tensor:
         """Map queries x (B, S, dim) and the other view's tokens y (B, T, dim) to (B, S, dim)."""

@@ -207,7 +207,7 @@ def identity(state: State, keys: list[str]) -> str:
     for key in sorted(keys):
         tensor = state[key].detach().contiguous()
         digest.update(f"{key}|{tuple(tensor.shape)}|{tensor.dtype}".encode())
-        digest.update(memoryview(tensor.reshape(-1).view(torch.uint8).numpy()))
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()[:IDENTITY_LENGTH]
 
 

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn import functional
 
 from flocc_agent.perception.mast3r.blocks import Mlp
 from flocc_agent.perception.mast3r.sizes import LOCAL_DIMENSION, PATCH_PX, Mast3rSizes
@@ -12,9 +12,15 @@ from flocc_agent.perception.mast3r.sizes import LOCAL_DIMENSION, PATCH_PX, Mast3
 POINT_AND_CONFIDENCE_DIM = 4
 
 
+def as_map(tokens: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Tokens (B, S, C) as a map (B, C, gh, gw); a view, whose memory has channels last."""
+    batch, _, channels = tokens.shape
+    return tokens.transpose(1, 2).reshape(batch, channels, *grid)
+
+
 def upsample2(x: Tensor) -> Tensor:
     """Bilinear upsampling by two with aligned corners."""
-    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+    return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
 
 
 class ResidualConv(nn.Module):
@@ -27,7 +33,7 @@ class ResidualConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, dim, h, w) to the same shape."""
-        return x + self.conv2(F.relu(self.conv1(F.relu(x))))  # type: ignore[no-any-return]
+        return x + self.conv2(functional.relu(self.conv1(functional.relu(x))))  # type: ignore[no-any-return]
 
 
 class Fusion(nn.Module):
@@ -93,7 +99,7 @@ class Dpt(nn.Module):
 
     def levels(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> list[Tensor]:
         """Token maps at strides 4, 8, 16 and 32, each with its own channels."""
-        maps = [tokens[k].transpose(1, 2).unflatten(-1, grid) for k in self.hooks]
+        maps = [as_map(tokens[k], grid) for k in self.hooks]
         return [adapter(x) for adapter, x in zip(self.act_postprocess, maps, strict=True)]
 
     def fuse(self, levels: Sequence[Tensor], grid: tuple[int, int]) -> list[Tensor]:
@@ -110,8 +116,10 @@ class Dpt(nn.Module):
         path1 = self.fuse(self.levels(tokens, grid), grid)[-1]
         x = self.head[:-1](path1)
         last = self.head[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
         # The exponentials that follow amplify rounding: the last projection is float32 in every mode.
-        return F.conv2d(x.float(), last.weight.float(), last.bias.float())
+        return functional.conv2d(x.float(), last.weight.float(), last.bias.float())
 
 
 class Head(nn.Module):
@@ -129,5 +137,5 @@ class Head(nn.Module):
 
     def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Raw points and confidence (B, 4, H, W) and raw local features (B, 25, H, W), float32."""
-        local = self.local(tokens).transpose(1, 2).unflatten(-1, grid)
-        return self.dpt(tokens, grid), F.pixel_shuffle(local, PATCH_PX).float()
+        local = functional.pixel_shuffle(as_map(self.local(tokens), grid), PATCH_PX)
+        return self.dpt(tokens, grid), local.float()

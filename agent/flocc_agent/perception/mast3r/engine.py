@@ -6,8 +6,9 @@ would only share the same cores and double the memory.
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from flocc_agent.perception.mast3r.network import Mast3r, View
 
 Float32 = NDArray[np.float32]
 Size = tuple[int, int]
+Result = TypeVar("Result")
 
 ENCODE_SMOOTHING_RATIO = 0.2
 
@@ -108,7 +110,7 @@ class Engine:
         before = self.encode_s
         self.encode_s = seconds if before is None else before + ENCODE_SMOOTHING_RATIO * (seconds - before)
 
-    def _run(self, function, *arguments):  # type: ignore[no-untyped-def]
+    def _run(self, function: Callable[..., Result], *arguments: object) -> Result:
         """Call the network; running out of memory becomes one clear error, and what was cached is freed."""
         try:
             return function(*arguments)
@@ -126,7 +128,7 @@ def prepared(network: Mast3r, compute: Compute) -> Mast3r:
     if network.with_decoder:
         for head in (network.downstream_head1, network.downstream_head2):
             head.to(compute.head_dtype)
-            head.dpt.to(memory_format=torch.channels_last)
+            head.dpt.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network.eval().requires_grad_(False)
 
 

@@ -75,11 +75,11 @@ def nearest(queries: Tensor, database: Tensor) -> Tensor:
         (Q,) int64.
     """
     block = BLOCK_CPU if database.device.type == "cpu" else BLOCK_ACCELERATOR
-    blocks = database.split(block)
+    blocks = [database[k : k + block] for k in range(0, len(database), block)]
     best_of_block = torch.stack([(queries @ rows.T).amax(dim=1) for rows in blocks])
     winner = best_of_block.argmax(dim=0)
     found = torch.empty(len(queries), dtype=torch.int64, device=database.device)
-    for k in winner.unique().tolist():
+    for k in np.unique(winner.cpu().numpy()).tolist():
         chosen = (winner == k).nonzero()[:, 0]
         found[chosen] = k * block + (queries[chosen] @ blocks[k].T).argmax(dim=1)
     return found
@@ -146,9 +146,7 @@ def reciprocal_matches(
         search: Finds nearest neighbours.
     """
     start = seeds(desc_1.shape[0], desc_1.shape[1], subsample, desc_1.device)
-    index_1, index_2, converged = reciprocal_indices(
-        desc_1.flatten(0, 1), desc_2.flatten(0, 1), start, rounds, search
-    )
+    index_1, index_2, converged = reciprocal_indices(desc_1.flatten(0, 1), desc_2.flatten(0, 1), start, rounds, search)
     pairs = torch.unique(torch.stack([index_1[converged], index_2[converged]], dim=1), dim=0)
     return Matches(_pixels(pairs[:, 0], desc_1.shape[1]), _pixels(pairs[:, 1], desc_2.shape[1]))
 
@@ -198,9 +196,7 @@ def match_confidences(matches: Matches, confidence_1: Tensor, confidence_2: Tens
     return torch.minimum(of_1, of_2).float().cpu().numpy()
 
 
-def match_views(
-    desc: tuple[Tensor, Tensor], confidence: tuple[Tensor, Tensor], parameters: MatchParameters
-) -> Matches:
+def match_views(desc: tuple[Tensor, Tensor], confidence: tuple[Tensor, Tensor], parameters: MatchParameters) -> Matches:
     """Match two views with all filters applied; the count of Eq. (1) is the length of what this gives.
 
     Args:

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import angle_rad
-from flocc_agent.perception.mast3r.matching import MatchParameters, Matches, match_views
+from flocc_agent.perception.mast3r.matching import Matches, MatchParameters, match_views
 from flocc_agent.perception.mast3r.network import View
 from flocc_agent.perception.mast3r.payload import Geometry
 from flocc_agent.perception.mast3r.relative_pose import (

@@ -90,9 +90,9 @@ def dequantised(content: Latent) -> Float32:
     values, scale = content.arrays["latent"], content.arrays.get("scale")
     if values.ndim == 2 and values.dtype == np.float16 and scale is None:
         return values.astype(np.float32)
-    if values.ndim == 2 and values.dtype == np.int8 and scale is not None:
-        if scale.dtype == np.float32 and scale.shape == (values.shape[1],):
-            return np.asarray(values * scale, np.float32)
+    per_channel = scale is not None and scale.dtype == np.float32 and scale.shape == values.shape[1:]
+    if values.ndim == 2 and values.dtype == np.int8 and per_channel:
+        return np.asarray(values * scale, np.float32)
     raise BadLatent(f"the latent's values are {values.dtype} {values.shape} without the scales that belong to them")
 
 
@@ -199,7 +199,7 @@ def _crop(value: object) -> Crop:
     inside = 0 <= crop.x0 <= crop.resized_width - crop.width and 0 <= crop.y0 <= crop.resized_height - crop.height
     sides = (crop.width, crop.height)
     fits = all(PATCH_PX <= side <= SIDE_MAX_PX and side % PATCH_PX == 0 for side in sides)
-    if not (inside and fits and 1 <= min(value[:2]) and max(value) <= SOURCE_SIDE_MAX_PX):
+    if not (inside and fits and min(value[:2]) >= 1 and max(value) <= SOURCE_SIDE_MAX_PX):
         raise BadLatent(f"the latent's header has an impossible crop {value}")
     return crop
 
@@ -209,7 +209,7 @@ def _calibration(value: object) -> Float:
     if not isinstance(value, list) or len(value) != 4 or not all(isinstance(number, (int, float)) for number in value):
         raise BadLatent("the latent's header lacks its intrinsics")
     fx, fy, cx, cy = (float(number) for number in value)
-    if not (np.all(np.isfinite([fx, fy, cx, cy])) and 1.0 <= min(fx, fy) and max(fx, fy, abs(cx), abs(cy)) <= 1e6):
+    if not (np.all(np.isfinite([fx, fy, cx, cy])) and min(fx, fy) >= 1.0 and max(fx, fy, abs(cx), abs(cy)) <= 1e6):
         raise BadLatent(f"the latent's header has impossible intrinsics {value}")
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 

@@ -6,6 +6,7 @@ depth only and put it on the pixel's true ray; uncalibrated ones estimate the fo
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -174,17 +175,22 @@ def _ransac(
     count = 0 if not found or inliers is None else len(inliers)
     if count < parameters.inliers_min:
         return PoseFailed(f"{count} of {len(points)} matches agree on a pose, {parameters.inliers_min} needed")
-    T_2_1 = pose(cv2.Rodrigues(rotation)[0], t[:, 0])
-    kept = inliers[:, 0]
+    T_2_1 = pose_of(rotation, t)
+    kept = np.asarray(inliers[:, 0], np.intp)
     for _ in range(2):
         rotation, t = cv2.solvePnPRefineLM(points[kept], uv[kept].astype(np.float64), K, None, rotation, t)
-        T_2_1 = pose(cv2.Rodrigues(rotation)[0], t[:, 0])
+        T_2_1 = pose_of(rotation, t)
         kept = np.flatnonzero(reprojection_errors_px(points, uv, K, T_2_1) < parameters.reprojection_px)
         if len(kept) < parameters.inliers_min:
             return PoseFailed(f"{len(kept)} matches agree after refinement, {parameters.inliers_min} needed")
     if not np.all(np.isfinite(T_2_1)):
         return PoseFailed("PnP gave no finite pose", degenerate=True)
     return T_2_1, kept
+
+
+def pose_of(rotation: NDArray[Any], t: NDArray[Any]) -> Float:
+    """Pose of OpenCV's rotation vector and translation, (3, 1) each."""
+    return pose(np.asarray(cv2.Rodrigues(rotation)[0], np.float64), np.asarray(t[:, 0], np.float64))
 
 
 def reprojection_errors_px(points: Float, uv: Float, K: Float, T_2_1: Float) -> Float:
@@ -202,7 +208,9 @@ def reprojection_jacobian(points: Float, K: Float, T_2_1: Float) -> Float:
     fx, fy, one, zero = K[0, 0], K[1, 1], np.ones_like(x), np.zeros_like(x)
     by_point = np.array([[fx / z, zero, -fx * x / z**2], [zero, fy / z, -fy * y / z**2]]).transpose(2, 0, 1)
     # T_2_1 becomes Exp(-xi) T_2_1, so a point moves by hat(p) omega - v.
-    by_xi = np.array([[zero, -z, y, -one, zero, zero], [z, zero, -x, zero, -one, zero], [-y, x, zero, zero, zero, -one]])
+    by_xi = np.array(
+        [[zero, -z, y, -one, zero, zero], [z, zero, -x, zero, -one, zero], [-y, x, zero, zero, zero, -one]]
+    )
     return np.asarray((by_point @ by_xi.transpose(2, 0, 1)).reshape(-1, 6))
 
 

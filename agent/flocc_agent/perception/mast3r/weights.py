@@ -98,7 +98,8 @@ def load_mast3r(
     with torch.device("meta"):
         network = Mast3r(sizes, with_decoder, attention)
     load_strictly(network, checkpoint, dtype, device)
-    return LoadedMast3r(network, f"mast3r-{identity(encoder_part(checkpoint.state), sorted(encoder_part(checkpoint.state)))}")
+    encoder = encoder_part(checkpoint.state)
+    return LoadedMast3r(network, f"mast3r-{identity(encoder, list(encoder))}")
 
 
 def backbone_of(checkpoint: Checkpoint) -> str:
@@ -110,9 +111,9 @@ def backbone_of(checkpoint: Checkpoint) -> str:
     keys = checkpoint.state.keys()
     if "backbone.28.weight" in keys:
         return "VGG16"
-    blocks = {stage: len({key.split(".")[2] for key in keys if key.startswith(f"backbone.{stage}.")}) for stage in (5, 6)}
-    name = STAGE_2_BLOCKS.get(blocks[5], "")
-    if name == "ResNet50" and blocks[6] == 23:
+    second, third = (len({key.split(".")[2] for key in keys if key.startswith(f"backbone.{k}.")}) for k in (5, 6))
+    name = STAGE_2_BLOCKS.get(second, "")
+    if name == "ResNet50" and third == 23:
         name = "ResNet101"
     if not name:
         raise BadCheckpoint(f"{checkpoint.path}: holds no backbone that CosPlace uses")
