@@ -1,16 +1,43 @@
 """The composition root: names the concrete perception back-ends, the optimiser and the runtime.
 
-Everything heavy (OpenCV, GTSAM, torch, zenoh) is imported in the function that needs it.
+Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is imported where it is used.
 """
 
-from collections.abc import Callable
+import asyncio
+import os
+import time
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeVar
 
-from flocc_agent.config import BackendConfig, PerceptionConfig
-from flocc_agent.core.interfaces import Describer, Encoder, Image, OdometryPair, Registrar
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.config import AgentConfig, BackendConfig, PerceptionConfig, RadioConfig
+from flocc_agent.core.effects import Correction
+from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, OdometryPair, Registrar
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import is_rigid
+from flocc_agent.radio import Radio
+from flocc_agent.runtime.driver import Driver, Skills
+from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.persistence import restore
+from flocc_agent.runtime.playback import play
+from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.reporting import Reporter
+from flocc_agent.runtime.store import Store
+from flocc_agent.runtime.workers import Workers
+from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.arrays import Array
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import LogId
+
+T = TypeVar("T")
+
+Float = NDArray[np.float64]
 
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
 
@@ -68,3 +95,246 @@ def build_optimiser(config: BackendConfig) -> Optimiser:
     from flocc_agent.backend.optimiser import optimise
 
     return lambda graph, initial: optimise(graph, config, initial)
+
+
+class Agent:
+    """One robot's agent, for the robot's own program.
+
+    Example::
+
+        async with Agent(AgentConfig(name="r1"), camera=camera) as agent:
+            await agent.add_keyframe(pixels, T_odom_body, stamp_s)      # (H, W, 3) uint8 RGB, (4, 4), seconds
+            async for correction in agent.corrections():
+                T_map_body = correction.T_map_odom @ T_odom_body
+    """
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        camera: Camera | None = None,
+        T_body_camera: Float | None = None,
+        on_line: Callable[[dict[str, Any]], None] | None = None,
+        clock_s: Callable[[], float] | None = None,
+    ) -> None:
+        """Prepare an agent; `async with` starts it.
+
+        Args:
+            config: Everything that can be turned.
+            camera: Intrinsics of the images; None where a recording brings its own.
+            T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
+            on_line: Takes each event as a dictionary (see docs/report.md); must not block.
+            clock_s: Seconds since the start of the run; None counts from now.
+
+        Raises:
+            FloccError: The recording, the store, a checkpoint or the network cannot be used.
+        """
+        started_s = time.monotonic()
+        self.config = config
+        self._on_line = on_line or (lambda _: None)
+        self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
+        self._recording = _recording(config)
+        self._camera = self._recording.camera if self._recording else camera
+        given = np.eye(4) if T_body_camera is None else T_body_camera
+        self._T_body_camera = self._recording.T_body_camera if self._recording else given
+        self._selector = KeyframeSelector(config.keyframes)
+        self._driver: Driver | None = None
+        self._store: Store | None = None
+        self._run: asyncio.Task[None] | None = None
+        self._playing: asyncio.Task[None] | None = None
+        self._radio: Radio | None = None
+        self._slowness = 1.0
+
+    @property
+    def log(self) -> LogId:
+        """The log that this agent writes: its name and incarnation."""
+        return self._started.robot.log
+
+    async def __aenter__(self) -> "Agent":
+        """Open the store and the network, restore what the disk holds, start the loop and the playback."""
+        try:
+            self._driver = await asyncio.to_thread(self._compose)
+            self._run = asyncio.create_task(self._driver.run())
+            await self._driver.opened(self._run)
+        except BaseException:
+            self._close_store()
+            raise
+        if self._recording is not None:
+            self._playing = asyncio.create_task(self._play(self._recording))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Hand over, close everything; an error of the loop is raised here."""
+        assert self._run is not None
+        self.stop()
+        if self._playing is not None:
+            self._playing.cancel()
+        try:
+            await self._run
+            if self._playing is not None:
+                await asyncio.gather(self._playing, return_exceptions=True)
+        finally:
+            self._close_store()
+
+    async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
+        """Give the agent a keyframe; waits while too many wait for the encoder.
+
+        Args:
+            pixels: (H, W, 3) uint8, RGB, of the size that the camera says.
+            T_odom_body: (4, 4) metric odometry of the body at the time of the image.
+            stamp_s: Time of the image on the robot's clock, seconds.
+
+        Raises:
+            BadKeyframe: The pose is not finite and rigid, the image does not fit the camera, or there is no camera.
+        """
+        if self._camera is None:
+            raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
+        if not is_rigid(np.asarray(T_odom_body)) or not np.isfinite(stamp_s):
+            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: its pose is not finite and rigid")
+        try:
+            image = Image(pixels, self._camera)
+        except ValueError as error:
+            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
+        await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+
+    async def add_frame(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> bool:
+        """Give the agent any frame; it becomes a keyframe when the robot moved enough. Returns whether it did."""
+        if not self._selector.wants(T_odom_body):
+            return False
+        await self.add_keyframe(pixels, T_odom_body, stamp_s)
+        self._selector.took(T_odom_body)
+        return True
+
+    def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
+        """Give the agent an absolute position (3,) of the last keyframe's camera, with its covariance (3, 3)."""
+        self._started.add_fix(position_m, covariance_m2)
+
+    async def corrections(self) -> AsyncIterator[Correction]:
+        """Corrections as they come, the last one first; ends when the agent stops."""
+        queue = self._started.subscribe()
+        while (correction := await queue.get()) is not None:
+            yield correction
+
+    def stop(self) -> None:
+        """Ask the agent to hand over and end."""
+        if self._driver is not None:
+            self._driver.stop()
+
+    async def finished(self) -> None:
+        """Wait until the agent stops, by `stop`, or by the end of its recording and `hold_s`.
+
+        Raises:
+            FloccError: The recording cannot be played on.
+        """
+        assert self._run is not None
+        waiting: set[asyncio.Task[None]] = {self._run}
+        if self._playing is not None:
+            waiting.add(self._playing)
+        while self._run not in (done := (await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED))[0]):
+            waiting -= done
+            for task in done:
+                task.result()
+
+    def result(self) -> dict[str, Any] | None:
+        """What this robot knows (`result.json`), None before it started."""
+        return None if self._driver is None else self._driver.result()
+
+    def set_radio(self, config: RadioConfig) -> None:
+        """Change the emulated links from now on."""
+        if self._radio is not None:
+            self._radio.parameters = config.parameters()
+
+    def set_slowness(self, factor: float) -> None:
+        """Make encoding, registration and optimisation take this many times as long, for tests."""
+        self._slowness = max(factor, 1.0)
+
+    def status(self) -> dict[str, Any]:
+        """What the agent does now, for tables and dashboards."""
+        status = self._started.status()
+        playing = self._playing is not None and not self._playing.done()
+        return {**status, "playing": playing, "busy": status["busy"] or playing}
+
+    @property
+    def _started(self) -> Driver:
+        if self._driver is None:
+            raise RuntimeError("the agent is not running; use it in 'async with'")
+        return self._driver
+
+    def _compose(self) -> Driver:
+        """Name every concrete class."""
+        config = self.config
+        self._store = Store.open(
+            None if config.folder is None else config.folder / "store",
+            config.name,
+            config.store,
+            incarnation=_drawn_incarnation() if config.incarnation is None else config.incarnation,
+            incarnation_after_loss=_drawn_incarnation(),
+        )
+        parameters = config.radio.parameters()
+        rng = np.random.default_rng(config.seed)
+        self._radio = Radio(parameters, rng)
+        perception = build_perception(config.perception, config.seed)
+        restored = restore(self._store)
+        log = self._store.identity.log
+        boot = int.from_bytes(os.urandom(6))
+        core = Robot(log, config.compute_class, boot, config.core, self._clock_s(), restored)
+        return Driver(
+            core,
+            ZenohTransport(config.swarm, config.name, config.transport, self._radio, self._clock_s),
+            self._store,
+            Workers(),
+            Skills(
+                lambda image: self._slowed(perception.encode, image),
+                lambda *latents: self._slowed(perception.register, *latents),
+                partial(optimise_graph, config.backend),
+            ),
+            Reporter(config.name, self._T_body_camera, config.backend.steepness),
+            self._on_line,
+            self._clock_s,
+        )
+
+    def _slowed(self, function: Callable[..., T], *arguments: Any) -> T:
+        started_s = time.monotonic()
+        result = function(*arguments)
+        time.sleep((self._slowness - 1.0) * (time.monotonic() - started_s))
+        return result
+
+    async def _play(self, recording: Recording) -> None:
+        source = self.config.source
+        resumed = len(self._started.robot.gossip.logs[self.log]) > 0
+
+        async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
+            await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+
+        await play(recording, source, self._selector, add, self._clock_s, self._on_position, resumed)
+        if source.hold_s > 0:
+            await asyncio.sleep(source.hold_s)
+            self.stop()
+
+    def _on_position(self, position_m: Float) -> None:
+        if self._radio is not None:
+            self._radio.update_position(self.config.name, position_m)
+
+    def _close_store(self) -> None:
+        if self._store is not None:
+            self._store.close()
+
+
+class BadKeyframe(FloccError):
+    """A keyframe that cannot be used; the agent goes on without it."""
+
+
+def optimise_graph(
+    config: BackendConfig, graph: PoseGraph, initial: GraphSolution | None
+) -> GraphSolution | OptimisationFailed:
+    """Optimise, in a worker process."""
+    return build_optimiser(config)(graph, initial)
+
+
+def _recording(config: AgentConfig) -> Recording | None:
+    path = config.source.recording
+    return None if path is None else Recording.open(path)
+
+
+def _drawn_incarnation() -> int:
+    """A number that no earlier life of this robot had: the wall clock, in milliseconds."""
+    return time.time_ns() // 1_000_000

@@ -1,0 +1,464 @@
+"""The asyncio driver: one task owns the core; zenoh's threads and the workers only put events into its inbox.
+
+Effects are carried out in order. What is persisted is on disk before what follows it is sent. Encoding,
+registration, optimisation, fetches and disk writes never run on the event loop.
+"""
+
+import asyncio
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.corrections import pose7
+from flocc_agent.core.effects import (
+    Broadcast,
+    Correction,
+    Deliver,
+    Effect,
+    Encode,
+    FetchLatent,
+    Optimise,
+    PersistCorrection,
+    PersistRecord,
+    PersistTerm,
+    Register,
+    Report,
+    Unicast,
+)
+from flocc_agent.core.events import (
+    Event,
+    FixMeasured,
+    GraphOptimisationFailed,
+    GraphOptimised,
+    KeyframeCaptured,
+    KeyframeEncoded,
+    KeyframeEncodingFailed,
+    LatentFetched,
+    LatentFetchFailed,
+    LatentMissing,
+    Leaving,
+    MessageReceived,
+    PairRegistered,
+)
+from flocc_agent.core.interfaces import Image, OdometryPair
+from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph, map_frame
+from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.persistence import Persist, write
+from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.store import Store
+from flocc_agent.runtime.transport import Fetched, Transport
+from flocc_agent.runtime.workers import Workers, WorkFailed
+from flocc_protocol.arrays import Array
+from flocc_protocol.errors import DecodeError, FloccError
+from flocc_protocol.ids import KeyframeId
+from flocc_protocol.messages import Envelope, Message, UnknownVersion, decode, encode, kind_of
+
+logger = logging.getLogger(__name__)
+
+Float = NDArray[np.float64]
+
+IMAGES_MAX = 8
+CORRECTIONS_MAX = 16
+BYTES_PERIOD_S = 1.0
+
+
+class Encoded(Protocol):
+    """What encoding an image gives."""
+
+    @property
+    def descriptor(self) -> Array:
+        """Place descriptor."""
+        ...
+
+    @property
+    def latent(self) -> bytes:
+        """Latent of the registrar."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Skills:
+    """What the driver's workers can do; named by the composition root.
+
+    Attributes:
+        encode: Image to descriptor and latent.
+        register: (query latent, match latent, odometry pair) to a relative pose up to scale.
+        optimise: Pose graph and last solution to a solution; must be importable by a worker process.
+    """
+
+    encode: Callable[[Image], Encoded]
+    register: Callable[[bytes, bytes, OdometryPair | None], Registration | RegistrationFailed]
+    optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+
+
+class Driver:
+    """Runs one robot's core on an event loop."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        transport: Transport,
+        store: Store,
+        workers: Workers,
+        skills: Skills,
+        reporter: Reporter,
+        on_line: Callable[[dict[str, Any]], None],
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare; `run` does the rest.
+
+        Args:
+            robot: The core, already restored from the store.
+            transport: Carries messages and latents; the driver opens and closes it.
+            store: Disk or memory.
+            workers: Pools off the loop.
+            skills: What the workers compute.
+            reporter: Turns the core's reports into lines.
+            on_line: Takes each line of `events.jsonl`; must not block.
+            clock_s: Seconds since the start of the run; the core's only clock.
+        """
+        self.robot = robot
+        self._transport = transport
+        self._store = store
+        self._workers = workers
+        self._skills = skills
+        self._reporter = reporter
+        self._on_line = on_line
+        self._clock_s = clock_s
+        self._inbox: deque[Event] = deque()
+        self._wake = asyncio.Event()
+        self._opened = asyncio.Event()
+        self._images: dict[int, Image] = {}
+        self._image_count = 0
+        self._image_slots = asyncio.Semaphore(IMAGES_MAX)
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._stopping = False
+        self._subscribers: list[asyncio.Queue[Correction | None]] = []
+        self._refused: Counter[tuple[str, str]] = Counter()
+        self._last_graph: PoseGraph | None = None
+        self._bytes_due_s = clock_s() + BYTES_PERIOD_S
+        self.last_correction: Correction | None = None
+        self.last_solution: GraphSolution | None = None
+
+    async def opened(self, run: "asyncio.Task[None]") -> None:
+        """Wait until the network is open; raises what `run` raised."""
+        opening = asyncio.create_task(self._opened.wait())
+        done, _ = await asyncio.wait({opening, run}, return_when=asyncio.FIRST_COMPLETED)
+        if run in done:
+            opening.cancel()
+            run.result()
+
+    # For the robot's own program
+
+    async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
+        """Take a keyframe in; waits while too many images wait for the encoder."""
+        await self._image_slots.acquire()
+        self._image_count += 1
+        self._images[self._image_count] = image
+        self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), self._image_count))
+
+    def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
+        """Take in an absolute position of the last keyframe's camera."""
+        x, y, z = (float(v) for v in position_m)
+        self.put(FixMeasured((x, y, z), tuple(float(v) for v in covariance_m2.ravel())))
+
+    def subscribe(self) -> "asyncio.Queue[Correction | None]":
+        """A queue of corrections, newest kept when it is full; None ends it."""
+        queue: asyncio.Queue[Correction | None] = asyncio.Queue(CORRECTIONS_MAX)
+        self._subscribers.append(queue)
+        if self.last_correction is not None:
+            queue.put_nowait(self.last_correction)
+        return queue
+
+    def put(self, event: Event) -> None:
+        """Put an event into the inbox, on the loop's thread."""
+        self._inbox.append(event)
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Ask `run` to hand over and end."""
+        self._stopping = True
+        self._wake.set()
+
+    def busy(self) -> bool:
+        """Whether images, fetches, registrations or rounds are under way."""
+        return bool(self._inbox or self._images or self._tasks or self.robot.closing.load)
+
+    def status(self) -> dict[str, Any]:
+        """What this robot does now: leader, neighbours, sizes, map frame, bytes, refusals."""
+        robot, counters = self.robot, self._transport.counters()
+        applied, term = robot.corrections.applied, robot.election.term
+        digests = robot.gossip.digests()
+        return {
+            "t": round(self._clock_s(), 3),
+            "robot": robot.log.robot,
+            "log": str(robot.log),
+            "leader": None if term is None else term.leader.robot,
+            "term": None if term is None else term.counter,
+            "role": robot.election.role.value,
+            "neighbours": robot.neighbours.names(),
+            "keyframes": robot.gossip.logs[robot.log].keyframes,
+            "closures": robot.assembly.closures,
+            "candidates": robot.closing.load,
+            "map_frame": None if applied is None else map_frame(applied.anchor),
+            "round": None if applied is None else applied.round,
+            "logs": {str(digest.log): [digest.count, digest.checksum] for digest in digests},
+            "sent_bytes": sum(traffic.payload_bytes for traffic in counters.sent.values()),
+            "received_bytes": sum(traffic.payload_bytes for traffic in counters.received.values()),
+            "refused": self.counters(),
+            "busy": self.busy(),
+        }
+
+    def counters(self) -> dict[str, int]:
+        """What was refused or dropped, by reason."""
+        refused = Counter[str]()
+        for (_, reason), count in self._refused.items():
+            refused[f"refused {reason}"] += count
+        return {**self._transport.counters().dropped, **refused}
+
+    def result(self) -> dict[str, Any]:
+        """What this robot knows, for `result.json`."""
+        return result_of(self.robot, self._reporter.T_body_camera, self.last_solution)
+
+    # The loop
+
+    async def run(self) -> None:
+        """Open the transport, live until `stop`, hand over, close everything.
+
+        Raises:
+            TransportError: The network cannot be used as configured.
+        """
+        self._transport.set_receiver(self._on_payload)
+        self._transport.serve_latents(self._latent_named)
+        try:
+            await self._transport.open()
+            self._opened.set()
+            await self._live()
+            await self._carry_out(self.robot.handle(Leaving(), self._clock_s()))
+        finally:
+            await self._close()
+
+    async def _live(self) -> None:
+        while not self._stopping:
+            now = self._clock_s()
+            if self.robot.deadline() <= now:
+                await self._carry_out(self.robot.tick(now))
+            while self._inbox and self.robot.deadline() > self._clock_s():
+                await self._carry_out(self.robot.handle(self._inbox.popleft(), self._clock_s()))
+            self._count_bytes()
+            await self._sleep()
+
+    async def _sleep(self) -> None:
+        """Wait for an event or for the next deadline."""
+        if self._inbox or self._stopping:
+            await asyncio.sleep(0)
+            return
+        self._wake.clear()
+        pause_s = min(self.robot.deadline(), self._bytes_due_s) - self._clock_s()
+        try:
+            await asyncio.wait_for(self._wake.wait(), max(pause_s, 0.0))
+        except TimeoutError:
+            return
+
+    async def _close(self) -> None:
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._count_bytes(last=True)
+        await self._transport.close()
+        await self._workers.close()
+        for queue in self._subscribers:
+            _put_newest(queue, None)
+
+    def _latent_named(self, key: str) -> bytes | None:
+        """A latent for the transport, by a name that a peer gave."""
+        try:
+            return self._store.latent(KeyframeId.parse(key))
+        except (ValueError, FloccError):
+            return None
+
+    # Messages
+
+    def _on_payload(self, sender: str, kind: str, payload: bytes) -> None:
+        """Check a payload of a peer; what is refused is counted, and logged once per peer and reason."""
+        try:
+            envelope = decode(payload)
+        except UnknownVersion as error:
+            self._refuse(sender, str(error))
+            return
+        except DecodeError:
+            self._refuse(sender, "malformed message")
+            return
+        if envelope.sender.robot != sender or kind_of(envelope.message) != kind:
+            self._refuse(sender, "message of another robot or kind than its key")
+            return
+        self.put(MessageReceived(envelope))
+
+    def _refuse(self, peer: str, reason: str) -> None:
+        self._refused[peer, reason] += 1
+        if self._refused[peer, reason] == 1:
+            logger.warning("%s: refused %s: %s", self.robot.log, peer, reason)
+            self._report(Report("peer_refused", {"peer": peer, "reason": reason}))
+
+    def _send(self, message: Message, to: str | None) -> None:
+        payload = encode(Envelope(self.robot.log, message))
+        if to is None:
+            self._transport.broadcast(kind_of(message), payload)
+        else:
+            self._transport.unicast(to, kind_of(message), payload)
+
+    # Effects
+
+    async def _carry_out(self, effects: list[Effect]) -> None:
+        written: list[Persist] = []
+        for effect in effects:
+            match effect:
+                case PersistRecord() | PersistTerm() | PersistCorrection():
+                    written.append(effect)
+                    continue
+                case Report():
+                    self._report(effect)
+                    continue
+            await self._write(written)
+            self._do(effect)
+        await self._write(written)
+
+    async def _write(self, written: list[Persist]) -> None:
+        """Bring what is to be kept onto the disk before anything is sent that depends on it."""
+        if written:
+            batch = written.copy()
+            written.clear()
+            await asyncio.to_thread(write, self._store, batch)
+
+    def _do(self, effect: Effect) -> None:
+        match effect:
+            case Broadcast(message):
+                self._send(message, None)
+            case Unicast(to, message):
+                self._send(message, to)
+            case Deliver(correction):
+                self._deliver(correction)
+            case Encode(keyframe, image):
+                self._start(self._encode(keyframe, image))
+            case FetchLatent():
+                self._start(self._fetch(effect))
+            case Register():
+                self._start(self._register(effect))
+            case Optimise():
+                self._start(self._optimise(effect))
+            case _:
+                raise AssertionError(f"no way to carry out {type(effect).__name__}")
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and task.exception() is not None:
+            logger.error("%s: a task failed", self.robot.log, exc_info=task.exception())
+            self.stop()
+
+    def _deliver(self, correction: Correction) -> None:
+        self.last_correction = correction
+        for queue in self._subscribers:
+            _put_newest(queue, correction)
+
+    async def _encode(self, keyframe: KeyframeId, image: int) -> None:
+        result = await self._workers.run("encode", self._skills.encode, self._images[image])
+        del self._images[image]
+        self._image_slots.release()
+        if isinstance(result, WorkFailed):
+            self.put(KeyframeEncodingFailed(keyframe, result.reason))
+            return
+        await asyncio.to_thread(self._store.put_latent, keyframe, result.value.latent)
+        self.put(KeyframeEncoded(keyframe, result.value.descriptor))
+
+    async def _fetch(self, effect: FetchLatent) -> None:
+        keyframe, holder = effect.keyframe, effect.holder
+        answer = await self._transport.fetch_latent(holder, str(keyframe), effect.deadline_s)
+        if not isinstance(answer, Fetched):
+            self.put(LatentFetchFailed(keyframe, holder, answer.problem.value))
+            return
+        await asyncio.to_thread(self._store.put_latent, keyframe, answer.latent)
+        self.put(LatentFetched(keyframe, holder))
+
+    async def _register(self, effect: Register) -> None:
+        latents: dict[KeyframeId, bytes] = {}
+        for keyframe in (effect.query, effect.match, effect.neighbour):
+            latent = await asyncio.to_thread(self._store.latent, keyframe)
+            if latent is None:
+                self.put(LatentMissing(effect.pair, keyframe))
+                return
+            latents[keyframe] = latent
+        pair = OdometryPair(
+            latents[effect.neighbour],
+            pose_from_tq(np.array(effect.T_neighbour_query)),
+            f"{effect.neighbour} {effect.query}",
+        )
+        arguments = (latents[effect.query], latents[effect.match], pair)
+        result = await self._workers.run("register", self._skills.register, *arguments)
+        if isinstance(result, WorkFailed):
+            self.put(PairRegistered(effect.pair, RegistrationFailed(RegistrationFailure.CRASHED, result.reason)))
+            return
+        self.put(PairRegistered(effect.pair, result.value))
+
+    async def _optimise(self, effect: Optimise) -> None:
+        result = await self._workers.run("optimise", self._skills.optimise, effect.graph, effect.initial)
+        failure = result.reason if isinstance(result, WorkFailed) else None
+        if not isinstance(result, WorkFailed) and isinstance(result.value, OptimisationFailed):
+            failure = result.value.reason
+        if failure is not None or isinstance(result, WorkFailed):
+            self.put(GraphOptimisationFailed(effect.term, effect.round, failure or "no result"))
+            return
+        self.last_solution = result.value
+        self.put(GraphOptimised(effect.term, effect.round, result.value))
+
+    # Reports
+
+    def _report(self, report: Report) -> None:
+        line = self._reporter.line(report, self._clock_s())
+        logger.log(_level(report), "%s: %s %s", self.robot.log, report.event, _brief(report.fields))
+        self._on_line(line)
+
+    def _count_bytes(self, last: bool = False) -> None:
+        now = self._clock_s()
+        if now < self._bytes_due_s and not last:
+            return
+        self._bytes_due_s = now + BYTES_PERIOD_S
+        counters = self._transport.counters()
+        sent = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.sent.items())}
+        received = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.received.items())}
+        self._on_line(self._reporter.line(Report("bytes", {"sent": dict(sent), "received": dict(received)}), now))
+
+
+_WARNINGS = frozenset({"peer_refused", "duplicate_name", "log_forked", "latent_lost", "optimisation_failed"})
+_INFOS = frozenset(
+    {"leader", "leader_lost", "neighbour_up", "neighbour_down", "closure_accepted", "correction", "optimised"}
+)
+
+
+def _level(report: Report) -> int:
+    if report.event in _WARNINGS:
+        return logging.WARNING
+    return logging.INFO if report.event in _INFOS else logging.DEBUG
+
+
+def _brief(fields: Mapping[str, Any]) -> str:
+    return " ".join(f"{key}={value}" for key, value in fields.items() if not isinstance(value, (list, dict)))
+
+
+def _put_newest(queue: "asyncio.Queue[Correction | None]", item: Correction | None) -> None:
+    """Put without waiting; the oldest item makes room."""
+    if queue.full():
+        queue.get_nowait()
+    queue.put_nowait(item)

@@ -1,0 +1,48 @@
+"""Between the core and the store: what a robot keeps, and what it finds when it starts."""
+
+from collections.abc import Iterable
+
+from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
+from flocc_agent.core.robot import Restored
+from flocc_agent.runtime.store import Store, StoredRecord
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import CorrectionMessage, Envelope, decode, encode
+
+Persist = PersistRecord | PersistTerm | PersistCorrection
+
+
+def write(store: Store, effects: Iterable[Persist]) -> None:
+    """Bring a batch onto the disk; own records are safe when this returns."""
+    batch = list(effects)
+    records = [StoredRecord(e.log, e.number, e.data) for e in batch if isinstance(e, PersistRecord)]
+    if records:
+        store.put_records(records)
+    for effect in batch:
+        match effect:
+            case PersistTerm(counter):
+                store.put_term_counter(counter)
+            case PersistCorrection(correction):
+                envelope = Envelope(store.identity.log, correction)
+                store.put_correction(correction.log.robot, encode(envelope))
+            case PersistRecord():
+                pass
+
+
+def restore(store: Store) -> Restored:
+    """Read everything back; of another robot's log as far as it has no gap."""
+    own = store.identity.log
+    kept = store.correction(own.robot)
+    correction = None if kept is None else decode(kept).message
+    assert correction is None or isinstance(correction, CorrectionMessage)
+    return Restored(
+        records=tuple((log, _prefix(store, log)) for log in store.logs()),
+        latents=tuple(store.latent_keyframes()),
+        term_counter=store.term_counter(),
+        correction=correction if correction is not None and correction.log == own else None,
+    )
+
+
+def _prefix(store: Store, log: LogId) -> tuple[bytes, ...]:
+    records = store.records(log)
+    whole = [record.data for position, record in enumerate(records) if record.number == position]
+    return tuple(whole)

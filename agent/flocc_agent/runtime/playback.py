@@ -1,0 +1,62 @@
+"""Playing a recording into an agent by its stamps, as if the robot were moving now."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.config import SourceConfig
+from flocc_agent.core.interfaces import Image
+from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.recording import Recording
+
+Float = NDArray[np.float64]
+AddKeyframe = Callable[[Image, Float, float], Awaitable[None]]
+
+READY_S = 1.0
+"""Frames due before this are played at once: an agent needs a moment to start."""
+
+
+def due_s(stamp_s: float, first_stamp_s: float, config: SourceConfig) -> float:
+    """When a frame is played, seconds since the start of the run."""
+    return config.start_s + (stamp_s - first_stamp_s) / config.rate
+
+
+async def play(
+    recording: Recording,
+    config: SourceConfig,
+    selector: KeyframeSelector,
+    add_keyframe: AddKeyframe,
+    clock_s: Callable[[], float],
+    on_position: Callable[[Float], None],
+    resumed: bool = False,
+) -> None:
+    """Play frames when they are due; late ones are played at once, none is skipped.
+
+    Args:
+        recording: What to play.
+        config: Speed and start.
+        selector: Decides which frames become keyframes.
+        add_keyframe: Takes (image, T_odom_body, stamp_s); may wait.
+        clock_s: Seconds since the start of the run.
+        on_position: Takes the true position (3,) of each frame, where it is known, for emulated range.
+        resumed: The agent was restarted: frames that were due before now are skipped.
+
+    Raises:
+        RecordingError: An image cannot be read.
+    """
+    first_s = recording.frames[0].stamp_s
+    started_s = clock_s()
+    for frame in recording.frames:
+        wanted_s = due_s(frame.stamp_s, first_s, config)
+        if resumed and wanted_s < started_s - READY_S:
+            continue
+        await asyncio.sleep(max(wanted_s - clock_s(), 0.0))
+        truth = recording.ground_truth(frame.stamp_s)
+        if truth is not None:
+            on_position(truth[:3, 3])
+        if selector.wants(frame.T_odom_body):
+            selector.took(frame.T_odom_body)
+            image = await asyncio.to_thread(recording.load_image, frame)
+            await add_keyframe(image, frame.T_odom_body, frame.stamp_s)

@@ -1,0 +1,147 @@
+"""One agent process: plays its recording, writes its events and its result, tells its state once a second.
+
+`flocc agent` and `flocc launch` both run this. A launched agent speaks JSON lines: states on standard output,
+orders (`{"stop": true}`, `{"radio": {...}}`) on standard input.
+"""
+
+import argparse
+import asyncio
+import json
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TextIO
+
+from flocc_agent.config import AgentConfig, RadioConfig, validated
+from flocc_protocol.errors import FloccError
+
+logger = logging.getLogger(__name__)
+
+STATUS_PERIOD_S = 0.5
+EXIT_BAD_INPUT = 2
+
+
+class Lines:
+    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file: TextIO | None = None
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("a", encoding="utf-8")
+
+    def write(self, line: dict[str, Any]) -> None:
+        """Append one event."""
+        if self._file is not None:
+            self._file.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")
+            self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+async def run_agent(
+    config: AgentConfig,
+    epoch_s: float,
+    on_status: Callable[[dict[str, Any]], None],
+    orders: asyncio.StreamReader | None = None,
+) -> None:
+    """Run one agent until it is told to stop (a signal, an order, or the end of its recording and `hold_s`).
+
+    Args:
+        config: The agent's configuration; with `folder`, its events and result are written there.
+        epoch_s: Start of the run on this machine's monotonic clock.
+        on_status: Takes a state, twice a second.
+        orders: JSON lines from the launcher.
+
+    Raises:
+        FloccError: The configuration, the recording or the network cannot be used.
+    """
+    from flocc_agent.composition import Agent
+
+    lines = Lines(config.folder / "events.jsonl" if config.folder else None)
+    agent = Agent(config, on_line=lines.write, clock_s=lambda: time.monotonic() - epoch_s)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, agent.stop)
+    background: list[asyncio.Task[None]] = []
+    try:
+        async with agent:
+            background = [asyncio.create_task(_tell(agent, on_status))]
+            if orders is not None:
+                background.append(asyncio.create_task(_obey(agent, orders)))
+            await agent.finished()
+    finally:
+        for task in background:
+            task.cancel()
+        _write_result(config.folder, agent)
+        lines.write({"t": round(time.monotonic() - epoch_s, 6), "robot": config.name, "event": "agent_stopped"})
+        lines.close()
+
+
+def _write_result(folder: Path | None, agent: Any) -> None:
+    result = agent.result()
+    if folder is not None and result is not None:
+        path = folder / "result.json"
+        path.with_suffix(".tmp").write_text(json.dumps(result, allow_nan=False), encoding="utf-8")
+        path.with_suffix(".tmp").replace(path)
+
+
+async def _tell(agent: Any, on_status: Callable[[dict[str, Any]], None]) -> None:
+    while True:
+        on_status(agent.status())
+        await asyncio.sleep(STATUS_PERIOD_S)
+
+
+async def _obey(agent: Any, orders: asyncio.StreamReader) -> None:
+    """Carry out the launcher's orders; its end is an order to stop, so that no agent is left behind."""
+    while line := await orders.readline():
+        order = json.loads(line)
+        if "radio" in order:
+            agent.set_radio(validated(RadioConfig, order["radio"], "order"))
+        if "slow" in order:
+            agent.set_slowness(float(order["slow"]))
+        if order.get("stop"):
+            agent.stop()
+            return
+    agent.stop()
+
+
+async def _standard_input() -> asyncio.StreamReader:
+    reader = asyncio.StreamReader()
+    loop = asyncio.get_running_loop()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    return reader
+
+
+def _print_status(status: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(status, separators=(",", ":")) + "\n")
+    sys.stdout.flush()
+
+
+async def _run_launched(config: AgentConfig, epoch_s: float) -> None:
+    await run_agent(config, epoch_s, _print_status, await _standard_input())
+
+
+def main() -> None:
+    """Entry point of a launched agent."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--epoch-s", type=float, required=True)
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    try:
+        config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
+        asyncio.run(_run_launched(config, arguments.epoch_s))
+    except FloccError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(EXIT_BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()
