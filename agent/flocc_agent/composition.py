@@ -27,7 +27,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
-from flocc_agent.runtime.reporting import Reporter
+from flocc_agent.runtime.reporting import Reporter, result_of
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
@@ -262,13 +262,7 @@ class Agent:
     def _compose(self) -> Driver:
         """Name every concrete class."""
         config = self.config
-        self._store = Store.open(
-            None if config.folder is None else config.folder / "store",
-            config.name,
-            config.store,
-            incarnation=_drawn_incarnation() if config.incarnation is None else config.incarnation,
-            incarnation_after_loss=_drawn_incarnation(),
-        )
+        self._store = _open_store(config)
         parameters = config.radio.parameters()
         rng = np.random.default_rng(config.seed)
         self._radio = Radio(parameters, rng)
@@ -328,6 +322,28 @@ def optimise_graph(
 ) -> GraphSolution | OptimisationFailed:
     """Optimise, in a worker process."""
     return build_optimiser(config)(graph, initial)
+
+
+def stored_result(config: AgentConfig) -> dict[str, Any]:
+    """What a robot knew when it was killed (`result.json`), from its store."""
+    recording = _recording(config)
+    T_body_camera = np.eye(4) if recording is None else recording.T_body_camera
+    store = _open_store(config)
+    try:
+        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restore(store))
+    finally:
+        store.close()
+    return result_of(robot, T_body_camera)
+
+
+def _open_store(config: AgentConfig) -> Store:
+    return Store.open(
+        None if config.folder is None else config.folder / "store",
+        config.name,
+        config.store,
+        incarnation=_drawn_incarnation() if config.incarnation is None else config.incarnation,
+        incarnation_after_loss=_drawn_incarnation(),
+    )
 
 
 def _recording(config: AgentConfig) -> Recording | None:

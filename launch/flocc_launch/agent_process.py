@@ -79,13 +79,20 @@ async def run_agent(
     finally:
         for task in background:
             task.cancel()
-        _write_result(config.folder, agent)
+        _write_result(config.folder, agent.result())
         lines.write({"t": round(time.monotonic() - epoch_s, 6), "robot": config.name, "event": "agent_stopped"})
         lines.close()
 
 
-def _write_result(folder: Path | None, agent: Any) -> None:
-    result = agent.result()
+def recover_result(config: AgentConfig) -> None:
+    """Write the result of an agent that was killed, from what its store holds."""
+    from flocc_agent.composition import stored_result
+
+    if config.folder is not None and (config.folder / "store").exists():
+        _write_result(config.folder, stored_result(config))
+
+
+def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
     if folder is not None and result is not None:
         path = folder / "result.json"
         path.with_suffix(".tmp").write_text(json.dumps(result, allow_nan=False), encoding="utf-8")

@@ -1,0 +1,189 @@
+"""The command line. Commands import what they need when they run, so that `--help` stays fast."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from flocc_protocol.errors import FloccError
+
+if TYPE_CHECKING:
+    from flocc_launch.report.model import Report
+    from flocc_launch.scenario import Scenario
+
+EXIT_MISSED = 1
+EXIT_BAD_INPUT = 2
+
+app = typer.Typer(
+    name="flocc",
+    help="Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
+Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
+Latency = Annotated[float | None, typer.Option(help="Delay on every link, seconds.")]
+Bandwidth = Annotated[float | None, typer.Option(help="Capacity of every link, kilobytes per second.")]
+Range = Annotated[float | None, typer.Option("--range", help="Communication range by true position, metres.")]
+Duration = Annotated[float | None, typer.Option(help="End after this many seconds instead of when all is settled.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
+
+
+def main() -> None:
+    """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
+    try:
+        app()
+    except FloccError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def fail(sentence: str) -> NoReturn:
+    """Print an error and leave."""
+    typer.echo(f"error: {sentence}", err=True)
+    sys.exit(EXIT_BAD_INPUT)
+
+
+@app.command()
+def demo(
+    out: Out = Path("runs/demo"),
+    robots: Annotated[int, typer.Option(min=2, max=8, help="Robots in the generated world.")] = 3,
+    seed: Annotated[int, typer.Option(help="Another seed is another world.")] = 7,
+) -> None:
+    """Run the main job: robots in a generated world, real images, real zenoh, one report."""
+    from flocc_launch.scenario import Scenario
+    from flocc_launch.shipped import read_shipped
+
+    scenario = read_shipped("demo", {"world.robots": robots, "world.seed": seed})
+    assert isinstance(scenario, Scenario)
+    _launch(scenario, out)
+
+
+@app.command()
+def launch(
+    scenario: Annotated[str, typer.Argument(help="Scenario file (TOML), or the name of a shipped one.")],
+    out: Out = Path("runs/launch"),
+    agents: Annotated[int | None, typer.Option(min=1, help="Number of robots of the world or data set.")] = None,
+    loss: Loss = None,
+    latency: Latency = None,
+    bandwidth: Bandwidth = None,
+    range_m: Range = None,
+    duration: Duration = None,
+    seed: Seed = None,
+    rate: Annotated[float | None, typer.Option(help="Playback speed of recordings.")] = None,
+) -> None:
+    """Run a scenario with one process per robot on this machine, over real zenoh."""
+    changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
+    if rate is not None:
+        changes["rate"] = rate
+    _launch(_read(scenario, changes, agents), out)
+
+
+@app.command()
+def simulate(
+    scenario: Annotated[str, typer.Argument(help="Scenario file (TOML), or the name of a shipped one.")],
+    out: Out = Path("runs/simulate"),
+    agents: Annotated[int | None, typer.Option(min=1, help="Number of robots.")] = None,
+    seed: Seed = None,
+    loss: Loss = None,
+    latency: Latency = None,
+    bandwidth: Bandwidth = None,
+    range_m: Range = None,
+    duration: Duration = None,
+) -> None:
+    """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
+    from flocc_launch.simulation import simulate as run
+
+    changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
+    _show(run(_read(scenario, changes, agents), out), out)
+
+
+@app.command()
+def agent(
+    config: Annotated[Path, typer.Option(help="Configuration of the agent (TOML); see docs/configuration.md.")],
+    verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
+) -> None:
+    """Run one robot's agent until it is stopped."""
+    import asyncio
+    import logging
+    import time
+
+    from flocc_agent.config import AgentConfig
+    from flocc_launch.agent_process import run_agent
+
+    level = logging.DEBUG if verbose else logging.INFO
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
+    asyncio.run(run_agent(AgentConfig.read(config), time.monotonic(), lambda _: None))
+
+
+@app.command()
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
+    json_out: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Evaluate a run folder anew: ATE and RPE against ground truth, closures, bytes, leaders."""
+    from flocc_launch.report.evaluate import evaluate as run_evaluation
+
+    typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
+
+
+def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
+    from flocc_launch.shipped import read_scenario
+
+    return read_scenario(scenario, changes, agents)
+
+
+def _changes(
+    loss: float | None,
+    latency: float | None,
+    bandwidth: float | None,
+    range_m: float | None,
+    duration: float | None,
+    seed: int | None,
+) -> dict[str, Any]:
+    """What the command line changes in a scenario."""
+    given = {
+        "radio.loss_ratio": loss,
+        "radio.latency_s": latency,
+        "radio.bandwidth_bytes_s": None if bandwidth is None else 1000.0 * bandwidth,
+        "radio.range_m": range_m,
+        "duration_s": duration,
+        "seed": seed,
+    }
+    return {key: value for key, value in given.items() if value is not None}
+
+
+def _launch(scenario: "Scenario", out: Path) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from flocc_launch.data import recordings
+    from flocc_launch.launching import launch as run
+    from flocc_launch.live_table import LiveTable
+
+    console = Console()
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("preparing data", total=None)
+        recordings(scenario, lambda done, total: bar.update(task, completed=done, total=total))
+    with LiveTable(console) as table:
+        report = run(scenario, out, table.show)
+    _show(report, out)
+
+
+def _show(report: "Report", out: Path) -> None:
+    from flocc_launch.report.text import sentences
+
+    for sentence in sentences(report):
+        typer.echo(sentence)
+    typer.echo(f"report: {(out / 'report.html').resolve()}")
+    if any(expectation.met is False for expectation in report.expectations):
+        sys.exit(EXIT_MISSED)
+
+
+if __name__ == "__main__":
+    main()

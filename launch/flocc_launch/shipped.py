@@ -1,0 +1,48 @@
+"""Scenarios that come with flocc, by name, and scenario files of the user."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from flocc_agent.config import ConfigError
+from flocc_launch.scenario import Scenario
+
+FOLDER = Path(__file__).parent / "scenarios"
+
+
+def names() -> list[str]:
+    """Names of the shipped scenarios, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def read_shipped(name: str, changes: Mapping[str, object] | None = None) -> Scenario:
+    """Read a shipped scenario.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    path = FOLDER / f"{name}.toml"
+    if not path.exists():
+        raise ConfigError(f"{name}: is neither a file nor a shipped scenario ({', '.join(names())})")
+    return Scenario.read(path, changes)
+
+
+def read_scenario(text: str, changes: Mapping[str, object], agents: int | None = None) -> Scenario:
+    """Read a scenario file, or a shipped scenario by its name.
+
+    Args:
+        text: Path or name.
+        changes: Keys that the command line overrides.
+        agents: Number of robots of its world, data set or tracks.
+
+    Raises:
+        ConfigError: It cannot be read, or it has no robots that could be counted anew.
+    """
+    read = Scenario.read if Path(text).suffix == ".toml" or Path(text).exists() else None
+    scenario = read(Path(text), changes) if read else read_shipped(text, changes)
+    if agents is None:
+        return scenario
+    source = next((key for key in ("world", "dataset", "tracks") if getattr(scenario, key) is not None), None)
+    if source is None:
+        raise ConfigError(f"{text}: its robots are listed one by one; --agents cannot change their number")
+    counted = {**changes, f"{source}.robots": agents}
+    return read(Path(text), counted) if read else read_shipped(text, counted)
