@@ -36,6 +36,10 @@ class RobotScenario(Section):
     """0: small robot, 9: server with a GPU."""
     start_s: float = Field(0.0, ge=0)
     """When it is switched on, seconds after the start of the run."""
+    clock_offset_s: float = Field(0.0, ge=0)
+    """How far its clock is ahead (simulate only)."""
+    clock_drift_ratio: float = Field(0.0, gt=-0.1, lt=0.1)
+    """How much faster its clock runs than the true one (simulate only)."""
 
 
 class WorldScenario(Section):

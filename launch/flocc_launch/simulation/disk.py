@@ -1,0 +1,42 @@
+"""A simulated disk: what survives a robot's death, unless the disk dies with it."""
+
+from dataclasses import dataclass, field
+
+from flocc_agent.core.robot import Restored
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import CorrectionMessage
+
+
+@dataclass(slots=True)
+class Disk:
+    """Records, latents, the claimed term and the applied correction of one robot.
+
+    Attributes:
+        latent_bytes_max: Beyond this the oldest latents go first.
+    """
+
+    latent_bytes_max: int = 2 * 1024**3
+    records: dict[LogId, list[bytes]] = field(default_factory=dict)
+    latents: dict[KeyframeId, bytes] = field(default_factory=dict)
+    term_counter: int = 0
+    correction: CorrectionMessage | None = None
+    latent_bytes: int = 0
+
+    def put_record(self, log: LogId, number: int, data: bytes) -> None:
+        """Append a record; the core never leaves a gap."""
+        records = self.records.setdefault(log, [])
+        assert number == len(records), f"record {number} of {log} does not follow {len(records)}"
+        records.append(data)
+
+    def put_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
+        """Keep a latent; the oldest make room."""
+        self.latent_bytes += len(latent) - len(self.latents.pop(keyframe, b""))
+        self.latents[keyframe] = latent
+        while self.latent_bytes > self.latent_bytes_max and len(self.latents) > 1:
+            oldest = next(iter(self.latents))
+            self.latent_bytes -= len(self.latents.pop(oldest))
+
+    def restored(self) -> Restored:
+        """What a robot finds when it starts again."""
+        records = tuple((log, tuple(data)) for log, data in sorted(self.records.items()))
+        return Restored(records, tuple(sorted(self.latents)), self.term_counter, self.correction)

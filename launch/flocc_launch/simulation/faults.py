@@ -1,0 +1,65 @@
+"""A scenario's timeline of faults, carried out on a simulated swarm."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from flocc_agent.radio import Blackout, LinkParameters, Partition, RadioParameters
+from flocc_launch.scenario import Fault, FaultKind
+from flocc_launch.simulation.swarm import Swarm
+
+
+def schedule(swarm: Swarm, faults: Iterable[Fault]) -> None:
+    """Enter every fault into the swarm's agenda."""
+    for fault in faults:
+        swarm.agenda.at(fault.at_s, lambda fault=fault: inject(swarm, fault))  # type: ignore[misc]
+
+
+def inject(swarm: Swarm, fault: Fault) -> None:
+    """Let one fault happen now."""
+    match fault.kind:
+        case FaultKind.KILL:
+            for name in fault.robots:
+                swarm.kill(name)
+        case FaultKind.RESTART:
+            for name in fault.robots:
+                restart(swarm, name, fault.disk_lost)
+        case FaultKind.SLOW:
+            for name in fault.robots:
+                swarm.stations[name].workers.slowness = fault.value or 1.0
+        case _:
+            swarm.radio.parameters = changed(swarm.radio.parameters, fault, swarm.agenda.now_s)
+
+
+def restart(swarm: Swarm, name: str, disk_lost: bool) -> None:
+    """Switch a robot on again, after killing it if need be."""
+    swarm.kill(name)
+    if disk_lost:
+        swarm.lose_disk(name)
+    swarm.start(name)
+
+
+def changed(radio: RadioParameters, fault: Fault, now_s: float) -> RadioParameters:
+    """The links after a fault."""
+    match fault.kind:
+        case FaultKind.PARTITION:
+            return replace(radio, partitions=(Partition(fault.groups, now_s),))
+        case FaultKind.BLACKOUT:
+            return replace(radio, blackouts=(*radio.blackouts, Blackout(fault.robots, now_s)))
+        case FaultKind.HEAL:
+            return radio.healed()
+        case FaultKind.LOSS:
+            return _every_link(radio, loss_ratio=fault.value or 0.0)
+        case FaultKind.LATENCY:
+            return _every_link(radio, latency_s=fault.value or 0.0)
+        case FaultKind.RANGE:
+            return replace(radio, range_m=fault.value or None)
+        case _:
+            return radio
+
+
+def _every_link(radio: RadioParameters, **values: float) -> RadioParameters:
+    def better(link: LinkParameters) -> LinkParameters:
+        return replace(link, **values)  # type: ignore[arg-type]
+
+    overrides = tuple(replace(override, link=better(override.link)) for override in radio.overrides)
+    return replace(radio, link=better(radio.link), overrides=overrides)

@@ -1,0 +1,140 @@
+"""`flocc simulate`: run a scenario on virtual time and leave a run folder."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from flocc_agent.composition import build_optimiser, build_perception
+from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.reporting import result_of
+from flocc_agent.runtime.trajectory import write_tum
+from flocc_launch.report.finish import finish
+from flocc_launch.report.model import Report
+from flocc_launch.run_folder import RobotResult, Run, RunFolder
+from flocc_launch.scenario import Scenario
+from flocc_launch.simulation.eyes import ImageEyes
+from flocc_launch.simulation.faults import schedule
+from flocc_launch.simulation.playback import Playback, nothing, of_recording, of_walk
+from flocc_launch.simulation.swarm import Equipment, Swarm
+from flocc_launch.simulation.tracks import walks
+
+LOOK_S = 1.0
+LONGEST_AFTER_LAST_S = 300.0
+QUIET_KINDS = frozenset({"optimised", "correction", "keyframe", "candidate", "closure_accepted", "closure_rejected"})
+
+
+def simulate(
+    scenario: Scenario,
+    out: Path,
+    seed: int | None = None,
+    recordings: Mapping[str, Path] | None = None,
+    cache: Path | None = None,
+) -> Report:
+    """Run a scenario on virtual time.
+
+    Args:
+        scenario: What happens; its seed counts where none is given.
+        out: Folder of the run, new.
+        seed: Seed of links, boots and workers.
+        recordings: Robots' recordings, where the scenario's world or data set was made into some.
+        cache: Folder that keeps what perception found out about images, so that a second run is fast.
+
+    Returns:
+        The report, which the folder holds as well.
+
+    Raises:
+        FloccError: A recording cannot be read, or the folder holds a run already.
+    """
+    chosen = scenario.seed if seed is None else seed
+    folder = RunFolder.create(out)
+    playbacks = playbacks_of(scenario, recordings or {})
+    swarm = swarm_of(scenario, playbacks, chosen, cache)
+    end_s = run(swarm)
+    write(folder, swarm, chosen, end_s)
+    return finish(folder)
+
+
+def swarm_of(scenario: Scenario, playbacks: Mapping[str, Playback], seed: int, cache: Path | None = None) -> Swarm:
+    """Put the robots of a scenario on virtual time, with their faults to come."""
+    eyes = ImageEyes(build_perception(scenario.perception, seed), scenario.perception, cache)
+    swarm = Swarm(scenario, playbacks, Equipment(eyes, build_optimiser(scenario.backend)), seed)
+    schedule(swarm, scenario.faults)
+    return swarm
+
+
+def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str, Playback]:
+    """What each robot of a scenario sees."""
+    drawn = walks(scenario.tracks) if scenario.tracks else []
+    walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
+    playbacks = {}
+    for name in scenario.names():
+        path = scenario.robot(name).recording or recordings.get(name)
+        if path is not None:
+            playbacks[name] = of_recording(Recording.open(path), scenario.keyframes)
+        elif name in walked:
+            playbacks[name] = of_walk(walked[name], name, scenario.keyframes)
+        else:
+            playbacks[name] = nothing()
+    return playbacks
+
+
+def run(swarm: Swarm) -> float:
+    """Let time pass to the scenario's end, or until everything has settled; gives the end, seconds."""
+    scenario = swarm.scenario
+    if scenario.duration_s is not None:
+        swarm.run_until(scenario.duration_s)
+        return scenario.duration_s
+    last_s = max([_last_capture_s(swarm, name) for name in swarm.stations] + [fault.at_s for fault in scenario.faults])
+    swarm.run_until(last_s)
+    while swarm.agenda.now_s < last_s + LONGEST_AFTER_LAST_S and not _is_quiet(swarm, last_s):
+        swarm.run_until(swarm.agenda.now_s + LOOK_S)
+    return swarm.agenda.now_s
+
+
+def write(folder: RunFolder, swarm: Swarm, seed: int, end_s: float) -> None:
+    """Write what happened, and what every robot knew at the end."""
+    scenario = swarm.scenario
+    for name, station in swarm.stations.items():
+        _write_robot(folder, swarm, name)
+        if station.playback.truth is not None:
+            truth = folder.path / "groundtruth" / f"{name}.tum"
+            truth.parent.mkdir(exist_ok=True)
+            write_tum(truth, station.playback.truth)
+    folder.write_events(swarm.lines)
+    limits = scenario.expectations.model_dump(exclude_none=True)
+    folder.write_run(
+        Run(
+            scenario=scenario.name,
+            seed=seed,
+            robots=list(swarm.stations),
+            driver="simulate",
+            radio=scenario.radio.model_dump(mode="json", exclude_defaults=True),
+            expectations={name: float(limit) for name, limit in limits.items()},
+            duration_s=end_s,
+        )
+    )
+
+
+def _write_robot(folder: RunFolder, swarm: Swarm, name: str) -> None:
+    station, traffic = swarm.stations[name], swarm.network.traffic.get(name)
+    if traffic is not None:
+        fields = {"sent": dict(sorted(traffic.sent.items())), "received": dict(sorted(traffic.received.items()))}
+        swarm.report(name, "bytes", fields)
+    if station.core is not None:
+        fields = result_of(station.core, station.playback.T_body_camera, station.solution)
+        folder.write_result(RobotResult.model_validate(fields))
+        swarm.report(name, "agent_stopped", {})
+
+
+def _last_capture_s(swarm: Swarm, name: str) -> float:
+    playback, start_s = swarm.stations[name].playback, swarm.scenario.robot(name).start_s
+    if not playback.captures:
+        return start_s
+    return start_s + (playback.captures[-1].stamp_s - playback.first_stamp_s) / swarm.scenario.rate
+
+
+def _is_quiet(swarm: Swarm, last_s: float) -> bool:
+    """Whether nothing of interest happened for the scenario's settling time."""
+    if any(s.core.closing.load for s in swarm.running() if s.core):
+        return False
+    latest_s = next((line["t"] for line in reversed(swarm.lines) if line["event"] in QUIET_KINDS), 0.0)
+    return swarm.agenda.now_s >= max(latest_s, last_s) + swarm.scenario.settle_s

@@ -1,0 +1,158 @@
+"""A whole swarm on virtual time: stations, links, latents, and what happens to them over time."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flocc_agent.core.effects import Effect, Report
+from flocc_agent.core.events import Event
+from flocc_agent.radio import Radio
+from flocc_agent.runtime.reporting import Reporter
+from flocc_launch.scenario import Scenario
+from flocc_launch.simulation.agenda import Agenda
+from flocc_launch.simulation.disk import Disk
+from flocc_launch.simulation.latents import LatentFetcher
+from flocc_launch.simulation.network import Network
+from flocc_launch.simulation.playback import Playback
+from flocc_launch.simulation.robot import Clock, Station, Surroundings
+from flocc_launch.simulation.workers import Eyes, Optimiser, Workers, WorkTimes
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import Envelope, Message
+
+Observer = Callable[[Station, Event | None, list[Effect]], None]
+
+POSITION_PERIOD_S = 0.5
+LINKS, WORK, BOOTS = 1, 2, 3
+"""Purposes of generators, so that one more draw for one thing changes no other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Equipment:
+    """What all robots of a swarm carry."""
+
+    eyes: Eyes
+    optimiser: Optimiser
+    times: WorkTimes = WorkTimes()
+
+
+class Swarm:
+    """Robots, links and their clock.
+
+    Attributes:
+        agenda: The clock.
+        radio: The links.
+        stations: By name.
+        lines: What was reported, as lines of `events.jsonl`.
+        observers: Told of every step of every station.
+    """
+
+    def __init__(self, scenario: Scenario, playbacks: Mapping[str, Playback], equipment: Equipment, seed: int) -> None:
+        self.scenario = scenario
+        self.agenda = Agenda()
+        self.radio = Radio(scenario.radio.parameters(), np.random.default_rng([seed, LINKS]))
+        self.network = Network(self.agenda, self.radio, self._receive)
+        self.stations: dict[str, Station] = {}
+        self.lines: list[dict[str, Any]] = []
+        self.observers: list[Observer] = []
+        self._equipment = equipment
+        self._seed = seed
+        self._fetcher = LatentFetcher(self.agenda, self.network, self._running)
+        self._reporters: dict[str, Reporter] = {}
+        self._around = Surroundings(self._broadcast, self._unicast, self._fetcher.fetch, self._observe)
+        for number, name in enumerate(sorted(playbacks)):
+            self._add(name, number, playbacks[name])
+
+    def run_until(self, end_s: float) -> None:
+        """Let time pass."""
+        self.agenda.run_until(end_s)
+
+    def start(self, name: str) -> None:
+        """Switch a robot on."""
+        station = self.stations[name]
+        boot = int(np.random.default_rng([self._seed, BOOTS, *name.encode(), station.life]).integers(2**52))
+        station.start(boot, self.scenario.core)
+
+    def kill(self, name: str) -> None:
+        """A robot dies; its disk stays."""
+        station = self.stations[name]
+        if station.running:
+            station.kill()
+            self._fetcher.forget(name)
+            self.report(name, "agent_died", {"signal": 9})
+
+    def lose_disk(self, name: str) -> None:
+        """A dead robot's disk is replaced; it comes back as a new incarnation."""
+        station = self.stations[name]
+        assert not station.running
+        station.disk = Disk(self.scenario.store.latent_bytes_max)
+        station.log = LogId(station.log.robot, station.log.incarnation + 1)
+
+    def report(self, name: str, event: str, fields: Mapping[str, Any]) -> None:
+        """Add a line that is not the core's."""
+        self.lines.append({"t": round(self.agenda.now_s, 6), "robot": name, "event": event, **fields})
+
+    def running(self) -> list[Station]:
+        """Stations that are switched on, by name."""
+        return [station for station in self.stations.values() if station.running]
+
+    def _add(self, name: str, number: int, playback: Playback) -> None:
+        robot = self.scenario.robot(name)
+        rng = np.random.default_rng([self._seed, WORK, number])
+        self.stations[name] = Station(
+            name,
+            LogId(name),
+            robot.compute_class,
+            playback,
+            Workers(self._equipment.eyes, self._equipment.optimiser, self._equipment.times, rng),
+            Disk(self.scenario.store.latent_bytes_max),
+            Clock(robot.clock_offset_s, robot.clock_drift_ratio),
+            self.agenda,
+            self._around,
+        )
+        self._reporters[name] = Reporter(name, playback.T_body_camera, self.scenario.backend.steepness)
+        self.agenda.at(robot.start_s, lambda: self.start(name))
+        self._play(self.stations[name], robot.start_s)
+
+    def _play(self, station: Station, start_s: float) -> None:
+        """Enter every keyframe, and where the robot is meanwhile."""
+        playback, rate = station.playback, self.scenario.rate
+        for k, capture in enumerate(playback.captures):
+            at_s = start_s + (capture.stamp_s - playback.first_stamp_s) / rate
+            self.agenda.at(at_s, lambda k=k: station.capture(k))  # type: ignore[misc]
+        if playback.truth is not None:
+            self._follow(station, start_s)
+
+    def _follow(self, station: Station, start_s: float) -> None:
+        """Tell the radio where a robot is, as long as it moves."""
+        truth = station.playback.truth
+        assert truth is not None
+        since_s = max(self.agenda.now_s - start_s, 0.0) * self.scenario.rate
+        position_m = station.playback.position_m(since_s)
+        if position_m is not None:
+            self.radio.update_position(station.name, position_m)
+        if since_s + station.playback.first_stamp_s < float(truth.stamps_s[-1]):
+            self.agenda.after(POSITION_PERIOD_S, lambda: self._follow(station, start_s))
+
+    def _broadcast(self, sender: Station, message: Message) -> None:
+        receivers = [name for name in self.stations if name != sender.name]
+        self.network.send(sender.name, Envelope(sender.log, message), receivers)
+
+    def _unicast(self, sender: Station, to: str, message: Message) -> None:
+        receivers = [s.name for s in self.stations.values() if s.log.robot == to and s is not sender]
+        self.network.send(sender.name, Envelope(sender.log, message), receivers)
+
+    def _receive(self, receiver: str, envelope: Envelope) -> None:
+        self.stations[receiver].receive(envelope)
+
+    def _running(self, robot: str) -> Station | None:
+        """The station that answers to a robot's name."""
+        return next((s for s in self.stations.values() if s.log.robot == robot and s.running), None)
+
+    def _observe(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Report):
+                self.lines.append(self._reporters[station.name].line(effect, self.agenda.now_s))
+        for observer in self.observers:
+            observer(station, event, effects)
