@@ -19,6 +19,7 @@ app = typer.Typer(
     name="flocc",
     help="Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots.",
     no_args_is_help=True,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
     add_completion=False,
 )

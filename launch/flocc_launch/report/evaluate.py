@@ -1,0 +1,38 @@
+"""`flocc evaluate`: finish a run folder anew and say what came of it."""
+
+from pathlib import Path
+
+from flocc_launch.evaluation import evo_ape
+from flocc_launch.report.finish import finish
+from flocc_launch.report.text import sentences
+from flocc_launch.run_folder import RunFolder
+
+
+def evaluate(run: Path, with_evo: bool = False, as_json: bool = False) -> str:
+    """Write a run folder's trajectories, report.json and report.html again, and put the result into words.
+
+    Args:
+        run: Run folder.
+        with_evo: Add what evo says of each robot's corrected trajectory.
+        as_json: Give the report as JSON instead of sentences.
+
+    Raises:
+        RunFolderError: The folder is missing, cut off, or of another version.
+        FloccError: evo is asked for and not installed.
+    """
+    report = finish(RunFolder.open(run))
+    if as_json:
+        return report.model_dump_json(indent=1)
+    lines = list(sentences(report))
+    lines += [f"{robot}: ATE {value:.3f} m" for robot, value in report.ate_m.items() if value is not None]
+    if with_evo:
+        lines += [evo_of(run, robot) for robot in report.robots]
+    return "\n".join([*lines, f"report: {(run / 'report.html').resolve()}"])
+
+
+def evo_of(run: Path, robot: str) -> str:
+    """What evo says of one robot, or why it says nothing."""
+    truth, estimate = run / "groundtruth" / f"{robot}.tum", run / "trajectories" / f"{robot}.tum"
+    if not truth.exists() or not estimate.exists():
+        return f"{robot}: evo has nothing to compare ({'no ground truth' if not truth.exists() else 'no correction'})"
+    return f"{robot}: evo_ape\n{evo_ape(truth, estimate)}"
