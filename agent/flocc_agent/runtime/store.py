@@ -136,7 +136,7 @@ class Store:
     def records(self, log: LogId, first: int = 0) -> list[StoredRecord]:
         """Give a log's records from a number on, in order; in others' logs numbers may be missing."""
         rows = self._records.read("SELECT number, data FROM records WHERE log = ? AND number >= ?", (str(log), first))
-        found: dict[int, bytes] = {number: data for number, data in reversed(rows)}
+        found: dict[int, bytes] = dict(reversed(rows))
         return [StoredRecord(log, number, found[number]) for number in sorted(found)]
 
     def logs(self) -> list[LogId]:
