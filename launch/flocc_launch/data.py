@@ -41,7 +41,7 @@ def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:
 
 
 def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
-    from flocc_launch.datasets import split
+    from flocc_launch.datasets.commands import split
 
     source = dataset.source.resolve()
     key = hashlib.sha256(f"{source} {dataset.robots} {dataset.seed}".encode()).hexdigest()[:12]
