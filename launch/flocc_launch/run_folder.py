@@ -317,6 +317,8 @@ class RobotResult(Record):
     closures: list[ClosureKnown] = []
     logs: dict[str, int] = {}
     """Log -> number of its records that this robot holds."""
+    best_similarities: dict[str, float] = {}
+    """Robot -> best cosine similarity of any of its keyframes with one of this robot, below the threshold as well."""
 
     def T_odom_body(self) -> Float:
         """Odometry of all keyframes, (N, 4, 4)."""

@@ -70,6 +70,11 @@ def test_the_page_shows_every_part(tmp_path: Path) -> None:
     assert ">seed</td><td><code>7</code>" in html
 
 
+def test_the_page_says_why_maps_have_not_merged(tmp_path: Path) -> None:
+    assert "Why the maps have not merged" in html_of(tmp_path / "apart", Synthetic(merged_s=None))[0]
+    assert "Why the maps have not merged" not in html_of(tmp_path / "merged")[0]
+
+
 def test_names_from_outside_are_escaped(tmp_path: Path) -> None:
     folder = synthetic_run.write(tmp_path / "run")
     run = folder.run().model_copy(update={"scenario": "<b onload='x'>&", "settings": {"<i>": "</code>"}})

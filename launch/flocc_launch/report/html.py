@@ -22,6 +22,7 @@ def page(report: Report, loaded: LoadedRun) -> str:
         sections.kicker(report),
         element("h1", text_of(verdict(report))),
         sections.tiles(report),
+        sections.findings(loaded),
         sections.expectations(report),
         sections.warnings(report),
         sections.trajectories(report, loaded),

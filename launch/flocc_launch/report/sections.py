@@ -47,8 +47,11 @@ def tiles(report: Report) -> str:
 def ate_tile(report: Report) -> tuple[str, str]:
     """The joint error beside odometry's; of the one map there is, where some robots are not in it."""
     before, after = report.ate_joint_odometry_m, report.ate_joint_m
-    if after is None and len(report.map_frames) == 1:
-        return number(report.ate_by_frame_m[report.map_frames[0]], "m"), f"ATE of the robots in {report.map_frames[0]}"
+    alone = report.ate_by_frame_m.get(report.map_frames[0]) if len(report.map_frames) == 1 else None
+    if after is None and alone is not None:
+        return number(alone, "m"), f"ATE of the robots in {report.map_frames[0]}"
+    if before is None:
+        return number(after, "m"), "joint ATE; ground truth of all robots is needed"
     gain = f" ({100 * (after / before - 1):+.0f}\u00a0%)" if before and after is not None else ""
     return number(after, "m"), f"joint ATE; odometry alone: {number(before, 'm')}{gain}"
 
@@ -72,6 +75,17 @@ def warnings(report: Report) -> str:
         return ""
     items = "".join(element("li", text_of(warning)) for warning in report.warnings)
     return element("div", element("h3", "Worth knowing"), element("ul", items), class_="callout")
+
+
+def findings(loaded: LoadedRun) -> str:
+    """What the doctor says where maps have not merged."""
+    from flocc_launch.doctor import Severity, diagnose_loaded  # the doctor reads runs as the report does
+
+    found = [finding for finding in diagnose_loaded(loaded) if finding.severity is Severity.BLOCKS]
+    if not found:
+        return ""
+    items = [element("li", text_of(f.sentence), " ", element("em", text_of(f.advice))) for f in found]
+    return element("div", element("h3", "Why the maps have not merged"), element("ul", *items), class_="callout")
 
 
 def trajectories(report: Report, loaded: LoadedRun) -> str:

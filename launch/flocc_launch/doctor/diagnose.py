@@ -1,0 +1,80 @@
+"""Why the maps of a run have or have not merged, and what to change.
+
+Two robots merge when a chain of steps holds: both take keyframes, their records meet, places look alike, latents
+arrive, registrations are accepted, a leader optimises, its corrections arrive. For every two groups of robots that
+did not merge, the pair that came furthest is looked at, and the first step that failed is named.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from flocc_launch.doctor.finding import Finding, Severity
+from flocc_launch.doctor.general import GENERAL
+from flocc_launch.doctor.steps import STEPS
+from flocc_launch.report.load import LoadedRun, load
+from flocc_launch.run_folder import AgentDied, RunFolder, of_kind
+
+
+def diagnose(folder: RunFolder) -> list[Finding]:
+    """Say why the maps of a run have or have not merged, what blocks first.
+
+    Raises:
+        RunFolderError: The folder is cut off or damaged.
+    """
+    return diagnose_loaded(load(folder))
+
+
+def diagnose_loaded(loaded: LoadedRun) -> list[Finding]:
+    """As `diagnose`, of a run that was read already."""
+    findings = [*merging(loaded), *(finding for look in GENERAL for finding in look(loaded))]
+    order = list(Severity)
+    return sorted(together(findings), key=lambda finding: order.index(finding.severity))
+
+
+def merging(loaded: LoadedRun) -> list[Finding]:
+    """One finding for every two groups of living robots that are in different maps; or that all is well."""
+    groups = groups_of(loaded)
+    if sum(len(group) for group in groups) < 2:
+        return []
+    if len(groups) == 1 and loaded.tracks[groups[0][0]].map_frame is not None:
+        frame = loaded.tracks[groups[0][0]].map_frame
+        return [Finding("merged", Severity.GOOD, f"All {len(groups[0])} robots are in {frame}.", robots=groups[0])]
+    return [furthest(loaded, first, second) for k, first in enumerate(groups) for second in groups[k + 1 :]]
+
+
+def groups_of(loaded: LoadedRun) -> list[tuple[str, ...]]:
+    """Living robots by their map frame at the end; a robot without one is a group of its own."""
+    died = {event.robot for event in of_kind(loaded.events, AgentDied)} - loaded.results.keys()
+    groups: dict[str, list[str]] = {}
+    for robot in loaded.robots:
+        if robot not in died:
+            frame = loaded.tracks[robot].map_frame
+            groups.setdefault(frame if frame is not None else f"none of {robot}", []).append(robot)
+    return [tuple(group) for _, group in sorted(groups.items())]
+
+
+def furthest(loaded: LoadedRun, first: Iterable[str], second: Iterable[str]) -> Finding:
+    """What stopped the pair of robots that came furthest towards merging two groups."""
+    stopped = [stop(loaded, a, b) for a in first for b in second]
+    return max(stopped, key=lambda found: found[0])[1]
+
+
+def stop(loaded: LoadedRun, a: str, b: str) -> tuple[int, Finding]:
+    """The first step that failed between two robots, with its number."""
+    for number_of, step in enumerate(STEPS):
+        found = step(loaded, a, b)
+        if found is not None:
+            return number_of, found
+    sentence = f"{a} and {b} have closures and corrections, and yet two maps."
+    return len(STEPS), Finding("unknown", Severity.BLOCKS, sentence, "Please report this run.", (a, b))
+
+
+def together(findings: Iterable[Finding]) -> list[Finding]:
+    """Findings with equal sentences become one."""
+    found: dict[tuple[str, str], Finding] = {}
+    for finding in findings:
+        key = (finding.cause, finding.sentence)
+        known = found.get(key)
+        robots = finding.robots if known is None else tuple(sorted({*known.robots, *finding.robots}))
+        found[key] = replace(finding, robots=robots)
+    return list(found.values())

@@ -1,0 +1,70 @@
+"""Findings that do not concern two robots: deaths, warnings, failures, unsteady leaders."""
+
+from collections.abc import Callable
+
+from flocc_launch.doctor.finding import Finding, Severity
+from flocc_launch.report.build import how_it_died
+from flocc_launch.report.load import LoadedRun
+from flocc_launch.report.svg import seconds
+from flocc_launch.run_folder import AgentDied, EncodingFailed, GraphOptimised, of_kind
+
+LEADER_CHANGES_MANY = 6
+
+
+def deaths(loaded: LoadedRun) -> list[Finding]:
+    """Agents that died."""
+    return [
+        Finding(
+            "agent-died",
+            Severity.HINDERS,
+            f"{event.robot} died at {seconds(event.t)} ({how_it_died(event)}).",
+            f"Read robots/{event.robot}/agent.log; start it again, it comes back with the same identity.",
+            (event.robot,),
+        )
+        for event in of_kind(loaded.events, AgentDied)
+    ]
+
+
+def solver_warnings(loaded: LoadedRun) -> list[Finding]:
+    """What the solver warned of last."""
+    rounds = of_kind(loaded.events, GraphOptimised)
+    advice = "See docs/report.md on the pose graph; more closures from other view points make scales observable."
+    warnings = rounds[-1].warnings if rounds else []
+    return [Finding("solver-warning", Severity.HINDERS, f"The solver warns: {text}.", advice) for text in warnings]
+
+
+def encoding_failures(loaded: LoadedRun) -> list[Finding]:
+    """Keyframes without descriptor or latent."""
+    found: dict[str, list[EncodingFailed]] = {}
+    for event in of_kind(loaded.events, EncodingFailed):
+        found.setdefault(event.robot, []).append(event)
+    return [
+        Finding(
+            "encoding-failed",
+            Severity.HINDERS,
+            f"{len(events)} keyframes of {robot} could not be encoded (last: {events[-1].reason}).",
+            "Check the images, and the checkpoints of the perception back-end.",
+            (robot,),
+        )
+        for robot, events in sorted(found.items())
+    ]
+
+
+def unsteady_leaders(loaded: LoadedRun) -> list[Finding]:
+    """Leaders that change all the time."""
+    findings = []
+    for robot in loaded.robots:
+        mine = [following for following in loaded.followings if following.robot == robot]
+        if len(mine) > LEADER_CHANGES_MANY:
+            sentence = f"{robot} followed {len(mine)} leaders in {seconds(loaded.end_s)}."
+            advice = "Links flap or heartbeats come late: raise core.election.leader_timeout_s, or lower the load."
+            findings.append(Finding("unsteady-leader", Severity.HINDERS, sentence, advice, (robot,)))
+    return findings
+
+
+GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
+    deaths,
+    solver_warnings,
+    encoding_failures,
+    unsteady_leaders,
+)

@@ -1,0 +1,273 @@
+"""The doctor names the right cause in each of its broken set-ups, and sends nobody after a wrong one."""
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+from tests.launch import synthetic_run
+from tests.launch.synthetic_run import Synthetic
+
+from flocc_launch.doctor import Finding, Severity, diagnose
+from flocc_launch.run_folder import ClosureKnown, KeyframeResult, RobotResult, Run, RunFolder
+from flocc_launch.scenario import Scenario
+
+IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+PAIR = {"query": "r1/3", "match": "r2/5"}
+SETTINGS = {
+    "core": {
+        "place_recognition": {"similarity_threshold": 0.1},
+        "loop_closing": {"match_ratio_threshold": 0.3},
+    }
+}
+
+
+@dataclass
+class Story:
+    """Two robots that merge, if nothing is changed; each set-up breaks one thing."""
+
+    events: list[dict[str, Any]] = field(default_factory=list)
+    keyframes: dict[str, int] = field(default_factory=lambda: {"r1": 10, "r2": 10})
+    frames: dict[str, str | None] = field(default_factory=lambda: {"r1": "map/r1", "r2": "map/r2"})
+    logs: dict[str, dict[str, int]] = field(default_factory=lambda: {r: {"r1": 11, "r2": 10} for r in ("r1", "r2")})
+    closures: list[ClosureKnown] = field(default_factory=list)
+    best_similarities: dict[str, float] = field(default_factory=dict)
+    left_no_result: set[str] = field(default_factory=set)
+
+    def say(self, t: float, robot: str, event: str, **fields: Any) -> "Story":
+        self.events.append({"t": t, "robot": robot, "event": event, **fields})
+        return self
+
+    def without(self, *kinds: str) -> "Story":
+        self.events = [event for event in self.events if event["event"] not in kinds]
+        return self
+
+    def write(self, path: Path) -> RunFolder:
+        folder = RunFolder.create(path)
+        folder.write_run(Run(scenario="broken", robots=["r1", "r2"], settings=SETTINGS))
+        folder.write_events(self.events)
+        for robot in {"r1", "r2"} - self.left_no_result:
+            folder.write_result(self.result(robot))
+        return folder
+
+    def result(self, robot: str) -> RobotResult:
+        keyframes = [
+            KeyframeResult(index=i, stamp_s=float(i), T_odom_body=IDENTITY) for i in range(self.keyframes[robot])
+        ]
+        return RobotResult(
+            robot=robot,
+            map_frame=self.frames[robot],
+            T_map_odom=IDENTITY,
+            keyframes=keyframes,
+            closures=self.closures,
+            logs=self.logs[robot],
+            best_similarities=self.best_similarities if robot == "r1" else {},
+        )
+
+
+def healthy() -> Story:
+    """Everything that happens until two robots are joined, but for the last correction."""
+    story = Story()
+    for robot, peer in (("r1", "r2"), ("r2", "r1")):
+        story.say(1.0, robot, "neighbour_up", peer=peer)
+        story.say(2.0, robot, "leader", term=1, leader="r1")
+        story.say(6.0, robot, "correction", term=1, round=1, map_frame=f"map/{robot}", T_map_odom=IDENTITY)
+    story.say(5.0, "r1", "optimised", term=1, round=1, components=[["r1"], ["r2"]], closures_used=0)
+    story.say(9.0, "r1", "candidate", **PAIR, similarity=0.8)
+    story.say(10.0, "r1", "closure_accepted", **PAIR, **accepted())
+    story.say(12.0, "r1", "optimised", term=1, round=2, components=[["r1", "r2"]], closures_used=1)
+    return story.say(30.0, "r1", "bytes", sent={}, received={})
+
+
+def accepted() -> dict[str, Any]:
+    return {"ratio": 0.9, "probability": 0.4, "correspondences": 90, "odometry_correspondences": 100, "by": "r1"}
+
+
+def no_keyframes() -> Story:
+    story = healthy().without("candidate", "closure_accepted")
+    story.keyframes["r2"] = 0
+    return story
+
+
+def no_peer() -> Story:
+    story = healthy().without("neighbour_up", "candidate", "closure_accepted")
+    story.logs = {"r1": {"r1": 10}, "r2": {"r2": 10}}
+    return story
+
+
+def refused() -> Story:
+    return no_peer().say(1.0, "r1", "peer_refused", peer="r2", reason="speaks protocol version 9")
+
+
+def duplicate_name() -> Story:
+    return no_peer().say(1.0, "r1", "duplicate_name", peer="r2", reason="two robots run with this name")
+
+
+def one_way_link() -> Story:
+    return no_peer().say(1.0, "r1", "neighbour_up", peer="r2")
+
+
+def no_descriptors() -> Story:
+    story = no_peer()
+    for robot, peer in (("r1", "r2"), ("r2", "r1")):
+        story.say(1.0, robot, "neighbour_up", peer=peer).say(3.5, robot, "neighbour_down", peer=peer)
+    return story
+
+
+def low_similarity() -> Story:
+    story = healthy().without("candidate", "closure_accepted")
+    story.best_similarities = {"r2": 0.07}
+    return story
+
+
+def latents() -> Story:
+    failure = {"keyframe": "r2/5", "holder": "r2", "reason": "no answer in 10 s"}
+    return healthy().without("closure_accepted").say(20.0, "r1", "latent_failed", **failure)
+
+
+def not_registered() -> Story:
+    return healthy().without("closure_accepted")
+
+
+def registrations_rejected() -> Story:
+    story = healthy().without("closure_accepted")
+    story.say(11.0, "r1", "closure_rejected", **PAIR, ratio=0.21, reason="match ratio too low")
+    return story.say(
+        12.0, "r1", "closure_rejected", query="r1/4", match="r2/7", ratio=0.05, reason="few correspondences"
+    )
+
+
+def no_leader() -> Story:
+    return healthy().without("leader", "optimised", "correction")
+
+
+def leader_silent() -> Story:
+    story = healthy()
+    story.events = [e for e in story.events if not (e["event"] == "optimised" and e["round"] == 2)]
+    return story.say(10.5, "r1", "agent_died", signal=9)
+
+
+def solver_failed() -> Story:
+    story = healthy()
+    story.events = [e for e in story.events if not (e["event"] == "optimised" and e["round"] == 2)]
+    return story.say(12.0, "r1", "optimisation_failed", term="1:r1", round=2, reason="the system is singular")
+
+
+def closures_not_connecting() -> Story:
+    parts = {"components": [["r1"], ["r2"]], "closures_used": 0, "closures_rejected": 1}
+    return healthy().say(14.0, "r1", "optimised", term=1, round=3, **parts)
+
+
+def corrections_lost() -> Story:
+    return healthy().say(13.0, "r1", "correction", term=1, round=2, map_frame="map/r1", T_map_odom=IDENTITY)
+
+
+SETUPS: dict[str, Callable[[], Story]] = {
+    "no-keyframes": no_keyframes,
+    "no-peer": no_peer,
+    "refused": refused,
+    "duplicate-name": duplicate_name,
+    "one-way-link": one_way_link,
+    "no-descriptors": no_descriptors,
+    "low-similarity": low_similarity,
+    "latents": latents,
+    "not-registered": not_registered,
+    "registrations-rejected": registrations_rejected,
+    "no-leader": no_leader,
+    "leader-silent": leader_silent,
+    "solver-failed": solver_failed,
+    "closures-not-connecting": closures_not_connecting,
+    "corrections-lost": corrections_lost,
+}
+
+
+def blocking(folder: RunFolder) -> list[Finding]:
+    return [finding for finding in diagnose(folder) if finding.severity is Severity.BLOCKS]
+
+
+@pytest.mark.parametrize("cause", SETUPS)
+def test_the_doctor_names_the_cause_and_only_it(tmp_path: Path, cause: str) -> None:
+    assert [finding.cause for finding in blocking(SETUPS[cause]().write(tmp_path / "run"))] == [cause]
+
+
+@pytest.mark.parametrize("cause", SETUPS)
+def test_every_finding_says_what_to_change(tmp_path: Path, cause: str) -> None:
+    (finding,) = blocking(SETUPS[cause]().write(tmp_path / "run"))
+    assert finding.sentence.endswith(".")
+    assert finding.advice.endswith(".")
+    assert {"r1", "r2"} >= set(finding.robots) != set()
+
+
+@pytest.mark.parametrize("cause", SETUPS)
+def test_every_setting_that_the_doctor_names_exists(tmp_path: Path, cause: str) -> None:
+    (finding,) = blocking(SETUPS[cause]().write(tmp_path / "run"))
+    for name in re.findall(r"\b(?:core|keyframes|backend|perception)(?:\.\w+)+", finding.advice):
+        assert name in set(settings_of(Scenario, "")), name
+
+
+def settings_of(section: Any, above: str) -> Iterator[str]:
+    fields = section.model_fields if issubclass(section, BaseModel) else section.__dataclass_fields__
+    for name, described in fields.items():
+        yield f"{above}{name}"
+        kind = described.annotation if issubclass(section, BaseModel) else described.type
+        if isinstance(kind, type) and (issubclass(kind, BaseModel) or hasattr(kind, "__dataclass_fields__")):
+            yield from settings_of(kind, f"{above}{name}.")
+
+
+def test_the_figures_that_show_it_stand_in_the_sentence(tmp_path: Path) -> None:
+    (rejected,) = blocking(registrations_rejected().write(tmp_path / "rejected"))
+    assert "r1/3 – r2/5: 0.210, r1/4 – r2/7: 0.0500" in rejected.sentence
+    assert "below R_thr 0.3" in rejected.sentence
+    (similar,) = blocking(low_similarity().write(tmp_path / "similar"))
+    assert "below the threshold of 0.1, the best was 0.07" in similar.sentence
+    (latent,) = blocking(latents().write(tmp_path / "latent"))
+    assert "no answer in 10 s" in latent.sentence
+
+
+def test_a_merged_run_is_said_to_be_well(tmp_path: Path) -> None:
+    story = corrections_lost()
+    story.frames["r2"] = "map/r1"
+    assert [(f.cause, f.sentence) for f in diagnose(story.write(tmp_path / "run"))] == [
+        ("merged", "All 2 robots are in map/r1.")
+    ]
+
+
+def test_a_dead_robot_is_named_and_the_others_are_well(tmp_path: Path) -> None:
+    findings = diagnose(synthetic_run.write(tmp_path / "run", Synthetic(died=("r1", 50.0))))
+    assert [finding.cause for finding in findings][:2] == ["merged", "agent-died"]
+    assert findings[1].robots == ("r1",)
+
+
+def test_robots_that_do_not_merge_though_all_is_there_are_not_explained_away(tmp_path: Path) -> None:
+    story = corrections_lost().say(13.1, "r2", "correction", term=1, round=2, map_frame="map/r2", T_map_odom=IDENTITY)
+    assert [finding.cause for finding in blocking(story.write(tmp_path / "run"))] == ["unknown"]
+
+
+def test_warnings_failures_and_restless_leaders_are_told(tmp_path: Path) -> None:
+    story = corrections_lost()
+    story.frames["r2"] = "map/r1"
+    story.say(14.0, "r1", "optimised", term=1, round=3, components=[["r1", "r2"]], warnings=["a scale collapsed"])
+    story.say(15.0, "r2", "encoding_failed", keyframe="r2/3", reason="image is black")
+    for k in range(8):
+        story.say(16.0 + k, "r2", "leader", term=2 + k, leader=f"r{1 + k % 2}")
+    findings = diagnose(story.write(tmp_path / "run"))
+    assert [finding.cause for finding in findings] == ["merged", "solver-warning", "encoding-failed", "unsteady-leader"]
+    assert "a scale collapsed" in findings[1].sentence
+
+
+def test_a_robot_that_left_no_result_is_judged_by_the_events(tmp_path: Path) -> None:
+    story = latents()
+    story.left_no_result = {"r1", "r2"}
+    for robot in ("r1", "r2"):
+        story.say(0.5, robot, "keyframe", keyframe=f"{robot}/0", stamp_s=0.0, T_odom_body=IDENTITY)
+    assert [finding.cause for finding in blocking(story.write(tmp_path / "run"))] == ["latents"]
+
+
+def test_one_robot_alone_has_nothing_to_merge(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.write_run(Run(scenario="alone", robots=["r1"]))
+    folder.write_events([])
+    assert diagnose(folder) == []
