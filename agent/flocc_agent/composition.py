@@ -9,7 +9,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,6 @@ from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
-
-T = TypeVar("T")
 
 Float = NDArray[np.float64]
 
@@ -142,7 +140,7 @@ class Agent:
         self._run: asyncio.Task[None] | None = None
         self._playing: asyncio.Task[None] | None = None
         self._radio: Radio | None = None
-        self._slowness = 1.0
+        self._workers: Workers | None = None
 
     @property
     def log(self) -> LogId:
@@ -245,7 +243,8 @@ class Agent:
 
     def set_slowness(self, factor: float) -> None:
         """Make encoding, registration and optimisation take this many times as long, for tests."""
-        self._slowness = max(factor, 1.0)
+        if self._workers is not None:
+            self._workers.slowdown = max(factor, 1.0)
 
     def status(self) -> dict[str, Any]:
         """What the agent does now, for tables and dashboards."""
@@ -263,9 +262,8 @@ class Agent:
         """Name every concrete class."""
         config = self.config
         self._store = _open_store(config)
-        parameters = config.radio.parameters()
-        rng = np.random.default_rng(config.seed)
-        self._radio = Radio(parameters, rng)
+        self._workers = Workers()
+        self._radio = Radio(config.radio.parameters(), np.random.default_rng(config.seed))
         perception = build_perception(config.perception, config.seed)
         restored = restore(self._store)
         log = self._store.identity.log
@@ -275,22 +273,16 @@ class Agent:
             core,
             ZenohTransport(config.swarm, config.name, config.transport, self._radio, self._clock_s),
             self._store,
-            Workers(),
+            self._workers,
             Skills(
-                lambda image: self._slowed(perception.encode, image),
-                lambda *latents: self._slowed(perception.register, *latents),
+                perception.encode,
+                perception.register,
                 partial(optimise_graph, config.backend),
             ),
             Reporter(config.name, self._T_body_camera, config.backend.steepness),
             self._on_line,
             self._clock_s,
         )
-
-    def _slowed(self, function: Callable[..., T], *arguments: Any) -> T:
-        started_s = time.monotonic()
-        result = function(*arguments)
-        time.sleep((self._slowness - 1.0) * (time.monotonic() - started_s))
-        return result
 
     async def _play(self, recording: Recording) -> None:
         source = self.config.source
