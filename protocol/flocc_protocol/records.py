@@ -33,6 +33,7 @@ RECORD_BYTES_MAX = 8 * 1024
 DESCRIPTOR_DIMENSION_MAX = 2048
 REASON_LENGTH_MAX = 80
 UPPER_TRIANGLE = 21
+SCALE_INITIAL_MIN, SCALE_INITIAL_MAX = 1e-9, 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +133,7 @@ _BY_CODE: dict[int, Codec[Record]] = {
         correspondences=COUNT,
         odometry_correspondences=COUNT,
         match_ratio=real(0.0, 1e6),
-        scale_initial=optional(real(1e-9, 1e9)),
+        scale_initial=optional(real(SCALE_INITIAL_MIN, SCALE_INITIAL_MAX)),
         covariance=optional(ARRAY),
     ),
     3: struct(

@@ -35,6 +35,7 @@ from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
 from flocc_agent.core.rounds import Rounds, solution_report
+from flocc_agent.geometry import is_rigid
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
@@ -53,11 +54,14 @@ from flocc_protocol.messages import (
     RecordRequest,
 )
 from flocc_protocol.records import (
+    SCALE_INITIAL_MAX,
+    SCALE_INITIAL_MIN,
     ClosureRecord,
     FixRecord,
     KeyframeRecord,
     Record,
     RejectionRecord,
+    encode_record,
 )
 
 
@@ -261,9 +265,10 @@ class Robot:
             return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
         if ratio < limits.match_ratio_threshold:
             return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
-        covariance = None if result.covariance is None else upper_triangle(result.covariance)
-        T_query_match = pose7(result.T_query_match_unscaled)
-        return ClosureRecord(query, match, T_query_match, *counts, ratio, result.scale_initial, covariance)
+        try:
+            return _closure(query, match, result, ratio)
+        except ValueError as error:
+            return RejectionRecord(query, match, f"no closure: {error}", *counts)
 
     def _on_optimised(self, event: GraphOptimised) -> list[Effect]:
         if not self.rounds.on_solution(event.term, event.round, event.solution):
@@ -359,6 +364,24 @@ def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:
         "keyframe",
         {"keyframe": keyframe, "stamp_s": record.stamp_s, "T_odom_camera": pose_facts},  # type: ignore[dict-item]
     )
+
+
+def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: float) -> ClosureRecord:
+    """The record of an accepted registration; a scale that no record can hold counts as none.
+
+    Raises:
+        ValueError: The registration makes no sense; a log must never hold it.
+    """
+    if not is_rigid(result.T_query_match_unscaled):
+        raise ValueError("the relative pose is not rigid")
+    scale = result.scale_initial
+    if scale is not None and not SCALE_INITIAL_MIN <= scale <= SCALE_INITIAL_MAX:
+        scale = None
+    covariance = None if result.covariance is None else upper_triangle(result.covariance)
+    counts = (result.correspondences, result.odometry_correspondences)
+    record = ClosureRecord(query, match, pose7(result.T_query_match_unscaled), *counts, ratio, scale, covariance)
+    encode_record(record)
+    return record
 
 
 def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
