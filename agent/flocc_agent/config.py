@@ -82,7 +82,7 @@ class BackendConfig(Section):
     """Closures whose keyframes are fewer than this apart on both sides share a scale cluster."""
     scale_link_sigma_ratio: float = Field(0.1, gt=0)
     """Standard deviation of the difference of two linked scales, relative to their size."""
-    scale_prior_sigma_ratio: float = Field(5.0, gt=0)
+    scale_prior_sigma_ratio: float = Field(20.0, gt=0)
     """Weak prior on each scale around its initial value, relative to it; keeps unobservable scales finite."""
     weight_by_probability: bool = True
     """Multiply each closure's information by the probability of Eq. (2); off for measurements that carry a trusted
@@ -93,6 +93,8 @@ class BackendConfig(Section):
     """Control parameter at which GNC starts at the latest; smaller starts more convex and takes more solves."""
     gnc_step: float = Field(2.0, gt=1)
     """Factor of the control parameter per GNC round; smaller is more careful and slower."""
+    gnc_inner_steps: int = Field(2, ge=1)
+    """Linear solves per GNC round; more follows each round's optimum more closely."""
     relative_tolerance: float = Field(1e-5, gt=0)
     """Stop when a step lowers the cost by less than this part of it."""
     absolute_tolerance: float = Field(1e-9, ge=0)
@@ -275,20 +277,12 @@ class PeerEndpoints(Section):
 
 
 class TlsConfig(Section):
-    """Mutual TLS: the files that `flocc keys` wrote for this robot."""
+    """Mutual TLS, one writer per key, and signed records: with the folder that `flocc keys` made for this robot."""
 
-    ca: Path
-    """Certificate of the swarm's authority; whoever it did not certify is refused."""
-    certificate: Path
-    """This robot's certificate; its common name is the robot's name."""
-    key: Path
-    """This robot's private key."""
+    folder: Path
+    """Holds ca.crt, robot.crt, robot.key, signing.key and members.json."""
     names_verified: bool = False
     """True also demands that the dialled address stands in the peer's certificate."""
-    members: tuple[str, ...] = ()
-    """Robots that may write, each under its own name only; empty: those of the roster."""
-    operators: tuple[str, ...] = ("operator",)
-    """Certificate names that may ask for status and inject faults."""
 
 
 class TransportConfig(Section):

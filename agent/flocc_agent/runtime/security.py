@@ -1,80 +1,217 @@
 """Who may write what: TLS settings and access rules for zenoh, and Ed25519 signatures over records.
 
-TLS names the last hop only; records travel through relays, so each carries a signature by the robot that wrote it.
+TLS proves who the next hop is; records travel through relays, so each carries a signature of the robot that wrote it.
 `cryptography` is imported where it is used: installations that trust their network need not have it.
 """
 
-from collections.abc import Iterable
+import json
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import TlsConfig
 from flocc_agent.runtime.transport import TransportError
 from flocc_protocol import keys
+from flocc_protocol.errors import DecodeError
+from flocc_protocol.ids import NAME_PATTERN, LogId
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+CA, CERTIFICATE, KEY, SIGNING_KEY, MEMBERS = "ca.crt", "robot.crt", "robot.key", "signing.key", "members.json"
+SIGNATURE_BYTES = 64
+MEMBERS_MAX = 1000
 
 WRITES = ["put", "delete", "liveliness_token", "declare_queryable", "reply"]
 READS = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
 
 
-def tls_settings(tls: TlsConfig) -> dict[str, Any]:
-    """Give zenoh's settings for mutual TLS, and nothing but TLS.
+@dataclass(frozen=True, slots=True)
+class Members:
+    """Who belongs to a swarm.
+
+    Attributes:
+        swarm: Name of the swarm.
+        robots: Public signing key (32 bytes) by robot; each writes under its own name only.
+        operators: Names of certificates that may ask for status and inject faults.
+    """
+
+    swarm: str
+    robots: Mapping[str, bytes]
+    operators: tuple[str, ...]
+
+
+def read_members(path: Path) -> Members:
+    """Read what `flocc keys` wrote.
 
     Raises:
-        TransportError: A file is missing or unreadable; the message names it.
+        TransportError: The file is missing or not such a file; the message names it.
     """
-    for path in (tls.ca, tls.certificate, tls.key):
-        check_readable(path)
-    return {
-        "transport/link/protocols": ["tls"],
-        "transport/link/tls/root_ca_certificate": str(tls.ca),
-        "transport/link/tls/enable_mtls": True,
-        "transport/link/tls/listen_private_key": str(tls.key),
-        "transport/link/tls/listen_certificate": str(tls.certificate),
-        "transport/link/tls/connect_private_key": str(tls.key),
-        "transport/link/tls/connect_certificate": str(tls.certificate),
-        "transport/link/tls/verify_name_on_connect": tls.names_verified,
-    }
-
-
-def check_readable(path: Path) -> None:
-    """Raise a TransportError that names the file, if it cannot be read."""
     try:
-        path.read_bytes()
+        content = json.loads(read(path))
+        robots = {str(name): bytes.fromhex(key) for name, key in content["robots"].items()}
+        members = Members(str(content["swarm"]), robots, tuple(str(name) for name in content["operators"]))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TransportError(f"{path}: is not a list of members: {error}") from error
+    names = [*members.robots, *members.operators]
+    if len(names) > MEMBERS_MAX or not all(NAME_PATTERN.fullmatch(name) for name in names):
+        raise TransportError(f"{path}: holds more than {MEMBERS_MAX} names, or one that is no name")
+    return members
+
+
+def read(path: Path) -> bytes:
+    """Read a file.
+
+    Raises:
+        TransportError: It cannot be read; the message names it.
+    """
+    try:
+        return path.read_bytes()
     except OSError as error:
         raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def access_control(swarm: str, members: Iterable[str], operators: Iterable[str]) -> dict[str, Any]:
-    """Give zenoh's access rules: everybody certified reads the swarm, each robot writes under its own name only.
+def secure_settings(tls: TlsConfig, swarm: str, robot: str) -> dict[str, Any]:
+    """Give zenoh's settings for mutual TLS, nothing but TLS, and one writer per key.
+
+    Raises:
+        TransportError: A file is missing or unreadable, or this robot is not a member of this swarm.
+    """
+    members = read_members(tls.folder / MEMBERS)
+    if members.swarm != swarm:
+        raise TransportError(f"{tls.folder / MEMBERS}: is of swarm {members.swarm}, not of {swarm}")
+    if robot not in members.robots and robot not in members.operators:
+        raise TransportError(f"{tls.folder / MEMBERS}: does not name {robot}")
+    return tls_settings(tls) | {"access_control": access_control(swarm, members.robots, members.operators)}
+
+
+def tls_settings(tls: TlsConfig) -> dict[str, Any]:
+    """Give zenoh's settings for mutual TLS.
+
+    Raises:
+        TransportError: A file is missing or unreadable; the message names it.
+    """
+    ca, certificate, key = (tls.folder / name for name in (CA, CERTIFICATE, KEY))
+    for path in (ca, certificate, key):
+        read(path)
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls/root_ca_certificate": str(ca),
+        "transport/link/tls/enable_mtls": True,
+        "transport/link/tls/listen_private_key": str(key),
+        "transport/link/tls/listen_certificate": str(certificate),
+        "transport/link/tls/connect_private_key": str(key),
+        "transport/link/tls/connect_certificate": str(certificate),
+        "transport/link/tls/verify_name_on_connect": tls.names_verified,
+    }
+
+
+def access_control(swarm: str, robots: Iterable[str], operators: Iterable[str]) -> dict[str, Any]:
+    """Give zenoh's access rules: whoever is certified reads the swarm, each robot writes under its own name only.
 
     Rules apply to what comes in, by the common name of the link's certificate; what is not allowed is dropped.
     """
     everything = f"{keys.ROOT}/{keys.VERSION}/{swarm}/**"
     latents = f"{keys.ROOT}/{keys.VERSION}/{swarm}/*/{keys.LATENT}/**"
     admin = [keys.admin_key(swarm, "*", each) for each in keys.Admin]
-    members, operators = sorted(set(members)), sorted(set(operators))
-    own = [_rule(f"write-{name}", WRITES, [f"{keys.robot_prefix(swarm, name)}/**"], ["ingress"]) for name in members]
+    robots, operators = sorted(set(robots)), sorted(set(operators))
+    everybody = sorted({*robots, *operators})
     rules = [
         _rule("read", READS, [everything, keys.presence_pattern()], ["ingress"]),
         _rule("fetch", ["query"], [latents], ["ingress"]),
         _rule("send", [*WRITES, *READS, "query"], ["**"], ["egress"]),
         _rule("operate", ["query"], admin, ["ingress"]),
-        *own,
+        *(_rule(f"write-{name}", WRITES, [f"{keys.robot_prefix(swarm, name)}/**"], ["ingress"]) for name in robots),
     ]
-    everybody = [*members, *(name for name in operators if name not in members)]
-    subjects = [{"id": name, "cert_common_names": [name]} for name in everybody]
-    policies: list[dict[str, Any]] = [{"rules": ["read", "fetch", "send"], "subjects": everybody}]
-    policies += [{"rules": [f"write-{name}"], "subjects": [name]} for name in members]
-    if operators:
-        policies.append({"rules": ["operate"], "subjects": operators})
+    policies = [
+        {"rules": ["read", "fetch", "send"], "subjects": everybody},
+        *({"rules": [f"write-{name}"], "subjects": [name]} for name in robots),
+        *([{"rules": ["operate"], "subjects": operators}] if operators else []),
+    ]
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": subjects,
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in everybody],
         "policies": policies,
     }
 
 
 def _rule(name: str, messages: list[str], key_exprs: list[str], flows: list[str]) -> dict[str, Any]:
     return {"id": name, "messages": messages, "flows": flows, "permission": "allow", "key_exprs": key_exprs}
+
+
+class RecordSealer:
+    """Signs this robot's records and checks those of all members: record bytes in, record bytes plus 64 out.
+
+    The signature covers swarm, log and number as well, so that a record cannot be moved to another place.
+    """
+
+    def __init__(self, swarm: str, signing_key: "Ed25519PrivateKey", members: Mapping[str, bytes]) -> None:
+        self._swarm = swarm
+        self._signing_key = signing_key
+        self._verifying_keys = {robot: _public_key(key) for robot, key in members.items()}
+
+    @classmethod
+    def of(cls, tls: TlsConfig) -> "RecordSealer":
+        """Read this robot's signing key and the members' public ones.
+
+        Raises:
+            TransportError: A file is missing or not a key, or the extra `secure` is not installed.
+        """
+        _check_installed()
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+        path = tls.folder / SIGNING_KEY
+        try:
+            signing_key = load_pem_private_key(read(path), password=None)
+        except ValueError as error:
+            raise TransportError(f"{path}: is not a private key") from error
+        if not isinstance(signing_key, Ed25519PrivateKey):
+            raise TransportError(f"{path}: is not an Ed25519 key")
+        members = read_members(tls.folder / MEMBERS)
+        return cls(members.swarm, signing_key, members.robots)
+
+    def seal(self, log: LogId, number: int, record: bytes) -> bytes:
+        """Append this robot's signature to a record of its own log."""
+        return record + self._signing_key.sign(signed_text(self._swarm, log, number, record))
+
+    def opened(self, log: LogId, number: int, sealed: bytes) -> bytes:
+        """Give the record without its signature, once that is checked.
+
+        Raises:
+            DecodeError: The robot is no member, or its signature is missing or wrong.
+        """
+        from cryptography.exceptions import InvalidSignature
+
+        verifying_key = self._verifying_keys.get(log.robot)
+        if verifying_key is None:
+            raise DecodeError(f"log {log} is of no member of the swarm")
+        record, signature = sealed[:-SIGNATURE_BYTES], sealed[-SIGNATURE_BYTES:]
+        try:
+            verifying_key.verify(signature, signed_text(self._swarm, log, number, record))
+        except InvalidSignature as error:
+            raise DecodeError(f"record {number} of log {log} carries no signature of {log.robot}") from error
+        return record
+
+
+def signed_text(swarm: str, log: LogId, number: int, record: bytes) -> bytes:
+    """Give what a signature covers: where the record stands, unambiguously, then the record."""
+    place = f"{keys.ROOT}/{keys.VERSION}/{swarm}/{log}/{number}".encode()
+    return struct.pack(">H", len(place)) + place + record
+
+
+def _public_key(raw: bytes) -> "Ed25519PublicKey":
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+    return Ed25519PublicKey.from_public_bytes(raw)
+
+
+def _check_installed() -> None:
+    try:
+        import cryptography  # noqa: F401
+    except ImportError as error:
+        raise TransportError("signed records need the extra 'secure': pip install 'flocc[secure]'") from error

@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from flocc_agent.config import TransportConfig
-from flocc_agent.runtime.security import access_control, tls_settings
+from flocc_agent.runtime.security import secure_settings
 from flocc_agent.runtime.transport import TransportError
 
 RX_MESSAGE_MARGIN_BYTES = 64 * 1024
@@ -66,9 +66,7 @@ def session_settings(config: TransportConfig, swarm: str, robot: str, plane: Pla
     if not control:
         settings["transport/link/tcp/so_sndbuf"] = config.bulk_send_buffer_bytes
     if config.tls is not None:
-        settings |= tls_settings(config.tls)
-        members = sorted({*config.tls.members, *config.roster, robot})
-        settings["access_control"] = access_control(swarm, members, config.tls.operators)
+        settings |= secure_settings(config.tls, swarm, robot)
     return settings
 
 

@@ -1,0 +1,246 @@
+"""`flocc keys`: a swarm's authority, a certificate and a signing key per robot, ready to be copied.
+
+    FOLDER/authority/   ca.crt, ca.key: stays here; whoever has ca.key can admit robots
+    FOLDER/ROBOT/       ca.crt, robot.crt, robot.key, signing.key, members.json: belongs on that robot
+
+Running it again with more names admits more robots; existing keys stay. All robots then need the new members.json.
+"""
+
+import ipaddress
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flocc_agent.runtime.security import CA, CERTIFICATE, KEY, MEMBERS, SIGNING_KEY
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import checked_name
+
+if TYPE_CHECKING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+AUTHORITY, CA_KEY = "authority", "ca.key"
+AUTHORITY_DAYS = 3650
+ROBOT_DAYS = 1825
+CLOCK_MARGIN = timedelta(days=1)
+OPERATORS = ("operator",)
+
+
+class KeysError(FloccError):
+    """Keys that cannot be made or read; the message names the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """Who certifies robots."""
+
+    certificate: "x509.Certificate"
+    key: "EllipticCurvePrivateKey"
+
+
+def make_keys(
+    folder: Path,
+    swarm: str,
+    robots: Iterable[str],
+    operators: Iterable[str] = OPERATORS,
+    addresses: Mapping[str, Iterable[str]] | None = None,
+    now: datetime | None = None,
+) -> dict[str, Path]:
+    """Make what is missing: the authority, and keys for each robot and operator.
+
+    Args:
+        folder: Where the authority and a folder per robot stand or will stand.
+        swarm: Name of the swarm; one authority certifies one swarm.
+        robots: Names of robots to admit.
+        operators: Names of people who may ask for status and inject faults.
+        addresses: IP addresses or host names of each robot, for `names_verified`.
+        now: Begin of validity; None is the clock's time.
+
+    Returns:
+        Each member's folder, also of those admitted earlier.
+
+    Raises:
+        KeysError: The folder is of another swarm, cannot be written, or `cryptography` is not installed.
+        BadName: A name that no robot can have.
+    """
+    _check_installed()
+    moment = now or datetime.now(UTC)
+    names = {checked_name(name): "robots" for name in robots} | {checked_name(name): "operators" for name in operators}
+    if AUTHORITY in names:
+        raise KeysError(f"{folder}: no robot can be named {AUTHORITY!r} here")
+    try:
+        authority = _authority(folder / AUTHORITY, checked_name(swarm, "swarm name"), moment)
+        members = _members(folder / AUTHORITY / MEMBERS, swarm)
+        for name, role in sorted(names.items()):
+            public_key = _member_keys(folder / name, name, authority, list((addresses or {}).get(name, ())), moment)
+            members[role][name] = public_key.hex()
+        return _publish(folder, swarm, members, authority)
+    except OSError as error:
+        raise KeysError(f"{error.filename}: cannot be written: {error.strerror}") from error
+
+
+def _publish(folder: Path, swarm: str, members: dict[str, dict[str, str]], authority: Authority) -> dict[str, Path]:
+    """Give every member the list of members and the authority's certificate."""
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    content = {"swarm": swarm, "robots": members["robots"], "operators": sorted(members["operators"])}
+    listed = json.dumps(content, indent=2, sort_keys=True).encode() + b"\n"
+    folders = {name: folder / name for role in members.values() for name in role}
+    for path in (folder / AUTHORITY, *folders.values()):
+        path.mkdir(parents=True, exist_ok=True)
+        _write(path / MEMBERS, listed)
+        _write(path / CA, authority.certificate.public_bytes(Encoding.PEM))
+    return dict(sorted(folders.items()))
+
+
+def _members(path: Path, swarm: str) -> dict[str, dict[str, str]]:
+    """Read the members admitted so far."""
+    if not path.exists():
+        return {"robots": {}, "operators": {}}
+    content = json.loads(path.read_bytes())
+    if content["swarm"] != swarm:
+        raise KeysError(f"{path}: is of swarm {content['swarm']}, not of {swarm}")
+    return {"robots": content["robots"], "operators": dict.fromkeys(content["operators"], "")}
+
+
+def _authority(folder: Path, swarm: str, now: datetime) -> Authority:
+    """Read the authority, or make one."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    if (folder / CA_KEY).exists():
+        try:
+            key = load_pem_private_key((folder / CA_KEY).read_bytes(), password=None)
+            certificate = x509.load_pem_x509_certificate((folder / CA).read_bytes())
+        except ValueError as error:
+            raise KeysError(f"{folder}: holds no readable authority: {error}") from error
+        assert isinstance(key, ec.EllipticCurvePrivateKey)
+        return Authority(certificate, key)
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(f"flocc swarm {swarm}")
+    certificate = (
+        _certificate(name, name, key, now, AUTHORITY_DAYS)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, _hash())
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_private(folder / CA_KEY, _pem(key))
+    _write(folder / CA, _certificate_pem(certificate))
+    return Authority(certificate, key)
+
+
+def _member_keys(folder: Path, name: str, authority: Authority, addresses: list[str], now: datetime) -> bytes:
+    """Make a member's keys where they are missing, and give its public signing key."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID
+
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / KEY).exists():
+        key = ec.generate_private_key(ec.SECP256R1())
+        purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        certificate = (
+            _certificate(_name(name), authority.certificate.subject, key, now, ROBOT_DAYS)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+            .add_extension(x509.SubjectAlternativeName(_alternative_names(name, addresses)), critical=False)
+            .sign(authority.key, _hash())
+        )
+        _write(folder / CERTIFICATE, _certificate_pem(certificate))
+        _write_private(folder / KEY, _pem(key))
+    return _signing_key(folder / SIGNING_KEY)
+
+
+def _signing_key(path: Path) -> bytes:
+    """Make a signing key where there is none, and give its public half, 32 bytes."""
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    if path.exists():
+        key = load_pem_private_key(path.read_bytes(), password=None)
+        assert isinstance(key, Ed25519PrivateKey)
+    else:
+        key = Ed25519PrivateKey.generate()
+        _write_private(path, _pem(key))
+    return key.public_key().public_bytes_raw()
+
+
+def _certificate(
+    subject: "x509.Name", issuer: "x509.Name", key: "EllipticCurvePrivateKey", now: datetime, days: int
+) -> "x509.CertificateBuilder":
+    from cryptography import x509
+
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - CLOCK_MARGIN)
+        .not_valid_after(now + timedelta(days=days))
+    )
+
+
+def _alternative_names(name: str, addresses: list[str]) -> "list[x509.GeneralName]":
+    from cryptography import x509
+
+    names: list[x509.GeneralName] = [x509.DNSName(name)]
+    for address in addresses:
+        try:
+            names.append(x509.IPAddress(ipaddress.ip_address(address)))
+        except ValueError:
+            names.append(x509.DNSName(address))
+    return names
+
+
+def _name(text: str) -> "x509.Name":
+    from cryptography import x509
+    from cryptography.x509.oid import NameOID
+
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _hash() -> "hashes.SHA256":
+    from cryptography.hazmat.primitives import hashes
+
+    return hashes.SHA256()
+
+
+def _pem(key: "EllipticCurvePrivateKey | Ed25519PrivateKey") -> bytes:
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _certificate_pem(certificate: "x509.Certificate") -> bytes:
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    return certificate.public_bytes(Encoding.PEM)
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file so that it is either the old one or the whole new one."""
+    temporary = path.with_name(path.name + ".new")
+    temporary.write_bytes(content)
+    temporary.replace(path)
+
+
+def _write_private(path: Path, content: bytes) -> None:
+    """Write a file that only its owner can read."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(content)
+
+
+def _check_installed() -> None:
+    try:
+        import cryptography  # noqa: F401
+    except ImportError as error:
+        raise KeysError("flocc keys needs the extra 'secure': pip install 'flocc[secure]'") from error

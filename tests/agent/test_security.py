@@ -1,0 +1,220 @@
+"""Claims on keys, signatures and mutual TLS, the last over real zenoh on loopback."""
+
+import json
+import stat
+from pathlib import Path
+
+import pytest
+from tests.agent.runtime.loopback import loopback_configs, until
+
+from flocc_agent.config import TlsConfig, TransportConfig
+from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportError
+from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
+from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_launch.keys import KeysError, make_keys
+from flocc_protocol.errors import DecodeError
+from flocc_protocol.ids import LogId
+
+SWARM = "field"
+ROBOTS = ("r1", "r2")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return make_keys(tmp_path_factory.mktemp("keys"), SWARM, [*ROBOTS, "r3"])
+
+
+def sealer(folders: dict[str, Path], robot: str) -> RecordSealer:
+    return RecordSealer.of(TlsConfig(folder=folders[robot]))
+
+
+# --- keys
+
+
+def test_private_keys_are_readable_by_their_owner_only(folders: dict[str, Path]) -> None:
+    private = [folders["r1"] / "robot.key", folders["r1"] / "signing.key", folders["r1"].parent / "authority/ca.key"]
+    assert [stat.S_IMODE(path.stat().st_mode) for path in private] == [0o600] * 3
+    assert not (folders["r1"] / "ca.key").exists()
+
+
+def test_admits_more_robots_without_touching_those_that_are_there(tmp_path: Path) -> None:
+    first = make_keys(tmp_path, SWARM, ["r1"])
+    before = {path.name: path.read_bytes() for path in first["r1"].iterdir() if path.name != "members.json"}
+    both = make_keys(tmp_path, SWARM, ["r2"])
+    after = {path.name: path.read_bytes() for path in both["r1"].iterdir() if path.name != "members.json"}
+    assert before == after
+    assert list(both) == ["operator", "r1", "r2"]
+    lists = [json.loads((folder / "members.json").read_bytes()) for folder in both.values()]
+    assert [sorted(content["robots"]) for content in lists] == [["r1", "r2"]] * 3
+
+
+def test_one_folder_is_of_one_swarm(tmp_path: Path) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    with pytest.raises(KeysError, match="is of swarm field, not of farm"):
+        make_keys(tmp_path, "farm", ["r2"])
+
+
+# --- signatures
+
+
+def test_a_relay_can_pass_a_record_on_and_not_change_it(folders: dict[str, Path]) -> None:
+    log, record = LogId("r1", 3), b"a keyframe"
+    sealed = sealer(folders, "r1").seal(log, 7, record)
+    judge = sealer(folders, "r2")
+    assert judge.opened(log, 7, sealed) == record
+    altered = [
+        (log, 7, b"A" + sealed[1:]),
+        (log, 7, sealed[:-1] + bytes([sealed[-1] ^ 1])),
+        (log, 8, sealed),
+        (LogId("r1", 4), 7, sealed),
+        (LogId("r2", 3), 7, sealed),
+        (LogId("r9", 3), 7, sealed),
+        (log, 7, b""),
+        (log, 7, sealed[:20]),
+    ]
+    for claim in altered:
+        with pytest.raises(DecodeError):
+            judge.opened(*claim)
+
+
+def test_a_relay_cannot_sign_for_another(folders: dict[str, Path]) -> None:
+    forged = sealer(folders, "r2").seal(LogId("r1"), 0, b"forged")
+    with pytest.raises(DecodeError, match="carries no signature of r1"):
+        sealer(folders, "r3").opened(LogId("r1"), 0, forged)
+
+
+def test_a_signature_is_of_one_swarm(tmp_path: Path, folders: dict[str, Path]) -> None:
+    elsewhere = RecordSealer("farm", sealer(folders, "r1")._signing_key, {})
+    sealed = elsewhere.seal(LogId("r1"), 0, b"record")
+    with pytest.raises(DecodeError):
+        sealer(folders, "r2").opened(LogId("r1"), 0, sealed)
+
+
+# --- files
+
+
+@pytest.mark.parametrize("name", ["ca.crt", "robot.crt", "robot.key", "members.json"])
+def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+    folder = make_keys(tmp_path, SWARM, ["r1"])["r1"]
+    (folder / name).unlink()
+    config = TransportConfig(tls=TlsConfig(folder=folder), control_listen=("tls/[::]:0",), bulk_listen=("tls/[::]:0",))
+    with pytest.raises(TransportError, match=f"{name}: cannot be read: No such file"):
+        session_settings(config, SWARM, "r1", Plane.CONTROL)
+
+
+def test_a_robot_that_is_no_member_is_named(folders: dict[str, Path]) -> None:
+    config = TransportConfig(
+        tls=TlsConfig(folder=folders["r1"]), control_listen=("tls/[::]:0",), bulk_listen=("tls/[::]:0",)
+    )
+    with pytest.raises(TransportError, match="does not name r8"):
+        session_settings(config, SWARM, "r8", Plane.CONTROL)
+
+
+# --- mutual TLS over real zenoh
+
+
+class Listener:
+    """A transport that remembers what it received."""
+
+    def __init__(self, robot: str, config: TransportConfig) -> None:
+        self.received: list[tuple[str, str, bytes]] = []
+        self.transport = ZenohTransport(SWARM, robot, config)
+        self.transport.set_receiver(lambda *message: self.received.append(message))
+        self.transport.serve_latents(lambda key: b"secret latent")
+
+
+def secure_configs(folders: dict[str, Path]) -> dict[str, TransportConfig]:
+    configs = loopback_configs(["r1", "r2", "r3"], tls=TlsConfig(folder=folders["r1"]))
+    return {
+        name: config.model_copy(update={"tls": TlsConfig(folder=folders[name])}) for name, config in configs.items()
+    }
+
+
+@pytest.mark.swarm
+async def test_members_talk_and_fetch(folders: dict[str, Path]) -> None:
+    configs = secure_configs(folders)
+    one, two = Listener("r1", configs["r1"]), Listener("r2", configs["r2"])
+    async with one.transport, two.transport:
+        await until(lambda: bool(two.received), act=lambda: one.transport.broadcast("log", b"to all"))
+        await until(lambda: bool(one.received), act=lambda: two.transport.unicast("r1", "pull", b"to one"))
+        assert two.received[0] == ("r1", "log", b"to all")
+        assert one.received[0] == ("r2", "pull", b"to one")
+        fetched = await one.transport.fetch_latent("r2", "r2/0", 10.0)
+        assert not isinstance(fetched, FetchFailed)
+
+
+def stranger_configs(folders: dict[str, Path], elsewhere: Path) -> dict[str, dict[str, object]]:
+    """Settings of processes that must get nothing, made from those of r3."""
+    member = session_settings(secure_configs(folders)["r3"], SWARM, "r3", Plane.CONTROL)
+    member.pop("access_control")
+    other = make_keys(elsewhere, SWARM, ["r3"])["r3"]
+    path = "transport/link/tls"
+    without = {key: value for key, value in member.items() if not key.startswith(f"{path}/connect_")}
+    foreign = {
+        f"{path}/{role}_{what}": str(other / name)
+        for role in ("listen", "connect")
+        for what, name in (("certificate", "robot.crt"), ("private_key", "robot.key"))
+    }
+    return {
+        "no certificate": without | {f"{path}/enable_mtls": False},
+        "another authority's certificate": member | foreign,
+        "plain TCP": {key: value for key, value in member.items() if "tls" not in key and "protocols" not in key},
+    }
+
+
+@pytest.mark.swarm
+@pytest.mark.parametrize("who", ["no certificate", "another authority's certificate", "plain TCP"])
+async def test_a_stranger_reads_nothing_and_writes_nothing(folders: dict[str, Path], tmp_path: Path, who: str) -> None:
+    configs = secure_configs(folders)
+    one, two = Listener("r1", configs["r1"]), Listener("r2", configs["r2"])
+    settings = dict(stranger_configs(folders, tmp_path)[who])
+    dialled = [*configs["r1"].control_listen, *configs["r2"].control_listen]
+    if who == "plain TCP":
+        dialled = [endpoint.replace("tls/", "tcp/") for endpoint in dialled]
+        settings["listen/endpoints"] = ["tcp/127.0.0.1:0"]
+    settings["connect/endpoints"] = dialled
+    heard: list[str] = []
+    async with one.transport, two.transport:
+        stranger = open_session(settings, "stranger")
+        try:
+            stranger.declare_subscriber("**", lambda sample: heard.append(str(sample.key_expr)))
+            await until(
+                lambda: len(two.received) > 100,
+                act=lambda: (one.transport.broadcast("log", b"x"), stranger.put("flocc/v1/field/r3/log", b"forged")),  # type: ignore[func-returns-value,arg-type]
+            )
+            replies = list(stranger.get("flocc/v1/field/*/latent/r1/0", timeout=1.0))
+            assert stranger.info.peers_zid() == []
+        finally:
+            stranger.close()
+    assert [key for key in heard if not key.startswith("flocc/v1/field/r3")] == []
+    assert [reply for reply in replies if reply.ok is not None] == []
+    assert {sender for sender, *_ in (*one.received, *two.received)} <= {"r1", "r2"}
+
+
+@pytest.mark.swarm
+async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path]) -> None:
+    """r3, rightly certified, turns rogue: it leaves its own rules away and writes as r2."""
+    configs = secure_configs(folders)
+    one = Listener("r1", configs["r1"])
+    settings = session_settings(configs["r3"], SWARM, "r3", Plane.CONTROL)
+    settings.pop("access_control")
+    async with one.transport:
+        rogue = open_session(settings, "rogue")
+        try:
+
+            def write() -> None:
+                rogue.put("flocc/v1/field/r2/log", b"forged")
+                rogue.put("flocc/v1/field/r2/to/r1/pull", b"forged")
+                rogue.put("flocc/v1/field/r3/log", b"own")
+
+            await until(lambda: len(one.received) > 20, act=write)
+        finally:
+            rogue.close()
+    assert {(sender, payload) for sender, _, payload in one.received} == {("r3", b"own")}
+
+
+@pytest.mark.swarm
+async def test_a_fetch_from_a_robot_without_a_link_says_no_answer(folders: dict[str, Path]) -> None:
+    async with Listener("r1", secure_configs(folders)["r1"]).transport as transport:
+        assert await transport.fetch_latent("r2", "r2/0", 10.0) == FetchFailed(FetchProblem.NO_ANSWER)
