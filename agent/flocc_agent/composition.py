@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend import optimise_graph
 from flocc_agent.config import AgentConfig, BackendConfig, PerceptionConfig, RadioConfig
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, OdometryPair, Registrar
@@ -89,10 +90,8 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
 
 
 def build_optimiser(config: BackendConfig) -> Optimiser:
-    """Make the pose-graph optimiser."""
-    from flocc_agent.backend.optimiser import optimise
-
-    return lambda graph, initial: optimise(graph, config, initial)
+    """Make the pose-graph optimiser; it can be sent to a worker process."""
+    return partial(optimise_graph, config)
 
 
 class Agent:
@@ -277,7 +276,7 @@ class Agent:
             Skills(
                 perception.encode,
                 perception.register,
-                partial(optimise_graph, config.backend),
+                build_optimiser(config.backend),
             ),
             Reporter(config.name, self._T_body_camera, config.backend.steepness),
             self._on_line,
@@ -307,13 +306,6 @@ class Agent:
 
 class BadKeyframe(FloccError):
     """A keyframe that cannot be used; the agent goes on without it."""
-
-
-def optimise_graph(
-    config: BackendConfig, graph: PoseGraph, initial: GraphSolution | None
-) -> GraphSolution | OptimisationFailed:
-    """Optimise, in a worker process."""
-    return build_optimiser(config)(graph, initial)
 
 
 def stored_result(config: AgentConfig) -> dict[str, Any]:

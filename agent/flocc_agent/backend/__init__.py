@@ -3,3 +3,15 @@
 `optimiser.optimise` is the entry point; everything else is a step of it. Knows the core's pose-graph types and the
 configuration; must not know images, messages or clocks of others.
 """
+
+from flocc_agent.config import BackendConfig
+from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
+
+
+def optimise_graph(
+    config: BackendConfig, graph: PoseGraph, initial: GraphSolution | None
+) -> GraphSolution | OptimisationFailed:
+    """Optimise in whatever process this is called in; only that process pays for loading GTSAM."""
+    from flocc_agent.backend.optimiser import optimise
+
+    return optimise(graph, config, initial)

@@ -241,6 +241,7 @@ class Driver:
         try:
             await self._transport.open()
             self._opened.set()
+            self._start(self._warm_up())
             await self._live()
             await self._carry_out(self.robot.handle(Leaving(), self._clock_s()))
         finally:
@@ -411,6 +412,10 @@ class Driver:
             self.put(PairRegistered(effect.pair, RegistrationFailed(RegistrationFailure.CRASHED, result.reason)))
             return
         self.put(PairRegistered(effect.pair, result.value))
+
+    async def _warm_up(self) -> None:
+        """Start the optimiser's process now, so that the first round does not wait for it."""
+        await self._workers.run("optimise", self._skills.optimise, PoseGraph({}), None)
 
     async def _optimise(self, effect: Optimise) -> None:
         result = await self._workers.run("optimise", self._skills.optimise, effect.graph, effect.initial)
