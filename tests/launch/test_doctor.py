@@ -12,7 +12,8 @@ from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
 from flocc_launch.doctor import Finding, Severity, diagnose
-from flocc_launch.run_folder import ClosureKnown, KeyframeResult, RobotResult, Run, RunFolder
+from flocc_launch.run_folder import RunFolder
+from flocc_launch.run_records import ClosureKnown, KeyframeResult, RobotResult, Run
 from flocc_launch.scenario import Scenario
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]

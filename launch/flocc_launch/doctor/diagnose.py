@@ -12,7 +12,8 @@ from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.steps import STEPS
 from flocc_launch.report.load import LoadedRun, load
-from flocc_launch.run_folder import AgentDied, RunFolder, of_kind
+from flocc_launch.run_folder import RunFolder
+from flocc_launch.run_records import AgentDied, of_kind
 
 
 def diagnose(folder: RunFolder) -> list[Finding]:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from flocc_launch.report.closures import Pair
 from flocc_launch.report.load import LoadedRun
-from flocc_launch.run_folder import CorrectionApplied, of_kind
+from flocc_launch.run_records import CorrectionApplied, of_kind
 from flocc_protocol.ids import LogId
 
 

@@ -6,7 +6,7 @@ from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.report.build import how_it_died
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import seconds
-from flocc_launch.run_folder import AgentDied, EncodingFailed, GraphOptimised, of_kind
+from flocc_launch.run_records import AgentDied, EncodingFailed, GraphOptimised, of_kind
 
 LEADER_CHANGES_MANY = 6
 

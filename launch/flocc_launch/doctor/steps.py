@@ -17,7 +17,7 @@ from flocc_launch.doctor.evidence import (
 from flocc_launch.doctor.finding import Finding, blocked
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import count_of, number, seconds
-from flocc_launch.run_folder import (
+from flocc_launch.run_records import (
     AgentDied,
     GraphOptimised,
     LatentFailed,
@@ -127,7 +127,7 @@ def looked_different(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     """Records met, but no two keyframes were similar enough."""
     if pairs_between(loaded, a, b):
         return None
-    threshold = setting_number(loaded.run.settings, "similarity_threshold")
+    threshold = setting_number(loaded.run.settings, "similarity_threshold", "similarity_min")
     best = best_similarity(loaded, a, b)
     said = "" if best is None else f", the best was {best:.2f}"
     limit = "the threshold" if threshold is None else f"the threshold of {threshold:g}"
@@ -181,7 +181,7 @@ def rejected_all(loaded: LoadedRun, a: str, b: str) -> Finding | None:
         return None
     rejected = sorted((pair for pair in pairs if pair.rejected), key=lambda pair: -(pair.ratio or 0.0))
     examples = ", ".join(f"{pair.query} – {pair.match}: {number(pair.ratio)}" for pair in rejected[:EXAMPLES_MAX])
-    threshold = setting_number(loaded.run.settings, "match_ratio_threshold")
+    threshold = setting_number(loaded.run.settings, "match_ratio_threshold", "match_ratio_min")
     limit = "" if threshold is None else f" below R_thr {threshold:g}"
     reasons = sorted({pair.reason for pair in rejected if pair.reason})
     return blocked(

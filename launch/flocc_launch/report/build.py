@@ -21,7 +21,7 @@ from flocc_launch.report.model import (
 )
 from flocc_launch.report.timeline import corrections_of, ends, leader_changes, merged_after_s, terms_led
 from flocc_launch.report.tracks import Track
-from flocc_launch.run_folder import AgentDied, BytesCounted, GraphOptimised, PeerRefused, of_kind
+from flocc_launch.run_records import AgentDied, BytesCounted, GraphOptimised, PeerRefused, of_kind
 
 Float = NDArray[np.float64]
 

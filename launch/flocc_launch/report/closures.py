@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from flocc_launch.run_folder import CandidateFound, ClosureAccepted, ClosureRejected, Event, RobotResult
+from flocc_launch.run_records import CandidateFound, ClosureAccepted, ClosureRejected, Event, RobotResult
 from flocc_protocol.ids import KeyframeId
 
 

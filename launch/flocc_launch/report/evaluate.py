@@ -23,8 +23,7 @@ def evaluate(run: Path, with_evo: bool = False, as_json: bool = False) -> str:
     report = finish(RunFolder.open(run))
     if as_json:
         return report.model_dump_json(indent=1)
-    lines = list(sentences(report))
-    lines += [f"{robot}: ATE {value:.3f} m" for robot, value in report.ate_m.items() if value is not None]
+    lines = sentences(report)
     if with_evo:
         lines += [evo_of(run, robot) for robot in report.robots]
     return "\n".join([*lines, f"report: {(run / 'report.html').resolve()}"])

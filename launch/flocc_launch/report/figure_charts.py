@@ -8,7 +8,7 @@ from flocc_launch.report.figure_map import colour
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import Axis, element, path, svg, text_of, title
 from flocc_launch.report.tracks import Track
-from flocc_launch.run_folder import setting_number
+from flocc_launch.run_records import setting_number
 
 Float = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def ratio_figure(loaded: LoadedRun) -> str | None:
     )
     x, y = axes(0.0, float(edges[-1]), float((accepted + rejected).max()))
     bars = [bar for k in range(BINS) for bar in stacked(x, y, edges, int(rejected[k]), int(accepted[k]), k)]
-    limit = setting_number(loaded.run.settings, "match_ratio_threshold")
+    limit = setting_number(loaded.run.settings, "match_ratio_threshold", "match_ratio_min")
     mark = "" if limit is None else threshold(x, y, limit)
     return svg(WIDTH_PX, HEIGHT_PX, frame(x, y, "match ratio, Eq. (1)", "pairs"), *bars, mark, label="Match ratios")
 

@@ -9,7 +9,7 @@ from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report
 from flocc_launch.report.svg import Axis, count_of, element, path, seconds, svg, text_of, title
 from flocc_launch.report.timeline import Link
-from flocc_launch.run_folder import AgentDied, AgentStopped, CorrectionApplied, of_kind
+from flocc_launch.run_records import AgentDied, AgentStopped, CorrectionApplied, of_kind
 from flocc_protocol.ids import LogId
 
 WIDTH_PX = 960.0

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from flocc_launch.report.closures import Pair, pairs_of
 from flocc_launch.report.timeline import Following, Link, end_s, followings, links
 from flocc_launch.report.tracks import Track, tracks_of
-from flocc_launch.run_folder import Event, RobotResult, Run, RunFolder
+from flocc_launch.run_folder import RunFolder
+from flocc_launch.run_records import Event, RobotResult, Run
 
 
 @dataclass(frozen=True, slots=True, eq=False)

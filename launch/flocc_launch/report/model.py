@@ -3,7 +3,7 @@
 The keys that other programs rely on stand in DESIGN.md section 8, all of them in docs/report.md.
 """
 
-from flocc_launch.run_folder import Record
+from flocc_launch.run_records import Record
 
 SCHEMA_VERSION = 1
 

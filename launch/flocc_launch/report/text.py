@@ -1,34 +1,46 @@
 """A report for the terminal: the verdict, the figures, expectations, warnings."""
 
-from collections.abc import Iterator
-
-from flocc_launch.report.model import Expectation, Report
+from flocc_launch.report.model import Report
+from flocc_launch.report.svg import count_of, number, seconds, size_of
 from flocc_launch.report.verdict import verdict
 
 
-def sentences(report: Report) -> Iterator[str]:
-    """Lines that a person reads after a run."""
-    yield verdict(report)
-    closures = report.closures
-    between = f"{closures.accepted_inter_robot} between robots"
-    yield f"closures: {closures.accepted} accepted ({between}), {closures.rejected} rejected"
-    yield f"joint ATE: {metres(report.ate_joint_m)}; odometry alone {metres(report.ate_joint_odometry_m)}"
-    yield f"map frames: {', '.join(report.map_frames) or 'none'}"
-    total = sum(report.bytes.values())
-    yield f"sent: {total / 1e6:.2f} MB; leader changes: {report.leader_changes}"
-    for expectation in report.expectations:
-        yield expected(expectation)
-    for warning in report.warnings:
-        yield f"warning: {warning}"
+def sentences(report: Report) -> list[str]:
+    """Lines that a person reads after a run: the verdict, the figures, the robots, what was expected."""
+    closures, bytes_sent = report.closures, sum(report.bytes.values())
+    lines = [
+        verdict(report),
+        "",
+        f"map frames    {', '.join(report.map_frames) or 'none'}",
+        f"merged after  {seconds(report.merged_after_s)}",
+        f"closures      {count_of(closures.accepted)} accepted ({count_of(closures.accepted_inter_robot)} between "
+        f"robots), {count_of(closures.rejected)} rejected of {count_of(closures.candidates)} candidates",
+        f"joint ATE     {number(report.ate_joint_m, 'm')}; odometry at its true starts "
+        f"{number(report.ate_joint_odometry_m, 'm')}, aligned {number(report.ate_joint_odometry_aligned_m, 'm')}",
+        f"sent          {size_of(bytes_sent) if report.bytes else '–'}"
+        + "".join(f", {kind} {size_of(n)}" for kind, n in sorted(report.bytes.items(), key=lambda item: -item[1])),
+        f"leaders       {', '.join(f'{span.leader} (term {span.term})' for span in report.leaders) or 'none'}",
+        "",
+        *robot_lines(report),
+    ]
+    lines += [
+        f"expected      {e.name} {number(e.limit)}: {number(e.value)}, {judged(e.met)}" for e in report.expectations
+    ]
+    return lines + [f"note          {warning}" for warning in report.warnings]
 
 
-def metres(value: float | None) -> str:
-    """A length, or that it is not known."""
-    return "not known" if value is None else f"{value:.3f} m"
+def judged(met: bool | None) -> str:
+    """What became of an expectation."""
+    return "not measured" if met is None else "met" if met else "MISSED"
 
 
-def expected(expectation: Expectation) -> str:
-    """Whether an expectation came true."""
-    verdicts = {True: "met", False: "MISSED", None: "could not be measured"}
-    value = "unknown" if expectation.value is None else f"{expectation.value:g}"
-    return f"expected {expectation.name} {expectation.limit:g}: {value}, {verdicts[expectation.met]}"
+def robot_lines(report: Report) -> list[str]:
+    """A table of robots."""
+    head = f"{'robot':<14}{'keyframes':>10}{'ATE, m':>10}{'odometry':>10}{'RPE, m':>10}{'odometry':>10}  map frame"
+    rows = [
+        f"{robot.robot:<14}{robot.keyframes:>10}{number(robot.corrected.ate_m):>10}{number(robot.odometry.ate_m):>10}"
+        f"{number(robot.corrected.rpe_translation_m):>10}{number(robot.odometry.rpe_translation_m):>10}"
+        f"  {robot.map_frame or '–'}"
+        for robot in report.robot_details
+    ]
+    return [head, *rows, ""]

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median_high
 
-from flocc_launch.run_folder import (
+from flocc_launch.run_records import (
     AgentDied,
     AgentStopped,
     CorrectionApplied,
