@@ -126,7 +126,7 @@ def inverse_depths_from(points: Float, T_view_query: Float, observed: Float) -> 
     seen = np.column_stack([observed, np.ones(len(observed))])
     t = np.broadcast_to(T_view_query[:3, 3], seen.shape)
     normal, offset = np.cross(seen, t), np.cross(seen, rays)
-    return -(normal * offset).sum(axis=1) / np.maximum((normal * normal).sum(axis=1), 1e-12)
+    return np.asarray(-(normal * offset).sum(axis=1) / np.maximum((normal * normal).sum(axis=1), 1e-12))
 
 
 def tangent_basis(direction: Float) -> Float:

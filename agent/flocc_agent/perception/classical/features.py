@@ -38,7 +38,7 @@ class FeatureExtractor:
     def __init__(self, config: ClassicalConfig) -> None:
         cv2.setNumThreads(1)  # global in OpenCV: one worker, one core
         self._features_max = config.features_max
-        self._sift = cv2.SIFT_create(nfeatures=config.features_max, contrastThreshold=config.contrast_threshold)
+        self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=config.contrast_threshold)
 
     def extract(self, image: Image) -> Features:
         """Find and describe the features of an image; an image of one colour has none."""
@@ -50,7 +50,9 @@ class FeatureExtractor:
             return Features(np.zeros((0, 2), np.float32), empty, focal_px)
         pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64)[: self._features_max]
         points = undistorted(pixels, image.camera)
-        return Features(points.astype(np.float32), root_sift(sift[: self._features_max]), focal_px)
+        return Features(
+            points.astype(np.float32), root_sift(np.asarray(sift[: self._features_max], np.float32)), focal_px
+        )
 
 
 def undistorted(pixels: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
@@ -66,4 +68,4 @@ def root_sift(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Normalise SIFT descriptors (N, 128) to RootSIFT and quantise them to bytes."""
     total = np.maximum(sift.sum(axis=1, keepdims=True), 1e-6)
     quantised = np.sqrt(sift / total) * QUANTISATION
-    return np.minimum(np.rint(quantised), 255.0).astype(np.uint8)
+    return np.asarray(np.minimum(np.rint(quantised), 255.0), np.uint8)

@@ -10,7 +10,6 @@ from collections import OrderedDict
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import OdometryPair
@@ -24,19 +23,22 @@ from flocc_agent.geometry import inverse
 from flocc_agent.perception.classical.bundle import (
     DirectionPrior,
     Refined,
-    View,
     covariance_of_view,
-    refine,
 )
+from flocc_agent.perception.classical.degeneracy import degeneracy
 from flocc_agent.perception.classical.encoder import decode_features
 from flocc_agent.perception.classical.features import Features
+from flocc_agent.perception.classical.three_view import three_view
 from flocc_agent.perception.classical.two_view import TwoView, two_view
 from flocc_agent.perception.latent import BadLatent
 
-Float = NDArray[np.float64]
-
 BASELINE_MIN_M = 1e-3
 """An odometry pair that moved less gives no scale."""
+ROTATION_SIGMA_MIN_RAD = 0.005
+"""Calibration is not better than this, whatever the correspondences say."""
+TRANSLATION_SIGMA_MIN_RATIO = 0.01
+LENGTH_MIN = 0.1
+"""Translations below this, in network units, are not more certain for being short."""
 
 
 class ClassicalRegistrar:
@@ -55,21 +57,27 @@ class ClassicalRegistrar:
             odometry_pair = self._odometry_pair(query_features, odometry)
         except BadLatent as error:
             return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
-        odometry_count = count(odometry_pair)
         loop_pair = two_view(query_features, match_features, self._config)
+        return self._judged(query_features, loop_pair, odometry_pair, odometry)
+
+    def _judged(
+        self, query: Features, loop_pair: TwoView | int, odometry_pair: TwoView | int, odometry: OdometryPair | None
+    ) -> Registration | RegistrationFailed:
+        """Turn verified pairs into a result: with scale, without, or why not."""
+        counts = count(loop_pair), count(odometry_pair)
         if isinstance(loop_pair, int):
             detail = f"{loop_pair} verified correspondences, {self._config.correspondences_min} needed"
-            return RegistrationFailed(RegistrationFailure.FEW_CORRESPONDENCES, detail, loop_pair, odometry_count)
-        if odometry is not None and isinstance(odometry_pair, TwoView):
-            scaled = self._with_scale(query_features, loop_pair, odometry_pair)
-            if scaled is not None:
-                length_m = odometry.T_neighbour_query[:3, 3]
-                scale = odometry_scale(length_m, odometry_pair.view.T_view_query[:3, 3])
-                return self._result(loop_pair, scaled, 1, odometry_count, scale)
-        if self._direction_sigma_rad(loop_pair) > self._config.direction_sigma_max_rad:
-            detail = "the images fix no direction of translation, and no scale from odometry"
-            return RegistrationFailed(RegistrationFailure.DEGENERATE, detail, loop_pair.correspondences, odometry_count)
-        return self._result(loop_pair, loop_pair.refined, 0, odometry_count, None)
+            return RegistrationFailed(RegistrationFailure.FEW_CORRESPONDENCES, detail, *counts)
+        if odometry is not None and isinstance(odometry_pair, TwoView) and odometry_pair.view.prior is not None:
+            scaled = three_view(query, odometry_pair, loop_pair, self._config)
+            scale = odometry_scale(odometry.T_neighbour_query[:3, 3], odometry_pair.view.T_view_query[:3, 3])
+            if scaled is not None and scale is not None:
+                return registration(scaled, 1, counts, scale)
+        points = query.points[loop_pair.query_indices].astype(np.float64)
+        reason = degeneracy(points, loop_pair, self._config)
+        if reason is not None:
+            return RegistrationFailed(RegistrationFailure.DEGENERATE, reason, *counts)
+        return registration(loop_pair.refined, 0, counts, None)
 
     def _odometry_pair(self, query: Features, odometry: OdometryPair | None) -> TwoView | int:
         """Verify the odometry pair, or look it up."""
@@ -92,65 +100,18 @@ class ClassicalRegistrar:
                 self._odometry_pairs.popitem(last=False)
         return pair
 
-    def _with_scale(self, query: Features, loop_pair: TwoView, odometry_pair: TwoView) -> Refined | None:
-        """Refine neighbour, query and match together; None where they do not fix the closure's length."""
-        if odometry_pair.view.prior is None:
-            return None
-        indices = np.union1d(loop_pair.query_indices, odometry_pair.query_indices)
-        neighbour = _view_of(odometry_pair, indices)
-        match = _view_of(loop_pair, indices)
-        common = neighbour.seen & match.seen
-        if int(common.sum()) < self._config.common_points_min:
-            return None
-        depths = np.zeros(len(indices))
-        depths[match.seen] = loop_pair.refined.inverse_depths
-        depths[neighbour.seen] = odometry_pair.refined.inverse_depths
-        loop_depths = np.zeros(len(indices))
-        loop_depths[match.seen] = loop_pair.refined.inverse_depths
-        usable = common & (depths > 1e-3) & (loop_depths > 1e-3)
-        ratio = float(np.median(loop_depths[usable] / depths[usable])) if usable.any() else 1.0
-        T = match.T_view_query.copy()
-        T[:3, 3] *= ratio
-        only_loop = match.seen & ~neighbour.seen
-        depths[only_loop] = loop_depths[only_loop] / ratio
-        match = View(T, match.observed, match.seen, match.focal_px, unit_translation=False)
-        points = query.points[indices].astype(np.float64)
-        refined = refine(points, depths, (neighbour, match), self._config.sigma_px)
-        covariance = covariance_of_view(refined, 1, np.zeros(6))
-        t = inverse(refined.views[1].T_view_query)[:3, 3]
-        length = float(np.linalg.norm(t))
-        sigma = float(np.sqrt(max(t @ covariance[3:, 3:] @ t, 0.0))) / max(length, 1e-9) / max(length, 1.0)
-        return refined if sigma < self._config.scale_sigma_ratio_max else None
 
-    def _direction_sigma_rad(self, pair: TwoView) -> float:
-        """How uncertain the direction of translation is."""
-        covariance = covariance_of_view(pair.refined, 0, np.zeros(6))
-        return float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0)))
-
-    def _result(
-        self, loop_pair: TwoView, refined: Refined, k: int, odometry_count: int, scale: float | None
-    ) -> Registration:
-        """Put the refined match view into a registration."""
-        T_query_match = inverse(refined.views[k].T_view_query)
-        length = float(np.linalg.norm(T_query_match[:3, 3]))
-        floor = np.array([0.005] * 3 + [0.01 * max(length, 0.1)] * 3)
-        covariance = covariance_of_view(refined, k, floor)
-        if scale is None:
-            t = refined.views[k].T_view_query[:3, 3]
-            covariance[3:, 3:] += np.outer(t, t)
-        return Registration(T_query_match, loop_pair.correspondences, odometry_count, scale, covariance)
+def registration(refined: Refined, k: int, counts: tuple[int, int], scale_initial: float | None) -> Registration:
+    """Put view k, the match, into a result; without scale its length is one and as uncertain."""
+    view = refined.views[k]
+    length = float(np.linalg.norm(view.T_view_query[:3, 3]))
+    floor = np.array([ROTATION_SIGMA_MIN_RAD] * 3 + [TRANSLATION_SIGMA_MIN_RATIO * max(length, LENGTH_MIN)] * 3)
+    covariance = covariance_of_view(refined, k, floor)
+    if scale_initial is None:
+        covariance[3:, 3:] += np.outer(view.T_view_query[:3, 3], view.T_view_query[:3, 3])
+    return Registration(inverse(view.T_view_query), *counts, scale_initial, covariance)
 
 
 def count(pair: TwoView | int) -> int:
     """Verified correspondences of a pair, whether or not it gave a pose."""
     return pair if isinstance(pair, int) else pair.correspondences
-
-
-def _view_of(pair: TwoView, indices: NDArray[np.intp]) -> View:
-    """Spread a pair's view over a larger, sorted set of query features."""
-    places = np.searchsorted(indices, pair.query_indices)
-    observed = np.zeros((len(indices), 2))
-    observed[places] = pair.view.observed
-    seen = np.zeros(len(indices), np.bool_)
-    seen[places] = True
-    return View(pair.view.T_view_query, observed, seen, pair.view.focal_px, pair.view.unit_translation, pair.view.prior)

@@ -112,7 +112,7 @@ def essential_pose(
         return None
     inliers = mask.ravel() > 0
     best, best_front = None, -1
-    for T in decompose_essential(E):
+    for T in decompose_essential(np.asarray(E, np.float64)):
         inverse_depths = inverse_depths_from(points, T, observed)
         rays = np.column_stack([points, np.ones(len(points))])
         z_other = (rays @ T[:3, :3].T + inverse_depths[:, None] * T[:3, 3])[:, 2]
