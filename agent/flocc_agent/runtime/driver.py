@@ -419,14 +419,12 @@ class Driver:
 
     async def _optimise(self, effect: Optimise) -> None:
         result = await self._workers.run("optimise", self._skills.optimise, effect.graph, effect.initial)
-        failure = result.reason if isinstance(result, WorkFailed) else None
-        if not isinstance(result, WorkFailed) and isinstance(result.value, OptimisationFailed):
-            failure = result.value.reason
-        if failure is not None or isinstance(result, WorkFailed):
-            self.put(GraphOptimisationFailed(effect.term, effect.round, failure or "no result"))
+        solution = result if isinstance(result, WorkFailed) else result.value
+        if isinstance(solution, (WorkFailed, OptimisationFailed)):
+            self.put(GraphOptimisationFailed(effect.term, effect.round, solution.reason))
             return
-        self.last_solution = result.value
-        self.put(GraphOptimised(effect.term, effect.round, result.value))
+        self.last_solution = solution
+        self.put(GraphOptimised(effect.term, effect.round, solution))
 
     # Reports
 
