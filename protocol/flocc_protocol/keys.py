@@ -102,11 +102,7 @@ def latent_key(swarm: str, holder: str, latent: str) -> str:
 
 def admin_key(swarm: str, robot: str, admin: Admin) -> str:
     """Key at which an agent answers an operator; robot '*' asks all of them."""
-    prefix = (
-        f"{ROOT}/{VERSION}/{checked_name(swarm, 'swarm name')}/*"
-        if robot == "*"
-        else robot_prefix(swarm, robot)
-    )
+    prefix = f"{ROOT}/{VERSION}/{checked_name(swarm, 'swarm name')}/*" if robot == "*" else robot_prefix(swarm, robot)
     return f"{prefix}/{admin.value}"
 
 
@@ -177,6 +173,18 @@ def parse_latent_key(text: str) -> tuple[str, str]:
     if rest[0] != LATENT or not LATENT_PATTERN.fullmatch(latent):
         raise DecodeError(f"key {text[:KEY_CHARACTERS_MAX]!r} names no latent")
     return holder, latent
+
+
+def parse_admin_key(text: str) -> str:
+    """Read which robot answers under the key of an operator's request.
+
+    Raises:
+        DecodeError: Not such a key of this protocol version.
+    """
+    _, robot, rest = _split(text)
+    if rest not in [[admin.value] for admin in Admin]:
+        raise DecodeError(f"key {text[:KEY_CHARACTERS_MAX]!r} is no operator's request")
+    return robot
 
 
 def parse_alive_key(text: str) -> Presence:

@@ -34,7 +34,7 @@ def test_reads_back_the_latent_of_any_keyframe(
 
 @given(st.text(max_size=300) | st.from_regex(r"\Aflocc/v1/[a-z*$/]{0,60}\Z"))
 def test_any_other_text_is_a_decode_error_or_an_address(text: str) -> None:
-    for parse in (keys.parse_message_key, keys.parse_latent_key, keys.parse_alive_key):
+    for parse in (keys.parse_message_key, keys.parse_latent_key, keys.parse_alive_key, keys.parse_admin_key):
         try:
             parse(text)
         except DecodeError:
@@ -47,6 +47,11 @@ def test_writes_the_documented_keys() -> None:
     assert keys.latent_key("field", "r1", "r1~5/7") == "flocc/v1/field/r1/latent/r1~5/7"
     assert keys.admin_key("field", "*", keys.Admin.STATUS) == "flocc/v1/field/*/status"
     assert keys.alive_key("field", "r1", "0f") == "flocc/v1/field/r1/alive/0f"
+
+
+@given(NAMES, NAMES, st.sampled_from(keys.Admin))
+def test_reads_back_who_answers_an_operator(swarm: str, robot: str, admin: keys.Admin) -> None:
+    assert keys.parse_admin_key(keys.admin_key(swarm, robot, admin)) == robot
 
 
 def test_names_the_version_of_a_foreign_key() -> None:

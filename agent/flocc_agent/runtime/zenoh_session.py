@@ -26,16 +26,18 @@ class Plane(Enum):
     BULK = "bulk"
 
 
-def session_settings(config: TransportConfig, swarm: str, robot: str, plane: Plane) -> dict[str, Any]:
+def session_settings(
+    config: TransportConfig, swarm: str, robot: str, plane: Plane, dials_all: bool = False
+) -> dict[str, Any]:
     """Give zenoh's settings, by zenoh's path, for one session of one robot.
 
-    Robots with a higher name dial those with a lower one, so that each pair has one link.
+    Robots with a higher name dial those with a lower one, so that each pair has one link. An operator dials all.
     """
     control = plane is Plane.CONTROL
     dialled = [
         endpoint
         for name, peer in sorted(config.roster.items())
-        if name < robot
+        if name < robot or dials_all
         for endpoint in (peer.control if control else peer.bulk)
     ]
     strategy = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}

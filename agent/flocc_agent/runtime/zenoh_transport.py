@@ -32,6 +32,7 @@ from flocc_agent.runtime.transport import (
     TransportCounters,
     TransportError,
 )
+from flocc_agent.runtime.zenoh_admin import AdminService, Answer
 from flocc_agent.runtime.zenoh_bulk import BulkService
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
 from flocc_protocol import keys
@@ -84,6 +85,7 @@ class ZenohTransport:
         self._counter = TrafficCounter()
         self._limiter = RateLimiter(config.peer_messages_per_s, config.peer_bytes_per_s, config.peers_max)
         self._bulk = BulkService(self.swarm, self.robot, config, self._counter, radio, clock_s)
+        self._admin = AdminService(self.swarm, self.robot)
         self._receiver: Receiver = lambda *_: None
         self._session: zenoh.Session | None = None
         self._token: zenoh.LivelinessToken | None = None
@@ -117,6 +119,10 @@ class ZenohTransport:
     def serve_latents(self, lookup: LatentLookup) -> None:
         """Name who holds latents."""
         self._bulk.serve(lookup)
+
+    def serve_admin(self, admin: keys.Admin, answer: Answer) -> None:
+        """Answer operators; call before `open`. The answer is made on the event loop's thread."""
+        self._admin.serve(admin, answer)
 
     def counters(self) -> TransportCounters:
         """What went through so far; emulated losses are `radio-...`."""
@@ -158,6 +164,8 @@ class ZenohTransport:
         self._token = liveliness.declare_token(keys.alive_key(self.swarm, self.robot, self.boot))
         for kind in keys.Kind:
             self._publishers[kind.value] = self._declare(kind.value)
+        assert self._loop is not None
+        self._admin.open(session, self._loop)
         self._bulk.open(bulk, whose)
 
     def _declare(self, kind: str) -> zenoh.Publisher:
@@ -186,6 +194,7 @@ class ZenohTransport:
             if session is not None:
                 session.close()
             self._slow.shutdown(wait=True, cancel_futures=True)
+            self._admin.close()
 
     # --- sending
 

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterable
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from tests.agent.runtime.loopback import loopback_configs, until
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import LinkParameters, Partition, Radio, RadioParameters
 from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, TransportError
+from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_protocol.keys import Admin
 
 pytestmark = pytest.mark.swarm
 
@@ -279,10 +282,30 @@ async def test_closing_ends_a_fetch_and_may_be_repeated() -> None:
         assert one.transport.counters().dropped["not-sent"] == 1
 
 
+def greeting_of(robot: str, request: bytes) -> bytes:
+    return request + robot.encode()
+
+
+async def test_an_operator_is_answered_by_everybody_or_by_one() -> None:
+    configs = loopback_configs(ROBOTS)
+    members = [Member(name, config) for name, config in configs.items()]
+    for member in members:
+        member.transport.serve_admin(Admin.STATUS, partial(greeting_of, member.robot))
+    async with members[0].transport, members[1].transport:
+        assert await ask(configs["r1"], "test", Admin.STATUS, b"I am ", timeout_s=1.5) == {
+            "r1": b"I am r1",
+            "r2": b"I am r2",
+        }
+        assert await ask(configs["r1"], "test", Admin.STATUS, b"", "r2", timeout_s=1.0) == {"r2": b"r2"}
+        assert await ask(configs["r1"], "test", Admin.CHAOS, b"", timeout_s=1.0) == {}
+
+
 LEAVES = """
 import asyncio
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_protocol.keys import Admin
 async def main():
     async with ZenohTransport("test", "r1", TransportConfig(multicast=False)):
         raise SystemExit(3)

@@ -1,0 +1,147 @@
+"""What operators ask of running agents: status and faults on demand, as queries on the control session.
+
+An agent answers under its own name; with TLS only certificates of operators may ask. Requests and answers are small
+and opaque here; a few may wait, the rest go unanswered.
+"""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import zenoh
+
+from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
+from flocc_protocol import keys
+from flocc_protocol.errors import DecodeError
+
+logger = logging.getLogger(__name__)
+
+Answer = Callable[[bytes], bytes]
+"""Takes a request and gives the answer, on the event loop's thread."""
+
+PENDING_MAX = 16
+REQUEST_BYTES_MAX = 64 * 1024
+ANSWER_BYTES_MAX = 1024 * 1024
+OPERATOR = "operator"
+LOOK_PERIOD_S = 0.05
+
+
+class AdminService:
+    """Answers operators for one agent."""
+
+    def __init__(self, swarm: str, robot: str) -> None:
+        self._swarm, self._robot = swarm, robot
+        self._answers: dict[keys.Admin, Answer] = {}
+        self._threads = ThreadPoolExecutor(1, thread_name_prefix=f"{robot}-admin")
+        self._pending = 0
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def serve(self, admin: keys.Admin, answer: Answer) -> None:
+        """Answer one kind of request; call before `open`."""
+        self._answers[admin] = answer
+
+    def open(self, session: zenoh.Session, loop: asyncio.AbstractEventLoop) -> None:
+        """Declare what is answered, on the control session."""
+        self._loop = loop
+        for admin in self._answers:
+            key = keys.admin_key(self._swarm, self._robot, admin)
+            session.declare_queryable(key, partial(self._enqueue, admin), allowed_origin=zenoh.Locality.REMOTE)
+
+    def close(self) -> None:
+        """End the thread; blocks."""
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    def _enqueue(self, admin: keys.Admin, query: zenoh.Query) -> None:
+        assert self._loop is not None
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        if len(payload) > REQUEST_BYTES_MAX or self._pending >= PENDING_MAX:
+            query.drop()
+            return
+        try:
+            self._loop.call_soon_threadsafe(self._answer, admin, query, payload)
+        except RuntimeError:  # the loop is closed
+            query.drop()
+
+    def _answer(self, admin: keys.Admin, query: zenoh.Query, payload: bytes) -> None:
+        """Ask the robot, on the loop; a thread sends what it says."""
+        self._pending += 1
+        answer = self._answers[admin](payload)
+        sent = asyncio.get_running_loop().run_in_executor(self._threads, self._reply, admin, query, answer)
+        sent.add_done_callback(self._replied)
+
+    def _reply(self, admin: keys.Admin, query: zenoh.Query, answer: bytes) -> None:
+        try:
+            with query:
+                query.reply(keys.admin_key(self._swarm, self._robot, admin), answer)
+        except zenoh.ZError as error:
+            logger.debug("robot %s: an operator was not answered: %s", self._robot, error)
+
+    def _replied(self, _: "asyncio.Future[None]") -> None:
+        self._pending -= 1
+
+
+async def ask(
+    config: TransportConfig,
+    swarm: str,
+    admin: keys.Admin,
+    request: bytes = b"",
+    robot: str = "*",
+    timeout_s: float = 3.0,
+) -> dict[str, bytes]:
+    """Ask agents in reach, as an operator.
+
+    Args:
+        config: How to reach the swarm: its roster, or scouting; with TLS the operator's folder.
+        swarm: Name of the swarm.
+        admin: What is asked.
+        request: Its content.
+        robot: Whom to ask, '*' for everybody.
+        timeout_s: Time for finding agents, and again for their answers.
+
+    Returns:
+        Answer by robot; who did not answer is not in it.
+
+    Raises:
+        TransportError: The network cannot be used as configured.
+    """
+    return await asyncio.to_thread(_ask_blocking, config, swarm, admin, request, robot, timeout_s)
+
+
+def _ask_blocking(
+    config: TransportConfig, swarm: str, admin: keys.Admin, request: bytes, robot: str, timeout_s: float
+) -> dict[str, bytes]:
+    settings = session_settings(config, swarm, OPERATOR, Plane.CONTROL, dials_all=True) | {"listen/endpoints": []}
+    session = open_session(settings, OPERATOR)
+    try:
+        _find(session, len(config.roster), timeout_s)
+        replies = session.get(
+            keys.admin_key(swarm, robot, admin),
+            zenoh.handlers.FifoChannel(256),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=request,
+        )
+        return dict(sorted(answer for answer in map(_read, replies) if answer is not None))
+    finally:
+        session.close()
+
+
+def _find(session: zenoh.Session, count: int, timeout_s: float) -> None:
+    """Wait until as many agents as the roster names are linked, or without a roster for half of the time."""
+    deadline_s = time.monotonic() + (timeout_s if count else timeout_s / 2)
+    while time.monotonic() < deadline_s and (not count or len(session.info.peers_zid()) < count):
+        time.sleep(LOOK_PERIOD_S)
+
+
+def _read(reply: zenoh.Reply) -> tuple[str, bytes] | None:
+    if reply.ok is None or len(reply.ok.payload) > ANSWER_BYTES_MAX:
+        return None
+    try:
+        return keys.parse_admin_key(str(reply.ok.key_expr)), reply.ok.payload.to_bytes()
+    except DecodeError:
+        return None
