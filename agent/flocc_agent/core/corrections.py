@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.gossip import remember
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.geometry import pose_from_tq, tq_from_pose
@@ -40,6 +41,11 @@ class Corrections:
         """The newest known correction of a log."""
         return self._newest.get(log)
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        logs_max = self._gossip.logs_max
+        return {"corrections": (len(self._newest), logs_max), "asked_corrections": (len(self._asked_until_s), logs_max)}
+
     def restore(self, message: CorrectionMessage) -> None:
         """Put back the correction that was applied before a restart."""
         self._newest[message.log] = message
@@ -55,7 +61,7 @@ class Corrections:
             held = self._newest.get(version.log)
             newer = held is None or (version.term, version.round) > (held.term, held.round)
             if newer and self._asked_until_s.get(version.log, now) <= now:
-                self._asked_until_s[version.log] = now + self._gossip.request_timeout_s
+                remember(self._asked_until_s, version.log, now + self._gossip.request_timeout_s)
                 effects.append(Unicast(peer, CorrectionRequest(version.log)))
         return effects
 

@@ -6,6 +6,7 @@ neighbour about what was sent, so a lost, doubled, late or reordered message can
 """
 
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.parameters import GossipParameters
@@ -19,6 +20,15 @@ from flocc_protocol.messages import (
     RecordRequest,
 )
 from flocc_protocol.records import KeyframeRecord, Record, chain, decode_record, encode_record
+
+Key = TypeVar("Key")
+Entry = TypeVar("Entry")
+
+REMEMBERED_MAX = 1024
+"""Open requests, pauses and forks that are remembered; beyond this the oldest are forgotten."""
+
+
+PAUSES_MAX = 4096
 
 
 @dataclass(slots=True)
@@ -72,8 +82,18 @@ class Gossip:
         self._asked: dict[LogId, _Asked] = {}
         self._pauses_s: dict[tuple[LogId, str], float] = {}
         self._not_before_s: dict[tuple[LogId, str], float] = {}
-        self._forked: set[tuple[LogId, str]] = set()
+        self._forked: dict[tuple[LogId, str], None] = {}
         self._digests: tuple[LogDigest, ...] | None = None
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        logs_max = self._parameters.logs_max
+        return {
+            "logs": (len(self.logs), logs_max),
+            "asked": (len(self._asked), logs_max),
+            "paused": (len(self._not_before_s), PAUSES_MAX),
+            "forked": (len(self._forked), PAUSES_MAX),
+        }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
         """Put back a record that was read from disk, in order."""
@@ -169,7 +189,7 @@ class Gossip:
             self._did_not_deliver(log, asked.peer, now)
         if now < self._not_before_s.get((log, peer), now):
             return []
-        self._asked[log] = _Asked(peer, now + self._parameters.request_timeout_s)
+        remember(self._asked, log, _Asked(peer, now + self._parameters.request_timeout_s))
         return [Unicast(peer, RecordRequest(log, first))]
 
     def _ask_on(self, sender: LogId, batch: RecordBatch, now: float) -> list[Effect]:
@@ -190,8 +210,8 @@ class Gossip:
     def _did_not_deliver(self, log: LogId, peer: str, now: float) -> None:
         del self._asked[log]
         pause = min(2 * self._pauses_s.get((log, peer), 0.125), self._parameters.backoff_max_s)
-        self._pauses_s[log, peer] = pause
-        self._not_before_s[log, peer] = now + pause
+        remember(self._pauses_s, (log, peer), pause)
+        remember(self._not_before_s, (log, peer), now + pause)
 
     def _own_log_elsewhere(self, sender: LogId, batch: RecordBatch) -> list[Effect]:
         """Only this robot writes its log; a copy that differs means a second writer."""
@@ -204,8 +224,15 @@ class Gossip:
     def _fork(self, peer: str, log: LogId) -> list[Effect]:
         if (log, peer) in self._forked:
             return []
-        self._forked.add((log, peer))
+        remember(self._forked, (log, peer), None)
         return [Report("log_forked", {"peer": peer, "log": str(log), "reason": "two writers of one log"})]
+
+
+def remember(entries: dict[Key, Entry], key: Key, entry: Entry, entries_max: int = REMEMBERED_MAX) -> None:
+    """Note an entry and forget the oldest ones beyond the maximum: strangers must not fill the memory."""
+    entries[key] = entry
+    while len(entries) > entries_max:
+        del entries[next(iter(entries))]
 
 
 def _fitting(encoded: list[bytes], first: int) -> tuple[bytes, ...]:
