@@ -214,6 +214,10 @@ class Radio:
         """Where a robot was last said to be, None if nobody said."""
         return self._positions_m.get(robot)
 
+    def connects(self, sender: str, receiver: str, now_s: float) -> bool:
+        """Whether a message could get through at all now."""
+        return self._separation(sender, receiver, now_s, None, None) is None
+
     def transmit(
         self,
         sender: str,

@@ -78,7 +78,11 @@ class TracksScenario(Section):
 
 
 class FaultKind(StrEnum):
-    """What goes wrong, or right again."""
+    """What goes wrong, or right again.
+
+    `start` switches dead robots on, `leave` stops them in order; `calm` makes every link perfect but for its range
+    and every worker as fast as it was (the last two and `mute` in simulate only).
+    """
 
     KILL = "kill"
     RESTART = "restart"
@@ -89,6 +93,10 @@ class FaultKind(StrEnum):
     LATENCY = "latency"
     RANGE = "range"
     SLOW = "slow"
+    MUTE = "mute"
+    START = "start"
+    LEAVE = "leave"
+    CALM = "calm"
 
 
 class Fault(Section):
@@ -104,19 +112,25 @@ class Fault(Section):
     """Groups of a partition; robots that no group names are one more group."""
     value: float | None = None
     """Loss ratio, latency in seconds, range in metres, or the factor by which robots are slow."""
+    message: str | None = None
+    """Kind of message that a mute swallows, with probability `value` (simulate only)."""
     disk_lost: bool = False
     """A restart comes without the disk, as a new incarnation."""
 
     @model_validator(mode="after")
     def _is_complete(self) -> Self:
-        needs_robots = {FaultKind.KILL, FaultKind.RESTART, FaultKind.BLACKOUT, FaultKind.SLOW}
-        needs_value = {FaultKind.LOSS, FaultKind.LATENCY, FaultKind.RANGE, FaultKind.SLOW}
+        needs_robots = {
+            FaultKind.KILL, FaultKind.RESTART, FaultKind.BLACKOUT, FaultKind.SLOW, FaultKind.START, FaultKind.LEAVE
+        }  # fmt: skip
+        needs_value = {FaultKind.LOSS, FaultKind.LATENCY, FaultKind.RANGE, FaultKind.SLOW, FaultKind.MUTE}
         if self.kind in needs_robots and not self.robots:
             raise ValueError(f"a fault '{self.kind.value}' names its robots")
         if self.kind in needs_value and self.value is None:
             raise ValueError(f"a fault '{self.kind.value}' has a value")
         if self.kind is FaultKind.PARTITION and not self.groups:
             raise ValueError("a partition names its groups")
+        if self.kind is FaultKind.MUTE and self.message is None:
+            raise ValueError("a mute names the kind of message that it swallows")
         return self
 
 

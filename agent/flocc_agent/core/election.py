@@ -28,6 +28,7 @@ Rank = tuple[int, LogId]
 
 COUNTER_JUMP_MAX = 2**20
 LOST_MAX = 64
+PEERS_MAX = 256
 
 
 class Role(Enum):
@@ -89,6 +90,10 @@ class LeaderElection:
     def counter_max(self) -> int:
         """Highest term counter heard of."""
         return self._counter_max
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        return {"lost_terms": (len(self._lost), LOST_MAX), "peers": (len(self._peers), PEERS_MAX)}
 
     def advert(self) -> LeaderAdvert | None:
         """What a heartbeat says of the leader; a leader's beat grows with each call."""

@@ -106,6 +106,20 @@ class LoopClosing:
         """Registrations that wait here."""
         return len(self._work)
 
+    def open_pairs(self) -> list[CandidatePair]:
+        """Pairs that this robot is to register, or waits for others to register; sorted."""
+        return sorted({*self._work, *self._offers})
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Queues and tables with their maximum."""
+        limits = self._parameters
+        return {
+            "candidates": (len(self._work), limits.candidates_max),
+            "offers": (len(self._offers), limits.candidates_max),
+            "relayed": (len(self._relayed), limits.relays_max),
+            "fetches": (len(self._fetches), 3 * limits.candidates_max + limits.relays_max),
+        }
+
     def on_candidates(self, candidates: Iterable[Candidate], now: float) -> list[Effect]:
         """Pairs that place recognition found here."""
         effects: list[Effect] = []

@@ -149,6 +149,17 @@ class Robot:
             self.rounds.deadline(),
         )
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Every queue, table and cache: how much is in it, and its maximum."""
+        neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
+        return {
+            "neighbours": neighbours,
+            **self.gossip.sizes(),
+            **self.closing.sizes(),
+            **self.corrections.sizes(),
+            **self.election.sizes(),
+        }
+
     # Events
 
     def _dispatch(self, event: Event, now: float) -> list[Effect]:

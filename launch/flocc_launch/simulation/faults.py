@@ -23,6 +23,17 @@ def inject(swarm: Swarm, fault: Fault) -> None:
         case FaultKind.RESTART:
             for name in fault.robots:
                 restart(swarm, name, fault.disk_lost)
+        case FaultKind.START:
+            for name in fault.robots:
+                if not swarm.stations[name].running:
+                    swarm.start(name)
+        case FaultKind.LEAVE:
+            for name in fault.robots:
+                swarm.leave(name)
+        case FaultKind.MUTE:
+            swarm.network.muted[fault.message or ""] = fault.value or 0.0
+        case FaultKind.CALM:
+            calm(swarm)
         case FaultKind.SLOW:
             for name in fault.robots:
                 swarm.stations[name].workers.slowness = fault.value or 1.0
@@ -36,6 +47,14 @@ def restart(swarm: Swarm, name: str, disk_lost: bool) -> None:
     if disk_lost:
         swarm.lose_disk(name)
     swarm.start(name)
+
+
+def calm(swarm: Swarm) -> None:
+    """From now on nothing goes wrong any more."""
+    swarm.radio.parameters = RadioParameters(range_m=swarm.radio.parameters.range_m)
+    swarm.network.muted.clear()
+    for station in swarm.stations.values():
+        station.workers.slowness = 1.0
 
 
 def changed(radio: RadioParameters, fault: Fault, now_s: float) -> RadioParameters:

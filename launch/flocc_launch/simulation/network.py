@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from flocc_agent.radio import Radio
 from flocc_launch.simulation.agenda import Agenda
 from flocc_protocol.messages import Envelope, Message, decode, encode, kind_of
@@ -24,10 +26,13 @@ class Network:
 
     Attributes:
         traffic: By station.
+        muted: Kind of message -> probability that the air swallows it, on top of the radio's losses.
     """
 
-    def __init__(self, agenda: Agenda, radio: Radio, receive: Receive) -> None:
+    def __init__(self, agenda: Agenda, radio: Radio, receive: Receive, rng: np.random.Generator) -> None:
         self.traffic: dict[str, Traffic] = {}
+        self.muted: dict[str, float] = {}
+        self._rng = rng
         self._agenda = agenda
         self._radio = radio
         self._receive = receive
@@ -40,7 +45,10 @@ class Network:
         packet = _Packet(data)
         now_s = self._agenda.now_s
         arrivals: dict[float, list[str]] = {}
+        muted = self.muted.get(kind, 0.0)
         for receiver in receivers:
+            if muted and self._rng.uniform() < muted:
+                continue
             for time_s in self._radio.transmit(sender, receiver, kind, len(data), now_s):
                 arrivals.setdefault(time_s, []).append(receiver)
         for time_s, together in arrivals.items():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.core.effects import Effect, Report
-from flocc_agent.core.events import Event
+from flocc_agent.core.events import Event, Leaving
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.reporting import Reporter
 from flocc_launch.scenario import Scenario
@@ -24,7 +24,7 @@ from flocc_protocol.messages import Envelope, Message
 Observer = Callable[[Station, Event | None, list[Effect]], None]
 
 POSITION_PERIOD_S = 0.5
-LINKS, WORK, BOOTS = 1, 2, 3
+LINKS, WORK, BOOTS, AIR = 1, 2, 3, 4
 """Purposes of generators, so that one more draw for one thing changes no other."""
 
 
@@ -52,7 +52,7 @@ class Swarm:
         self.scenario = scenario
         self.agenda = Agenda()
         self.radio = Radio(scenario.radio.parameters(), np.random.default_rng([seed, LINKS]))
-        self.network = Network(self.agenda, self.radio, self._receive)
+        self.network = Network(self.agenda, self.radio, self._receive, np.random.default_rng([seed, AIR]))
         self.stations: dict[str, Station] = {}
         self.lines: list[dict[str, Any]] = []
         self.observers: list[Observer] = []
@@ -81,6 +81,15 @@ class Swarm:
             station.kill()
             self._fetcher.forget(name)
             self.report(name, "agent_died", {"signal": 9})
+
+    def leave(self, name: str) -> None:
+        """A robot stops in order."""
+        station = self.stations[name]
+        if station.running:
+            station.handle(Leaving())
+            station.kill()
+            self._fetcher.forget(name)
+            self.report(name, "agent_stopped", {})
 
     def lose_disk(self, name: str) -> None:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
@@ -112,8 +121,13 @@ class Swarm:
             self._around,
         )
         self._reporters[name] = Reporter(name, playback.T_body_camera, self.scenario.backend.steepness)
-        self.agenda.at(robot.start_s, lambda: self.start(name))
+        self.agenda.at(robot.start_s, lambda: self._first_start(name))
         self._play(self.stations[name], robot.start_s)
+
+    def _first_start(self, name: str) -> None:
+        """Switch on, unless a fault did so or undid it before."""
+        if self.stations[name].life == 0:
+            self.start(name)
 
     def _play(self, station: Station, start_s: float) -> None:
         """Enter every keyframe, and where the robot is meanwhile."""

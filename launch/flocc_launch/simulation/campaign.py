@@ -1,0 +1,139 @@
+"""Campaigns: many seeds, each a scenario with faults of its own, checked in every step (safety) and then at rest.
+
+After the faults of a run have stopped, everything must come true within `LIVENESS_S`; a run that is as it should be
+ends early. A seed that fails replays exactly; `shrink` looks for fewer faults that still fail.
+"""
+
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+
+from flocc_agent.composition import build_perception
+from flocc_launch.scenario import FaultKind, Scenario
+from flocc_launch.simulation.alignment import align
+from flocc_launch.simulation.checkers import Checker, Violation, Watch, all_checkers
+from flocc_launch.simulation.eyes import ImageEyes
+from flocc_launch.simulation.faults import schedule
+from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_launch.simulation.simulate import playbacks_of
+from flocc_launch.simulation.swarm import Equipment, Swarm
+
+LIVENESS_S = 60.0
+LOOK_S = 2.5
+SEEDS_PER_TASK = 8
+SEPARATING = {FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.LOSS, FaultKind.MUTE, FaultKind.LEAVE}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One seed's run.
+
+    Attributes:
+        seed: It.
+        violations: What did not hold.
+        settled_after_s: Time from the end of the faults until everything was as it must be, None if never.
+    """
+
+    seed: int
+    violations: tuple[Violation, ...]
+    settled_after_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """All runs of a campaign."""
+
+    outcomes: tuple[Outcome, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """What `campaign.json` holds."""
+        settled = sorted(o.settled_after_s for o in self.outcomes if o.settled_after_s is not None)
+        return {
+            "runs": len(self.outcomes),
+            "violations": [
+                {"seed": o.seed, **asdict(violation)} for o in self.outcomes for violation in o.violations
+            ],
+            "settled_after_s": {"median": settled[len(settled) // 2], "max": settled[-1]} if settled else None,
+        }
+
+
+def campaign(
+    seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[Outcome], None] = lambda outcome: None
+) -> Campaign:
+    """Run every seed, in several processes; `on_outcome` hears of each run in the order of the seeds."""
+    outcomes: list[Outcome] = []
+    for outcome in _outcomes(list(seeds), processes):
+        on_outcome(outcome)
+        outcomes.append(outcome)
+    return Campaign(tuple(outcomes))
+
+
+def _outcomes(seeds: list[int], processes: int) -> Iterator[Outcome]:
+    if processes == 1:
+        yield from map(run_seed, seeds)
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        yield from pool.map(run_seed, seeds, chunksize=SEEDS_PER_TASK)
+
+
+def run_seed(seed: int) -> Outcome:
+    """One seed of the default campaign."""
+    return run_checked(drawn_scenario(seed))
+
+
+def run_checked(scenario: Scenario) -> Outcome:
+    """Run a scenario under all checkers; a crash of the core is a violation like any other."""
+    swarm = prepared(scenario)
+    watch = Watch(swarm, checkers_of(scenario))
+    try:
+        settled_after_s = _run(swarm, watch)
+    except Exception:  # noqa: BLE001 - whatever the core throws is what the campaign looks for
+        last = traceback.format_exc().strip().splitlines()[-8:]
+        crash = Violation("no crash", swarm.agenda.now_s, " | ".join(line.strip() for line in last))
+        return Outcome(scenario.seed, (crash, *watch.violations), None)
+    lacking = watch.lacking() if settled_after_s is None else []
+    first = {violation.invariant: violation for violation in reversed([*watch.violations, *lacking])}
+    return Outcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s)
+
+
+def checkers_of(scenario: Scenario) -> list[Checker]:
+    """All invariants; two robots may register one pair only where they could not hear each other for a while."""
+    separating = any(fault.kind in SEPARATING for fault in scenario.faults)
+    links = [scenario.radio, *scenario.radio.overrides]
+    lossy = any(link.loss_ratio or link.burst_ratio or link.bandwidth_bytes_s for link in links)
+    return all_checkers(separating or lossy or scenario.radio.range_m is not None)
+
+
+def prepared(scenario: Scenario) -> Swarm:
+    """A swarm with quick stand-ins for perception and back end, and its faults to come."""
+    eyes = ImageEyes(build_perception(scenario.perception, scenario.seed), scenario.perception, None)
+    swarm = Swarm(scenario, playbacks_of(scenario, {}), Equipment(eyes, align), scenario.seed)
+    schedule(swarm, scenario.faults)
+    return swarm
+
+
+def shrink(scenario: Scenario, fails: Callable[[Scenario], bool] | None = None) -> Scenario:
+    """Leave out faults, one after the other, as long as the rest still fails."""
+    still_fails = fails or (lambda smaller: bool(run_checked(smaller).violations))
+    k = 0
+    while k < len(scenario.faults):
+        fewer = scenario.faults[:k] + scenario.faults[k + 1 :]
+        smaller = scenario.model_copy(update={"faults": fewer})
+        if scenario.faults[k].kind is not FaultKind.CALM and still_fails(smaller):
+            scenario = smaller
+        else:
+            k += 1
+    return scenario
+
+
+def _run(swarm: Swarm, watch: Watch) -> float | None:
+    """Let the faults happen, then wait for peace."""
+    swarm.run_until(FAULTS_END_S + LOOK_S)
+    while swarm.agenda.now_s <= FAULTS_END_S + LIVENESS_S:
+        if not watch.lacking():
+            return swarm.agenda.now_s - FAULTS_END_S
+        swarm.run_until(swarm.agenda.now_s + LOOK_S)
+    return None
+
+

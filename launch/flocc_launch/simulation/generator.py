@@ -1,0 +1,116 @@
+"""Faults drawn from a seed: a whole scenario that begins with faults and ends in peace."""
+
+import numpy as np
+
+from flocc_agent.config import KeyframeConfig, LinkOverrideConfig, PerceptionConfig, RadioConfig, SyntheticConfig
+from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
+from flocc_launch.scenario import Fault, FaultKind, RobotScenario, Scenario, TracksScenario
+
+FAULTS_END_S = 30.0
+ROBOTS_MAX = 5
+FAULTS_MAX = 6
+
+
+def drawn_scenario(seed: int) -> Scenario:
+    """Draw robots, clocks, links and a timeline of faults; from `FAULTS_END_S` on nothing goes wrong any more."""
+    rng = np.random.default_rng([seed, 0])
+    count = int(rng.integers(2, ROBOTS_MAX + 1))
+    names = [f"r{k + 1}" for k in range(count)]
+    return Scenario(
+        name="campaign",
+        seed=seed,
+        tracks=TracksScenario(
+            robots=count, seed=int(rng.integers(1000)), area_m=12.0, speed_m_s=0.8, length_m=float(rng.uniform(8, 20))
+        ),
+        robots={name: _robot(rng) for name in names},
+        radio=_radio(rng, names),
+        core=CoreParameters(place_recognition=PlaceRecognitionParameters(similarity_threshold=0.5)),
+        keyframes=KeyframeConfig(distance_m=1.5, rotation_rad=1.2),
+        perception=PerceptionConfig(
+            method="synthetic", synthetic=SyntheticConfig(dimension=16, outlier_probability=0.0, alias_probability=0.0)
+        ),
+        faults=_faults(rng, names),
+    )
+
+
+def _robot(rng: np.random.Generator) -> RobotScenario:
+    return RobotScenario(
+        compute_class=int(rng.choice([0, 0, 0, 3])),
+        start_s=round(float(rng.choice([0.0, 0.0, rng.uniform(0, 10)])), 3),
+        clock_offset_s=round(float(rng.choice([0.0, rng.uniform(0, 1000)])), 3),
+        clock_drift_ratio=float(rng.choice([0.0, rng.uniform(-0.02, 0.02)])),
+    )
+
+
+def _radio(rng: np.random.Generator, names: list[str]) -> RadioConfig:
+    overrides = [_override(rng, names) for _ in range(int(rng.integers(0, 3)))]
+    ranged = rng.uniform() < 0.2
+    return RadioConfig(
+        **_link(rng), overrides=tuple(overrides), range_m=round(float(rng.uniform(5, 12)), 2) if ranged else None
+    )
+
+
+def _link(rng: np.random.Generator) -> dict[str, float | None]:
+    """Quality of a link; half of all links are good in each respect."""
+
+    def sometimes(low: float, high: float) -> float:
+        return round(float(rng.uniform(low, high)), 4) if rng.uniform() < 0.5 else 0.0
+
+    return {
+        "loss_ratio": sometimes(0.0, 0.5),
+        "burst_ratio": sometimes(0.0, 0.3),
+        "latency_s": sometimes(0.0, 0.3),
+        "jitter_s": sometimes(0.0, 0.3),
+        "duplicate_ratio": sometimes(0.0, 0.3),
+        "reorder_ratio": sometimes(0.0, 0.3),
+        "bandwidth_bytes_s": round(float(rng.uniform(4000, 50000))) if rng.uniform() < 0.2 else None,
+    }
+
+
+def _override(rng: np.random.Generator, names: list[str]) -> LinkOverrideConfig:
+    """One direction of one link is of another quality, perhaps dead."""
+    sender, receiver = (str(name) for name in rng.choice(names, size=2, replace=False))
+    link = {"loss_ratio": 1.0} if rng.uniform() < 0.3 else _link(rng)
+    return LinkOverrideConfig(sender=sender, receiver=receiver, **link)  # type: ignore[arg-type]
+
+
+def _faults(rng: np.random.Generator, names: list[str]) -> tuple[Fault, ...]:
+    drawn: list[Fault] = []
+    for _ in range(int(rng.integers(0, FAULTS_MAX + 1))):
+        drawn += _fault(rng, names, round(float(rng.uniform(1.0, FAULTS_END_S - 2.0)), 3))
+    calm = [Fault(at_s=FAULTS_END_S, kind=FaultKind.CALM)]
+    if rng.uniform() < 0.8:
+        calm += [Fault(at_s=FAULTS_END_S, kind=FaultKind.START, robots=tuple(names))]
+    return (*sorted(drawn, key=lambda fault: fault.at_s), *calm)
+
+
+def _fault(rng: np.random.Generator, names: list[str], at_s: float) -> list[Fault]:
+    """One fault, with its end where it has one."""
+    victim = (str(rng.choice(names)),)
+    end_s = round(min(at_s + float(rng.uniform(0.5, 20.0)), FAULTS_END_S), 3)
+    kind = rng.choice(["kill", "kill", "restart", "disk", "partition", "blackout", "slow", "loss", "mute", "leave"])
+    match kind:
+        case "kill":
+            return [Fault(at_s=at_s, kind=FaultKind.KILL, robots=victim)]
+        case "restart" | "disk":
+            return [Fault(at_s=at_s, kind=FaultKind.RESTART, robots=victim, disk_lost=kind == "disk")]
+        case "partition":
+            cut = int(rng.integers(1, len(names)))
+            shuffled = [str(name) for name in rng.permutation(names)]
+            heal = Fault(at_s=end_s, kind=FaultKind.HEAL)
+            groups = (tuple(shuffled[:cut]), tuple(shuffled[cut:]))
+            return [Fault(at_s=at_s, kind=FaultKind.PARTITION, groups=groups), heal]
+        case "blackout":
+            return [
+                Fault(at_s=at_s, kind=FaultKind.BLACKOUT, robots=victim),
+                Fault(at_s=end_s, kind=FaultKind.HEAL),
+            ]
+        case "slow":
+            return [Fault(at_s=at_s, kind=FaultKind.SLOW, robots=victim, value=float(rng.uniform(2, 30)))]
+        case "mute":
+            message = str(rng.choice(["correction", "records", "candidates", "coordinator", "election", "heartbeat"]))
+            return [Fault(at_s=at_s, kind=FaultKind.MUTE, message=message, value=float(rng.uniform(0.3, 1.0)))]
+        case "leave":
+            return [Fault(at_s=at_s, kind=FaultKind.LEAVE, robots=victim)]
+        case _:
+            return [Fault(at_s=at_s, kind=FaultKind.LOSS, value=float(rng.uniform(0.0, 0.9)))]
