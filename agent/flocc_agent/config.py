@@ -82,14 +82,17 @@ class BackendConfig(Section):
     """Closures whose keyframes are fewer than this apart on both sides share a scale cluster."""
     scale_link_sigma_ratio: float = Field(0.1, gt=0)
     """Standard deviation of the difference of two linked scales, relative to their size."""
-    scale_prior_sigma_ratio: float = Field(20.0, gt=0)
-    """Weak prior on each scale around its initial value, relative to it; keeps unobservable scales finite."""
+    scale_prior_sigma_ratio: float = Field(3.0, gt=0)
+    """Weak prior on a scale that Eq. (6) initialises: standard deviation relative to its initial value. It keeps
+    unobservable scales finite; smaller rejects closures whose scale is far from its initial value."""
+    scale_prior_unknown_sigma_ratio: float = Field(20.0, gt=0)
+    """The same for closures without an initial scale, around one metre per network unit."""
     weight_by_probability: bool = True
     """Multiply each closure's information by the probability of Eq. (2); off for measurements that carry a trusted
     covariance of their own."""
-    inlier_probability: float = Field(0.99, gt=0, lt=1)
+    inlier_probability: float = Field(0.9999, gt=0, lt=1)
     """Chi-square quantile below which a closure counts as right; larger rejects less."""
-    gnc_start_ratio: float = Field(1e-3, gt=0)
+    gnc_start_ratio: float = Field(1e-4, gt=0)
     """Control parameter at which GNC starts at the latest; smaller starts more convex and takes more solves."""
     gnc_step: float = Field(2.0, gt=1)
     """Factor of the control parameter per GNC round; smaller is more careful and slower."""

@@ -148,13 +148,13 @@ def _unscaled(edges: Edges, state: State) -> tuple[Float, Float, Float]:
     return np.concatenate([2.0 * q_error[:, 1:], np.einsum("eij,ej->ei", R_hat_inverse, p)], axis=1), q_error, p
 
 
-def residuals(edges: Edges, state: State) -> Residuals:
-    """Whitened residuals of all edges, own scales eliminated."""
+def residuals(edges: Edges, state: State, hold: bool = True) -> Residuals:
+    """Whitened residuals of all edges, own scales eliminated; without `hold` a scale may pass its lower bound."""
     e0, q_error, p = _unscaled(edges, state)
     c = cluster_scales(edges, state)
     e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
     gamma = own_scales(edges, e, c)
-    held = (edges.sigma > 0) & (gamma < GAMMA_MIN)
+    held = (edges.sigma > 0) & (gamma < GAMMA_MIN) & hold
     bound = np.zeros(len(edges))
     L = edges.sqrt_information_wide
     if np.any(held):

@@ -19,7 +19,7 @@ from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.scale_report import scale_warnings
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Solved, solve
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Objective, Solved, solve
 from flocc_agent.config import BackendConfig, Solver
 from flocc_agent.core.pose_graph import (
     AbsoluteFix,
@@ -133,8 +133,8 @@ def _solve_connected(
     T_initial = initial_poses(trajectories, closures, config.steepness, initial)
     problem = build(trajectories, closures, fixes, config)
     state = state_of(_stacked(problem, T_initial), problem.clusters)
-    linear = LinearSolver(0, config.scale_prior_sigma_ratio)
-    solved = solve(problem.edges, state, problem.closure_rows, linear, config)
+    linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
+    solved = solve(Objective(problem.edges, problem.closure_rows, linear, config), state)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     return _collect(problem, trajectories, closures, solved, linear, config)

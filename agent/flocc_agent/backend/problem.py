@@ -165,29 +165,37 @@ def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, c
 def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple[Int, Float, int]:
     """Cluster index, own standard deviation and number of clusters for a formulation.
 
-    The prior on a scale is `gamma ~ N(1, scale_prior_sigma_ratio^2)`. Clusters of one closure need no variable:
+    The prior on a scale is `gamma ~ N(1, sigma^2)` with the sigma of `prior_sigmas`. Clusters of one closure need no variable:
     prior and link widen the edge together.
     """
     n = len(closures)
     free = np.array([not c.metric for c in closures], dtype=bool)
     labels, sigma = np.full(n, NO_CLUSTER), np.zeros(n)
-    prior, link = config.scale_prior_sigma_ratio, config.scale_link_sigma_ratio
     if config.formulation is Formulation.BASE or not np.any(free):
-        return labels, sigma, 0
-    if config.formulation is Formulation.INDEPENDENT:
-        sigma[free] = prior
         return labels, sigma, 0
     if config.formulation is Formulation.SHARED:
         labels[free] = 0
         return labels, sigma, 1
+    prior = prior_sigmas(closures, config)
+    if config.formulation is Formulation.INDEPENDENT:
+        sigma[free] = prior[free]
+        return labels, sigma, 0
     raw = cluster_labels(closures, config.cluster_keyframes_max)
     raw[~free] = NO_CLUSTER
     sizes = np.bincount(raw[raw >= 0], minlength=1)
     renumbered = np.cumsum(sizes > 1) - 1
     together = free & (sizes[np.maximum(raw, 0)] > 1)
     labels[together] = renumbered[raw[together]]
-    sigma[free] = np.where(together[free], link, np.hypot(prior, link))
+    link = config.scale_link_sigma_ratio
+    sigma[free] = np.where(together, link, np.hypot(prior, link))[free]
     return labels, sigma, int(np.sum(sizes > 1))
+
+
+def prior_sigmas(closures: Sequence[LoopClosure], config: BackendConfig) -> Float:
+    """Relative standard deviation (L,) of the prior on each closure's scale."""
+    raw = config.scale_initial is ScaleInitial.RAW
+    known = np.array([c.scale_initial is not None and not raw for c in closures], dtype=bool)
+    return np.where(known, config.scale_prior_sigma_ratio, config.scale_prior_unknown_sigma_ratio)
 
 
 def fix_edges(fixes: Sequence[AbsoluteFix], offsets: Mapping[LogId, int], world: int) -> Edges:

@@ -1,6 +1,8 @@
 """Nonlinear solvers on the edges of one component: Levenberg-Marquardt, robust kernels and GNC.
 
-Closures carry weights in [0, 1] that multiply their information; odometry and fixes always weigh 1.
+Closures carry weights in [0, 1] that multiply their information; odometry and fixes always weigh 1. On the way a
+closure's scale may pass through zero, which is what keeps the search out of corners; at the end it is held at its
+bound (`edges.GAMMA_MIN`) and the rest moves to the constrained optimum.
 """
 
 from dataclasses import dataclass
@@ -18,8 +20,10 @@ Float = NDArray[np.float64]
 DAMPING_MIN, DAMPING_MAX = 1.0, 1e12
 DAMPING_FACTOR = 10.0
 WEIGHT_MIN = 1e-6
-GNC_INNER_STEPS = 2
+KERNEL_STEPS = 1
 ACCEPTED_WEIGHT_MIN = 0.5
+CONTROL_MAX = 1e6
+SELECTIONS_MAX = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,79 +45,109 @@ class Solved:
     converged: bool
 
 
-def cost_of(edges: Edges, state: State, weights: Float, scale_prior_sigma: float) -> float:
-    """Sum of half squared residuals, weighted, with the priors of cluster scales."""
-    prior = np.sum(((state.scale - 1.0) / scale_prior_sigma) ** 2)
-    return float(0.5 * (weights @ residuals(edges, state).squared() + prior))
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """What is minimised: edges, which of them are closures, and how its linear systems are solved."""
+
+    edges: Edges
+    closures: slice
+    linear: LinearSolver
+    config: BackendConfig
+
+    def cost(self, state: State, weights: Float, hold: bool) -> float:
+        """Sum of half squared residuals, weighted, with the priors of cluster scales."""
+        prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
+        return float(0.5 * (weights @ residuals(self.edges, state, hold).squared() + prior))
+
+    def closure_residuals(self, state: State) -> Float:
+        """Squared residuals (L,) of the closures."""
+        return residuals(self.edges, state, hold=False).squared()[self.closures]
+
+    def weights(self, of_closures: Float | float = 1.0) -> Float:
+        """Weights (E,) of all edges, given those of the closures."""
+        out = np.ones(len(self.edges))
+        out[self.closures] = of_closures
+        return out
+
+    def bounds(self) -> Float:
+        """Squared residual (L,) below which a right closure lies with the configured probability.
+
+        A free scale takes one of the six degrees of freedom.
+        """
+        free = (self.edges.sigma[self.closures] > 0) | (self.edges.cluster[self.closures] >= 0)
+        return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - self.config.inlier_probability))
 
 
-def solve(edges: Edges, state: State, closures: slice, linear: LinearSolver, config: BackendConfig) -> Solved:
-    """Run the configured solver from a state."""
-    if config.solver is Solver.LM or closures.start == closures.stop:
-        return levenberg_marquardt(edges, state, np.ones(len(edges)), linear, config)
-    if config.solver in (Solver.HUBER, Solver.CAUCHY):
-        return reweighted(edges, state, closures, linear, config)
-    return graduated(edges, state, closures, linear, config)
+def solve(objective: Objective, state: State) -> Solved:
+    """Run the configured solver from a state, then hold scales at their bound where they passed it."""
+    solver = objective.config.solver
+    if solver is Solver.LM or objective.closures.start == objective.closures.stop:
+        solved = descend(objective, state, objective.weights())
+    elif solver in (Solver.HUBER, Solver.CAUCHY):
+        solved = reweighted(objective, state)
+    else:
+        solved = graduated(objective, state)
+    return held(objective, solved)
 
 
-def levenberg_marquardt(
-    edges: Edges,
-    state: State,
-    weights: Float,
-    linear: LinearSolver,
-    config: BackendConfig,
-    steps_max: int | None = None,
+def held(objective: Objective, solved: Solved) -> Solved:
+    """Move to the optimum whose scales all stay above their bound."""
+    at = residuals(objective.edges, solved.state)
+    if not np.any(at.held & (solved.weights > WEIGHT_MIN)):
+        return solved
+    final = descend(objective, solved.state, solved.weights, hold=True)
+    return Solved(final.state, final.weights, final.cost, solved.iterations + final.iterations, final.converged)
+
+
+def descend(
+    objective: Objective, state: State, weights: Float, steps_max: int | None = None, hold: bool = False
 ) -> Solved:
-    """Minimise the weighted cost: Gauss-Newton steps, damped only where one does not go down."""
-    sigma, sqrt_weights = linear.scale_prior_sigma, np.sqrt(weights)
-    cost, damping, began = cost_of(edges, state, weights, sigma), 0.0, linear.solves
-    budget = config.iterations_max if steps_max is None else steps_max
-    while linear.solves - began < budget:
-        at = residuals(edges, state)
-        jac = jacobians(edges, at)
-        candidate, candidate_cost = state, np.inf
-        while linear.solves - began < budget:
+    """Levenberg-Marquardt for given weights: Gauss-Newton steps, damped only where one does not go down."""
+    budget = objective.config.iterations_max if steps_max is None else steps_max
+    cost, damping, solves = objective.cost(state, weights, hold), 0.0, 0
+    while solves < budget:
+        at = residuals(objective.edges, state, hold)
+        jac = jacobians(objective.edges, at)
+        while True:
+            solves += 1
             try:
-                candidate = state.retract(linear.step(edges, state, at, jac, sqrt_weights, damping))
-                candidate_cost = cost_of(edges, candidate, weights, sigma)
+                delta = objective.linear.step(objective.edges, state, at, jac, np.sqrt(weights), damping)
+                candidate = state.retract(delta)
+                candidate_cost = objective.cost(candidate, weights, hold)
             except SingularSystem:
-                candidate_cost = np.inf
-            if candidate_cost <= cost * (1 + 1e-12):
+                candidate, candidate_cost = state, np.inf
+            if candidate_cost <= cost:
                 break
-            if damping >= DAMPING_MAX:
-                return Solved(state, weights, cost, linear.solves - began, False)
+            if _is_finished(objective.config, cost, candidate_cost - cost):
+                return Solved(state, weights, cost, solves, True)
+            if solves >= budget or damping >= DAMPING_MAX:
+                return Solved(state, weights, cost, solves, False)
             damping = max(damping * DAMPING_FACTOR, DAMPING_MIN)
-        if not candidate_cost <= cost * (1 + 1e-12):
-            break
-        decrease = cost - candidate_cost
-        state, cost = candidate, min(cost, candidate_cost)
-        if decrease <= config.relative_tolerance * cost or cost < config.absolute_tolerance:
-            return Solved(state, weights, cost, linear.solves - began, True)
+        decrease, state, cost = cost - candidate_cost, candidate, candidate_cost
+        if _is_finished(objective.config, cost, decrease):
+            return Solved(state, weights, cost, solves, True)
         damping = 0.0 if damping <= DAMPING_MIN else damping / DAMPING_FACTOR**2
-    return Solved(state, weights, cost, linear.solves - began, False)
+    return Solved(state, weights, cost, solves, False)
 
 
-def thresholds(edges: Edges, closures: slice, probability: float) -> Float:
-    """Squared residual (L,) below which a right closure lies with the given probability; a free scale costs one."""
-    freedom = np.where((edges.sigma[closures] > 0) | (edges.cluster[closures] >= 0), 5.0, 6.0)
-    return np.asarray(chdtri(freedom, 1.0 - probability))
+def _is_finished(config: BackendConfig, cost: float, change: float) -> bool:
+    return change <= max(config.relative_tolerance * cost, config.absolute_tolerance)
 
 
-def reweighted(edges: Edges, state: State, closures: slice, linear: LinearSolver, config: BackendConfig) -> Solved:
+def reweighted(objective: Objective, state: State) -> Solved:
     """Iteratively reweighted least squares with a Huber or Cauchy kernel on closures."""
-    bound = thresholds(edges, closures, config.inlier_probability)
-    cost, iterations = np.inf, 0
-    weights = np.ones(len(edges))
-    while iterations < config.iterations_max:
-        squared = residuals(edges, state).squared()[closures]
-        weights[closures] = kernel_weights(config.solver, squared, bound)
-        solved = levenberg_marquardt(edges, state, np.maximum(weights, WEIGHT_MIN), linear, config, steps_max=1)
-        iterations += max(solved.iterations, 1)
-        state = solved.state
-        if cost - solved.cost <= config.relative_tolerance * solved.cost and np.isfinite(cost):
-            return Solved(state, weights, solved.cost, iterations, True)
-        cost = solved.cost
-    return Solved(state, weights, cost, iterations, False)
+    config, bound = objective.config, objective.bounds()
+    robust_before, iterations = np.inf, 0
+    while True:
+        squared = objective.closure_residuals(state)
+        weights = objective.weights(kernel_weights(config.solver, squared, bound))
+        solved = descend(objective, state, np.maximum(weights, WEIGHT_MIN), steps_max=KERNEL_STEPS)
+        state, iterations = solved.state, iterations + solved.iterations
+        others = objective.cost(state, objective.weights(0.0), hold=False)
+        robust = others + 0.5 * float(np.sum(kernel_loss(config.solver, objective.closure_residuals(state), bound)))
+        if abs(robust_before - robust) <= config.relative_tolerance * robust or iterations >= config.iterations_max:
+            return Solved(state, weights, solved.cost, iterations, iterations < config.iterations_max)
+        robust_before = robust
 
 
 def kernel_weights(solver: Solver, squared: Float, bound: Float) -> Float:
@@ -123,28 +157,43 @@ def kernel_weights(solver: Solver, squared: Float, bound: Float) -> Float:
     return np.asarray(1.0 / (1.0 + squared / bound))
 
 
-def graduated(edges: Edges, state: State, closures: slice, linear: LinearSolver, config: BackendConfig) -> Solved:
-    """Graduated non-convexity (Yang 2020) with truncated least squares or Geman-McClure."""
-    bound = thresholds(edges, closures, config.inlier_probability)
-    weights, iterations = np.ones(len(edges)), 0
-    squared = residuals(edges, state).squared()[closures]
+def kernel_loss(solver: Solver, squared: Float, bound: Float) -> Float:
+    """Twice the robust loss of squared residuals; its derivative by `squared` is the weight."""
+    if solver is Solver.HUBER:
+        return np.where(squared <= bound, squared, 2.0 * np.sqrt(bound * squared) - bound)
+    return np.asarray(bound * np.log1p(squared / bound))
+
+
+def graduated(objective: Objective, state: State) -> Solved:
+    """Graduated non-convexity (Yang 2020) with truncated least squares or Geman-McClure, then plain inliers."""
+    config, bound = objective.config, objective.bounds()
+    squared, iterations = objective.closure_residuals(state), 0
     control = initial_control(config.solver, squared, bound, config.gnc_start_ratio)
     while iterations < config.iterations_max:
-        weights[closures] = gnc_weights(config.solver, squared, bound, control)
-        solved = levenberg_marquardt(
-            edges, state, np.maximum(weights, WEIGHT_MIN), linear, config, steps_max=GNC_INNER_STEPS
-        )
-        iterations += max(solved.iterations, 1)
-        state = solved.state
-        squared = residuals(edges, state).squared()[closures]
-        if gnc_finished(config.solver, weights[closures], control):
+        of_closures = gnc_weights(config.solver, squared, bound, control)
+        weights = np.maximum(objective.weights(of_closures), WEIGHT_MIN)
+        solved = descend(objective, state, weights, steps_max=config.gnc_inner_steps)
+        state, iterations = solved.state, iterations + solved.iterations
+        squared = objective.closure_residuals(state)
+        if gnc_finished(config.solver, of_closures, control):
             break
         control = control * config.gnc_step if config.solver is Solver.GNC_TLS else control / config.gnc_step
-    weights[closures] = (
-        (weights[closures] >= ACCEPTED_WEIGHT_MIN) if config.solver is Solver.GNC_TLS else weights[closures]
-    )
-    final = levenberg_marquardt(edges, state, np.maximum(weights, WEIGHT_MIN), linear, config)
-    return Solved(final.state, weights, final.cost, iterations + final.iterations, final.converged)
+    return selected(objective, state, iterations)
+
+
+def selected(objective: Objective, state: State, iterations: int) -> Solved:
+    """Keep the closures within their bounds, solve with them alone, and repeat until the choice stands."""
+    bound = objective.bounds()
+    chosen = objective.closure_residuals(state) <= bound
+    for _ in range(SELECTIONS_MAX):
+        weights = objective.weights(chosen.astype(float))
+        solved = descend(objective, state, np.maximum(weights, WEIGHT_MIN))
+        state, iterations = solved.state, iterations + solved.iterations
+        again = objective.closure_residuals(state) <= bound
+        if np.array_equal(again, chosen) or iterations >= objective.config.iterations_max:
+            break
+        chosen = again
+    return Solved(state, weights, solved.cost, iterations, solved.converged)
 
 
 def initial_control(solver: Solver, squared: Float, bound: Float, start_ratio: float) -> float:
@@ -168,4 +217,4 @@ def gnc_finished(solver: Solver, weights: Float, control: float) -> bool:
     """Whether weights are binary (TLS) or the original cost is reached (GM)."""
     if solver is Solver.GNC_GM:
         return control <= 1.0
-    return bool(np.all((weights < 1e-4) | (weights > 1 - 1e-4))) or control > 1e6
+    return bool(np.all((weights < 1e-4) | (weights > 1 - 1e-4))) or control > CONTROL_MAX

@@ -1,0 +1,149 @@
+"""g2o files: SE(3) edges with quaternions and SE(2) edges, in and out.
+
+Two-dimensional graphs are lifted into the plane z = 0 with unit information on what a plane does not have. A folder
+holds one file per robot (keys of all robots in their top byte), and maybe a `*_groundTruth.txt` with `x,y,theta` of
+all keyframes, robot after robot.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph
+from flocc_agent.geometry import R_from_q_wxyz, pose, q_wxyz_from_R, so3_exp
+from flocc_launch.graph_files.graph_file import INDEX_BITS, GraphFile, GraphFileError, Measurement, pose_graph
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+
+SE3_NUMBERS, SE2_NUMBERS = 7 + 21, 3 + 6
+ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+
+
+def read_g2o(path: Path) -> GraphFile:
+    """Read a g2o file, or all robots' files of a folder.
+
+    Raises:
+        GraphFileError: A file is missing or a line is damaged; the message names both.
+    """
+    files = _robot_files(path) if path.is_dir() else [path]
+    measurements = [m for file in files for m in _measurements(file)]
+    if not measurements:
+        raise GraphFileError(f"{path}: has no edges")
+    graph = pose_graph(measurements, str(path))
+    return GraphFile(graph, _truth(path, graph) if path.is_dir() else {})
+
+
+def _robot_files(folder: Path) -> list[Path]:
+    files = sorted(file for file in folder.glob("*.g2o") if file.stem.isdigit())
+    if not files:
+        raise GraphFileError(f"{folder}: has no files 0.g2o, 1.g2o, ... of robots")
+    return files
+
+
+def _measurements(path: Path) -> Iterable[Measurement]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise GraphFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words or words[0] not in ("EDGE_SE3:QUAT", "EDGE_SE2"):
+            continue
+        try:
+            yield _se3(words[1:]) if words[0] == "EDGE_SE3:QUAT" else _se2(words[1:])
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise GraphFileError(f"{path}: line {number}: {error}") from error
+
+
+def _numbers(words: list[str], count: int) -> tuple[int, int, Float]:
+    if len(words) != 2 + count:
+        raise ValueError(f"an edge has {len(words)} fields, expected {2 + count}")
+    values = np.array([float(word) for word in words[2:]])
+    if not np.all(np.isfinite(values)):
+        raise ValueError("an edge has a value that is not finite")
+    return int(words[0]), int(words[1]), values
+
+
+def _symmetric(upper: Float, size: int) -> Float:
+    out = np.zeros((size, size))
+    out[np.triu_indices(size)] = upper
+    return np.asarray(out + np.triu(out, 1).T)
+
+
+def _se3(words: list[str]) -> Measurement:
+    """One `EDGE_SE3:QUAT`: quaternion x y z w, information with translation first."""
+    first, second, v = _numbers(words, SE3_NUMBERS)
+    T = pose(R_from_q_wxyz(v[[6, 3, 4, 5]]), v[:3])
+    information = _symmetric(v[7:], 6)[np.ix_(ROTATION_FIRST, ROTATION_FIRST)]
+    return Measurement(first, second, T, np.linalg.inv(information))
+
+
+def _se2(words: list[str]) -> Measurement:
+    first, second, v = _numbers(words, SE2_NUMBERS)
+    T = pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
+    covariance = np.eye(6)
+    planar = np.ix_([3, 4, 2], [3, 4, 2])
+    covariance[planar] = np.linalg.inv(_symmetric(v[3:], 3))
+    return Measurement(first, second, T, covariance)
+
+
+def _truth(folder: Path, graph: PoseGraph) -> dict[LogId, Float]:
+    """True positions of all robots, cut from one list in the order of the robots."""
+    file = next(iter(sorted(folder.glob("*_groundTruth.txt"))), None)
+    if file is None:
+        return {}
+    rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    positions = np.column_stack([rows[:, 0], rows[:, 1], np.zeros(len(rows))])
+    truth, start = {}, 0
+    for log in sorted(graph.trajectories):
+        truth[log] = positions[start : start + len(graph.trajectories[log])]
+        start += len(graph.trajectories[log])
+    if start > len(positions):
+        raise GraphFileError(f"{file}: has {len(positions)} poses, the robots have {start} keyframes")
+    return truth
+
+
+def write_g2o(path: Path, T_keyframe: Mapping[LogId, Float], closures: Iterable[LoopClosure] = ()) -> None:
+    """Write poses (N, 4, 4) of every log and the metric closures between them.
+
+    Keys carry the robot's number (from `a` on, in the order of the logs) in their top byte; odometry edges join
+    consecutive poses as they are. A covariance that is not given is written as unit information.
+
+    Raises:
+        GraphFileError: The file cannot be written.
+    """
+    numbers = {log: ord("a") + n for n, log in enumerate(sorted(T_keyframe))}
+
+    def key(keyframe: KeyframeId) -> int:
+        return (numbers[keyframe.log] << INDEX_BITS) | keyframe.index
+
+    try:
+        with path.open("w", encoding="utf-8") as out:
+            for log in sorted(T_keyframe):
+                for k, T in enumerate(T_keyframe[log]):
+                    out.write(f"VERTEX_SE3:QUAT {key(KeyframeId(log, k))} {_seven(T)}\n")
+            for log in sorted(T_keyframe):
+                T_all = T_keyframe[log]
+                for k in range(len(T_all) - 1):
+                    T = np.linalg.solve(T_all[k], T_all[k + 1])
+                    _write_edge(out, key(KeyframeId(log, k)), key(KeyframeId(log, k + 1)), T, np.eye(6))
+            for c in closures:
+                information = np.linalg.inv(np.eye(6) if c.covariance is None else c.covariance)
+                _write_edge(out, key(c.query), key(c.match), c.T_query_match_unscaled, information)
+    except OSError as error:
+        raise GraphFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _seven(T: Float) -> str:
+    q = q_wxyz_from_R(T[:3, :3])
+    return " ".join(repr(float(v)) for v in [*T[:3, 3], *q[1:], q[0]])
+
+
+def _write_edge(out: TextIO, first: int, second: int, T: Float, information: NDArray[np.floating[Any]]) -> None:
+    """One edge; information (6, 6) with rotation first is written with translation first."""
+    upper = information[np.ix_(ROTATION_FIRST, ROTATION_FIRST)][np.triu_indices(6)]
+    out.write(f"EDGE_SE3:QUAT {first} {second} {_seven(T)} {' '.join(repr(float(v)) for v in upper)}\n")

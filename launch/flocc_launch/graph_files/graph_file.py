@@ -1,0 +1,157 @@
+"""What every graph file becomes: a pose graph, and what the file knows beyond it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.geometry import inverse, umeyama
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+
+INDEX_BITS = 56
+INDEX_MASK = (1 << INDEX_BITS) - 1
+
+
+class GraphFileError(FloccError):
+    """A pose-graph file that cannot be used; the message names the file and the line or key."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """A relative pose between two keys of a file: (4, 4), and its covariance (6, 6), rotation first."""
+
+    first: int
+    second: int
+    T_first_second: Float
+    covariance: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphFile:
+    """A pose graph from a file.
+
+    Attributes:
+        graph: Odometry of every robot in its own frame, and closures, metric as in the file.
+        truth_m: (N, 3) true position of every keyframe of each log, where the file has them.
+        T_initial: (N, 4, 4) poses of each log in one frame, where the file has an initialisation.
+        outliers: Indices of closures that the file labels as wrong.
+    """
+
+    graph: PoseGraph
+    truth_m: Mapping[LogId, Float] = field(default_factory=dict)
+    T_initial: Mapping[LogId, Float] = field(default_factory=dict)
+    outliers: frozenset[int] = frozenset()
+
+    def without_outliers(self) -> "GraphFile":
+        """The same file without the closures that it labels as wrong."""
+        kept = tuple(c for k, c in enumerate(self.graph.closures) if k not in self.outliers)
+        return replace(self, graph=replace(self.graph, closures=kept), outliers=frozenset())
+
+    def with_unit_scale(self) -> "GraphFile":
+        """The same file with the translations of inter-robot closures reduced to length one and their scale free.
+
+        Covariances stay as they are in the file.
+        """
+        closures = tuple(unit_length(c) if c.query.log != c.match.log else c for c in self.graph.closures)
+        return replace(self, graph=replace(self.graph, closures=closures))
+
+
+def unit_length(closure: LoopClosure) -> LoopClosure:
+    """A closure whose translation has length one and whose scale is free; a zero translation stays."""
+    T = np.array(closure.T_query_match_unscaled)
+    length_m = float(np.linalg.norm(T[:3, 3]))
+    T[:3, 3] /= length_m if length_m > 0 else 1.0
+    return replace(closure, T_query_match_unscaled=T, metric=False, scale_initial=None)
+
+
+def log_of(key: int) -> LogId:
+    """The log of a GTSAM-style key: its top byte is the robot's letter, or nothing where there is one robot."""
+    number = key >> INDEX_BITS
+    letter = chr(number).lower() if number < 128 else ""
+    return LogId(letter if letter.isascii() and letter.isalnum() else f"robot-{number}")
+
+
+def pose_graph(measurements: Sequence[Measurement], path: str) -> PoseGraph:
+    """Sort measurements into odometry (consecutive keys of one robot, the first such) and closures.
+
+    Measurements that occur twice, word for word, are taken once.
+
+    Raises:
+        GraphFileError: A robot's keys have a gap that no measurement bridges.
+    """
+    odometry: dict[int, Measurement] = {}
+    closures: list[Measurement] = []
+    seen: set[tuple[int, int, bytes]] = set()
+    for m in measurements:
+        mark = (m.first, m.second, m.T_first_second.tobytes())
+        if mark in seen:
+            continue
+        seen.add(mark)
+        if m.second == m.first + 1 and m.first not in odometry:
+            odometry[m.first] = m
+        else:
+            closures.append(m)
+    keys = sorted({key for m in measurements for key in (m.first, m.second)})
+    trajectories = _trajectories(keys, odometry, path)
+    numbers = _numbers(keys)
+    return PoseGraph(trajectories, [_closure(m, numbers) for m in closures])
+
+
+def _numbers(keys: Sequence[int]) -> dict[int, KeyframeId]:
+    """Number every robot's keys from 0."""
+    counts: dict[LogId, int] = {}
+    numbers = {}
+    for key in keys:
+        log = log_of(key)
+        numbers[key] = KeyframeId(log, counts.setdefault(log, 0))
+        counts[log] += 1
+    return numbers
+
+
+def _trajectories(keys: Sequence[int], odometry: Mapping[int, Measurement], path: str) -> dict[LogId, Trajectory]:
+    by_log: dict[LogId, list[int]] = {}
+    for key in keys:
+        by_log.setdefault(log_of(key), []).append(key)
+    return {log: _trajectory(log, own, odometry, path) for log, own in by_log.items()}
+
+
+def _trajectory(log: LogId, keys: Sequence[int], odometry: Mapping[int, Measurement], path: str) -> Trajectory:
+    T = np.empty((len(keys), 4, 4))
+    T[0] = np.eye(4)
+    covariances = np.empty((len(keys) - 1, 6, 6))
+    for n, key in enumerate(keys[:-1]):
+        if key not in odometry or keys[n + 1] != key + 1:
+            index = key & INDEX_MASK
+            raise GraphFileError(f"{path}: robot {log} has no odometry from keyframe {index} to {index + 1}")
+        T[n + 1] = T[n] @ odometry[key].T_first_second
+        covariances[n] = odometry[key].covariance
+    return Trajectory(T, covariances)
+
+
+def _closure(m: Measurement, numbers: Mapping[int, KeyframeId]) -> LoopClosure:
+    return LoopClosure(numbers[m.first], numbers[m.second], m.T_first_second, covariance=m.covariance, metric=True)
+
+
+def ate_m(estimate_m: Mapping[LogId, Float], truth_m: Mapping[LogId, Float]) -> float | None:
+    """Translation RMSE over all keyframes of all robots after one SE(3) alignment; None without ground truth."""
+    logs = sorted(set(estimate_m) & set(truth_m))
+    if not logs:
+        return None
+    source = np.concatenate([estimate_m[log] for log in logs])
+    target = np.concatenate([truth_m[log] for log in logs])
+    known = np.isfinite(target).all(axis=1)
+    if not np.any(known):
+        return None
+    _, T = umeyama(source[known], target[known])
+    moved = source[known] @ T[:3, :3].T + T[:3, 3]
+    return float(np.sqrt(np.mean(np.sum((moved - target[known]) ** 2, axis=1))))
+
+
+def first_poses_at(T_odom: Float, T_world_first: Float) -> Float:
+    """Odometry (N, 4, 4) moved so that its first pose lies at a given one."""
+    return np.asarray(T_world_first @ inverse(T_odom[0]) @ T_odom)
