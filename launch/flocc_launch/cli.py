@@ -1,6 +1,7 @@
 """The command line. Commands import what they need when they run, so that `--help` stays fast."""
 
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -9,6 +10,8 @@ import typer
 from flocc_protocol.errors import FloccError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from flocc_launch.report.model import Report
     from flocc_launch.scenario import Scenario
 
@@ -97,10 +100,16 @@ def simulate(
     duration: Duration = None,
 ) -> None:
     """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
-    from flocc_launch.simulation import simulate as run
+    from flocc_launch.data import cache_folder, recordings
+    from flocc_launch.launching import fresh_folder
+    from flocc_launch.simulation.simulate import simulate as run
 
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
-    _show(run(_read(scenario, changes, agents), out), out)
+    read = _read(scenario, changes, agents)
+    with _progress("preparing data") as progress:
+        paths = recordings(read, progress)
+    fresh_folder(out)
+    _show(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out)
 
 
 @app.command()
@@ -133,6 +142,87 @@ def evaluate(
     typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
 
 
+@app.command()
+def doctor(run: Annotated[Path, typer.Argument(help="Run folder.")]) -> None:
+    """Say in sentences why maps have or have not merged, and what to change."""
+    from flocc_launch.doctor import Severity, diagnose
+    from flocc_launch.run_folder import RunFolder
+
+    findings = diagnose(RunFolder.open(run))
+    for finding in findings:
+        typer.echo(f"[{finding.severity.value}] {finding.sentence}" + (f" {finding.advice}" * bool(finding.advice)))
+    if any(finding.severity is Severity.BLOCKS for finding in findings):
+        sys.exit(EXIT_MISSED)
+
+
+@app.command()
+def keys(
+    folder: Annotated[Path, typer.Argument(help="Where the authority and a folder per robot stand or will stand.")],
+    robots: Annotated[list[str], typer.Argument(help="Names of the robots to admit.")],
+    swarm: Annotated[str, typer.Option(help="Name of the swarm; one authority certifies one swarm.")] = "swarm",
+) -> None:
+    """Make a swarm's certificate authority, and a certificate and a signing key per robot."""
+    from flocc_launch.keys import make_keys
+
+    for name, path in make_keys(folder, swarm, robots).items():
+        typer.echo(f"{name}: {path}")
+
+
+dataset = typer.Typer(help="Look at data sets, turn them into recordings, cut them into robots.", rich_markup_mode=None)
+app.add_typer(dataset, name="dataset")
+
+Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
+Format = Annotated[str | None, typer.Option("--format", help="Name of the format where it is not recognised.")]
+CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML) for a data set that has none.")]
+
+
+@dataset.command()
+def info(source: Source, format_name: Format = None) -> None:
+    """Say what a data set holds, without writing anything."""
+    from dataclasses import fields
+
+    from flocc_launch.datasets.commands import info as look
+
+    found = look(source, format_name)
+    for field in fields(found):
+        value = getattr(found, field.name)
+        typer.echo(f"{field.name:14} {value if value is not None else 'not known'}")
+
+
+@dataset.command()
+def convert(
+    source: Source,
+    out: Annotated[Path, typer.Option(help="Folder of the recording.")],
+    format_name: Format = None,
+    camera: CameraFile = None,
+    odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
+) -> None:
+    """Write a data set as one recording; a conversion that was cut short goes on where it ended."""
+    from flocc_launch.datasets.commands import convert as run
+
+    with _progress("converting") as progress:
+        path = run(source, out, format_name=format_name, camera=camera, odometry=odometry, progress=progress)
+    typer.echo(f"recording: {path}")
+
+
+@dataset.command()
+def split(
+    source: Source,
+    out: Annotated[Path, typer.Option(help="Folder of the recordings.")],
+    robots: Annotated[int, typer.Option(min=1, help="Pieces, one per robot.")] = 3,
+    seed: Annotated[int, typer.Option(help="Seed of the odometry drift.")] = 0,
+    format_name: Format = None,
+    camera: CameraFile = None,
+) -> None:
+    """Cut a data set by time into recordings of several robots, with seeded odometry drift."""
+    from flocc_launch.datasets.commands import split as run
+
+    with _progress("cutting") as progress:
+        paths = run(source, out, robots, seed=seed, format_name=format_name, camera=camera, progress=progress)
+    for path in paths:
+        typer.echo(f"recording: {path}")
+
+
 def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
     from flocc_launch.shipped import read_scenario
 
@@ -161,19 +251,26 @@ def _changes(
 
 def _launch(scenario: "Scenario", out: Path) -> None:
     from rich.console import Console
-    from rich.progress import Progress
 
     from flocc_launch.data import recordings
     from flocc_launch.launching import launch as run
     from flocc_launch.live_table import LiveTable
 
-    console = Console()
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("preparing data", total=None)
-        recordings(scenario, lambda done, total: bar.update(task, completed=done, total=total))
-    with LiveTable(console) as table:
+    with _progress("preparing data") as progress:
+        recordings(scenario, progress)
+    with LiveTable(Console()) as table:
         report = run(scenario, out, table.show)
     _show(report, out)
+
+
+@contextmanager
+def _progress(what: str) -> "Iterator[Callable[[int, int], None]]":
+    """A progress bar that takes (done, all)."""
+    from rich.progress import Progress
+
+    with Progress(transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _show(report: "Report", out: Path) -> None:
