@@ -1,0 +1,221 @@
+"""What is known of a swarm at one moment, folded from its events."""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.geometry import pose_from_tq
+from flocc_launch.dashboard.words import sentence_of
+from flocc_launch.run_records import (
+    AgentDied,
+    AgentStopped,
+    BytesCounted,
+    CandidateFound,
+    ClosureAccepted,
+    ClosureRejected,
+    CorrectionApplied,
+    Event,
+    GraphOptimised,
+    KeyframeCaptured,
+    LeaderFollowed,
+    LeaderLost,
+    NeighbourDown,
+    NeighbourUp,
+)
+from flocc_protocol.ids import KeyframeId
+
+Float = NDArray[np.float64]
+
+RECENT_MAX = 60
+PATH_POINTS_MAX = 600
+CLOSURES_MAX = 2000
+SILENT_S = 20.0
+
+
+@dataclass(slots=True)
+class RobotState:
+    """One robot as its own events tell it."""
+
+    leader: str | None = None
+    term: int | str | None = None
+    neighbours: set[str] = field(default_factory=set)
+    map_frame: str | None = None
+    T_map_odom: Float = field(default_factory=lambda: np.eye(4))
+    positions_odom_m: list[Float] = field(default_factory=list)
+    candidates: int = 0
+    accepted: int = 0
+    rejected: int = 0
+    sent: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
+    last_s: float = 0.0
+    end: str | None = None
+
+    def path_m(self) -> Float:
+        """Positions (N, 3) in the map frame of the last correction; in odom before the first."""
+        if not self.positions_odom_m:
+            return np.zeros((0, 3))
+        R, t = self.T_map_odom[:3, :3], self.T_map_odom[:3, 3]
+        return np.asarray(np.array(self.positions_odom_m) @ R.T + t)
+
+
+class SwarmState:
+    """Folds events; `snapshot` is what the page and the table show."""
+
+    def __init__(self, robots: list[str]) -> None:
+        self.robots = {robot: RobotState() for robot in sorted(robots)}
+        self.closures: dict[tuple[str, str], float] = {}
+        self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT_MAX)
+        self.optimised: GraphOptimised | None = None
+        self.t = 0.0
+
+    def apply(self, event: Event) -> None:
+        """Take one event; those of one robot come in order."""
+        robot = self.robots.setdefault(event.robot, RobotState())
+        self.t, robot.last_s = max(self.t, event.t), event.t
+        apply_to(robot, event)
+        if isinstance(event, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
+            self.closures[event.query, event.match] = event.probability
+        if isinstance(event, GraphOptimised):
+            self.optimised = event
+        said = sentence_of(event)
+        if said is not None:
+            self.recent.append({"t": event.t, "robot": event.robot, "text": said})
+
+    def snapshot(self, now_s: float | None = None) -> dict[str, Any]:
+        """Everything as plain JSON values.
+
+        Args:
+            now_s: Now on the run's clock; None for a run that is over.
+        """
+        names = sorted(self.robots)
+        living = {name: robot for name, robot in self.robots.items() if state_of(robot, now_s) == "running"}
+        return {
+            "t": self.t if now_s is None else now_s,
+            "running": now_s is not None,
+            "robots": [robot_json(name, self.robots[name], now_s) for name in names],
+            "maps": groups([(name, self.robots[name].map_frame) for name in names]),
+            "ranges": ranges(living),
+            "leaders": sorted({robot.leader for robot in living.values() if robot.leader is not None}),
+            "closures": [closure_json(self, query, match) for query, match in self.closures],
+            "optimised": optimised_json(self.optimised),
+            "recent": list(self.recent)[::-1],
+        }
+
+
+def apply_to(robot: RobotState, event: Event) -> None:
+    """What an event changes of its robot."""
+    match event:
+        case KeyframeCaptured():
+            robot.positions_odom_m.append(pose_from_tq(np.array(event.T_odom_body))[:3, 3])
+            robot.end = None
+        case CorrectionApplied():
+            robot.map_frame, robot.T_map_odom = event.map_frame, pose_from_tq(np.array(event.T_map_odom))
+        case LeaderFollowed():
+            robot.leader, robot.term = event.leader, event.term
+        case LeaderLost():
+            robot.leader = None
+        case NeighbourUp():
+            robot.neighbours.add(event.peer)
+        case NeighbourDown():
+            robot.neighbours.discard(event.peer)
+        case CandidateFound():
+            robot.candidates += 1
+        case ClosureAccepted():
+            robot.accepted += 1
+        case ClosureRejected():
+            robot.rejected += 1
+        case BytesCounted():
+            robot.sent, robot.received = event.sent, event.received
+        case AgentDied() | AgentStopped():
+            robot.end = "died" if isinstance(event, AgentDied) else "stopped"
+            robot.leader, robot.neighbours = None, set()
+
+
+def state_of(robot: RobotState, now_s: float | None) -> str:
+    """How a robot is: running, silent for a while, stopped or died."""
+    if robot.end is not None:
+        return robot.end
+    if now_s is None or now_s - robot.last_s <= SILENT_S:
+        return "running"
+    return "silent"
+
+
+def robot_json(name: str, robot: RobotState, now_s: float | None) -> dict[str, Any]:
+    """One robot as JSON values; its path is thinned."""
+    path = robot.path_m()
+    step = max(1, -(-len(path) // PATH_POINTS_MAX))
+    kept = path[::step] if step == 1 or not len(path) else np.vstack([path[::step], path[-1:]])
+    return {
+        "robot": name,
+        "state": state_of(robot, now_s),
+        "leader": robot.leader,
+        "term": robot.term,
+        "neighbours": sorted(robot.neighbours),
+        "map_frame": robot.map_frame,
+        "keyframes": len(robot.positions_odom_m),
+        "candidates": robot.candidates,
+        "accepted": robot.accepted,
+        "rejected": robot.rejected,
+        "sent": dict(sorted(robot.sent.items())),
+        "sent_bytes": sum(robot.sent.values()),
+        "received_bytes": sum(robot.received.values()),
+        "last_s": robot.last_s,
+        "path_m": np.round(kept, 3).tolist(),
+    }
+
+
+def closure_json(state: SwarmState, query: str, match: str) -> dict[str, Any]:
+    """A closure with the places of its ends, null where they are not known."""
+    ends = [place_of(state, KeyframeId.parse(keyframe)) for keyframe in (query, match)]
+    return {"query": query, "match": match, "probability": state.closures[query, match], "ends_m": ends}
+
+
+def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
+    """Position of a keyframe in its robot's map frame."""
+    robot = state.robots.get(keyframe.log.robot)
+    if robot is None or keyframe.index >= len(robot.positions_odom_m):
+        return None
+    p = robot.T_map_odom[:3, :3] @ robot.positions_odom_m[keyframe.index] + robot.T_map_odom[:3, 3]
+    return [round(float(v), 3) for v in p]
+
+
+def groups(members: list[tuple[str, str | None]]) -> list[dict[str, Any]]:
+    """Robots by map frame; those without one last."""
+    frames = Counter(frame for _, frame in members)
+    ordered = sorted(frames, key=lambda frame: (frame is None, frame or ""))
+    return [{"frame": f, "robots": [name for name, frame in members if frame == f]} for f in ordered]
+
+
+def ranges(robots: dict[str, RobotState]) -> list[list[str]]:
+    """Groups of robots that hear each other, over others as well; two groups are a partition."""
+    left = set(robots)
+    found = []
+    while left:
+        reached, frontier = set(), {min(left)}
+        while frontier:
+            reached |= frontier
+            heard = {peer for name in frontier for peer in robots[name].neighbours}
+            hearing = {name for name in left if robots[name].neighbours & frontier}
+            frontier = ((heard | hearing) & left) - reached
+        found.append(sorted(reached))
+        left -= reached
+    return found
+
+
+def optimised_json(event: GraphOptimised | None) -> dict[str, Any] | None:
+    """The last optimisation."""
+    if event is None:
+        return None
+    return {
+        "t": event.t,
+        "leader": event.robot,
+        "round": event.round,
+        "cost": event.cost,
+        "solve_s": event.solve_s,
+        "closures_used": event.closures_used,
+        "closures_rejected": event.closures_rejected,
+        "warnings": event.warnings,
+    }

@@ -1,0 +1,177 @@
+"""The live page: what it reads from a growing run folder, and what a browser shows of it."""
+
+import json
+import re
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.launch import synthetic_run
+from tests.launch.synthetic_run import Synthetic
+
+from flocc_launch.dashboard import Dashboard, DashboardError
+from flocc_launch.dashboard.source import RunSource
+from flocc_launch.dashboard.state import SwarmState
+from flocc_launch.dashboard.tail import LineTail
+from flocc_launch.run_folder import RunFolder, event_from_line
+from flocc_launch.run_records import Run
+
+START_S = 1_700_000_000.0
+IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+
+
+def growing(path: Path, start_s: float | None = START_S) -> RunFolder:
+    folder = RunFolder.create(path)
+    folder.write_run(Run(scenario="growing", robots=["r1", "r2", "r3"], start=start_s))
+    return folder
+
+
+def add(folder: RunFolder, t: float, robot: str, event: str, **fields: Any) -> None:
+    path = folder.path / "robots" / robot / "events.jsonl"
+    path.parent.mkdir(exist_ok=True)
+    with path.open("a") as file:
+        file.write(json.dumps({"t": t, "robot": robot, "event": event, **fields}) + "\n")
+
+
+def start_swarm(folder: RunFolder) -> None:
+    for robot in ("r1", "r2", "r3"):
+        add(folder, 1.0, robot, "keyframe", keyframe=f"{robot}/0", stamp_s=0.0, T_odom_body=IDENTITY)
+        for peer in {"r1", "r2", "r3"} - {robot}:
+            add(folder, 1.5, robot, "neighbour_up", peer=peer)
+        add(folder, 2.0, robot, "leader", term=1, leader="r1")
+        add(folder, 3.0, robot, "correction", term=1, round=1, map_frame="map/r1", T_map_odom=IDENTITY)
+
+
+def kill_the_leader(folder: RunFolder) -> None:
+    for robot in ("r2", "r3"):
+        add(folder, 30.0, robot, "neighbour_down", peer="r1")
+        add(folder, 31.0, robot, "leader_lost", term="1:r1", reason="silent")
+        add(folder, 32.0, robot, "leader", term=2, leader="r2")
+
+
+def robot_of(snapshot: dict[str, Any], robot: str) -> dict[str, Any]:
+    found: dict[str, Any] = next(r for r in snapshot["robots"] if r["robot"] == robot)
+    return found
+
+
+def test_a_growing_folder_is_read_as_it_grows(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run")
+    now_s = START_S + 4.0
+    source = RunSource(folder, clock_s=lambda: now_s)
+    assert source.snapshot()["leaders"] == []
+    start_swarm(folder)
+    before = source.snapshot()
+    assert (before["leaders"], before["ranges"]) == (["r1"], [["r1", "r2", "r3"]])
+    assert before["maps"] == [{"frame": "map/r1", "robots": ["r1", "r2", "r3"]}]
+    kill_the_leader(folder)
+    now_s = START_S + 33.0
+    after = source.snapshot()
+    assert [robot_of(after, r)["leader"] for r in ("r2", "r3")] == ["r2", "r2"]
+    assert robot_of(after, "r1")["state"] == "silent"
+    assert (after["leaders"], after["ranges"]) == (["r2"], [["r2", "r3"]])
+    assert (after["t"], after["running"]) == (33.0, True)
+
+
+def test_the_merged_file_replaces_what_was_read_before(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run")
+    source = RunSource(folder, clock_s=lambda: START_S + 5.0)
+    start_swarm(folder)
+    source.snapshot()
+    lines = [json.loads(line) for p in folder.path.glob("robots/*/events.jsonl") for line in p.read_text().splitlines()]
+    folder.write_events([*lines, {"t": 4.0, "robot": "r1", "event": "agent_died", "signal": 9}])
+    snapshot = source.snapshot()
+    assert not snapshot["running"]
+    assert robot_of(snapshot, "r1")["state"] == "died"
+    assert robot_of(snapshot, "r2")["keyframes"] == 1
+
+
+def test_a_torn_line_waits_for_its_end_and_a_broken_one_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    tail = LineTail(path)
+    assert tail.events() == []
+    path.write_text('{"t": 1, "robot": "r1", "event": "agent_stopped"}\nnonsense\n{"t": 2, "robot": "r1", "ev')
+    assert [event.t for event in tail.events()] == [1]
+    with path.open("a") as file:
+        file.write('ent": "agent_stopped"}\n')
+    assert [event.t for event in tail.events()] == [2]
+    assert tail.events() == []
+
+
+def test_a_partition_shows_as_two_ranges() -> None:
+    state = SwarmState(["r1", "r2", "r3", "r4"])
+    for robot, peer in (("r1", "r2"), ("r4", "r3")):
+        state.apply(event_from_line(f'{{"t": 1, "robot": "{robot}", "event": "neighbour_up", "peer": "{peer}"}}', ""))
+    assert state.snapshot()["ranges"] == [["r1", "r2"], ["r3", "r4"]]
+
+
+def test_the_snapshot_of_a_finished_run_agrees_with_its_report(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run")
+    snapshot = RunSource(folder).snapshot()
+    assert [r["keyframes"] for r in snapshot["robots"]] == [63, 60, 66]
+    assert sum(r["accepted"] for r in snapshot["robots"]) == len(snapshot["closures"]) == 63
+    assert {r["map_frame"] for r in snapshot["robots"]} == {"map/r1"}
+    json.dumps(snapshot, allow_nan=False)
+
+
+def test_the_server_answers_two_paths_and_nothing_else(tmp_path: Path) -> None:
+    with Dashboard(synthetic_run.write(tmp_path / "run"), port=0) as dashboard:
+        with urllib.request.urlopen(dashboard.url + "state.json") as answer:
+            assert json.load(answer)["scenario"] == "synthetic-hall"
+        with urllib.request.urlopen(dashboard.url) as answer:
+            assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+            assert not re.search(rb"(src|href)=.?https?:", answer.read())
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(dashboard.url + "../run.json")
+
+
+def test_a_port_in_use_is_one_sentence(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run")
+    with Dashboard(folder, port=0) as dashboard:
+        port = int(dashboard.url.rsplit(":", 1)[1].strip("/"))
+        with pytest.raises(DashboardError, match=rf"port {port} on 127\.0\.0\.1: Address already in use"):
+            Dashboard(folder, port=port)
+
+
+def browse(url: str, profile: Path) -> str:
+    """The page's elements after its scripts ran, in headless Chromium."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
+    flags += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    flags += [f"--user-data-dir={profile}", "--virtual-time-budget=3000", "--dump-dom"]
+    return subprocess.run([chromium, *flags, url], capture_output=True, text=True, check=True, timeout=120).stdout
+
+
+def rows(html: str) -> dict[str, dict[str, str]]:
+    found = re.findall(r"<tr ([^>]*data-robot=[^>]*)>", html)
+    attributes = [dict(re.findall(r'data-(\w+)="([^"]*)"', text)) for text in found]
+    return {row["robot"]: row for row in attributes}
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_new_leader_and_the_map_after_a_kill(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run", start_s=None)
+    start_swarm(folder)
+    with Dashboard(folder, port=0) as dashboard:
+        before = rows(browse(dashboard.url, tmp_path / "profile"))
+        assert {row["leader"] for row in before.values()} == {"r1"}
+        kill_the_leader(folder)
+        html = browse(dashboard.url, tmp_path / "profile")
+    after = rows(html)
+    assert (after["r2"]["leader"], after["r3"]["leader"]) == ("r2", "r2")
+    assert after["r2"]["frame"] == "map/r1"
+    assert "lost its leader" in html
+    assert "one map: map/r1" in html
+
+
+@pytest.mark.slow
+def test_a_browser_shows_maps_that_are_apart(tmp_path: Path) -> None:
+    with Dashboard(synthetic_run.write(tmp_path / "run", Synthetic(merged_s=None)), port=0) as dashboard:
+        html = browse(dashboard.url, tmp_path / "profile")
+    assert ">3 maps<" in html
+    assert html.count("<svg") == 3
