@@ -73,7 +73,7 @@ class Engine:
             start = time.perf_counter()
             for batch in batches([picture.shape for picture in inputs], self._batch_max):
                 images = torch.from_numpy(np.concatenate([inputs[k] for k in batch])).to(self._compute.device)
-                for k, latent in zip(batch, self._run(self._network.encode, images).split(1), strict=True):
+                for k, latent in zip(batch, self._run(self._network.encode, images)[:, None], strict=True):
                     out[k] = latent
             self._note_encode_s((time.perf_counter() - start) / max(len(inputs), 1))
         return [latent for latent in out if latent is not None]
