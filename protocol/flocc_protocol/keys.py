@@ -1,6 +1,6 @@
 """The grammar of flocc's zenoh keys, all of it: one writer per key, the version in the second chunk.
 
-    flocc/v1/SWARM/ROBOT/KIND                  broadcast to every robot in range: hb, log, elect, corr
+    flocc/v1/SWARM/ROBOT/KIND                  broadcast to every robot in range, such as KIND `heartbeat`
     flocc/v1/SWARM/ROBOT/to/RECEIVER/KIND      to one robot in range
     flocc/v1/SWARM/ROBOT/latent/LOG/INDEX      queryable: the latent of one keyframe, held by ROBOT
     flocc/v1/SWARM/ROBOT/status                queryable: what this agent knows and counts
@@ -28,12 +28,18 @@ BOOT_PATTERN = re.compile(r"[0-9a-f]{1,32}")
 
 
 class Kind(StrEnum):
-    """What is broadcast, by its chunk in the key."""
+    """What is said, by its chunk in the key: the kinds of messages, the most urgent first."""
 
-    HEARTBEAT = "hb"
-    RECORD = "log"
-    ELECTION = "elect"
-    CORRECTION = "corr"
+    HEARTBEAT = "heartbeat"
+    ELECTION = "election"
+    ANSWER = "answer"
+    COORDINATOR = "coordinator"
+    HANDOVER = "handover"
+    CORRECTION = "correction"
+    CORRECTION_REQUEST = "want-correction"
+    RECORDS = "records"
+    RECORD_REQUEST = "want-records"
+    CANDIDATES = "candidates"
 
 
 class Admin(StrEnum):

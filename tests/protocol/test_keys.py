@@ -42,7 +42,7 @@ def test_any_other_text_is_a_decode_error_or_an_address(text: str) -> None:
 
 
 def test_writes_the_documented_keys() -> None:
-    assert keys.broadcast_key("field", "r1", keys.Kind.HEARTBEAT) == "flocc/v1/field/r1/hb"
+    assert keys.broadcast_key("field", "r1", keys.Kind.HEARTBEAT) == "flocc/v1/field/r1/heartbeat"
     assert keys.unicast_key("field", "r1", "r2", "pull") == "flocc/v1/field/r1/to/r2/pull"
     assert keys.latent_key("field", "r1", "r1~5/7") == "flocc/v1/field/r1/latent/r1~5/7"
     assert keys.admin_key("field", "*", keys.Admin.STATUS) == "flocc/v1/field/*/status"

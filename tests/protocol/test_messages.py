@@ -25,7 +25,7 @@ from flocc_protocol.arrays import Array
 from flocc_protocol.codec import from_bytes, to_bytes
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INDEX_MAX, TERM_COUNTER_MAX, LogId
-from flocc_protocol.keys import broadcast_key, checked_kind
+from flocc_protocol.keys import Kind, broadcast_key, checked_kind
 from flocc_protocol.messages import (
     CORRECTION_KEYFRAMES_MAX,
     LOGS_MAX,
@@ -79,7 +79,8 @@ def test_the_largest_legal_message_of_every_kind_fits(message: Message) -> None:
     assert decode(data) == envelope
 
 
-def test_every_kind_can_be_a_chunk_of_a_key() -> None:
+def test_every_kind_is_a_chunk_of_the_key_grammar() -> None:
+    assert sorted(MESSAGE_KINDS) == sorted(kind.value for kind in Kind)
     for kind in MESSAGE_KINDS:
         assert checked_kind(kind) in broadcast_key("swarm", "alice", kind)
 

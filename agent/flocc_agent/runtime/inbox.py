@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from flocc_agent.runtime.transport import TrafficCounter
 from flocc_protocol.keys import Kind
 
-URGENT_FIRST = (Kind.HEARTBEAT.value, Kind.ELECTION.value, Kind.CORRECTION.value)
+URGENT_FIRST = tuple(kind.value for kind in Kind)
 KINDS_MAX = 32
 BATCH_MAX = 256
 BURST_S = 2.0

@@ -50,10 +50,17 @@ DELAYED_MAX = 20_000
 PRIORITY = {
     keys.Kind.HEARTBEAT.value: zenoh.Priority.REAL_TIME,
     keys.Kind.ELECTION.value: zenoh.Priority.INTERACTIVE_HIGH,
+    keys.Kind.ANSWER.value: zenoh.Priority.INTERACTIVE_HIGH,
+    keys.Kind.COORDINATOR.value: zenoh.Priority.INTERACTIVE_HIGH,
+    keys.Kind.HANDOVER.value: zenoh.Priority.INTERACTIVE_HIGH,
     keys.Kind.CORRECTION.value: zenoh.Priority.INTERACTIVE_LOW,
-    keys.Kind.RECORD.value: zenoh.Priority.DATA_HIGH,
+    keys.Kind.CORRECTION_REQUEST.value: zenoh.Priority.INTERACTIVE_LOW,
+    keys.Kind.RECORDS.value: zenoh.Priority.DATA_HIGH,
+    keys.Kind.RECORD_REQUEST.value: zenoh.Priority.DATA_HIGH,
+    keys.Kind.CANDIDATES.value: zenoh.Priority.DATA,
 }
-EXPRESS = frozenset({keys.Kind.HEARTBEAT.value, keys.Kind.ELECTION.value})
+EXPRESS_PRIORITIES = (zenoh.Priority.REAL_TIME, zenoh.Priority.INTERACTIVE_HIGH)
+EXPRESS = frozenset(kind for kind, priority in PRIORITY.items() if priority in EXPRESS_PRIORITIES)
 
 
 class ZenohTransport:
@@ -219,7 +226,14 @@ class ZenohTransport:
         quality = PRIORITY.get(kind, zenoh.Priority.DATA)
         drop = zenoh.CongestionControl.DROP
         self._put(
-            lambda: session.put(key, payload, congestion_control=drop, priority=quality, attachment=attachment),
+            lambda: session.put(
+                key,
+                payload,
+                congestion_control=drop,
+                priority=quality,
+                express=kind in EXPRESS,
+                attachment=attachment,
+            ),
             payload,
         )
         return self._counter.count_sent(keys.checked_kind(kind), len(payload), to)
