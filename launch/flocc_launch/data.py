@@ -4,8 +4,12 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from flocc_launch.scenario import DatasetScenario, Scenario, WorldScenario
+from flocc_launch.scenario import DatasetScenario, Scenario, TracksScenario, WorldScenario
+
+if TYPE_CHECKING:
+    from flocc_launch.simulation.tracks import Walk
 
 Progress = Callable[[int, int], None]
 
@@ -27,17 +31,20 @@ def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str
         made = _world(scenario.world, progress)
     elif scenario.dataset is not None:
         made = _dataset(scenario.dataset, progress)
+    elif scenario.tracks is not None:
+        made = _tracks(scenario.tracks)
     found = {f"r{i + 1}": path for i, path in enumerate(made)}
     given = {name: robot.recording for name, robot in scenario.robots.items() if robot.recording is not None}
     return {**found, **given}
 
 
 def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:
-    from flocc_launch.world import WorldSpec, generate
+    from flocc_launch.world.generate import generate
+    from flocc_launch.world.spec import WorldSpec
 
     spec = WorldSpec(robots=world.robots, seed=world.seed)
     key = hashlib.sha256(spec.model_dump_json().encode()).hexdigest()[:12]
-    return generate(spec, cache_folder() / "worlds" / key, progress)
+    return generate(spec, cache_folder() / "worlds" / key, progress=progress)
 
 
 def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
@@ -47,3 +54,30 @@ def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
     key = hashlib.sha256(f"{source} {dataset.robots} {dataset.seed}".encode()).hexdigest()[:12]
     out = cache_folder() / "datasets" / f"{source.name}-{key}"
     return split(source, out, dataset.robots, seed=dataset.seed, progress=progress)
+
+
+def _tracks(tracks: TracksScenario) -> list[Path]:
+    """Recordings whose images hold the true pose, which is what synthetic perception sees."""
+    from flocc_launch.simulation.tracks import walks
+
+    key = hashlib.sha256(tracks.model_dump_json().encode()).hexdigest()[:12]
+    folder = cache_folder() / "tracks" / key
+    return [_walked(folder / f"r{i + 1}", walk) for i, walk in enumerate(walks(tracks))]
+
+
+def _walked(path: Path, walk: "Walk") -> Path:
+    import cv2
+
+    from flocc_agent.perception.synthetic import pose_image
+    from flocc_launch.datasets.writer import RecordingWriter
+    from flocc_launch.simulation.tracks import T_BODY_CAMERA
+
+    with RecordingWriter(path, f"walk {path.parent.name}") as writer:
+        for k in range(writer.count, len(walk.truth)):
+            image = pose_image(walk.truth.T_fixed_body[k] @ T_BODY_CAMERA, f"{path.name}/{k}")
+            _, png = cv2.imencode(".png", image.pixels[:, :, ::-1])
+            writer.add(float(walk.truth.stamps_s[k]), png.tobytes(), ".png")
+            if k == 0:
+                writer.write_camera(image.camera, T_BODY_CAMERA)
+                writer.write_trajectories(walk.odometry, walk.truth)
+    return path

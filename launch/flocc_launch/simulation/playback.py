@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import KeyframeConfig
 from flocc_agent.core.interfaces import Image
-from flocc_agent.geometry import angle_rad, between
+from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_launch.simulation.tracks import T_BODY_CAMERA, Walk
@@ -89,19 +89,13 @@ def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
 
 def select(poses: Iterable[Float], config: KeyframeConfig) -> list[int]:
     """Choose keyframes: the first pose, then each that moved or turned enough since the last one chosen."""
-    chosen: list[int] = []
-    last: Float | None = None
-    for k, T in enumerate(poses):
-        if last is None or _moved(last, T, config):
+    selector = KeyframeSelector(config)
+    chosen = []
+    for k, T_odom_body in enumerate(poses):
+        if selector.wants(T_odom_body):
+            selector.took(T_odom_body)
             chosen.append(k)
-            last = T
     return chosen
-
-
-def _moved(T_odom_last: Float, T_odom_body: Float, config: KeyframeConfig) -> bool:
-    step = between(T_odom_last, T_odom_body)
-    far = float(np.linalg.norm(step[:3, 3])) >= config.distance_m
-    return far or angle_rad(step[:3, :3]) >= config.rotation_rad
 
 
 def _walked(walk: Walk, robot: str, k: int) -> Capture:
