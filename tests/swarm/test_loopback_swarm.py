@@ -1,0 +1,69 @@
+"""Claims on whole agents in processes of their own, over real zenoh on loopback."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from tests.agent.runtime.loopback import loopback_configs
+from tests.swarm.robots import RobotProcess, agent_configs, frames, leaders, logs_equal, neighbours, reached
+
+pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+
+NAMES = ("r1", "r2", "r3")
+LEADER_TIMEOUT_S = 3.0
+START_S = 30.0
+
+
+@asynccontextmanager
+async def running(folder: Path) -> AsyncIterator[list[RobotProcess]]:
+    """Three robots that follow one leader in one frame."""
+    configs = agent_configs(loopback_configs(NAMES), folder)
+    robots = [RobotProcess(config, folder / "logs") for config in configs.values()]
+    try:
+        await asyncio.gather(*(robot.start(phase_rad=0.6 * i) for i, robot in enumerate(robots)))
+        await reached(robots, lambda: leaders(robots) == {"r1"}, START_S, "all follow r1")
+        await reached(robots, lambda: frames(robots) == {"map/r1"}, 60.0, "one frame")
+        yield robots
+    finally:
+        await asyncio.gather(*(robot.close() for robot in robots))
+
+
+async def test_a_killed_leader_is_replaced_and_comes_back_with_its_log(tmp_path: Path) -> None:
+    async with running(tmp_path) as robots:
+        first, *rest = robots
+        before = first.status["logs"]["r1"][0]
+        round_before = max(robot.status["round"] for robot in rest)
+        await first.kill()
+        await reached(rest, lambda: leaders(rest) == {"r2"}, 2 * LEADER_TIMEOUT_S, "r2 leads")
+        await reached(
+            rest,
+            lambda: all((robot.status["term"], robot.status["round"]) > (1, 0) for robot in rest),
+            20.0,
+            "new term",
+        )
+        assert round_before >= 1
+        assert all("r1" not in neighbours(robot) for robot in rest)
+        await first.start(keyframes=10, phase_rad=3.0)
+        await reached(
+            robots, lambda: first.status.get("logs", {}).get("r1", [0])[0] >= before, START_S, "its log is back"
+        )
+        await reached(robots, lambda: leaders(robots) == {"r1"}, START_S, "r1 leads again")
+        await reached(
+            robots,
+            lambda: logs_equal(robots) and first.status["logs"]["r1"][0] >= before + 10 and not first.status["busy"],
+            30.0,
+            "all logs equal, with the new keyframes under the old numbering",
+        )
+        assert set(first.status["logs"]) == set(NAMES)
+        assert all(robot.status["refused"] == {} for robot in rest)
+
+
+async def test_agents_end_in_order_and_say_nothing_bad(tmp_path: Path) -> None:
+    async with running(tmp_path) as robots:
+        codes = await asyncio.gather(*(robot.close() for robot in robots))
+    assert codes == [0, 0, 0]
+    for robot in robots:
+        assert "Traceback" not in robot.log()
+        assert "never retrieved" not in robot.log()
