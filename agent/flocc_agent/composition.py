@@ -6,6 +6,7 @@ Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is
 import asyncio
 import os
 import time
+import zlib
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from functools import partial
@@ -262,7 +263,9 @@ class Agent:
         config = self.config
         self._store = _open_store(config)
         self._workers = Workers()
-        self._radio = Radio(config.radio.parameters(), np.random.default_rng(config.seed))
+        self._radio = Radio(
+            config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())])
+        )
         perception = build_perception(config.perception, config.seed)
         restored = restore(self._store)
         log = self._store.identity.log

@@ -483,7 +483,7 @@ class AgentConfig(Section):
     incarnation: int | None = Field(None, ge=0)
     """Number of this robot's life when it has no disk yet; None draws it from the wall clock."""
     seed: int = Field(0, ge=0)
-    """Seed of emulated links and synthetic perception."""
+    """Seed of emulated links and synthetic perception; the same for all robots of a swarm."""
     folder: Path | None = None
     """Where the robot's log, latents and events are kept; None keeps them in memory."""
     core: CoreParameters = CoreParameters()

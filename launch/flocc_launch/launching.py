@@ -126,7 +126,7 @@ class _Launch:
         names = self._scenario.names()
         transports = loopback_transports(names)
         agents = []
-        for index, name in enumerate(names):
+        for name in names:
             folder = self._folder.path / "robots" / name
             source = SourceConfig(
                 recording=self._paths[name].resolve() if name in self._paths else None,
@@ -134,7 +134,7 @@ class _Launch:
                 start_s=self._scenario.robot(name).start_s,
             )
             config = agent_config(
-                self._scenario, name, index, source=source, transport=transports[name], folder=folder.resolve()
+                self._scenario, name, source=source, transport=transports[name], folder=folder.resolve()
             )
             agents.append(AgentProcess(config, folder))
         return agents

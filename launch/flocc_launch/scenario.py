@@ -230,14 +230,14 @@ class Scenario(Section):
         return validated(cls, _resolved(fields, path.resolve().parent), str(path))
 
 
-def agent_config(scenario: Scenario, name: str, index: int, **changes: object) -> AgentConfig:
+def agent_config(scenario: Scenario, name: str, **changes: object) -> AgentConfig:
     """The configuration of one robot of a scenario."""
     return AgentConfig(
         name=name,
         swarm=scenario.name,
         compute_class=scenario.robot(name).compute_class,
         incarnation=0,
-        seed=scenario.seed * 1000 + index,
+        seed=scenario.seed,
         core=scenario.core,
         keyframes=scenario.keyframes,
         perception=scenario.perception,
