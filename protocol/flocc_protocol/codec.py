@@ -4,26 +4,20 @@ A codec is a pair of functions. `struct` lists a dataclass's fields once; nothin
 The checks on the way out are those on the way in: a robot cannot send what every other robot would refuse.
 """
 
+import inspect
 import math
 import operator
 import struct as binary
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 
 import msgpack
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import (
-    INCARNATION_MAX,
-    INDEX_MAX,
-    NAME_PATTERN,
-    TERM_COUNTER_MAX,
-    KeyframeId,
-    LogId,
-    Term,
-)
+from flocc_protocol.ids import INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
 
 T = TypeVar("T")
 
@@ -125,29 +119,40 @@ def sequence(inner: Codec[T], items_max: int) -> Codec[tuple[T, ...]]:
 
 
 def struct(build: Callable[..., T], **fields: Codec[Any]) -> Codec[T]:
-    """A dataclass as a list of its fields in the order given here; `build` raises ValueError for what cannot be."""
+    """A dataclass as a list of its fields, in its own order; `build` raises ValueError for what cannot be."""
+    assert tuple(fields) == tuple(inspect.signature(build).parameters)
     names = tuple(fields)
-    codecs = tuple(fields.values())
+    packs = tuple(codec.pack for codec in fields.values())
+    unpacks = tuple(codec.unpack for codec in fields.values())
 
     def pack(value: T) -> list[Any]:
-        return [codec.pack(getattr(value, name)) for name, codec in zip(names, codecs, strict=True)]
+        return [pack_field(getattr(value, name)) for name, pack_field in zip(names, packs, strict=True)]
 
     def unpack(value: Any) -> T:
-        if type(value) is not list or len(value) != len(codecs):
-            raise DecodeError(f"expected {len(codecs)} fields")
-        values = [codec.unpack(item) for codec, item in zip(codecs, value, strict=True)]
+        if type(value) is not list or len(value) != len(unpacks):
+            raise DecodeError(f"expected {len(unpacks)} fields")
+        values = [unpack_field(item) for unpack_field, item in zip(unpacks, value, strict=True)]
         try:
-            return build(**dict(zip(names, values, strict=True)))
+            return build(*values)
         except ValueError as error:
             raise DecodeError(str(error)) from error
 
     return Codec(pack, unpack)
 
 
-def _checked_name(value: Any) -> str:
-    if type(value) is not str or not NAME_PATTERN.fullmatch(value):
-        raise DecodeError("expected a robot name")
-    return value
+@lru_cache(maxsize=4096)
+def _log_id(robot: str, incarnation: int) -> LogId:
+    """The same few logs are named in every message; each is checked once."""
+    try:
+        return LogId(robot, incarnation)
+    except ValueError as error:
+        raise DecodeError("expected a robot name and an incarnation") from error
+
+
+def _unpack_log_id(value: Any) -> LogId:
+    if type(value) is not list or len(value) != 2 or type(value[0]) is not str or type(value[1]) is not int:
+        raise DecodeError("expected a robot name and an incarnation")
+    return _log_id(value[0], value[1])
 
 
 _POSE = binary.Struct("<7d")
@@ -184,11 +189,10 @@ def _unpack_array(value: Any) -> Array:
         raise DecodeError(str(error)) from error
 
 
-NAME: Codec[str] = Codec(_checked_name, _checked_name)
 POSE: Codec[Pose7] = Codec(_pack_pose, _unpack_pose)
 ARRAY: Codec[Array] = Codec(lambda a: [a.dtype, list(a.shape), a.data, float(a.scale)], _unpack_array)
 COUNT = integer(0, INDEX_MAX)
-LOG_ID = struct(LogId, robot=NAME, incarnation=integer(0, INCARNATION_MAX))
+LOG_ID: Codec[LogId] = Codec(lambda log: [log.robot, log.incarnation], _unpack_log_id)
 KEYFRAME_ID = struct(KeyframeId, log=LOG_ID, index=COUNT)
 TERM = struct(Term, counter=integer(0, TERM_COUNTER_MAX), leader=LOG_ID)
 
