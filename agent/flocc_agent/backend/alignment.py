@@ -20,9 +20,11 @@ from flocc_agent.geometry import Float, inverse, nearest_rotation, pose
 from flocc_protocol.ids import LogId
 
 Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
 
-HYPOTHESES_MAX = 64
-SCORED_MAX = 400
+HYPOTHESES_MAX = 32
+PARTNERS_MAX = 32
+SCORED_MAX = 200
 ROTATION_TOLERANCE_RAD = 0.25
 ROTATION_DRIFT_RAD_PER_M = 0.002
 TRANSLATION_TOLERANCE_M = 1.5
@@ -82,14 +84,15 @@ class Rays:
         """Start (K, 3) of each ray, for a rotation of frame b in frame a."""
         return np.asarray(self.T_i[:, :3, 3] - self.T_j[:, :3, 3] @ R_a_b.T)
 
-    def distances(self, t: Float, origins: Float) -> Float:
-        """Distance (..., K) of translations (..., 3) from each ray's allowed segment."""
-        offset = t[..., None, :] - origins
-        along = np.einsum("...ki,ki->...k", offset, self.u)
-        low = np.where(self.exact, self.length_m, np.nan_to_num(self.length_m / SCALE_RANGE_RATIO, nan=0.0))
-        high = np.where(self.exact, self.length_m, np.nan_to_num(self.length_m * SCALE_RANGE_RATIO, nan=np.inf))
+    def distances(self, t: Float, origins: Float, of: Int | slice = slice(None)) -> Float:
+        """Distance (..., K) of translations (..., 3) from the allowed segment of each ray, or of some of them."""
+        u, length_m = self.u[of], self.length_m[of]
+        offset = t[..., None, :] - origins[of]
+        along = np.einsum("...ki,ki->...k", offset, u)
+        low = np.where(self.exact[of], length_m, np.nan_to_num(length_m / SCALE_RANGE_RATIO, nan=0.0))
+        high = np.where(self.exact[of], length_m, np.nan_to_num(length_m * SCALE_RANGE_RATIO, nan=np.inf))
         nearest = np.clip(along, low, high)
-        return np.asarray(np.linalg.norm(offset - nearest[..., None] * self.u, axis=-1))
+        return np.asarray(np.linalg.norm(offset - nearest[..., None] * u, axis=-1))
 
 
 def align(
@@ -158,6 +161,7 @@ def align_pair(rays: Rays) -> PairAlignment:
     """Find the pose of frame b in frame a with which the most closures agree, and average those."""
     R_all = rays.rotations_a_b()
     best_score, best_R, best_t, best_tolerance = -1.0, np.eye(3), np.zeros(3), np.ones(len(R_all))
+    judges = evenly(np.arange(len(R_all)), SCORED_MAX)
     for k in _strongest(rays, R_all):
         apart_m = np.abs(rays.travelled_a_m - rays.travelled_a_m[k]) + np.abs(
             rays.travelled_b_m - rays.travelled_b_m[k]
@@ -166,8 +170,8 @@ def align_pair(rays: Rays) -> PairAlignment:
         tolerance_m = TRANSLATION_TOLERANCE_M + TRANSLATION_DRIFT_RATIO * apart_m
         origins = rays.origins(R_all[k])
         t = _translations(rays, origins, k, turned)
-        agreement = np.maximum(1.0 - (rays.distances(t, origins) / tolerance_m) ** 2, 0.0)
-        scores = agreement @ (rays.weight * turned)
+        agreement = np.maximum(1.0 - (rays.distances(t, origins, judges) / tolerance_m[judges]) ** 2, 0.0)
+        scores = agreement @ (rays.weight * turned)[judges]
         top = int(np.argmax(scores))
         if scores[top] > best_score:
             best_score, best_R, best_t = float(scores[top]), R_all[k], t[top]
@@ -179,16 +183,23 @@ def _strongest(rays: Rays, R_all: Float) -> list[int]:
     """Closures that are tried as hypotheses: those whose rotation the most others share, then the first."""
     if len(R_all) <= HYPOTHESES_MAX:
         return list(range(len(R_all)))
-    voters = np.linspace(0, len(R_all) - 1, min(len(R_all), SCORED_MAX)).astype(int)
+    voters = evenly(np.arange(len(R_all)), SCORED_MAX)
     votes = np.array([rays.weight[voters] @ (_angles(R_all[voters], R) < ROTATION_TOLERANCE_RAD) for R in R_all])
     ranked = np.lexsort((np.arange(len(votes)), -votes))
     spread = ranked[: max(len(ranked) // 2, HYPOTHESES_MAX)]
-    return [int(k) for k in spread[np.linspace(0, len(spread) - 1, HYPOTHESES_MAX).astype(int)]]
+    return [int(k) for k in evenly(spread, HYPOTHESES_MAX)]
+
+
+def evenly(indices: Int, count_max: int) -> Int:
+    """At most so many of the indices, evenly spread over them."""
+    if len(indices) <= count_max:
+        return indices
+    return np.asarray(indices[np.linspace(0, len(indices) - 1, count_max).astype(int)])
 
 
 def _translations(rays: Rays, origins: Float, k: int, partners: Bool) -> Float:
     """Points (M, 3) of ray k nearest to the rays of its partners, and at its expected length."""
-    others = np.flatnonzero(partners)[:SCORED_MAX]
+    others = evenly(np.flatnonzero(partners), PARTNERS_MAX)
     v = origins[others] - origins[k]
     cosine = rays.u[others] @ rays.u[k]
     sine2 = np.maximum(1.0 - cosine**2, 1e-3)

@@ -165,8 +165,8 @@ def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, c
 def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple[Int, Float, int]:
     """Cluster index, own standard deviation and number of clusters for a formulation.
 
-    The prior on a scale is `gamma ~ N(1, sigma^2)` with the sigma of `prior_sigmas`. Clusters of one closure need no variable:
-    prior and link widen the edge together.
+    The prior on a scale is `gamma ~ N(1, sigma^2)` with the sigma of `prior_sigmas`. A cluster of one
+    closure needs no variable: prior and link widen the edge together.
     """
     n = len(closures)
     free = np.array([not c.metric for c in closures], dtype=bool)
