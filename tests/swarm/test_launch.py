@@ -1,0 +1,94 @@
+"""Whole swarms: one process per robot, real zenoh on loopback, synthetic perception."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flocc_launch.launching import Watch, launch
+from flocc_launch.report.model import Report
+from flocc_launch.scenario import Fault, FaultKind, Scenario
+
+pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+    yield
+
+
+def meeting(**changes: object) -> Scenario:
+    """Three robots whose walks overlap, at four times the speed."""
+    fields: dict[str, object] = {
+        "name": "meeting",
+        "rate": 4.0,
+        "settle_s": 3.0,
+        "tracks": {"robots": 3, "seed": 3, "area_m": 12.0, "length_m": 40.0},
+        "perception": {"method": "synthetic"},
+        **changes,
+    }
+    return Scenario.model_validate(fields)
+
+
+def results(out: Path, report: Report) -> dict[str, dict[str, object]]:
+    """What each robot knew at its end."""
+    return {r: json.loads((out / "robots" / r / "result.json").read_text()) for r in report.robots}
+
+
+def alive(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
+
+
+def test_three_processes_merge_and_leave_none_behind(tmp_path: Path) -> None:
+    pids: set[int] = set()
+
+    def watch(seen: Watch) -> None:
+        pids.update(agent.process.pid for agent in seen.agents if agent.process)
+
+    report = launch(meeting(), tmp_path / "run", watch)
+    assert report.map_frames == ["map/r1"]
+    assert report.closures.accepted_inter_robot >= 5
+    assert report.ate_joint_m is not None
+    assert report.ate_joint_m < 1.0
+    assert len(pids) == 3
+    assert [pid for pid in pids if alive(pid)] == []
+    logs = [result["logs"] for result in results(tmp_path / "run", report).values()]
+    assert logs[0] == logs[1] == logs[2]
+
+
+def test_the_rest_elect_and_go_on_when_the_leader_is_killed(tmp_path: Path) -> None:
+    kill = Fault(at_s=8.0, kind=FaultKind.KILL, robots=("r1",))
+    report = launch(meeting(faults=[kill]), tmp_path / "run")
+    assert [span.leader for span in report.leaders][:1] == ["r1"]
+    assert report.leaders[-1].leader == "r2"
+    ends = {robot.robot: robot.end for robot in report.robot_details}
+    assert ends == {"r1": "died", "r2": "stopped", "r3": "stopped"}
+    known = results(tmp_path / "run", report)
+    assert known["r2"]["logs"] == known["r3"]["logs"]
+    assert known["r2"]["map_frame"] == known["r3"]["map_frame"] == "map/r1"
+
+
+def test_a_lossy_slow_radio_loses_nothing_for_ever(tmp_path: Path) -> None:
+    report = launch(meeting(radio={"loss_ratio": 0.3, "latency_s": 0.1}), tmp_path / "run")
+    assert report.map_frames == ["map/r1"]
+    known = results(tmp_path / "run", report)
+    assert known["r1"]["logs"] == known["r2"]["logs"] == known["r3"]["logs"]
+    assert known["r1"]["closures"] is not None
+    pairs = [[(c["query"], c["match"]) for c in result["closures"]] for result in known.values()]  # type: ignore[attr-defined]
+    assert pairs[0] == pairs[1] == pairs[2]
+
+
+def test_a_robot_comes_back_from_its_disk_with_its_numbering(tmp_path: Path) -> None:
+    faults = [
+        Fault(at_s=7.0, kind=FaultKind.KILL, robots=("r2",)),
+        Fault(at_s=9.0, kind=FaultKind.RESTART, robots=("r2",)),
+    ]
+    report = launch(meeting(faults=faults), tmp_path / "run")
+    known = results(tmp_path / "run", report)
+    keyframes = known["r2"]["keyframes"]
+    assert isinstance(keyframes, list)
+    assert [keyframe["index"] for keyframe in keyframes] == list(range(len(keyframes)))
+    assert known["r2"]["incarnation"] == 0
+    assert known["r1"]["logs"] == known["r2"]["logs"]
