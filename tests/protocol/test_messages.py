@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given
+from tests.protocol import wire_sizes
 from tests.protocol.wire_examples import (
     ALICE,
     BOB,
@@ -236,3 +237,7 @@ def test_a_keyframe_costs_less_than_700_bytes_in_a_batch() -> None:
 def test_a_correction_of_1500_keyframes_fits_one_message() -> None:
     correction = replace(CORRECTION, T_map_camera=poses_array(1500), covariance=Array.of(np.ones(21)))
     assert len(encode(Envelope(ALICE, correction))) < 43_000
+
+
+def test_the_sizes_in_the_readme_are_those_of_today() -> None:
+    assert wire_sizes.table() in wire_sizes.README.read_text(), "run `python -m tests.protocol.wire_sizes`"
