@@ -1,7 +1,6 @@
 """Whole swarms: one process per robot, real zenoh on loopback, synthetic perception."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,9 +13,8 @@ pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)
-def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLOCC_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
-    yield
 
 
 def meeting(**changes: object) -> Scenario:

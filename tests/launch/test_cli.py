@@ -1,0 +1,135 @@
+"""The command line: bad input gives one clear sentence and exit code 2, and nothing recorded is lost."""
+
+import socket
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flocc_launch.cli import main
+from flocc_launch.datasets.drift import DriftSpec
+from flocc_launch.scenario import TracksScenario
+from flocc_launch.simulation.tracks import walks
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Run `flocc` in this process and give its exit code."""
+    monkeypatch.setattr(sys, "argv", ["flocc", *arguments])
+    with pytest.raises(SystemExit) as left:
+        main()
+    code = left.value.code
+    return code if isinstance(code, int) else 0
+
+
+def sentence(capsys: pytest.CaptureFixture[str]) -> str:
+    """What stands on standard error, which must be one line."""
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def scenario(folder: Path, text: str) -> str:
+    path = folder / "scenario.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+BAD_SCENARIOS = [
+    ('name = "x"\n[world]\nseeed = 1\n', "the key 'world.seeed' does not exist"),
+    ('name = "x"\n[core.election]\nhopps = 1\n[world]\n', "the key 'core.election.hopps' does not exist"),
+    ('name = "Not A Name"\n[world]\n', "name: "),
+    ('name = "x"\n', "there is no robot"),
+    ('name = "x"\n[robots.r1]\n', "robot 'r1' has no recording"),
+    ('name = "x"\n[robots.r1]\nrecording="a"\n[robots.r1]\nrecording="b"\n', "Cannot declare ('robots', 'r1') twice"),
+    ('name = "x"\n[world]\n[[faults]]\nat_s=1.0\nkind="kill"\nrobots=["r9"]\n', "names robot 'r9'"),
+    ('name = "x\n', "is not TOML"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BAD_SCENARIOS)
+@pytest.mark.parametrize("command", ["launch", "simulate"])
+def test_a_bad_scenario_is_named_in_one_sentence(
+    text: str,
+    said: str,
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = scenario(tmp_path, text)
+    assert run(monkeypatch, command, path, "--out", str(tmp_path / "out")) == 2
+    assert said in (line := sentence(capsys))
+    assert path in line
+
+
+def test_a_missing_scenario_names_the_shipped_ones(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "launch", "nowhere") == 2
+    assert "demo" in sentence(capsys)
+
+
+@pytest.mark.parametrize("command", [["evaluate"], ["doctor"]])
+def test_a_missing_run_folder_is_named(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, *command, str(tmp_path / "nowhere")) == 2
+    assert "nowhere" in sentence(capsys)
+
+
+def test_a_folder_that_is_no_run_is_never_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    precious = tmp_path / "out" / "thesis.txt"
+    precious.parent.mkdir()
+    precious.write_text("three years of work", encoding="utf-8")
+    assert run(monkeypatch, "simulate", "meeting", "--out", str(precious.parent)) == 2
+    assert str(precious.parent) in sentence(capsys)
+    assert precious.read_text(encoding="utf-8") == "three years of work"
+
+
+def test_a_port_in_use_stops_an_agent_with_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        config = tmp_path / "agent.toml"
+        config.write_text(f'name = "r1"\n[transport]\ncontrol_listen = ["tcp/127.0.0.1:{port}"]\n', encoding="utf-8")
+        assert run(monkeypatch, "agent", "--config", str(config)) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("error: ")
+    assert str(port) in said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('name = "r1"\nspeed = 3\n', "the key 'speed' does not exist"),
+        ('swarm = "s"\n', "the key 'name' is missing"),
+        ('name = "r1"\n[source]\nrecording = "nowhere"\n', "nowhere"),
+        ('name = "r1"\n[transport]\ncontrol_listen = ["here"]\n', "is no endpoint"),
+    ],
+)
+def test_a_bad_agent_configuration_is_named(
+    text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "agent.toml"
+    config.write_text(text, encoding="utf-8")
+    assert run(monkeypatch, "agent", "--config", str(config)) == 2
+    assert said in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_help_names_every_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, "--help") == 0
+    text = capsys.readouterr().out
+    assert [c for c in ("demo", "launch", "simulate", "agent", "evaluate", "doctor", "dataset") if c not in text] == []
+
+
+def test_the_drift_of_walks_is_seeded() -> None:
+    first, again = (walks(TracksScenario(robots=2, seed=5), DriftSpec()) for _ in range(2))
+    other = walks(TracksScenario(robots=2, seed=6), DriftSpec())
+    assert np.array_equal(first[1].odometry.T_fixed_body, again[1].odometry.T_fixed_body)
+    assert not np.array_equal(first[1].odometry.T_fixed_body, other[1].odometry.T_fixed_body)
