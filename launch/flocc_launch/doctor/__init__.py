@@ -1,6 +1,6 @@
 """`flocc doctor`: says in sentences what is wrong, and what to change."""
 
 from flocc_launch.doctor.diagnose import diagnose, diagnose_loaded
-from flocc_launch.doctor.finding import Finding, Severity
+from flocc_launch.doctor.finding import Finding, Severity, finding_lines
 
-__all__ = ["diagnose", "diagnose_loaded", "Finding", "Severity"]
+__all__ = ["diagnose", "diagnose_loaded", "finding_lines", "Finding", "Severity"]

@@ -1,5 +1,6 @@
 """What the doctor says."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -30,6 +31,16 @@ class Finding:
     sentence: str
     advice: str = ""
     robots: tuple[str, ...] = ()
+
+
+def finding_lines(findings: Iterable[Finding]) -> list[str]:
+    """Findings as lines for a terminal, advice below each."""
+    marks = {Severity.GOOD: "ok  ", Severity.BLOCKS: "FAIL", Severity.HINDERS: "warn", Severity.NOTE: "note"}
+    lines = []
+    for finding in findings:
+        lines.append(f"{marks[finding.severity]}  {finding.sentence}")
+        lines += [f"      {finding.advice}"] if finding.advice else []
+    return lines
 
 
 def blocked(cause: str, sentence: str, advice: str, *robots: str) -> Finding:

@@ -1,0 +1,132 @@
+"""Commands that look: doctor, status, dashboard, view. `add_tools` puts them into the command line."""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from flocc_agent.config import TransportConfig
+    from flocc_launch.doctor import Finding
+
+EXIT_BLOCKED = 1
+
+RunArgument = Annotated[Path | None, typer.Argument(help="Run folder.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="An agent's configuration: its swarm and how to reach it.")]
+SwarmOption = Annotated[str | None, typer.Option(help="Name of a running swarm, found by scouting.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+
+
+def add_tools(app: typer.Typer) -> None:
+    """Register the commands."""
+    for command in (doctor, status, dashboard, view):
+        app.command()(command)
+
+
+def doctor(
+    run: RunArgument = None,
+    config: ConfigOption = None,
+    swarm: SwarmOption = None,
+    json_out: JsonOption = False,
+) -> None:
+    """Say why maps have or have not merged: of a run folder, of a running swarm, or check this installation."""
+    from flocc_launch.doctor import diagnose
+    from flocc_launch.doctor.installation import check_installation
+    from flocc_launch.doctor.live import diagnose_live
+    from flocc_launch.run_folder import RunFolder
+    from flocc_launch.status import status_of_swarm
+
+    if run is not None:
+        findings = diagnose(RunFolder.open(run))
+    elif config is not None or swarm is not None:
+        findings = diagnose_live(status_of_swarm(*_reach(config, swarm)))
+    else:
+        findings = check_installation()
+    _print_findings(findings, json_out)
+
+
+def status(
+    run: RunArgument = None,
+    config: ConfigOption = None,
+    swarm: SwarmOption = None,
+    json_out: JsonOption = False,
+    watch_s: Annotated[float | None, typer.Option("--watch", min=0.2, help="Ask again after so many seconds.")] = None,
+) -> None:
+    """Show every robot of a running swarm, or of a run folder, in one table."""
+    from rich.console import Console
+
+    from flocc_launch.status import status_json, status_of_run, status_of_swarm, status_table
+
+    while True:
+        rows = status_of_run(run) if run is not None else status_of_swarm(*_reach(config, swarm))
+        if json_out:
+            typer.echo(status_json(rows))
+        else:
+            Console().print(status_table(rows))
+        if watch_s is None:
+            return
+        time.sleep(watch_s)
+
+
+def dashboard(
+    run: Annotated[Path, typer.Argument(help="Run folder, of a run that goes on or is over.")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 8642,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; 0.0.0.0 shows the page to the network.")
+    ] = "127.0.0.1",
+) -> None:
+    """Serve one page that shows a run while it goes on; Ctrl-C ends it."""
+    from flocc_launch.dashboard import Dashboard
+    from flocc_launch.run_folder import RunFolder
+
+    with Dashboard(RunFolder.open(run), port, host) as page:
+        typer.echo(f"dashboard: {page.url}")
+        while True:
+            time.sleep(3600)
+
+
+def view(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening the viewer.")] = None,
+) -> None:
+    """Show a run in rerun: trajectories, closures, images, leaders and errors over time."""
+    from flocc_launch.run_folder import RunFolder
+    from flocc_launch.view import view as show
+
+    typer.echo(f"view: {show(RunFolder.open(run), save)}")
+
+
+def _reach(config: Path | None, swarm: str | None) -> "tuple[TransportConfig, str]":
+    """How to reach a swarm, and its name.
+
+    Raises:
+        ConfigError: The configuration cannot be read, or nothing says which swarm.
+    """
+    from flocc_agent.config import AgentConfig, ConfigError, TransportConfig
+
+    if config is not None:
+        read = AgentConfig.read(config)
+        return read.transport, swarm or read.swarm
+    if swarm is None:
+        raise ConfigError("give a run folder, --swarm NAME, or --config of an agent")
+    return TransportConfig(), swarm
+
+
+def _print_findings(findings: "list[Finding]", json_out: bool) -> None:
+    """Print findings; leave with 1 where something blocks."""
+    from flocc_launch.doctor import Severity, finding_lines
+
+    if json_out:
+        fields = [
+            {"cause": f.cause, "severity": f.severity.name.lower(), "sentence": f.sentence, "advice": f.advice,
+             "robots": list(f.robots)}
+            for f in findings
+        ]  # fmt: skip
+        typer.echo(json.dumps(fields, indent=1))
+    else:
+        typer.echo("\n".join(finding_lines(findings)) or "nothing to report")
+    if any(finding.severity is Severity.BLOCKS for finding in findings):
+        sys.exit(EXIT_BLOCKED)

@@ -1,0 +1,109 @@
+"""Findings of a swarm that runs, from what its agents answer."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from flocc_launch.doctor.evidence import named
+from flocc_launch.doctor.finding import Finding, Severity, blocked
+from flocc_launch.status import RobotStatus
+
+
+def diagnose_live(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Say why the maps of a running swarm have or have not merged, as far as its agents' states show."""
+    checks = (lonely, unheard, without_keyframes, leaderless, refusing)
+    found = [finding for check in checks for finding in check(rows)]
+    first = merging(rows, bool(found))
+    if any(finding.cause == "merged" for finding in first):
+        found = [replace(finding, severity=Severity.HINDERS) for finding in found]
+    return [*first, *found]
+
+
+def merging(rows: Sequence[RobotStatus], explained: bool) -> list[Finding]:
+    """Whether all that answered share one map."""
+    frames = sorted({row.map_frame for row in rows if row.map_frame is not None})
+    if len(rows) > 1 and len(frames) == 1 and all(row.map_frame for row in rows):
+        robots = tuple(row.robot for row in rows)
+        return [
+            Finding("merged", Severity.GOOD, f"All {len(rows)} robots that answered are in {frames[0]}.", "", robots)
+        ]
+    if explained or len(rows) < 2:
+        return []
+    closures = max(row.closures or 0 for row in rows)
+    sentence = f"{len(frames)} maps, {closures} closures known so far, and all robots hear and follow each other."
+    advice = "Give it time; once the run is over, flocc doctor on its run folder names the step that failed."
+    return [Finding("not-merged-yet", Severity.NOTE, sentence, advice)]
+
+
+def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Robots that hear nobody."""
+    alone = [row.robot for row in rows if not row.neighbours]
+    if not alone or len(rows) < 2:
+        return []
+    return [
+        blocked(
+            "no-peer",
+            f"{named(alone)} hear{'s' * (len(alone) == 1)} no other robot.",
+            "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            *alone,
+        )
+    ]
+
+
+def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Links that work in one direction only."""
+    hears = {row.robot: set(row.neighbours) for row in rows}
+    return [
+        blocked(
+            "one-way-link",
+            f"{a} hears {b}, but {b} does not hear {a}.",
+            "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power.",
+            a,
+            b,
+        )
+        for a in sorted(hears)
+        for b in sorted(hears[a])
+        if b in hears and hears[b] and a not in hears[b]
+    ]
+
+
+def without_keyframes(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Robots that took no keyframe."""
+    empty = [row.robot for row in rows if row.keyframes == 0]
+    advice = "Check that images and odometry of one clock arrive and that the robot moves; see keyframes.distance_m."
+    return [blocked("no-keyframes", f"{named(empty)} took no keyframe.", advice, *empty)] if empty else []
+
+
+def leaderless(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Robots that follow nobody, and robots in range of each other that follow different leaders."""
+    nobody = [row.robot for row in rows if row.leader is None]
+    found = []
+    if nobody:
+        advice = "An election takes a few seconds; if it does not end, heartbeats get lost: see core.election."
+        found.append(
+            blocked("no-leader", f"{named(nobody)} follow{'s' * (len(nobody) == 1)} no leader.", advice, *nobody)
+        )
+    leader = {row.robot: row.leader for row in rows}
+    for row in rows:
+        for peer in row.neighbours:
+            if row.robot < peer and leader.get(peer) not in (None, row.leader) and row.leader is not None:
+                sentence = f"{row.robot} and {peer} hear each other but follow {row.leader} and {leader[peer]}."
+                advice = "Two groups that just met agree within seconds; if they do not, look for one-way links."
+                found.append(Finding("two-leaders", Severity.HINDERS, sentence, advice, (row.robot, peer)))
+    return found
+
+
+def refusing(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Robots that drop or refuse messages."""
+    return [
+        Finding(
+            "refused",
+            Severity.HINDERS,
+            f"{row.robot} dropped or refused messages: "
+            + ", ".join(f"{count} × {reason}" for reason, count in sorted(row.refused.items()))
+            + ".",
+            "Run one flocc version with the same keys on all robots; drops alone mean more load than it can take.",
+            (row.robot,),
+        )
+        for row in rows
+        if row.refused
+    ]

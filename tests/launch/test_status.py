@@ -1,0 +1,117 @@
+"""flocc status, and the doctor of a running swarm and of an installation."""
+
+import json
+import socket
+from pathlib import Path
+
+import pytest
+import typer
+from tests.launch import synthetic_run
+from tests.launch.synthetic_run import Synthetic
+from typer.testing import CliRunner
+
+from flocc_agent.config import ConfigError, TransportConfig
+from flocc_launch.cli_tools import add_tools
+from flocc_launch.doctor import Finding, Severity, finding_lines, installation
+from flocc_launch.doctor.live import diagnose_live
+from flocc_launch.status import RobotStatus, StatusError, status_from, status_json, status_of_run, status_of_swarm
+
+
+def row(robot: str, neighbours: str = "", **fields: object) -> RobotStatus:
+    healthy = {"leader": "r1", "term": 1, "keyframes": 5, "map_frame": "map/r1", "neighbours": neighbours.split()}
+    return RobotStatus.model_validate({"robot": robot} | healthy | fields)
+
+
+def tools() -> typer.Typer:
+    app = typer.Typer()
+    add_tools(app)
+    return app
+
+
+def test_the_status_of_a_run_folder_is_that_of_its_robots(tmp_path: Path) -> None:
+    rows = status_of_run(synthetic_run.write(tmp_path / "run", Synthetic(died=("r1", 50.0))).path)
+    assert [(r.robot, r.state, r.map_frame) for r in rows] == [
+        ("r1", "died", "map/r1"),
+        ("r2", "stopped", "map/r1"),
+        ("r3", "stopped", "map/r1"),
+    ]
+    assert rows[1].keyframes == 60
+    assert [entry["robot"] for entry in json.loads(status_json(rows))] == ["r1", "r2", "r3"]
+
+
+def test_an_agents_answer_is_read_and_a_strange_one_is_shown_as_such() -> None:
+    answer = {"robot": "r2", "leader": "r1", "term": 3, "neighbours": ["r1"], "sent_bytes": 12, "new": [1]}
+    known = status_from("r2", json.dumps(answer).encode())
+    assert (known.leader, known.term, known.neighbours, known.closures) == ("r1", 3, ["r1"], None)
+    for strange in (b"\xff", b"[]", b"null", b'{"neighbours": 3}'):
+        assert status_from("r2", strange) == RobotStatus(robot="r2", state="answers in another format")
+
+
+@pytest.mark.swarm
+def test_a_swarm_that_nobody_is_in_is_one_sentence() -> None:
+    config = TransportConfig(control_listen=("tcp/127.0.0.1:0",), multicast=False)
+    with pytest.raises(StatusError, match=r"swarm nobody: no agent answered within 0\.2 s"):
+        status_of_swarm(config, "nobody", timeout_s=0.2)
+
+
+@pytest.mark.parametrize(
+    ("rows", "causes"),
+    [
+        ([row("r1", "r2"), row("r2", "r1")], ["merged"]),
+        ([row("r1"), row("r2")], ["merged", "no-peer"]),
+        ([row("r1", "r2 r3"), row("r2", "r3"), row("r3", "r1 r2")], ["merged", "one-way-link"]),
+        ([row("r1", "r2"), row("r2", "r1", keyframes=0, map_frame=None)], ["no-keyframes"]),
+        ([row("r1", "r2", leader=None), row("r2", "r1", map_frame="map/r2")], ["no-leader"]),
+        ([row("r1", "r2"), row("r2", "r1", leader="r2", map_frame="map/r2")], ["two-leaders"]),
+        ([row("r1", "r2"), row("r2", "r1", map_frame="map/r2")], ["not-merged-yet"]),
+        ([row("r1", "r2"), row("r2", "r1", refused={"refused unknown version": 3})], ["merged", "refused"]),
+        ([row("r1")], []),
+    ],
+)
+def test_the_doctor_of_a_running_swarm_names_the_cause(rows: list[RobotStatus], causes: list[str]) -> None:
+    assert [finding.cause for finding in diagnose_live(rows)] == causes
+
+
+def test_a_port_in_use_is_found_before_the_agent_finds_it() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        (finding,) = installation.ports(TransportConfig(control_listen=(endpoint,)))
+    assert (finding.cause, finding.severity) == ("port", Severity.BLOCKS)
+    assert endpoint in finding.sentence
+
+
+def test_a_clock_that_was_never_set_is_found() -> None:
+    assert installation.clock(86_400.0)[0].sentence == "The clock says 1970, it was never set."
+    assert installation.clock(1.8e9)[0].severity is Severity.GOOD
+
+
+def test_a_package_that_cannot_be_imported_is_named() -> None:
+    assert installation.import_problem("flocc_does_not_exist") == "No module named 'flocc_does_not_exist'"
+    assert installation.import_problem("json") is None
+
+
+@pytest.mark.swarm
+def test_two_zenoh_peers_of_this_machine_find_each_other() -> None:
+    assert installation.two_peers(TransportConfig(), by_multicast=False)
+
+
+def test_findings_read_as_lines() -> None:
+    findings = [Finding("a", Severity.GOOD, "All is well."), Finding("b", Severity.BLOCKS, "It broke.", "Mend it.")]
+    assert finding_lines(findings) == ["ok    All is well.", "FAIL  It broke.", "      Mend it."]
+
+
+def test_the_command_line_knows_the_tools(tmp_path: Path) -> None:
+    path = str(synthetic_run.write(tmp_path / "run", Synthetic(merged_s=None)).path)
+    blocked = CliRunner().invoke(tools(), ["doctor", path])
+    assert (blocked.exit_code, "FAIL" in blocked.stdout) == (1, True)
+    well = CliRunner().invoke(tools(), ["doctor", str(synthetic_run.write(tmp_path / "well").path), "--json"])
+    assert (well.exit_code, json.loads(well.stdout)[0]["cause"]) == (0, "merged")
+    shown = CliRunner().invoke(tools(), ["status", path, "--json"])
+    assert len(json.loads(shown.stdout)) == 3
+    assert "map/r3" in CliRunner().invoke(tools(), ["status", path], env={"COLUMNS": "160"}).stdout
+
+
+def test_a_status_of_nothing_says_what_to_give() -> None:
+    assert isinstance(CliRunner().invoke(tools(), ["status"]).exception, ConfigError)
