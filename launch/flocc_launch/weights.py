@@ -66,7 +66,7 @@ NEEDED = (
         "cosplace",
         "ResNet101_512_cosplace.pth (or another backbone and dimension of release v1.0)",
         "perception.mast3r.place_weights",
-        "code MIT; the terms of the weights are unclear: trained on Street View images, the author says MIT does not apply",
+        "code MIT; weights unclear: trained on Street View images, the author says that MIT does not apply",
         "https://github.com/gmberton/CosPlace",
     ),
 )

@@ -212,3 +212,32 @@ def match_views(desc: tuple[Tensor, Tensor], confidence: tuple[Tensor, Tensor], 
     if parameters.confidence_min > 0:
         matches = matches.where(match_confidences(matches, *confidence) >= parameters.confidence_min)
     return matches
+
+
+def symmetric_matches(
+    first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], confidences: tuple[Tensor, ...], subsample: int = 8
+) -> tuple[Matches, Float32]:
+    """Union of the matches of two decodes, (1, 2) and (2, 1), each searched both ways.
+
+    Args:
+        first: (H, W, D) descriptors of images 1 and 2 from the decode (1, 2).
+        second: The same from the decode (2, 1), image 1 first.
+        confidences: (H, W) descriptor confidences: images 1 and 2 of the first decode, then of the second.
+        subsample: Distance of the seeds, pixels.
+
+    Returns:
+        The matches and for each the geometric mean of its two confidences, from the decode that found it first.
+    """
+    found, values = [], []
+    for k, desc in enumerate((first, second)):
+        matches = reciprocal_matches_both_ways(desc[0], desc[1], subsample)
+        of_1, of_2 = confidences[2 * k], confidences[2 * k + 1]
+        at_1 = of_1[matches.xy1[:, 1], matches.xy1[:, 0]]
+        at_2 = of_2[matches.xy2[:, 1], matches.xy2[:, 0]]
+        found.append(matches)
+        values.append((at_1 * at_2).sqrt().float().cpu().numpy())
+    xy = [np.concatenate([getattr(matches, side) for matches in found]) for side in ("xy1", "xy2")]
+    widths = (first[0].shape[1], first[1].shape[1])
+    linear = np.stack([xy[0][:, 0] + widths[0] * xy[0][:, 1], xy[1][:, 0] + widths[1] * xy[1][:, 1]], axis=1)
+    _, kept = np.unique(linear, axis=0, return_index=True)
+    return Matches(xy[0][kept], xy[1][kept]), np.concatenate(values)[kept]

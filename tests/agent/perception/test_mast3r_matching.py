@@ -1,0 +1,125 @@
+"""Reciprocal matching: the reference's matches, exactly."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch, an optional extra, is not installed")
+
+from flocc_agent.perception.mast3r.matching import (  # noqa: E402
+    MatchParameters,
+    match_confidences,
+    match_views,
+    matches_near_starts,
+    nearest,
+    reciprocal_matches,
+    reciprocal_matches_both_ways,
+    symmetric_matches,
+)
+from tests.agent.perception.mast3r_examples import golden  # noqa: E402
+
+
+def records() -> tuple[dict[str, Any], list[Any]]:
+    everything = golden("match.pt")
+    fields = {record["name"]: record for record in everything if record["tag"] == "input"}
+    return fields, [record for record in everything if record["tag"] != "input"]
+
+
+@pytest.mark.golden
+def test_matches_equal_the_references_for_every_size_and_subsampling() -> None:
+    fields, cases = records()
+    checked = 0
+    for case in cases:
+        if "S" not in case:
+            continue
+        found = reciprocal_matches(fields[case["name"]]["A"], fields[case["name"]]["B"], case["S"])
+        assert np.array_equal(found.xy1, case["xy1"])
+        assert np.array_equal(found.xy2, case["xy2"])
+        checked += 1
+    assert checked == 24
+
+
+@pytest.mark.golden
+def test_given_starts_within_a_tolerance_equal_the_references() -> None:
+    fields, cases = records()
+    for case in (case for case in cases if case["tag"] == "pixel_tol5"):
+        starts = torch.stack(case["init"], dim=1).numpy()
+        found = matches_near_starts(fields[case["name"]]["A"], fields[case["name"]]["B"], starts, 5.0)
+        assert np.array_equal(found.xy1, case["xy1"])
+        assert np.array_equal(found.xy2, case["xy2"])
+
+
+@pytest.mark.golden
+def test_union_of_both_directions_and_its_confidences_equal_the_references() -> None:
+    fields, cases = records()
+    for case in (case for case in cases if case["tag"] == "nonsym"):
+        field = fields[case["name"]]
+        found = reciprocal_matches_both_ways(field["A"], field["B"])
+        assert np.array_equal(found.xy1, case["xy1"])
+        assert np.array_equal(found.xy2, case["xy2"])
+        assert np.array_equal(match_confidences(found, field["qa"], field["qb"]), case["conf"].numpy())
+
+
+@pytest.mark.golden
+def test_union_of_two_decodes_and_its_confidences_equal_the_references() -> None:
+    fields, cases = records()
+    for case in (case for case in cases if case["tag"] == "sym"):
+        field = fields[case["name"]]
+        found, confidences = symmetric_matches(
+            (field["A"], field["B"]), (case["f12"], case["f22"]), tuple(case["q"])
+        )
+        assert np.array_equal(found.xy1, case["xy1"])
+        assert np.array_equal(found.xy2, case["xy2"])
+        assert np.allclose(confidences, case["conf"].numpy(), rtol=1e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("name", "subsample"), [("tiny_sq", 4), ("tiny_min", 4), ("tiny_portrait", 4), ("small_land", 8)])
+def test_matches_of_decoded_descriptors_equal_the_references(name: str, subsample: int) -> None:
+    case = golden(f"{name}.pt")
+    desc = [case["out"][f"res{k}"]["desc"][0] for k in (1, 2)]
+    found = reciprocal_matches(desc[0], desc[1], subsample)
+    for kind in ("dot", "kdtree"):
+        assert np.array_equal(found.xy1, case["matches"][kind][0])
+        assert np.array_equal(found.xy2, case["matches"][kind][1])
+
+
+def unit_field(seed: int, height: int, width: int) -> Any:
+    values = torch.randn(height, width, 24, generator=torch.Generator().manual_seed(seed))
+    return values / values.norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("rows", [5, 1024, 1025, 5000])
+def test_nearest_equals_a_plain_search_for_any_size(rows: int) -> None:
+    queries, database = unit_field(1, 1, 300)[0], unit_field(2, 1, rows)[0]
+    assert torch.equal(nearest(queries, database), (queries @ database.T).argmax(dim=1))
+
+
+def test_nearest_takes_the_first_of_equals() -> None:
+    database = torch.ones(3000, 24) / 24**0.5
+    assert nearest(database[:7], database).tolist() == [0] * 7
+
+
+def test_a_field_matches_itself_at_every_seed_but_the_border() -> None:
+    field = unit_field(3, 40, 56)
+    confidence = torch.ones(40, 56)
+    everything = match_views((field, field), (confidence, confidence), MatchParameters(border_px=0))
+    assert len(everything) == 5 * 7
+    assert np.array_equal(everything.xy1, everything.xy2)
+    assert len(match_views((field, field), (confidence, confidence), MatchParameters(border_px=5))) == 4 * 6
+
+
+def test_low_confidence_pixels_do_not_match() -> None:
+    field = unit_field(4, 40, 56)
+    low = torch.ones(40, 56)
+    low[:, :28] = 0.5
+    kept = match_views((field, field), (torch.ones(40, 56), low), MatchParameters(confidence_min=0.9))
+    assert len(kept) > 0
+    assert kept.xy2[:, 0].min() >= 28
+
+
+def test_equal_descriptors_everywhere_match_without_error() -> None:
+    flat = torch.ones(40, 56, 24) / 24**0.5
+    confidence = torch.ones(40, 56)
+    assert len(match_views((flat, flat), (confidence, confidence), MatchParameters(border_px=0))) <= 1
