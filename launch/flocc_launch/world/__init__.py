@@ -1,0 +1,1 @@
+"""A generated world: a town, robots that walk through it, and what their cameras and odometry see."""
