@@ -1,6 +1,6 @@
 """Relative pose of two images from matched features: essential matrix, cheirality, refinement, degenerate cases."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,9 +20,12 @@ from flocc_agent.perception.classical.features import Features
 from flocc_agent.perception.classical.matching import Indices, mutual_matches
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 GENERATOR_STATE = 20_260_101
 """Start of the robust estimators' own generators: the same input gives the same result, in any thread."""
+INVERSE_DEPTH_MIN = -0.01
+"""A point at infinity may come out slightly behind the camera, in baselines^-1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,37 +70,56 @@ def two_view(
     query_indices, other_indices = mutual_matches(query.descriptors, other.descriptors, config.distance_ratio_max)
     points = query.points[query_indices].astype(np.float64)
     observed = other.points[other_indices].astype(np.float64)
-    found = essential_pose(points, observed, other.focal_px, config)
-    if found is None:
-        return 0
-    T_other_query, verified = found
-    if int(verified.sum()) < config.correspondences_min:
-        return int(verified.sum())
-    view = View(T_other_query, observed, verified, other.focal_px, unit_translation=True, prior=prior)
-    refined = refine(points, inverse_depths_from(points, T_other_query, observed), (view,), config.sigma_px)
-    errors = reprojection_errors_px(points, refined.inverse_depths, refined.views[0])
-    verified = (errors < config.inlier_threshold_px) & (refined.inverse_depths > INVERSE_DEPTH_MIN)
-    if int(verified.sum()) < config.correspondences_min:
-        return int(verified.sum())
-    view = View(
-        refined.views[0].T_view_query,
-        observed[verified],
-        np.ones(int(verified.sum()), np.bool_),
-        other.focal_px,
-        unit_translation=True,
-        prior=prior,
-    )
-    refined = refine(points[verified], refined.inverse_depths[verified], (view,), config.sigma_px)
+    found = _verified(points, observed, other.focal_px, config)
+    if isinstance(found, int):
+        return found
+    view, depths, verified = found
+    points = points[verified]
+    guesses = [(view, depths)]
+    if prior is not None:
+        by_odometry = replace(view, T_view_query=unit_translation(prior.T_view_query), prior=prior)
+        depths_by_odometry = inverse_depths_from(points, by_odometry.T_view_query, view.observed)
+        guesses = [(replace(view, prior=prior), depths), (by_odometry, depths_by_odometry)]
+    candidates = [refine(points, start, (guess,), config.sigma_px) for guess, start in guesses]
+    refined = min(candidates, key=lambda candidate: candidate.cost)
     return TwoView(query_indices[verified], other_indices[verified], refined)
 
 
-INVERSE_DEPTH_MIN = -0.01
-"""A point at infinity may come out slightly behind the camera, in baselines^-1."""
+def _verified(
+    points: Float, observed: Float, focal_px: float, config: ClassicalConfig
+) -> tuple[View, Float, Mask] | int:
+    """Find the relative pose and verify the matches with it, the same way for loop pairs and odometry pairs.
+
+    Returns:
+        The other image as a view of the verified points, their inverse depths, and which are verified; or how many
+        are verified where they are too few.
+    """
+    found = essential_pose(points, observed, focal_px, config)
+    if found is None:
+        return 0
+    T_other_query, agree = found
+    if int(agree.sum()) < config.correspondences_min:
+        return int(agree.sum())
+    view = View(T_other_query, observed, agree, focal_px, unit_translation=True)
+    refined = refine(points, inverse_depths_from(points, T_other_query, observed), (view,), config.sigma_px)
+    errors = reprojection_errors_px(points, refined.inverse_depths, refined.views[0])
+    verified = (errors < config.inlier_threshold_px) & (refined.inverse_depths > INVERSE_DEPTH_MIN)
+    count = int(verified.sum())
+    if count < config.correspondences_min:
+        return count
+    pose_found = refined.views[0].T_view_query
+    view = View(pose_found, observed[verified], np.ones(count, np.bool_), focal_px, unit_translation=True)
+    return view, refined.inverse_depths[verified], verified
+
+
+def unit_translation(T: Float) -> Float:
+    """The pose with its translation made one long."""
+    return pose(T[:3, :3], T[:3, 3] / np.linalg.norm(T[:3, 3]))
 
 
 def essential_pose(
     points: Float, observed: Float, focal_px: float, config: ClassicalConfig
-) -> tuple[Float, NDArray[np.bool_]] | None:
+) -> tuple[Float, Mask] | None:
     """Pose of the query in the other image by a robust essential matrix.
 
     Returns:
