@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from flocc_launch.cli_tools import add_tools
 from flocc_protocol.errors import FloccError
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+add_tools(app)
 
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
@@ -140,19 +142,6 @@ def evaluate(
     from flocc_launch.report.evaluate import evaluate as run_evaluation
 
     typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
-
-
-@app.command()
-def doctor(run: Annotated[Path, typer.Argument(help="Run folder.")]) -> None:
-    """Say in sentences why maps have or have not merged, and what to change."""
-    from flocc_launch.doctor import Severity, diagnose
-    from flocc_launch.run_folder import RunFolder
-
-    findings = diagnose(RunFolder.open(run))
-    for finding in findings:
-        typer.echo(f"[{finding.severity.value}] {finding.sentence}" + (f" {finding.advice}" * bool(finding.advice)))
-    if any(finding.severity is Severity.BLOCKS for finding in findings):
-        sys.exit(EXIT_MISSED)
 
 
 @app.command()
