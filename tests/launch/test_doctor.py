@@ -148,7 +148,9 @@ def no_leader() -> Story:
 def leader_silent() -> Story:
     story = healthy()
     story.events = [e for e in story.events if not (e["event"] == "optimised" and e["round"] == 2)]
-    return story.say(10.5, "r1", "agent_died", signal=9)
+    for event in story.events:
+        event.update({"leader": "server"} if event["event"] == "leader" else {})
+    return story.say(10.5, "server", "agent_died", signal=9)
 
 
 def solver_failed() -> Story:
@@ -265,6 +267,20 @@ def test_a_robot_that_left_no_result_is_judged_by_the_events(tmp_path: Path) -> 
     for robot in ("r1", "r2"):
         story.say(0.5, robot, "keyframe", keyframe=f"{robot}/0", stamp_s=0.0, T_odom_body=IDENTITY)
     assert [finding.cause for finding in blocking(story.write(tmp_path / "run"))] == ["latents"]
+
+
+def test_a_robot_that_hangs_on_one_closure_is_told(tmp_path: Path) -> None:
+    story = corrections_lost()
+    story.frames["r2"] = "map/r1"
+    story.closures = [ClosureKnown(**PAIR, scale=1.3), ClosureKnown(query="r1/4", match="r2/6")]
+    findings = diagnose(story.write(tmp_path / "run"))
+    assert [finding.cause for finding in findings] == ["merged", "weak-link", "weak-link"]
+    assert findings[1].sentence.startswith("r1 hangs on map/r1 by 1 of 2 accepted closures")
+
+
+def test_a_dead_robot_whose_store_was_read_blocks_nothing(tmp_path: Path) -> None:
+    story = healthy().say(13.0, "r2", "agent_died", signal=9)
+    assert blocking(story.write(tmp_path / "run")) == []
 
 
 def test_one_robot_alone_has_nothing_to_merge(tmp_path: Path) -> None:

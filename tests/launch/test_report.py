@@ -151,7 +151,7 @@ def test_evaluate_says_what_the_report_holds(folder: RunFolder) -> None:
     text = evaluate(folder.path)
     assert text.startswith("All three robots found one common map")
     assert "joint ATE     0.134 m; odometry at its true starts 1.64 m, aligned 1.46 m" in text
-    assert "expected      ate_max_m 0.500: 0.134, met" in text
+    assert "expected      merged_within_s 60: 41.3, met" in text
     assert Report.model_validate_json(evaluate(folder.path, as_json=True)) == read_report(folder.path / "report.json")
 
 

@@ -12,8 +12,9 @@ from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.steps import STEPS
 from flocc_launch.report.load import LoadedRun, load
+from flocc_launch.report.timeline import ends
 from flocc_launch.run_folder import RunFolder
-from flocc_launch.run_records import AgentDied, of_kind
+from flocc_launch.run_records import AgentDied
 
 
 def diagnose(folder: RunFolder) -> list[Finding]:
@@ -45,7 +46,7 @@ def merging(loaded: LoadedRun) -> list[Finding]:
 
 def groups_of(loaded: LoadedRun) -> list[tuple[str, ...]]:
     """Living robots by their map frame at the end; a robot without one is a group of its own."""
-    died = {event.robot for event in of_kind(loaded.events, AgentDied)} - loaded.results.keys()
+    died = {robot for robot, end in ends(loaded.events).items() if isinstance(end, AgentDied)}
     groups: dict[str, list[str]] = {}
     for robot in loaded.robots:
         if robot not in died:

@@ -4,11 +4,14 @@ from collections.abc import Callable
 
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.report.build import how_it_died
+from flocc_launch.report.closures import Pair
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import seconds
 from flocc_launch.run_records import AgentDied, EncodingFailed, GraphOptimised, of_kind
+from flocc_protocol.ids import KeyframeId
 
 LEADER_CHANGES_MANY = 6
+CLOSURES_FEW = 3
 
 
 def deaths(loaded: LoadedRun) -> list[Finding]:
@@ -62,8 +65,46 @@ def unsteady_leaders(loaded: LoadedRun) -> list[Finding]:
     return findings
 
 
+def weak_links(loaded: LoadedRun) -> list[Finding]:
+    """Robots that hang on their common map by so few closures that one false one misplaces them."""
+    used = used_closures(loaded)
+    findings = []
+    for robot, track in loaded.tracks.items():
+        others = {name for name, other in loaded.tracks.items() if other.map_frame == track.map_frame} - {robot}
+        ties = [ends for ends in used if robot in ends and ends - {robot} <= others and len(ends) == 2]
+        if track.map_frame is None or not others or not 0 < len(ties) < CLOSURES_FEW:
+            continue
+        accepted = sum(pair.accepted and robot in robots_of(pair) and pair.inter_robot for pair in loaded.pairs)
+        sentence = (
+            f"{robot} hangs on {track.map_frame} by {len(ties)} of {accepted} accepted closures; the solver did not "
+            "use the rest. One false closure misplaces it."
+        )
+        advice = (
+            "Let it meet the others again, or raise core.loop_closing.match_ratio_threshold so that fewer are false."
+        )
+        findings.append(Finding("weak-link", Severity.HINDERS, sentence, advice, (robot,)))
+    return findings
+
+
+def used_closures(loaded: LoadedRun) -> list[set[str]]:
+    """Robots of each closure whose scale a leader's last solution holds; empty where no scales are estimated."""
+    used: dict[tuple[str, str], set[str]] = {}
+    for result in loaded.results.values():
+        for closure in result.closures:
+            if closure.scale is not None:
+                ends = {KeyframeId.parse(keyframe).log.robot for keyframe in (closure.query, closure.match)}
+                used[closure.query, closure.match] = ends
+    return list(used.values())
+
+
+def robots_of(pair: Pair) -> set[str]:
+    """The two robots of a pair."""
+    return {pair.query.log.robot, pair.match.log.robot}
+
+
 GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     deaths,
+    weak_links,
     solver_warnings,
     encoding_failures,
     unsteady_leaders,

@@ -14,7 +14,8 @@ Float = NDArray[np.float64]
 
 WIDTH_PX = 470.0
 HEIGHT_PX = 250.0
-LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 48.0, 12.0, 14.0, 44.0
+LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 48.0, 12.0, 26.0, 44.0
+PEAK_RATIO_MAX = 4.0
 BINS = 20
 
 
@@ -27,23 +28,31 @@ def ratio_figure(loaded: LoadedRun) -> str | None:
     accepted, rejected = (
         np.histogram([ratio for ratio, taken in known if taken is wanted], edges)[0] for wanted in (True, False)
     )
-    x, y = axes(0.0, float(edges[-1]), float((accepted + rejected).max()))
+    x, y = axes(0.0, float(edges[-1]), shown_peak(accepted + rejected))
     bars = [bar for k in range(BINS) for bar in stacked(x, y, edges, int(rejected[k]), int(accepted[k]), k)]
     limit = setting_number(loaded.run.settings, "match_ratio_threshold", "match_ratio_min")
     mark = "" if limit is None else threshold(x, y, limit)
     return svg(WIDTH_PX, HEIGHT_PX, frame(x, y, "match ratio, Eq. (1)", "pairs"), *bars, mark, label="Match ratios")
 
 
+def shown_peak(counts: NDArray[np.int_]) -> float:
+    """Height of the axis: one bin far above all others is cut, so that the others can be seen."""
+    highest, second = (float(count) for count in np.sort(counts)[::-1][:2])
+    return highest if highest <= PEAK_RATIO_MAX * second or second == 0 else PEAK_RATIO_MAX * second
+
+
 def stacked(x: Axis, y: Axis, edges: Float, rejected: int, accepted: int, k: int) -> list[str]:
-    """The two bars of one bin."""
+    """The two bars of one bin; a bin that is cut says its count."""
     left, width = x(float(edges[k])) + 0.7, max(x(float(edges[k + 1])) - x(float(edges[k])) - 1.4, 1.0)
     bars = []
     for low, count, name in ((0, rejected, "bad"), (rejected, accepted, "good")):
-        if count:
-            top, height = y(low + count), y(low) - y(low + count)
+        top, bottom = (y(min(value, y.high)) for value in (low + count, low))
+        if count and bottom > top:
             word = "accepted" if name == "good" else "rejected"
             said = title(f"{count} {word}, ratio {edges[k]:.2f} to {edges[k + 1]:.2f}")
-            bars.append(element("rect", said, x=left, y=top, width=width, height=height, class_=f"bar {name}"))
+            bars.append(element("rect", said, x=left, y=top, width=width, height=bottom - top, class_=f"bar {name}"))
+    if rejected + accepted > y.high:
+        bars.append(element("text", f"↑ {rejected + accepted}", x=left + width + 4, y=y.to_px + 10, font_size=12))
     return bars
 
 
@@ -123,5 +132,5 @@ def frame(x: Axis, y: Axis, x_name: str, y_name: str) -> str:
     parts.append(element("line", x1=x.from_px, x2=x.to_px, y1=y.from_px, y2=y.from_px, class_="axis"))
     middle = (x.from_px + x.to_px) / 2
     parts.append(element("text", text_of(x_name), x=middle, y=HEIGHT_PX - 6, text_anchor="middle", class_="soft"))
-    parts.append(element("text", text_of(y_name), x=0, y=TOP_PX - 2, class_="soft", font_size=12))
+    parts.append(element("text", text_of(y_name), x=0, y=12, class_="soft", font_size=12))
     return "".join(parts)

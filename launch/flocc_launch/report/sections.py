@@ -11,7 +11,7 @@ from flocc_launch.report.figure_map import colour, map_figure, scenes, view_of
 from flocc_launch.report.figure_time import time_figure
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report, Robot
-from flocc_launch.report.svg import count_of, element, number, seconds, size_of, text_of
+from flocc_launch.report.svg import count_of, element, number, plain, seconds, size_of, text_of
 
 
 def kicker(report: Report) -> str:
@@ -65,7 +65,7 @@ def expectations(report: Report) -> str:
     for asked in report.expectations:
         class_, said = words[asked.met]
         verdict = element("span", said, class_=class_)
-        rows.append([text_of(asked.name), number(asked.limit), number(asked.value), verdict])
+        rows.append([text_of(asked.name), plain(asked.limit), plain(asked.value), verdict])
     return element("h2", "Expectations") + table(["name", "limit#", "value#", ""], rows, class_="narrow")
 
 
@@ -78,14 +78,17 @@ def warnings(report: Report) -> str:
 
 
 def findings(loaded: LoadedRun) -> str:
-    """What the doctor says where maps have not merged."""
+    """What the doctor says that blocks or hinders."""
     from flocc_launch.doctor import Severity, diagnose_loaded  # the doctor reads runs as the report does
 
-    found = [finding for finding in diagnose_loaded(loaded) if finding.severity is Severity.BLOCKS]
+    found = [f for f in diagnose_loaded(loaded) if f.severity in (Severity.BLOCKS, Severity.HINDERS)]
+    found = [f for f in found if f.cause not in ("agent-died", "solver-warning")]  # these stand under warnings
     if not found:
         return ""
+    blocked = any(f.severity is Severity.BLOCKS for f in found)
+    heading = "Why the maps have not merged" if blocked else "What the doctor finds"
     items = [element("li", text_of(f.sentence), " ", element("em", text_of(f.advice))) for f in found]
-    return element("div", element("h3", "Why the maps have not merged"), element("ul", *items), class_="callout")
+    return element("div", element("h3", heading), element("ul", *items), class_="callout")
 
 
 def trajectories(report: Report, loaded: LoadedRun) -> str:

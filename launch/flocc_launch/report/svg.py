@@ -95,6 +95,11 @@ def number(value: float | None, unit: str = "") -> str:
     return f"{text} {unit}" if unit else text
 
 
+def plain(value: float | None) -> str:
+    """A whole number as such, any other with three significant digits."""
+    return count_of(int(value)) if value is not None and value == int(value) else number(value)
+
+
 def count_of(value: int | None) -> str:
     """A count with thin spaces between thousands."""
     return "–" if value is None else f"{value:,}".replace(",", " ")

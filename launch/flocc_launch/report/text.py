@@ -1,7 +1,7 @@
 """A report for the terminal: the verdict, the figures, expectations, warnings."""
 
 from flocc_launch.report.model import Report
-from flocc_launch.report.svg import count_of, number, seconds, size_of
+from flocc_launch.report.svg import count_of, number, plain, seconds, size_of
 from flocc_launch.report.verdict import verdict
 
 
@@ -24,7 +24,7 @@ def sentences(report: Report) -> list[str]:
         *robot_lines(report),
     ]
     lines += [
-        f"expected      {e.name} {number(e.limit)}: {number(e.value)}, {judged(e.met)}" for e in report.expectations
+        f"expected      {e.name} {plain(e.limit)}: {plain(e.value)}, {judged(e.met)}" for e in report.expectations
     ]
     return lines + [f"note          {warning}" for warning in report.warnings]
 
