@@ -337,6 +337,8 @@ class TransportConfig(Section):
     """The same in bytes."""
     tls: TlsConfig | None = None
     """Mutual TLS and one writer per key; None is for trusted networks and emulation."""
+    chaos: bool = False
+    """Take orders of `flocc chaos`: partitions, loss, kills. For tests; without tls anybody on the network may order."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "TransportConfig":

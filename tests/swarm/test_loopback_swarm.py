@@ -9,6 +9,8 @@ import pytest
 from tests.agent.runtime.loopback import loopback_configs
 from tests.swarm.robots import RobotProcess, agent_configs, frames, leaders, logs_equal, neighbours, reached
 
+from flocc_launch.chaos import disturb, parse_order
+
 pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
@@ -17,9 +19,9 @@ START_S = 30.0
 
 
 @asynccontextmanager
-async def running(folder: Path) -> AsyncIterator[list[RobotProcess]]:
+async def running(folder: Path, **options: object) -> AsyncIterator[list[RobotProcess]]:
     """Three robots that follow one leader in one frame."""
-    configs = agent_configs(loopback_configs(NAMES), folder)
+    configs = agent_configs(loopback_configs(NAMES, **options), folder)
     robots = [RobotProcess(config, folder / "logs") for config in configs.values()]
     try:
         await asyncio.gather(*(robot.start(phase_rad=0.6 * i) for i, robot in enumerate(robots)))
@@ -58,6 +60,21 @@ async def test_a_killed_leader_is_replaced_and_comes_back_with_its_log(tmp_path:
         )
         assert set(first.status["logs"]) == set(NAMES)
         assert all(robot.status["refused"] == {} for robot in rest)
+
+
+async def test_an_operator_partitions_heals_and_kills(tmp_path: Path) -> None:
+    async with running(tmp_path, chaos=True) as robots:
+        operator = robots[0].config.transport
+
+        async def order(words: str) -> dict[str, str]:
+            return await asyncio.to_thread(disturb, operator, "test", parse_order(words))
+
+        assert await order("partition r1 | r2,r3") == dict.fromkeys(NAMES, "done")
+        await reached(robots, lambda: leaders(robots[1:]) == {"r2"} and neighbours(robots[0]) == set(), 15.0, "parted")
+        assert await order("heal") == dict.fromkeys(NAMES, "done")
+        await reached(robots, lambda: leaders(robots) == {"r1"} and logs_equal(robots), 15.0, "healed")
+        assert await order("kill r3") == {"r1": "not concerned", "r2": "not concerned", "r3": "done"}
+        await reached(robots, lambda: "r3" not in neighbours(robots[0]), 15.0, "r3 is gone")
 
 
 async def test_agents_end_in_order_and_say_nothing_bad(tmp_path: Path) -> None:
