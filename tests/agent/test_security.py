@@ -1,5 +1,6 @@
 """Claims on keys, signatures and mutual TLS, the last over real zenoh on loopback."""
 
+import asyncio
 import json
 import stat
 from pathlib import Path
@@ -10,11 +11,13 @@ from tests.agent.runtime.loopback import loopback_configs, until
 from flocc_agent.config import TlsConfig, TransportConfig
 from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportError
+from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_launch.keys import KeysError, make_keys
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
+from flocc_protocol.keys import Admin
 
 SWARM = "field"
 ROBOTS = ("r1", "r2")
@@ -218,3 +221,23 @@ async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path])
 async def test_a_fetch_from_a_robot_without_a_link_says_no_answer(folders: dict[str, Path]) -> None:
     async with Listener("r1", secure_configs(folders)["r1"]).transport as transport:
         assert await transport.fetch_latent("r2", "r2/0", 10.0) == FetchFailed(FetchProblem.NO_ANSWER)
+
+
+@pytest.mark.swarm
+async def test_only_operators_are_answered(folders: dict[str, Path]) -> None:
+    configs = secure_configs(folders)
+    one = Listener("r1", configs["r1"])
+    one.transport.serve_admin(Admin.STATUS, lambda _: b"well")
+    as_operator = configs["r1"].model_copy(
+        update={"tls": TlsConfig(folder=folders["operator"]), "roster": {"r1": configs["r1"].roster["r1"]}}
+    )
+    settings = session_settings(configs["r3"], SWARM, "r3", Plane.CONTROL)
+    async with one.transport:
+        assert await ask(as_operator, SWARM, Admin.STATUS, timeout_s=3.0) == {"r1": b"well"}
+        member = open_session(settings, "r3")
+        try:
+            await until(lambda: len(member.info.peers_zid()) == 1)
+            replies = await asyncio.to_thread(lambda: list(member.get("flocc/v1/field/*/status", timeout=1.0)))
+        finally:
+            member.close()
+    assert [reply for reply in replies if reply.ok is not None] == []

@@ -228,6 +228,20 @@ async def test_a_broken_peer_is_slowed_down_and_counted() -> None:
         assert len(two.received) <= 100
 
 
+async def test_hears_at_most_so_many_peers() -> None:
+    configs = loopback_configs(ROBOTS)
+    two = Member("r2", configs["r2"].model_copy(update={"peers_max": 1}))
+    members = [Member("r1", configs["r1"]), two, Member("r3", configs["r3"])]
+
+    def greet() -> None:
+        for member in (members[0], members[2]):
+            member.transport.broadcast(GREETING, b"")
+
+    async with members[0].transport, two.transport, members[2].transport:
+        await until(lambda: two.transport.counters().dropped.get("too-many-peers", 0) > 0, act=greet)
+        assert len(two.met) == 1
+
+
 async def test_a_message_that_is_too_large_is_neither_sent_nor_accepted() -> None:
     configs = loopback_configs(("r1", "r2"))
     small = configs["r2"].model_copy(update={"message_bytes_max": 1024})
