@@ -5,10 +5,11 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch, an optional extra, is not installed")
 
+from tests.agent.perception.mast3r_examples import golden, keyed_cosplace  # noqa: E402
+
 from flocc_agent.perception.mast3r.cosplace import CosPlace  # noqa: E402
 from flocc_agent.perception.mast3r.keyed import COSPLACE_SEED, keyed_image  # noqa: E402
 from flocc_agent.perception.mast3r.preprocess import place_input  # noqa: E402
-from tests.agent.perception.mast3r_examples import golden, keyed_cosplace  # noqa: E402
 
 OFFICIAL = [
     ("ResNet18", 512, 123, 11_439_169),

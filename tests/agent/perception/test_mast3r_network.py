@@ -4,6 +4,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch, an optional extra, is not installed")
 
+from tests.agent.perception.mast3r_examples import (  # noqa: E402
+    deviation,
+    golden,
+    golden_folder,
+    keyed_mast3r,
+)
+
 from flocc_agent.perception.mast3r.blocks import AttentionKind, set_attention  # noqa: E402
 from flocc_agent.perception.mast3r.keyed import (  # noqa: E402
     MAST3R_SEED,
@@ -13,12 +20,6 @@ from flocc_agent.perception.mast3r.keyed import (  # noqa: E402
 from flocc_agent.perception.mast3r.network import Mast3r, patch_grid, postprocess  # noqa: E402
 from flocc_agent.perception.mast3r.rope import grid_rotation, patch_positions, rotate  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import FULL, SMALL, TINY, Mast3rSizes  # noqa: E402
-from tests.agent.perception.mast3r_examples import (  # noqa: E402
-    deviation,
-    golden,
-    golden_folder,
-    keyed_mast3r,
-)
 
 pytestmark = pytest.mark.golden
 

@@ -9,10 +9,11 @@ import pytest
 
 pytest.importorskip("torch", reason="torch, an optional extra, is not installed")
 
-from PIL import Image as Pillow  # noqa: E402
+from PIL import Image as Pillow
+from tests.agent.perception.mast3r_examples import golden
 
-from flocc_agent.core.interfaces import Camera, Image  # noqa: E402
-from flocc_agent.perception.mast3r.preprocess import (  # noqa: E402
+from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.perception.mast3r.preprocess import (
     BadImage,
     mast3r_input,
     plan_crop,
@@ -21,7 +22,6 @@ from flocc_agent.perception.mast3r.preprocess import (  # noqa: E402
     rgb_pixels,
     without_distortion,
 )
-from tests.agent.perception.mast3r_examples import golden  # noqa: E402
 
 
 @pytest.mark.golden

@@ -100,8 +100,8 @@ def _line(error: BaseException) -> str:
 
 def _unpickling_complaint(message: str) -> str:
     """Tell pickled code from plain damage."""
-    found = re.search(r"(?:global|class|GLOBAL)\s+[`']?([\w.]+)", message)
-    if found and "Unsupported" in message:
+    found = re.search(r"unsupported global:? (?:global )?([\w.]+)", message, re.IGNORECASE)
+    if found:
         return f"holds pickled code ({found[1]}), which is never run; only plain weights are loaded"
     return "is truncated, damaged or no torch checkpoint"
 

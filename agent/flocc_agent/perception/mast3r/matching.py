@@ -222,7 +222,7 @@ def symmetric_matches(
     Args:
         first: (H, W, D) descriptors of images 1 and 2 from the decode (1, 2).
         second: The same from the decode (2, 1), image 1 first.
-        confidences: (H, W) descriptor confidences: images 1 and 2 of the first decode, then of the second.
+        confidences: (H, W) descriptor confidences of each decode's views 1 and 2; the second's view 1 is image 2.
         subsample: Distance of the seeds, pixels.
 
     Returns:
@@ -231,7 +231,7 @@ def symmetric_matches(
     found, values = [], []
     for k, desc in enumerate((first, second)):
         matches = reciprocal_matches_both_ways(desc[0], desc[1], subsample)
-        of_1, of_2 = confidences[2 * k], confidences[2 * k + 1]
+        of_1, of_2 = confidences[:2] if k == 0 else (confidences[3], confidences[2])
         at_1 = of_1[matches.xy1[:, 1], matches.xy1[:, 0]]
         at_2 = of_2[matches.xy2[:, 1], matches.xy2[:, 0]]
         found.append(matches)
