@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.gossip import remember
+from flocc_agent.core.gossip import REMEMBERED_MAX, remember
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.geometry import pose_from_tq, tq_from_pose
@@ -43,8 +43,10 @@ class Corrections:
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        logs_max = self._gossip.logs_max
-        return {"corrections": (len(self._newest), logs_max), "asked_corrections": (len(self._asked_until_s), logs_max)}
+        return {
+            "corrections": (len(self._newest), self._gossip.logs_max),
+            "asked_corrections": (len(self._asked_until_s), REMEMBERED_MAX),
+        }
 
     def restore(self, message: CorrectionMessage) -> None:
         """Put back the correction that was applied before a restart."""

@@ -112,14 +112,18 @@ class LeaderElection:
         return self._on_advert(heartbeat.leader, now) + self._renew_if_overtaken(now)
 
     def on_election(self, sender: LogId, now: float) -> list[Effect]:
-        """Answer a robot that this one outranks, and take the election over."""
+        """Answer a robot that this one outranks, and take the election over.
+
+        A follower need not: its heartbeats tell the asker of the leader, or it will miss the leader itself.
+        """
         peer = self._peers.get(sender.robot)
         if peer is None or peer.rank < self._rank:
             return []
         answer: list[Effect] = [Unicast(sender.robot, Answer(self._counter_max))]
         if self.leading:
             return [*answer, *self._announce()]
-        return answer if self._role is Role.ELECTING else [*answer, *self._start(now)]
+        settled = self._role in (Role.ELECTING, Role.FOLLOWING)
+        return answer if settled else [*answer, *self._start(now)]
 
     def on_answer(self, sender: LogId, now: float) -> list[Effect]:
         """A better-ranked robot is alive: wait for its claim."""
@@ -144,12 +148,15 @@ class LeaderElection:
             return []
         return self._lose_leader("handed over", now, beat=COUNTER_MAX)
 
-    def on_applied(self, term: Term) -> list[Effect]:
-        """Somebody applied a correction of this term; a leader whose own term is older claims anew."""
-        refused = self._learn_counter(term.leader, term.counter)
-        if refused or self._leader is None or not self.leading or term <= self._leader.term:
-            return refused
-        return self._claim()
+    def on_applied(self, sender: LogId, term: Term) -> list[Effect]:
+        """Somebody has a correction of this term; what is refused must not be applied here.
+
+        A leader whose own term is older claims anew with its next `tick`, since nobody would apply what it says.
+        """
+        refused = self._learn_counter(sender, term.counter)
+        if not refused and self._leader is not None and self.leading and term > self._leader.term:
+            self._due_s = float("-inf")
+        return refused
 
     def on_lost(self, name: str) -> None:
         """A robot is out of range; it need not be asked."""
@@ -159,9 +166,11 @@ class LeaderElection:
         """Hand over before an orderly stop."""
         if self._leader is None or not self.leading:
             return []
+        handover = Handover(self._leader.term)
         self._role = Role.LISTENING
+        self._leader = None
         self._due_s = float("inf")
-        return [Broadcast(Handover(self._leader.term))]
+        return [Broadcast(handover)]
 
     def tick(self, now: float) -> list[Effect]:
         """Time passed: a leader stood still, an ANSWER or a claim did not come, listening is over."""
@@ -175,7 +184,7 @@ class LeaderElection:
             case Role.LISTENING | Role.WAITING:
                 return self._start(now)
             case Role.LEADING:
-                return []
+                return self._claim()
 
     def deadline(self) -> float:
         """When `tick` is due next."""
@@ -229,7 +238,11 @@ class LeaderElection:
         return [report, *self._start(now)]
 
     def _start(self, now: float) -> list[Effect]:
-        """Ask those who outrank this robot; claim at once where there are none."""
+        """Ask those who outrank this robot; claim at once where there are none.
+
+        Meanwhile it follows nobody: who repeated a leader that it does not watch would keep a dead one alive.
+        """
+        self._leader = None
         better = [self._peers[name] for name in sorted(self._peers) if self._peers[name].rank < self._rank]
         if not better:
             return self._claim()

@@ -9,6 +9,9 @@ from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, Term
 from flocc_protocol.messages import CandidatePair, Envelope
 
+LATENT_UNKNOWN = "unknown"
+"""Reason of a LatentFetchFailed: the holder answered that it does not hold the latent (any more)."""
+
 
 @dataclass(frozen=True, slots=True)
 class KeyframeCaptured:

@@ -6,7 +6,7 @@ neighbour about what was sent, so a lost, doubled, late or reordered message can
 """
 
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.parameters import GossipParameters
@@ -28,7 +28,20 @@ REMEMBERED_MAX = 1024
 """Open requests, pauses and forks that are remembered; beyond this the oldest are forgotten."""
 
 
-PAUSES_MAX = 4096
+class Sealer(Protocol):
+    """Proves who wrote a record, over any number of relays. Logs hold, send and persist sealed records."""
+
+    def seal(self, log: LogId, number: int, record: bytes) -> bytes:
+        """Add this robot's proof to a record of its own log."""
+        ...
+
+    def opened(self, log: LogId, number: int, sealed: bytes) -> bytes:
+        """Give the record, once its proof is checked.
+
+        Raises:
+            DecodeError: It is not a record of that log at that number.
+        """
+        ...
 
 
 @dataclass(slots=True)
@@ -49,6 +62,12 @@ class LogCopy:
         self.encoded.append(data)
         self.checksums.append(chain(self.checksums[-1], data))
         self.keyframes += isinstance(record, KeyframeRecord)
+
+    def continues(self, batch: RecordBatch) -> bool:
+        """Whether a batch that starts within this copy agrees with it, as far as both go."""
+        held = self.encoded[batch.first : batch.first + len(batch.records)]
+        same_before = self.checksums[batch.first] == batch.checksum_before
+        return same_before and held == list(batch.records[: len(held)])
 
     def accepts(self, record: Record) -> bool:
         """Whether the record can be next: keyframes are numbered without gaps."""
@@ -75,30 +94,32 @@ class _Asked:
 class Gossip:
     """All logs that one robot holds."""
 
-    def __init__(self, own: LogId, parameters: GossipParameters) -> None:
+    def __init__(self, own: LogId, parameters: GossipParameters, sealer: Sealer | None = None) -> None:
         self._own = own
         self._parameters = parameters
+        self._sealer = sealer
         self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
         self._asked: dict[LogId, _Asked] = {}
         self._pauses_s: dict[tuple[LogId, str], float] = {}
         self._not_before_s: dict[tuple[LogId, str], float] = {}
         self._forked: dict[tuple[LogId, str], None] = {}
+        self._told: dict[tuple[str, str], None] = {}
         self._digests: tuple[LogDigest, ...] | None = None
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        logs_max = self._parameters.logs_max
         return {
-            "logs": (len(self.logs), logs_max),
-            "asked": (len(self._asked), logs_max),
-            "paused": (len(self._not_before_s), PAUSES_MAX),
-            "forked": (len(self._forked), PAUSES_MAX),
+            "logs": (len(self.logs), self._parameters.logs_max),
+            "asked": (len(self._asked), REMEMBERED_MAX),
+            "paused": (len(self._not_before_s), REMEMBERED_MAX),
+            "forked": (len(self._forked), REMEMBERED_MAX),
+            "refused": (len(self._told), REMEMBERED_MAX),
         }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
         """Put back a record that was read from disk, in order."""
         copy = self.logs.setdefault(log, LogCopy())
-        record = decode_record(data)
+        record = decode_record(self._opened(log, len(copy), data))
         copy.append(record, data)
         self._digests = None
         return NewRecord(log, len(copy) - 1, record)
@@ -106,7 +127,10 @@ class Gossip:
     def append(self, record: Record) -> tuple[NewRecord, list[Effect], RecordBatch]:
         """Add a record to the own log: persist it, then send the batch."""
         copy = self.logs[self._own]
-        number, data, before = len(copy), encode_record(record), copy.checksums[-1]
+        number, before = len(copy), copy.checksums[-1]
+        data = encode_record(record)
+        if self._sealer is not None:
+            data = self._sealer.seal(self._own, number, data)
         assert copy.accepts(record), "own keyframes are numbered without gaps"
         copy.append(record, data)
         self._digests = None
@@ -128,10 +152,18 @@ class Gossip:
             copy = self.logs.get(digest.log)
             held = len(copy) if copy else 0
             if digest.count > held:
-                effects += self._ask(sender.robot, digest.log, held, now)
+                effects += self._behind(sender.robot, digest.log, held, now)
             elif copy is not None and copy.checksums[digest.count] != digest.checksum:
-                effects += self._fork(sender.robot, digest.log)
+                effects += self._fork(sender.robot, digest.log, "two writers of one log")
         return effects
+
+    def _behind(self, peer: str, log: LogId, held: int, now: float) -> list[Effect]:
+        """Another robot has more of a log: ask for it, unless only this robot can have written it."""
+        if log == self._own:
+            return self._fork(peer, log, "others hold more of this robot's own log")
+        if log not in self.logs and len(self.logs) >= self._parameters.logs_max:
+            return self._refused(peer, "too many logs")
+        return self._ask(peer, log, held, now)
 
     def on_request(self, sender: LogId, request: RecordRequest) -> list[Effect]:
         """Send what follows, as much as fits a message."""
@@ -148,11 +180,11 @@ class Gossip:
             return [], self._own_log_elsewhere(sender, batch)
         copy = self.logs.get(batch.log) or LogCopy()
         if batch.first > len(copy):
-            return [], self._ask(sender.robot, batch.log, len(copy), now)
-        if copy.checksums[batch.first] != batch.checksum_before:
-            return [], self._fork(sender.robot, batch.log)
+            return [], self._behind(sender.robot, batch.log, len(copy), now)
+        if not copy.continues(batch):
+            return [], self._fork(sender.robot, batch.log, "two writers of one log")
         if batch.log not in self.logs and len(self.logs) >= self._parameters.logs_max:
-            return [], [_refused(sender.robot, "too many logs")]
+            return [], self._refused(sender.robot, "too many logs")
         new, effects = self._take(sender.robot, copy, batch)
         if new:
             self.logs[batch.log] = copy
@@ -167,20 +199,23 @@ class Gossip:
         effects: list[Effect] = []
         for data in batch.records[len(copy) - batch.first :]:
             try:
-                record = decode_record(data)
+                record = decode_record(self._opened(batch.log, len(copy), data))
             except DecodeError as error:
-                return new, [*effects, _refused(peer, f"bad record of {batch.log}: {error}")]
+                return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
             if not copy.accepts(record) or len(copy) >= self._parameters.records_max:
-                return new, [*effects, _refused(peer, f"record of {batch.log} out of place")]
+                return new, [*effects, *self._refused(peer, f"record of {batch.log} out of place")]
             number = len(copy)
             copy.append(record, data)
             new.append(NewRecord(batch.log, number, record))
             effects.append(PersistRecord(batch.log, number, data))
         return new, effects
 
+    def _opened(self, log: LogId, number: int, data: bytes) -> bytes:
+        return data if self._sealer is None else self._sealer.opened(log, number, data)
+
     def _ask(self, peer: str, log: LogId, first: int, now: float) -> list[Effect]:
         """Ask one peer at a time for one log; a peer that did not deliver waits longer each time."""
-        if log == self._own or (log, peer) in self._forked:
+        if (log, peer) in self._forked:
             return []
         asked = self._asked.get(log)
         if asked is not None and now < asked.until_s:
@@ -219,13 +254,21 @@ class Gossip:
         end = batch.first + len(batch.records)
         if end <= len(own) and tuple(own.encoded[batch.first : end]) == batch.records:
             return []
-        return self._fork(sender.robot, batch.log)
+        return self._fork(sender.robot, batch.log, "others hold more of this robot's own log")
 
-    def _fork(self, peer: str, log: LogId) -> list[Effect]:
+    def _fork(self, peer: str, log: LogId, reason: str) -> list[Effect]:
+        """A copy that contradicts this one: keep this one, take nothing of it from that peer, say so once."""
         if (log, peer) in self._forked:
             return []
         remember(self._forked, (log, peer), None)
-        return [Report("log_forked", {"peer": peer, "log": str(log), "reason": "two writers of one log"})]
+        return [Report("log_forked", {"peer": peer, "log": str(log), "reason": reason})]
+
+    def _refused(self, peer: str, reason: str) -> list[Effect]:
+        """Say once per peer and reason what was refused."""
+        if (peer, reason) in self._told:
+            return []
+        remember(self._told, (peer, reason), None)
+        return [Report("peer_refused", {"peer": peer, "reason": reason})]
 
 
 def remember(entries: dict[Key, Entry], key: Key, entry: Entry, entries_max: int = REMEMBERED_MAX) -> None:
@@ -245,7 +288,3 @@ def _fitting(encoded: list[bytes], first: int) -> tuple[bytes, ...]:
             break
         records.append(data)
     return tuple(records)
-
-
-def _refused(peer: str, reason: str) -> Report:
-    return Report("peer_refused", {"peer": peer, "reason": reason})

@@ -2,18 +2,17 @@
 
 Who registers a pair: one of its two owners, by a checksum of the pair, so that both agree without talking and the
 work is halved between them. A robot that has a neighbour of a higher compute class hands its pairs to it. Whoever
-found a pair that is another's to register tells it so until the record shows. When the other is silent for
-`takeover_s` and the latents are at hand, the finder registers the pair itself.
-
-A latent out of reach is asked of relays: heartbeats carry what a robot wants, and neighbours that can reach the
-owner fetch and hold it.
+found a pair that is another's to register tells it so until the record shows. When the other is out of range for
+`takeover_s`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
+exists no more is rejected, by a record like any other.
 """
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from flocc_agent.core.effects import Effect, FetchLatent, Register, Report, Unicast
+from flocc_agent.core.effects import Effect, Register, Report, Unicast
+from flocc_agent.core.latents import Latents, Peer, Reach
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
 from flocc_protocol.codec import Pose7
@@ -23,10 +22,12 @@ from flocc_protocol.messages import OFFERS_MAX, CandidateOffer, CandidatePair
 OdometryPairOf = Callable[[KeyframeId], tuple[KeyframeId, Pose7] | None]
 """Gives a keyframe's neighbour in its log and `T_neighbour_query`, or None while it has none."""
 
+FAR_TAKEOVERS = 2
+
 
 @dataclass(slots=True)
 class _Work:
-    """A pair that this robot registers."""
+    """A pair that this robot registers; the query is its own keyframe, or the one that has an odometry pair."""
 
     pair: CandidatePair
     similarity: float
@@ -41,7 +42,7 @@ class _Work:
 
 @dataclass(slots=True)
 class _Offer:
-    """A pair that another robot is to register."""
+    """A pair that another robot is to register; `since_s`: when it was last within reach, or became an offer."""
 
     candidate: Candidate
     to: str
@@ -50,61 +51,36 @@ class _Offer:
     transferred: bool
 
 
-@dataclass(slots=True)
-class _Fetch:
-    """The state of one wanted latent: in flight until then, or paused until then."""
-
-    in_flight_until_s: float | None = None
-    not_before_s: float = 0.0
-    pause_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Range:
-    """Who is in range now, as loop closing needs it.
-
-    Attributes:
-        names: Robots in range, sorted.
-        compute_class: Of each robot in range.
-        holds: Latents that each robot in range holds for others.
-        load: Registrations that wait at each robot in range.
-    """
-
-    names: tuple[str, ...]
-    compute_class: dict[str, int]
-    holds: dict[str, tuple[KeyframeId, ...]]
-    load: dict[str, int]
-
-
 def registrar_of(pair: CandidatePair) -> LogId:
     """The owner that registers a pair, the same at both: by checksum, so that each does half."""
     return pair.low.log if zlib.crc32(f"{pair.low} {pair.high}".encode()) % 2 == 0 else pair.high.log
 
 
 class LoopClosing:
-    """Pairs, latents and registrations of one robot."""
+    """Pairs and registrations of one robot."""
 
     def __init__(
         self, own: LogId, compute_class: int, odometry_pair: OdometryPairOf, parameters: LoopClosingParameters
     ) -> None:
+        self.latents = Latents(own, parameters)
+        self.dropped = 0
         self._own = own
         self._compute_class = compute_class
         self._odometry_pair = odometry_pair
         self._parameters = parameters
+        self._reach = Reach()
         self._work: dict[CandidatePair, _Work] = {}
+        self._order: list[_Work] | None = None
         self._offers: dict[CandidatePair, _Offer] = {}
         self._resolved: set[CandidatePair] = set()
-        self._held: set[KeyframeId] = set()
-        self._fetches: dict[KeyframeId, _Fetch] = {}
-        self._relayed: dict[KeyframeId, None] = {}
-        self._range = Range((), {}, {}, {})
-        self._ticked_s = float("-inf")
-        self.dropped = 0
+        self._load = 0
+        self._changed = True
+        self._due_s = float("inf")
 
     @property
     def load(self) -> int:
-        """Registrations that wait here."""
-        return len(self._work)
+        """Registrations that wait here and can be done, with latents that are here or can be had."""
+        return self._load
 
     def open_pairs(self) -> list[CandidatePair]:
         """Pairs that this robot is to register, or waits for others to register; sorted."""
@@ -112,19 +88,20 @@ class LoopClosing:
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Queues and tables with their maximum."""
-        limits = self._parameters
+        candidates_max = self._parameters.candidates_max
         return {
-            "candidates": (len(self._work), limits.candidates_max),
-            "offers": (len(self._offers), limits.candidates_max),
-            "relayed": (len(self._relayed), limits.relays_max),
-            "fetches": (len(self._fetches), 3 * limits.candidates_max + limits.relays_max),
+            "candidates": (len(self._work), candidates_max),
+            "offers": (len(self._offers), candidates_max),
+            **self.latents.sizes(),
         }
+
+    # Pairs
 
     def on_candidates(self, candidates: Iterable[Candidate], now: float) -> list[Effect]:
         """Pairs that place recognition found here."""
         effects: list[Effect] = []
         for candidate in candidates:
-            if candidate.pair in self._resolved or candidate.pair in self._work or candidate.pair in self._offers:
+            if self._knows(candidate.pair):
                 continue
             facts = {
                 "query": str(candidate.pair.low),
@@ -135,136 +112,164 @@ class LoopClosing:
             self._assign(candidate, now)
         return effects
 
-    def on_offer(self, offer: CandidateOffer) -> None:
+    def on_offer(self, offer: CandidateOffer, now: float) -> None:
         """Pairs that another robot found and that this one is to register."""
         for pair in offer.pairs:
-            if pair in self._resolved or pair in self._work:
-                continue
-            if offer.transferred or registrar_of(pair) == self._own:
-                self._offers.pop(pair, None)
+            if offer.transferred and pair not in self._resolved and pair not in self._work:
+                self._remove(pair)
                 self._add(Candidate(pair, 0.0))
+            elif registrar_of(pair) == self._own and not self._knows(pair):
+                self._assign(Candidate(pair, 0.0), now)
+
+    def roles(self, pair: CandidatePair) -> tuple[KeyframeId, KeyframeId] | None:
+        """Query and match of a pair whose registration is waited for, None if it is not."""
+        work = self._work.get(pair)
+        return (work.query, work.match) if work else None
 
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
-        self._work.pop(pair, None)
-        self._offers.pop(pair, None)
+        self._remove(pair)
+
+    def on_keyframe(self) -> None:
+        """A log grew: a keyframe may have got the neighbour that it lacked."""
+        self._changed = True
+
+    # Latents
 
     def on_held(self, keyframe: KeyframeId) -> None:
         """A latent is in this robot's store."""
-        self._held.add(keyframe)
-        self._fetches.pop(keyframe, None)
+        self.latents.add(keyframe)
+        self._changed = True
 
-    def on_latent_missing(self, pair: CandidatePair, keyframe: KeyframeId) -> list[Effect]:
-        """The store evicted a latent; another robot's is fetched again, an own one is lost."""
-        self._held.discard(keyframe)
+    def on_latent_missing(self, pair: CandidatePair, keyframe: KeyframeId) -> list[CandidatePair]:
+        """The store evicted a latent; another robot's is fetched again, an own one is lost. Pairs to reject."""
+        self.latents.remove(keyframe)
+        self._changed = True
         work = self._work.get(pair)
         if work is not None:
             work.registering_until_s = None
-        if keyframe.log == self._own and work is not None:
-            del self._work[pair]
-            return [Report("latent_lost", {"keyframe": str(keyframe)})]
-        return []
+        return self.on_latent_lost(keyframe) if keyframe.log == self._own else []
+
+    def on_latent_lost(self, keyframe: KeyframeId) -> list[CandidatePair]:
+        """A latent exists no more: the pairs that need it, which are to be rejected."""
+        return [work.pair for work in self._sorted_work() if keyframe in self._needs(work)]
 
     def on_fetch_failed(self, keyframe: KeyframeId, now: float) -> None:
-        """Wait before the next try, longer each time."""
-        fetch = self._fetches.get(keyframe)
-        if fetch is not None:
-            fetch.in_flight_until_s = None
-            doubled = max(2 * fetch.pause_s, self._parameters.retry_s)
-            fetch.pause_s = min(doubled, self._parameters.retry_max_s)
-            fetch.not_before_s = now + fetch.pause_s
-
-    def on_registered(self, pair: CandidatePair) -> None:
-        """A registration came to an end; its record follows through `on_resolved`."""
-        self._work.pop(pair, None)
-
-    def on_range(self, in_range: Range) -> None:
-        """Who is in range changed; a latent of a robot that came back is tried at once."""
-        for name in set(in_range.names) - set(self._range.names):
-            for keyframe, fetch in self._fetches.items():
-                if keyframe.log.robot == name and fetch.in_flight_until_s is None:
-                    fetch.not_before_s, fetch.pause_s = 0.0, 0.0
-        self._range = in_range
+        """A fetch ended without the latent."""
+        self.latents.on_failed(keyframe, now)
+        self._changed = True
 
     def on_wants(self, wants: Iterable[KeyframeId]) -> None:
-        """Latents that a neighbour cannot reach: hold them for it, newest wish last."""
-        for keyframe in wants:
-            if keyframe.log != self._own:
-                self._relayed.pop(keyframe, None)
-                self._relayed[keyframe] = None
-        while len(self._relayed) > self._parameters.relays_max:
-            del self._relayed[next(iter(self._relayed))]
+        """Latents that a neighbour cannot reach."""
+        self._changed |= self.latents.on_wants(wants)
 
-    def wants(self) -> tuple[KeyframeId, ...]:
+    def wants(self, now: float) -> tuple[KeyframeId, ...]:
         """Latents this robot needs, or relays, and cannot reach."""
-        needed = [k for work in self._sorted_work() for k in self._lacking(work)]
-        missing = [k for k in [*needed, *self._relayed] if k not in self._held and self._holder(k) is None]
-        return tuple(dict.fromkeys(missing))[: self._parameters.wants_max]
+        return self.latents.wants(self._lacking_all(), self._reach, now)
 
     def holds(self) -> tuple[KeyframeId, ...]:
         """Latents of others that this robot holds because somebody wanted them."""
-        return tuple(k for k in self._relayed if k in self._held)[: self._parameters.relays_max]
+        return self.latents.holds()
+
+    # Range
+
+    def on_peer(self, name: str, peer: Peer) -> None:
+        """A robot in range said how it is; one that comes into range is tried at once."""
+        if name not in self._reach:
+            self.latents.on_reached(name)
+        self._changed |= self._reach.update(name, peer)
+
+    def on_lost(self, name: str, now: float) -> None:
+        """A robot is out of range; the pairs that it was to register wait for `takeover_s`."""
+        self._reach.remove(name)
+        for offer in self._offers.values():
+            if offer.to == name:
+                offer.since_s = now
+        self._changed = True
+
+    # Time
 
     def tick(self, now: float) -> list[Effect]:
         """Do whatever can be done now: offers, fetches, registrations."""
-        self._ticked_s = now
+        if not self._changed and now < self._due_s:
+            return []
         self._give_up(now)
-        return [*self._tell(now), *self._fetch(now), *self._register(now)]
+        effects = [*self._tell(now), *self.latents.fetch(self._lacking_all(), self._reach, now), *self._register(now)]
+        self._changed = False
+        self._load = sum(self._can_be_done(work) for work in self._work.values())
+        self._due_s = self._next_due_s(now)
+        return effects
 
     def deadline(self) -> float:
         """When `tick` is due next."""
-        times = [offer.next_s for offer in self._offers.values()]
+        return self._due_s
+
+    def _next_due_s(self, now: float) -> float:
+        times = [self._offer_due_s(offer) for offer in self._offers.values()]
         times += [work.registering_until_s for work in self._work.values() if work.registering_until_s is not None]
-        times += [fetch.in_flight_until_s or fetch.not_before_s for fetch in self._fetches.values()]
-        return min((time for time in times if time > self._ticked_s), default=float("inf"))
+        return min((time for time in (*times, self.latents.due_s(now)) if time > now), default=float("inf"))
+
+    def _offer_due_s(self, offer: _Offer) -> float:
+        return offer.next_s if offer.to in self._reach else self._takeover_at_s(offer)
+
+    def _takeover_at_s(self, offer: _Offer) -> float:
+        """When the finder may register a pair itself; later where it takes others to bring the latents."""
+        pair = offer.candidate.pair
+        at_hand = offer.transferred or (pair.low in self.latents and pair.high in self.latents)
+        return offer.since_s + self._parameters.takeover_s * (1 if at_hand else FAR_TAKEOVERS)
 
     # Assignment
+
+    def _knows(self, pair: CandidatePair) -> bool:
+        return pair in self._resolved or pair in self._work or pair in self._offers
 
     def _assign(self, candidate: Candidate, now: float) -> None:
         owner = registrar_of(candidate.pair)
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
-            self._offers[candidate.pair] = _Offer(candidate, owner.robot, now, now, transferred=False)
+            self._offer(_Offer(candidate, owner.robot, now, now, transferred=False))
             return
-        stronger = self._stronger()
+        stronger = self._reach.stronger(self._compute_class)
         if stronger is not None:
-            self._offers[candidate.pair] = _Offer(candidate, stronger, now, now, transferred=True)
+            self._offer(_Offer(candidate, stronger, now, now, transferred=True))
             return
         self._add(candidate)
 
-    def _stronger(self) -> str | None:
-        """The neighbour of the highest compute class above this robot's, the least loaded of several."""
-        better = [
-            (-self._range.compute_class[name], self._range.load[name], name)
-            for name in self._range.names
-            if self._range.compute_class[name] > self._compute_class
-        ]
-        return min(better)[2] if better else None
+    def _offer(self, offer: _Offer) -> None:
+        self._offers[offer.candidate.pair] = offer
+        self._changed = True
+        if len(self._offers) > self._parameters.candidates_max:
+            del self._offers[max(self._offers, key=lambda pair: (-self._offers[pair].candidate.similarity, pair))]
+            self.dropped += 1
 
     def _add(self, candidate: Candidate) -> None:
         query, match = candidate.pair.low, candidate.pair.high
         if match.log == self._own:
             query, match = match, query
         self._work[candidate.pair] = _Work(candidate.pair, candidate.similarity, query, match)
+        self._order, self._changed = None, True
         if len(self._work) > self._parameters.candidates_max:
             waiting = [work for work in self._work.values() if work.registering_until_s is None]
-            del self._work[max(waiting, key=_Work.order).pair]
+            self._remove(max(waiting, key=_Work.order).pair)
             self.dropped += 1
+
+    def _remove(self, pair: CandidatePair) -> None:
+        if self._work.pop(pair, None) is not None:
+            self._order, self._changed = None, True
+        self._offers.pop(pair, None)
 
     # What is due
 
     def _tell(self, now: float) -> list[Effect]:
         """Tell robots in range what is theirs to register; take over from those that are gone."""
         due: dict[tuple[str, bool], list[CandidatePair]] = {}
-        for pair, offer in sorted(self._offers.items()):
-            if offer.to not in self._range.names:
-                if self._may_take_over(offer, now):
-                    del self._offers[pair]
-                    self._add(offer.candidate)
-                continue
-            offer.since_s = now
-            if offer.next_s <= now:
-                due.setdefault((offer.to, offer.transferred), []).append(pair)
+        for pair, offer in sorted(self._offers.items()) if self._offers else ():
+            if offer.to in self._reach:
+                if offer.next_s <= now:
+                    due.setdefault((offer.to, offer.transferred), []).append(pair)
+            elif self._takeover_at_s(offer) <= now:
+                del self._offers[pair]
+                self._add(offer.candidate)
         effects: list[Effect] = []
         for (to, transferred), pairs in sorted(due.items()):
             for pair in pairs[:OFFERS_MAX]:
@@ -272,40 +277,13 @@ class LoopClosing:
             effects.append(Unicast(to, CandidateOffer(tuple(pairs[:OFFERS_MAX]), transferred)))
         return effects
 
-    def _may_take_over(self, offer: _Offer, now: float) -> bool:
-        if offer.since_s + self._parameters.takeover_s > now:
-            return False
-        return offer.transferred or {offer.candidate.pair.low, offer.candidate.pair.high} <= self._held
-
-    def _fetch(self, now: float) -> list[Effect]:
-        in_flight = sum(fetch.in_flight_until_s is not None for fetch in self._fetches.values())
-        effects: list[Effect] = []
-        needed = self._needed()
-        self._forget_fetches(needed)
-        for keyframe in needed:
-            if in_flight >= self._parameters.fetches_max:
-                break
-            fetch = self._fetches.setdefault(keyframe, _Fetch())
-            holder = self._holder(keyframe)
-            if fetch.in_flight_until_s is not None or fetch.not_before_s > now or holder is None:
-                continue
-            fetch.in_flight_until_s = now + self._parameters.fetch_timeout_s
-            in_flight += 1
-            effects.append(FetchLatent(keyframe, holder, self._parameters.fetch_timeout_s))
-        return effects
-
-    def _forget_fetches(self, needed: list[KeyframeId]) -> None:
-        idle = [k for k, fetch in self._fetches.items() if fetch.in_flight_until_s is None]
-        for keyframe in set(idle) - set(needed):
-            del self._fetches[keyframe]
-
     def _register(self, now: float) -> list[Effect]:
         busy = sum(work.registering_until_s is not None for work in self._work.values())
         effects: list[Effect] = []
         for work in self._sorted_work():
             if busy >= self._parameters.registrations_max:
                 break
-            odometry = self._odometry_pair(work.query)
+            odometry = self._odometry_of(work)
             if work.registering_until_s is not None or odometry is None or self._lacking(work):
                 continue
             work.registering_until_s = now + self._parameters.registration_timeout_s
@@ -315,33 +293,38 @@ class LoopClosing:
 
     def _give_up(self, now: float) -> None:
         """Forget what gave no answer, so that it is tried again."""
-        for keyframe, fetch in self._fetches.items():
-            if fetch.in_flight_until_s is not None and fetch.in_flight_until_s <= now:
-                self.on_fetch_failed(keyframe, now)
+        self.latents.give_up(now)
         for work in self._work.values():
             if work.registering_until_s is not None and work.registering_until_s <= now:
                 work.registering_until_s = None
 
-    # Latents
+    def _odometry_of(self, work: _Work) -> tuple[KeyframeId, Pose7] | None:
+        """The query's odometry pair; where a log has one keyframe only, the pair is taken the other way round."""
+        odometry = self._odometry_pair(work.query)
+        if odometry is None and work.registering_until_s is None:
+            odometry = self._odometry_pair(work.match)
+            if odometry is not None:
+                work.query, work.match = work.match, work.query
+        return odometry
 
-    def _needed(self) -> list[KeyframeId]:
-        """Latents to fetch, the most similar pair's first, relayed ones last."""
-        needed = [k for work in self._sorted_work() for k in self._lacking(work)]
-        return [k for k in dict.fromkeys([*needed, *self._relayed]) if k not in self._held]
+    def _needs(self, work: _Work) -> list[KeyframeId]:
+        """Latents that a pair needs: of the match, the query and the query's neighbour."""
+        odometry = self._odometry_of(work)
+        return [work.match, work.query, *([odometry[0]] if odometry else [])]
 
     def _lacking(self, work: _Work) -> list[KeyframeId]:
         """Latents that a pair needs and the store does not hold."""
-        odometry = self._odometry_pair(work.query)
-        needed = [work.match, work.query, *([odometry[0]] if odometry else [])]
-        return [k for k in needed if k not in self._held]
+        return [k for k in self._needs(work) if k not in self.latents]
 
-    def _holder(self, keyframe: KeyframeId) -> str | None:
-        """Who in range can give a latent: its owner, or a robot that holds it."""
-        if keyframe.log == self._own:
-            return None
-        if keyframe.log.robot in self._range.names:
-            return keyframe.log.robot
-        return next((name for name in self._range.names if keyframe in self._range.holds[name]), None)
+    def _can_be_done(self, work: _Work) -> bool:
+        in_reach = all(self._reach.holder(keyframe) is not None for keyframe in self._lacking(work))
+        return in_reach and self._odometry_of(work) is not None
+
+    def _lacking_all(self) -> Iterator[KeyframeId]:
+        """Latents to fetch, the most similar pair's first."""
+        return (k for work in self._sorted_work() for k in self._lacking(work))
 
     def _sorted_work(self) -> list[_Work]:
-        return sorted(self._work.values(), key=_Work.order)
+        if self._order is None:
+            self._order = sorted(self._work.values(), key=_Work.order)
+        return self._order

@@ -27,6 +27,7 @@ class Neighbours:
         self._parameters = parameters
         self._by_name: dict[str, Neighbour] = {}
         self._duplicates: set[str] = set()
+        self._due_s = float("inf")
 
     def __contains__(self, name: str) -> bool:
         return name in self._by_name
@@ -48,22 +49,26 @@ class Neighbours:
             if len(self._by_name) >= self._parameters.neighbours_max:
                 return [Report("peer_refused", {"peer": sender.robot, "reason": "too many neighbours"})]
             self._by_name[sender.robot] = Neighbour(sender, heartbeat, now)
+            self._due_s = min(self._due_s, self._expires_s(sender.robot))
             return [Report("neighbour_up", {"peer": sender.robot, "log": str(sender)})]
         effects = self._restarted(known, sender, heartbeat)
         known.log, known.heartbeat, known.heard_s = sender, heartbeat, now
         return effects
 
-    def tick(self, now: float) -> list[Effect]:
-        """Drop robots that were silent for too long."""
+    def tick(self, now: float) -> list[str]:
+        """Drop robots that were silent for too long; their names, sorted."""
+        if now < self._due_s:
+            return []
         gone = [name for name in self.names() if self._expires_s(name) <= now]
         for name in gone:
             del self._by_name[name]
             self._duplicates.discard(name)
-        return [Report("neighbour_down", {"peer": name}) for name in gone]
+        self._due_s = min((self._expires_s(name) for name in self._by_name), default=float("inf"))
+        return gone
 
     def deadline(self) -> float:
-        """When the next neighbour would be dropped."""
-        return min((self._expires_s(name) for name in self._by_name), default=float("inf"))
+        """When a neighbour may have to be dropped; one that was heard meanwhile stays."""
+        return self._due_s
 
     def _expires_s(self, name: str) -> float:
         return self._by_name[name].heard_s + self._parameters.timeout_s

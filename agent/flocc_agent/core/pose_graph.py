@@ -125,6 +125,9 @@ class Component:
         T_map_odom: (4, 4) of each log: `T_map_keyframe[-1] @ inverse(T_odom_keyframe[-1])`.
         covariance_map_odom: (6, 6) marginal covariance of each log's `T_map_odom`, or None where not computed.
         cost: Sum of half squared weighted residuals at the solution.
+        cost_initial: The same where the solver started.
+        covariance_keyframe: (6, 6) marginal covariance of keyframes that were asked for, in their own tangent spaces.
+        T_map_world: (4, 4) pose of the fixes' world frame, or None without fixes.
     """
 
     logs: tuple[LogId, ...]
@@ -132,6 +135,9 @@ class Component:
     T_map_odom: Mapping[LogId, Float]
     covariance_map_odom: Mapping[LogId, Float | None]
     cost: float = 0.0
+    cost_initial: float = 0.0
+    covariance_keyframe: Mapping[KeyframeId, Float] = field(default_factory=dict)
+    T_map_world: Float | None = None
 
     @property
     def anchor(self) -> LogId:

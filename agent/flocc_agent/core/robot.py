@@ -14,6 +14,7 @@ from flocc_agent.core.corrections import Corrections, pose7, upper_triangle
 from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
+    LATENT_UNKNOWN,
     Event,
     FixMeasured,
     GraphOptimisationFailed,
@@ -28,8 +29,9 @@ from flocc_agent.core.events import (
     MessageReceived,
     PairRegistered,
 )
-from flocc_agent.core.gossip import Gossip, NewRecord
-from flocc_agent.core.loop_closing import LoopClosing, Range
+from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
+from flocc_agent.core.latents import Peer
+from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.place_recognition import PlaceRecognition
@@ -46,6 +48,7 @@ from flocc_protocol.messages import (
     Coordinator,
     CorrectionMessage,
     CorrectionRequest,
+    CorrectionVersion,
     Election,
     Envelope,
     Handover,
@@ -81,6 +84,10 @@ class Restored:
     term_counter: int = 0
     correction: CorrectionMessage | None = None
 
+    def counter_max(self) -> int:
+        """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
+        return max(self.term_counter, self.correction.term.counter if self.correction else 0)
+
 
 @dataclass(slots=True)
 class _Pending:
@@ -105,6 +112,7 @@ class Robot:
         parameters: CoreParameters,
         now: float,
         restored: Restored | None = None,
+        sealer: Sealer | None = None,
     ) -> None:
         restored = restored or Restored()
         self.log = log
@@ -115,12 +123,12 @@ class Robot:
         self._heartbeat_due_s = now
         self._pending: list[_Pending] = []
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
-        self.gossip = Gossip(log, parameters.gossip)
+        self.gossip = Gossip(log, parameters.gossip, sealer)
         self.assembly = GraphAssembly()
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing)
         self.corrections = Corrections(log, parameters.gossip, parameters.rounds)
-        self.election = LeaderElection(log, compute_class, restored.term_counter, parameters.election, now)
+        self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self._restore(restored, now)
 
@@ -178,16 +186,15 @@ class Robot:
                 self.closing.on_held(keyframe)
                 return [Report("latent_fetched", {"keyframe": str(keyframe), "holder": holder})]
             case LatentFetchFailed(keyframe, holder, reason):
-                self.closing.on_fetch_failed(keyframe, now)
-                return [Report("latent_failed", {"keyframe": str(keyframe), "holder": holder, "reason": reason})]
+                return self._on_fetch_failed(keyframe, holder, reason, now)
             case PairRegistered(pair, result):
                 return self._on_registered(pair, result, now)
             case LatentMissing(pair, keyframe):
-                return self.closing.on_latent_missing(pair, keyframe)
+                return self._reject_lost(self.closing.on_latent_missing(pair, keyframe), keyframe, now)
             case GraphOptimised():
                 return self._on_optimised(event)
             case GraphOptimisationFailed(term, round_number, reason):
-                self.rounds.on_failed(term, round_number)
+                self.rounds.on_failed(term, round_number, now)
                 return [Report("optimisation_failed", {"term": str(term), "round": round_number, "reason": reason})]
             case FixMeasured():
                 return self._on_fix(event, now)
@@ -215,11 +222,11 @@ class Robot:
             case RecordRequest():
                 return self.gossip.on_request(sender, message)
             case CorrectionMessage():
-                return self.election.on_applied(message.term) + self.corrections.on_message(message)
+                return self._on_correction(sender, message)
             case CorrectionRequest():
                 return self.corrections.on_request(sender.robot, message)
             case CandidateOffer():
-                self.closing.on_offer(message)
+                self.closing.on_offer(message, now)
                 return []
 
     def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
@@ -228,8 +235,36 @@ class Robot:
             return effects
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self.gossip.on_digests(sender, heartbeat.digests, now)
-        effects += self.corrections.on_versions(sender.robot, heartbeat.corrections, now)
+        effects += self._on_versions(sender, heartbeat.corrections, now)
+        self.closing.on_peer(sender.robot, Peer(heartbeat.compute_class, heartbeat.load, heartbeat.holds))
         self.closing.on_wants(heartbeat.wants)
+        return effects
+
+    def _on_correction(self, sender: LogId, message: CorrectionMessage) -> list[Effect]:
+        """A correction of an absurd term would fence out every leader to come."""
+        refused = self.election.on_applied(sender, message.term)
+        return refused or self.corrections.on_message(message)
+
+    def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
+        """What others apply: a leader outbids it, and whoever has something older asks for it."""
+        if not versions:
+            return []
+        refused = self.election.on_applied(sender, max(version.term for version in versions))
+        return refused or self.corrections.on_versions(sender.robot, versions, now)
+
+    def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
+        """Try again later, unless the owner itself no longer has the latent."""
+        self.closing.on_fetch_failed(keyframe, now)
+        report = Report("latent_failed", {"keyframe": str(keyframe), "holder": holder, "reason": reason})
+        lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
+        return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe) if lost else [], keyframe, now)]
+
+    def _reject_lost(self, pairs: list[CandidatePair], keyframe: KeyframeId, now: float) -> list[Effect]:
+        """Pairs whose latent exists no more are rejected, so that nobody waits for them."""
+        effects: list[Effect] = [Report("latent_lost", {"keyframe": str(keyframe)})] if pairs else []
+        for pair in pairs:
+            record = RejectionRecord(pair.low, pair.high, "a latent was lost", 0, 0)
+            effects += [*self._append(record, now), judgement_report(record, self.log)]
         return effects
 
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
@@ -260,13 +295,19 @@ class Robot:
     def _on_registered(
         self, pair: CandidatePair, result: Registration | RegistrationFailed, now: float
     ) -> list[Effect]:
-        """Accept by the ratio of Eq. (1), or refuse; either way a record says so to everybody."""
-        self.closing.on_registered(pair)
-        record = self._judge(pair, result)
+        """Accept by the ratio of Eq. (1), or refuse; either way a record says so to everybody.
+
+        A pair that another robot's record resolved in the meantime needs no second one.
+        """
+        roles = self.closing.roles(pair)
+        if roles is None:
+            return []
+        record = self._judge(*roles, result)
         return [*self._append(record, now), judgement_report(record, self.log)]
 
-    def _judge(self, pair: CandidatePair, result: Registration | RegistrationFailed) -> ClosureRecord | RejectionRecord:
-        query, match = (pair.high, pair.low) if pair.high.log == self.log else (pair.low, pair.high)
+    def _judge(
+        self, query: KeyframeId, match: KeyframeId, result: Registration | RegistrationFailed
+    ) -> ClosureRecord | RejectionRecord:
         counts = (result.correspondences, result.odometry_correspondences)
         if isinstance(result, RegistrationFailed):
             return RejectionRecord(query, match, result.failure.value, *counts)
@@ -299,9 +340,11 @@ class Robot:
         for new in new_records:
             self.assembly.add(new)
             match new.record:
-                case KeyframeRecord(index, _, _, descriptor) if descriptor is not None:
-                    found = self.recognition.on_keyframe(KeyframeId(new.log, index), descriptor.numpy())
-                    effects += self.closing.on_candidates(found, now)
+                case KeyframeRecord(index, _, _, descriptor):
+                    self.closing.on_keyframe()
+                    if descriptor is not None:
+                        found = self.recognition.on_keyframe(KeyframeId(new.log, index), descriptor.numpy())
+                        effects += self.closing.on_candidates(found, now)
                 case ClosureRecord(query, match) | RejectionRecord(query, match):
                     self.closing.on_resolved(CandidatePair.of(query, match))
                 case _:
@@ -338,34 +381,23 @@ class Robot:
                     load=self.closing.load,
                     digests=self.gossip.digests(),
                     corrections=self.corrections.versions(),
-                    wants=self.closing.wants(),
+                    wants=self.closing.wants(now),
                     holds=self.closing.holds(),
                 )
             )
         ]
 
     def _lose_silent(self, now: float) -> list[Effect]:
-        before = set(self.neighbours.names())
-        effects = self.neighbours.tick(now)
-        for name in sorted(before - set(self.neighbours.names())):
+        gone = self.neighbours.tick(now)
+        for name in gone:
             self.election.on_lost(name)
-        return effects
+            self.closing.on_lost(name, now)
+        return [Report("neighbour_down", {"peer": name}) for name in gone]
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
-        self.closing.on_range(self._range())
         self.rounds.on_term(self.election.term if self.election.leading else None)
         return [*self.closing.tick(now), *self.rounds.tick(now)]
-
-    def _range(self) -> Range:
-        names = tuple(self.neighbours.names())
-        heartbeats = {name: known.heartbeat for name in names if (known := self.neighbours.get(name))}
-        return Range(
-            names=names,
-            compute_class={name: heartbeat.compute_class for name, heartbeat in heartbeats.items()},
-            holds={name: heartbeat.holds for name, heartbeat in heartbeats.items()},
-            load={name: heartbeat.load for name, heartbeat in heartbeats.items()},
-        )
 
 
 def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:

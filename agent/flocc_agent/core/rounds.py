@@ -6,7 +6,7 @@ from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
 from flocc_protocol.ids import Term
 
-Shape = tuple[int, int, int]
+FAILURES_MAX = 6
 
 
 class Rounds:
@@ -18,8 +18,9 @@ class Rounds:
         self._term: Term | None = None
         self._round = 0
         self._running_until_s: float | None = None
-        self._next_s = 0.0
-        self._started: tuple[Shape, int] | None = None
+        self._next_s = float("-inf")
+        self._started: tuple[int, int] | None = None
+        self._failures = 0
         self._solution: GraphSolution | None = None
 
     @property
@@ -40,19 +41,20 @@ class Rounds:
         if not self._awaits(term, round_number):
             return False
         self._running_until_s = None
+        self._failures = 0
         self._solution = solution
         return True
 
-    def on_failed(self, term: Term, round_number: int) -> None:
-        """A round without a solution: the last one stands, the next change tries again."""
+    def on_failed(self, term: Term, round_number: int, now: float) -> None:
+        """A round without a solution: the last one stands; it is tried again, after a growing pause."""
         if self._awaits(term, round_number):
-            self._running_until_s = None
+            self._try_again(now)
 
     def tick(self, now: float) -> list[Effect]:
         """Give up a round that is overdue, start one that is wanted."""
         effects: list[Effect] = []
         if self._running_until_s is not None and self._running_until_s <= now:
-            self._running_until_s = None
+            self._try_again(now)
             effects.append(Report("round_timeout", {"term": str(self._term), "round": self._round}))
         if self._term is None or self._running_until_s is not None or self._next_s > now or not self._stale():
             return effects
@@ -70,8 +72,14 @@ class Rounds:
         self._round += 1
         self._running_until_s = now + self._parameters.timeout_s
         self._next_s = now + self._parameters.period_s
-        self._started = (self._assembly.shape, self._assembly.keyframes)
+        self._started = (self._assembly.revision, self._assembly.keyframes)
         return Optimise(term, self._round, self._assembly.graph(), self._solution)
+
+    def _try_again(self, now: float) -> None:
+        self._running_until_s = None
+        self._started = None
+        self._failures = min(self._failures + 1, FAILURES_MAX)
+        self._next_s = max(self._next_s, now + self._parameters.period_s * 2**self._failures)
 
     def _stale(self) -> bool:
         """Whether the last started round of this term missed a log, a closure, a fix or many keyframes."""
@@ -79,9 +87,9 @@ class Rounds:
             return False
         if self._started is None:
             return True
-        shape, keyframes = self._started
+        revision, keyframes = self._started
         grown = self._assembly.keyframes - keyframes
-        return shape != self._assembly.shape or grown >= self._parameters.keyframes_per_round
+        return revision != self._assembly.revision or grown >= self._parameters.keyframes_per_round
 
     def _awaits(self, term: Term, round_number: int) -> bool:
         return self._running_until_s is not None and (term, round_number) == (self._term, self._round)

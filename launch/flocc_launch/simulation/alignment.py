@@ -24,9 +24,7 @@ Float = NDArray[np.float64]
 def align(graph: PoseGraph, _initial: GraphSolution | None = None) -> GraphSolution:
     """Place every log in its component's map frame; trusts the closures it comes across first."""
     groups = components_of(list(graph.trajectories), graph.closures)
-    used = [
-        ClosureResult(c.query, c.match, ClosureState.USED, 1.0, c.scale_initial, 0.0) for c in graph.closures
-    ]
+    used = [ClosureResult(c.query, c.match, ClosureState.USED, 1.0, c.scale_initial, 0.0) for c in graph.closures]
     return GraphSolution(tuple(_component(logs, graph) for logs in groups), tuple(used))
 
 

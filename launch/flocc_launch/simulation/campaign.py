@@ -12,10 +12,11 @@ from dataclasses import asdict, dataclass
 from flocc_agent.composition import build_perception
 from flocc_launch.scenario import FaultKind, Scenario
 from flocc_launch.simulation.alignment import align
-from flocc_launch.simulation.checkers import Checker, Violation, Watch, all_checkers
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.faults import schedule
 from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_launch.simulation.invariants import Invariant, Violation, Watch
+from flocc_launch.simulation.safety import all_invariants
 from flocc_launch.simulation.simulate import playbacks_of
 from flocc_launch.simulation.swarm import Equipment, Swarm
 
@@ -51,20 +52,17 @@ class Campaign:
         settled = sorted(o.settled_after_s for o in self.outcomes if o.settled_after_s is not None)
         return {
             "runs": len(self.outcomes),
-            "violations": [
-                {"seed": o.seed, **asdict(violation)} for o in self.outcomes for violation in o.violations
-            ],
+            "violations": [{"seed": o.seed, **asdict(violation)} for o in self.outcomes for violation in o.violations],
             "settled_after_s": {"median": settled[len(settled) // 2], "max": settled[-1]} if settled else None,
         }
 
 
-def campaign(
-    seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[Outcome], None] = lambda outcome: None
-) -> Campaign:
+def campaign(seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[Outcome], None] | None = None) -> Campaign:
     """Run every seed, in several processes; `on_outcome` hears of each run in the order of the seeds."""
     outcomes: list[Outcome] = []
     for outcome in _outcomes(list(seeds), processes):
-        on_outcome(outcome)
+        if on_outcome is not None:
+            on_outcome(outcome)
         outcomes.append(outcome)
     return Campaign(tuple(outcomes))
 
@@ -85,7 +83,7 @@ def run_seed(seed: int) -> Outcome:
 def run_checked(scenario: Scenario) -> Outcome:
     """Run a scenario under all checkers; a crash of the core is a violation like any other."""
     swarm = prepared(scenario)
-    watch = Watch(swarm, checkers_of(scenario))
+    watch = Watch(swarm, invariants_of(scenario))
     try:
         settled_after_s = _run(swarm, watch)
     except Exception:  # noqa: BLE001 - whatever the core throws is what the campaign looks for
@@ -97,12 +95,12 @@ def run_checked(scenario: Scenario) -> Outcome:
     return Outcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s)
 
 
-def checkers_of(scenario: Scenario) -> list[Checker]:
+def invariants_of(scenario: Scenario) -> list[Invariant]:
     """All invariants; two robots may register one pair only where they could not hear each other for a while."""
     separating = any(fault.kind in SEPARATING for fault in scenario.faults)
     links = [scenario.radio, *scenario.radio.overrides]
     lossy = any(link.loss_ratio or link.burst_ratio or link.bandwidth_bytes_s for link in links)
-    return all_checkers(separating or lossy or scenario.radio.range_m is not None)
+    return all_invariants(separating or lossy or scenario.radio.range_m is not None)
 
 
 def prepared(scenario: Scenario) -> Swarm:
@@ -135,5 +133,3 @@ def _run(swarm: Swarm, watch: Watch) -> float | None:
             return swarm.agenda.now_s - FAULTS_END_S
         swarm.run_until(swarm.agenda.now_s + LOOK_S)
     return None
-
-

@@ -71,7 +71,7 @@ def _override(rng: np.random.Generator, names: list[str]) -> LinkOverrideConfig:
     """One direction of one link is of another quality, perhaps dead."""
     sender, receiver = (str(name) for name in rng.choice(names, size=2, replace=False))
     link = {"loss_ratio": 1.0} if rng.uniform() < 0.3 else _link(rng)
-    return LinkOverrideConfig(sender=sender, receiver=receiver, **link)  # type: ignore[arg-type]
+    return LinkOverrideConfig(sender=sender, receiver=receiver, **link)
 
 
 def _faults(rng: np.random.Generator, names: list[str]) -> tuple[Fault, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from flocc_agent.radio import Radio
 from flocc_launch.simulation.agenda import Agenda
-from flocc_protocol.messages import Envelope, Message, decode, encode, kind_of
+from flocc_protocol.messages import Envelope, decode, encode, kind_of
 
 Receive = Callable[[str, Envelope], None]
 
@@ -87,5 +87,3 @@ class _Packet:
         if self.decoded is None:
             self.decoded = decode(self.data)
         return self.decoded
-
-

@@ -26,12 +26,14 @@ class Capture:
         T_odom_body: (4, 4) by odometry, metres.
         load: Gives the image.
         source: Image file, or None where there is none.
+        camera_key: What the image means beyond its pixels: the intrinsics.
     """
 
     stamp_s: float
     T_odom_body: Float
     load: Callable[[], Image]
     source: Path | None = None
+    camera_key: bytes = b""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +83,7 @@ def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
             frames[k].T_odom_body,
             lambda frame=frames[k]: recording.load_image(frame),  # type: ignore[misc]
             frames[k].image_path,
+            repr(recording.camera).encode(),
         )
         for k in chosen
     )

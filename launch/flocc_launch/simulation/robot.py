@@ -6,7 +6,6 @@ memory is gone: answers of workers and links that belong to an earlier life are 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
@@ -222,5 +221,3 @@ class Station:
                 self.disk.correction = correction
             case Deliver() | Report():
                 pass
-
-

@@ -1,7 +1,7 @@
 """A whole swarm on virtual time: stations, links, latents, and what happens to them over time."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ class Equipment:
 
     eyes: Eyes
     optimiser: Optimiser
-    times: WorkTimes = WorkTimes()
+    times: WorkTimes = field(default_factory=WorkTimes)
 
 
 class Swarm:

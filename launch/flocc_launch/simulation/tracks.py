@@ -41,10 +41,10 @@ def _walk(scenario: TracksScenario, drift: DriftSpec, rng: np.random.Generator) 
     ring_m = _rounded(_block(scenario, rng))
     steps = max(2, round(scenario.length_m / STEP_M))
     start = int(rng.integers(len(ring_m)))
-    points_m = ring_m[(start + np.arange(steps + 1)) % len(ring_m)]
+    points_m: Float = ring_m[(start + np.arange(steps + 1)) % len(ring_m)]
     ahead = np.diff(points_m, axis=0)
     heading_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
-    stamps_s = np.arange(steps) * (STEP_M / scenario.speed_m_s)
+    stamps_s: Float = np.arange(steps) * (STEP_M / scenario.speed_m_s)
     truth = Trajectory(stamps_s, np.array([_standing(p, h) for p, h in zip(points_m, heading_rad, strict=False)]))
     return Walk(truth, drifted(truth, drift, rng))
 
@@ -70,7 +70,7 @@ def _rounded(ring_m: Float) -> Float:
     """Round the corners of a closed way (N, 2) by a moving mean."""
     width = min(max(1, round(CORNER_M / STEP_M)), len(ring_m) // 4)
     shifted = [np.roll(ring_m, k - width // 2, axis=0) for k in range(width)]
-    return np.asarray(np.mean(shifted, axis=0))
+    return np.asarray(np.mean(shifted, axis=0), dtype=np.float64)
 
 
 def _standing(point_m: Float, heading_rad: float) -> Float:

@@ -1,0 +1,194 @@
+"""Latents: which are here, which are being fetched, and which are kept for robots that cannot reach their owner.
+
+A latent out of reach is asked of relays: heartbeats carry what a robot wants, and neighbours that can reach the
+owner fetch and hold it. Failed fetches are tried again after growing pauses.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from flocc_agent.core.effects import Effect, FetchLatent
+from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_protocol.ids import KeyframeId, LogId
+
+PAUSED_MAX = 1024
+WANTS_TURN_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A robot in range, as loop closing needs it.
+
+    Attributes:
+        compute_class: 0 (small) to 9.
+        load: Registrations that wait there.
+        holds: Latents that it holds for others.
+    """
+
+    compute_class: int
+    load: int = 0
+    holds: tuple[KeyframeId, ...] = ()
+
+
+class Reach:
+    """Who is in range, and what can be had from whom."""
+
+    def __init__(self) -> None:
+        self._peers: dict[str, Peer] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._peers
+
+    def update(self, name: str, peer: Peer) -> bool:
+        """Note a robot in range; whether that changes what can be had."""
+        known = self._peers.get(name)
+        self._peers[name] = peer
+        return known is None or (known.compute_class, known.holds) != (peer.compute_class, peer.holds)
+
+    def remove(self, name: str) -> None:
+        """A robot is out of range."""
+        self._peers.pop(name, None)
+
+    def stronger(self, compute_class: int) -> str | None:
+        """The neighbour of the highest compute class above this one, the least loaded of several."""
+        better = [
+            (-peer.compute_class, peer.load, name)
+            for name, peer in self._peers.items()
+            if peer.compute_class > compute_class
+        ]
+        return min(better)[2] if better else None
+
+    def holder(self, keyframe: KeyframeId) -> str | None:
+        """Who in range can give a latent: its owner, or a robot that holds it."""
+        if keyframe.log.robot in self._peers:
+            return keyframe.log.robot
+        return min((name for name, peer in self._peers.items() if keyframe in peer.holds), default=None)
+
+
+@dataclass(slots=True)
+class _Fetch:
+    """The state of one wanted latent: in flight until then, or paused until then."""
+
+    in_flight_until_s: float | None = None
+    not_before_s: float = float("-inf")
+    pause_s: float = 0.0
+
+    def due_s(self) -> float:
+        """When something is to be done about it."""
+        return self.not_before_s if self.in_flight_until_s is None else self.in_flight_until_s
+
+
+class Latents:
+    """The latents of one robot's store, fetches under way, and wishes of others."""
+
+    def __init__(self, own: LogId, parameters: LoopClosingParameters) -> None:
+        self._own = own
+        self._parameters = parameters
+        self._held: set[KeyframeId] = set()
+        self._fetches: dict[KeyframeId, _Fetch] = {}
+        self._relayed: dict[KeyframeId, None] = {}
+
+    def __contains__(self, keyframe: KeyframeId) -> bool:
+        return keyframe in self._held
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        limits = self._parameters
+        return {
+            "relayed": (len(self._relayed), limits.relays_max),
+            "fetches": (len(self._fetches), PAUSED_MAX + limits.fetches_max),
+        }
+
+    def add(self, keyframe: KeyframeId) -> None:
+        """A latent is in this robot's store."""
+        self._held.add(keyframe)
+        self._fetches.pop(keyframe, None)
+
+    def remove(self, keyframe: KeyframeId) -> None:
+        """The store evicted a latent."""
+        self._held.discard(keyframe)
+
+    def on_failed(self, keyframe: KeyframeId, now: float) -> None:
+        """Wait before the next try, longer each time."""
+        fetch = self._fetches.get(keyframe)
+        if fetch is not None:
+            fetch.in_flight_until_s = None
+            doubled = max(2 * fetch.pause_s, self._parameters.retry_s)
+            fetch.pause_s = min(doubled, self._parameters.retry_max_s)
+            fetch.not_before_s = now + fetch.pause_s
+
+    def on_reached(self, name: str) -> None:
+        """A robot came into range: what it holds is tried at once."""
+        for keyframe, fetch in self._fetches.items():
+            if keyframe.log.robot == name and fetch.in_flight_until_s is None:
+                fetch.not_before_s, fetch.pause_s = float("-inf"), 0.0
+
+    def on_wants(self, wants: Iterable[KeyframeId]) -> bool:
+        """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new."""
+        new = False
+        for keyframe in wants:
+            if keyframe.log != self._own:
+                new |= keyframe not in self._relayed
+                self._relayed.pop(keyframe, None)
+                self._relayed[keyframe] = None
+        while len(self._relayed) > self._parameters.relays_max:
+            del self._relayed[next(iter(self._relayed))]
+        return new
+
+    def wants(self, needed: Iterable[KeyframeId], reach: Reach, now: float) -> tuple[KeyframeId, ...]:
+        """A few of the needed latents, and of those relayed, that nobody in range can give.
+
+        Others have their turn every `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
+        """
+        wanted = dict.fromkeys(k for k in (*needed, *self._relayed) if self._out_of_reach(k, reach))
+        count = self._parameters.wants_max
+        turns = -(-len(wanted) // count)
+        first = count * (int(now // WANTS_TURN_S) % turns) if turns else 0
+        return tuple(wanted)[first : first + count]
+
+    def _out_of_reach(self, keyframe: KeyframeId, reach: Reach) -> bool:
+        return keyframe not in self._held and keyframe.log != self._own and reach.holder(keyframe) is None
+
+    def holds(self) -> tuple[KeyframeId, ...]:
+        """Latents of others that this robot holds because somebody wanted them."""
+        return tuple(k for k in self._relayed if k in self._held)
+
+    def fetch(self, needed: Iterable[KeyframeId], reach: Reach, now: float) -> list[Effect]:
+        """Start fetches, in the given order and relayed ones last, as many as may be in flight."""
+        free = self._parameters.fetches_max - sum(f.in_flight_until_s is not None for f in self._fetches.values())
+        effects: list[Effect] = []
+        for keyframe in (*needed, *self._relayed) if free > 0 else ():
+            if len(effects) >= free:
+                break
+            holder = self._may_fetch(keyframe, reach, now)
+            if holder is not None:
+                self._fetches.setdefault(keyframe, _Fetch()).in_flight_until_s = now + self._parameters.fetch_timeout_s
+                effects.append(FetchLatent(keyframe, holder, self._parameters.fetch_timeout_s))
+        self._forget_oldest()
+        return effects
+
+    def give_up(self, now: float) -> None:
+        """Forget fetches that gave no answer, so that they are tried again."""
+        for keyframe, fetch in self._fetches.items():
+            if fetch.in_flight_until_s is not None and fetch.in_flight_until_s <= now:
+                self.on_failed(keyframe, now)
+
+    def due_s(self, now: float) -> float:
+        """When a fetch ends or may be tried again."""
+        times = (fetch.due_s() for fetch in self._fetches.values())
+        return min((time for time in times if time > now), default=float("inf"))
+
+    def _may_fetch(self, keyframe: KeyframeId, reach: Reach, now: float) -> str | None:
+        """Whom to ask for a latent now, if anybody."""
+        if keyframe in self._held or keyframe.log == self._own:
+            return None
+        fetch = self._fetches.get(keyframe)
+        if fetch is not None and (fetch.in_flight_until_s is not None or fetch.not_before_s > now):
+            return None
+        return reach.holder(keyframe)
+
+    def _forget_oldest(self) -> None:
+        """Pauses of latents that nobody may need any more are not kept for ever."""
+        idle = [k for k, fetch in self._fetches.items() if fetch.in_flight_until_s is None]
+        for keyframe in idle[: max(0, len(idle) - PAUSED_MAX)]:
+            del self._fetches[keyframe]

@@ -1,0 +1,152 @@
+"""Safety: what must never happen, whatever the faults. Each class watches the steps of all robots for one thing."""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from flocc_agent.core.effects import Broadcast, Correction, Deliver, Optimise, Register, Unicast
+from flocc_launch.simulation import liveness
+from flocc_launch.simulation.invariants import Invariant, Step, core
+from flocc_launch.simulation.robot import Station
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionMessage, RecordBatch
+
+SIZES_EVERY = 25
+TICKS_PER_S_MAX = 200
+
+
+def all_invariants(separated: bool) -> list[Invariant]:
+    """DESIGN.md, section 5, and that memory is bounded.
+
+    Args:
+        separated: At times robots cannot hear each other; then, and only then, may two of them take one pair.
+    """
+    return [
+        Invariant("agreement", lacking=liveness.without_one_leader),
+        Invariant("fencing", step=Fencing().step),
+        Invariant("one claim", step=OneClaim().step),
+        Invariant("no starvation", lacking=liveness.uncorrected),
+        Invariant("registered once", step=Once(separated).step, lacking=liveness.unregistered),
+        Invariant("one frame", lacking=liveness.in_other_frames),
+        Invariant("nothing lost", step=Published().step, lacking=liveness.not_everywhere),
+        Invariant("bounded", step=Bounded().step),
+    ]
+
+
+@dataclass(slots=True)
+class Fencing:
+    """No robot applies a correction older than one it applied, and a consumer is told when the frame changes."""
+
+    _last: dict[LogId, Correction] = field(default_factory=dict)
+
+    def step(self, step: Step) -> Iterator[str]:
+        """Deliveries whose (term, round) does not grow, or whose jump is not told."""
+        for effect in step.effects:
+            if isinstance(effect, Deliver):
+                yield from self._delivered(step.station.log, effect.correction)
+
+    def _delivered(self, log: LogId, correction: Correction) -> Iterator[str]:
+        last = self._last.get(log)
+        self._last[log] = correction
+        if last is None:
+            return
+        if (correction.term, correction.round) <= (last.term, last.round):
+            yield f"{log} applied {correction.term}/{correction.round} after {last.term}/{last.round}"
+        if correction.frame_changed != (correction.map_frame != last.map_frame):
+            yield f"{log} went from {last.map_frame} to {correction.map_frame}, told {correction.frame_changed}"
+
+
+@dataclass(slots=True)
+class OneClaim:
+    """A term is claimed by the leader that it names, once, and nobody else speaks with it."""
+
+    _claims: dict[Term, tuple[str, int]] = field(default_factory=dict)
+
+    def step(self, step: Step) -> Iterator[str]:
+        """Claims of another's term, claims repeated in another life, rounds of a term that is not one's own."""
+        station = step.station
+        for effect in step.effects:
+            match effect:
+                case Broadcast(Coordinator(advert)):
+                    claimer = (station.name, station.life)
+                    if advert.term.leader != station.log or self._claims.setdefault(advert.term, claimer) != claimer:
+                        yield f"{station.name} claims {advert.term}, which is another's"
+                case Optimise(term=term) if term.leader != station.log:
+                    yield f"{station.name} optimises in {term}"
+                case Broadcast(CorrectionMessage(term=term)) if term not in self._claims:
+                    yield f"{station.name} corrects in {term}, which nobody claimed"
+
+
+@dataclass(frozen=True, slots=True)
+class _Registered:
+    """A registration that began."""
+
+    by: Station
+    life: int
+
+
+@dataclass(slots=True)
+class Once:
+    """Each pair is registered by one robot, and again only where that robot died or was out of reach."""
+
+    separated: bool = False
+    _begun: dict[CandidatePair, list[_Registered]] = field(default_factory=lambda: defaultdict(list))
+
+    def step(self, step: Step) -> Iterator[str]:
+        """A second registration of a pair without an excuse."""
+        station = step.station
+        for effect in step.effects:
+            if isinstance(effect, Register):
+                earlier = self._begun[effect.pair]
+                for registered in earlier:
+                    if not self._excused(registered, station):
+                        pair = f"{effect.pair.low} {effect.pair.high}"
+                        yield f"{station.name} registers {pair} after {registered.by.name}"
+                earlier.append(_Registered(station, station.life))
+
+    def _excused(self, earlier: _Registered, again: Station) -> bool:
+        died = earlier.by.life != earlier.life
+        return died or (self.separated and earlier.by is not again)
+
+
+@dataclass(slots=True)
+class Published:
+    """What a robot published is never lost by it."""
+
+    _published: dict[LogId, int] = field(default_factory=dict)
+
+    def step(self, step: Step) -> Iterator[str]:
+        """A robot whose own log is shorter than what it once sent."""
+        log = step.station.log
+        for effect in step.effects:
+            match effect:
+                case Broadcast(RecordBatch() as batch) | Unicast(_, RecordBatch() as batch) if batch.log == log:
+                    self._published[log] = max(batch.first + len(batch.records), self._published.get(log, 0))
+        held = len(core(step.station).gossip.logs[log])
+        if held < self._published.get(log, 0):
+            yield f"{log} holds {held} of its {self._published[log]} published records"
+
+
+@dataclass(slots=True)
+class Bounded:
+    """Every queue, table and cache stays within its stated maximum, and no robot spins."""
+
+    _steps: int = 0
+    _ticks: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def step(self, step: Step) -> Iterator[str]:
+        """Sizes beyond their maximum; more ticks in one second than any timer explains."""
+        self._steps += 1
+        if self._steps % SIZES_EVERY == 0:
+            for name, (size, size_max) in core(step.station).sizes().items():
+                if size > size_max:
+                    yield f"{step.station.name}: {name} is {size}, at most {size_max}"
+        if step.event is None:
+            yield from self._ticked(step.station.name, int(step.at_s))
+
+    def _ticked(self, name: str, second: int) -> Iterator[str]:
+        then, count = self._ticks.get(name, (second, 0))
+        count = count + 1 if then == second else 1
+        self._ticks[name] = (second, count)
+        if count == TICKS_PER_S_MAX:
+            yield f"{name} ticked {count} times in second {second}"
