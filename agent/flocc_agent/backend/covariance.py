@@ -1,17 +1,16 @@
 """Marginal covariances at the solution, from the Bayes tree of the last linearisation."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
 
 from flocc_agent.backend.edges import jacobians, residuals
-from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.problem import Problem
-from flocc_agent.backend.solvers import WEIGHT_MIN, Solved
+from flocc_agent.backend.solvers import WEIGHT_MIN, Objective, Solved
 from flocc_agent.core.pose_graph import Trajectory
 from flocc_agent.geometry import Float, hat
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 
 
 def adjoint(T: Float) -> Float:
@@ -23,29 +22,42 @@ def adjoint(T: Float) -> Float:
     return out
 
 
-def keyframe_covariances(problem: Problem, solved: Solved, linear: LinearSolver, indices: list[int]) -> list[Float]:
-    """Marginal covariance (6, 6) of poses in their own tangent spaces, relative to the anchor's first keyframe."""
-    at = residuals(problem.edges, solved.state)
-    jac = jacobians(problem.edges, at)
-    sqrt_weights = np.sqrt(np.maximum(solved.weights, WEIGHT_MIN))
-    graph = linear.factors(problem.edges, solved.state, at, jac, sqrt_weights)
-    tree = graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
-    return [
-        np.zeros((6, 6)) if index == linear.fixed else np.asarray(tree.marginalCovariance(index)) for index in indices
-    ]
+def covariances_of(
+    problem: Problem,
+    objective: Objective,
+    solved: Solved,
+    trajectories: Mapping[LogId, Trajectory],
+    wanted: Sequence[KeyframeId],
+) -> tuple[dict[LogId, Float | None], dict[KeyframeId, Float]]:
+    """Marginal covariances (6, 6), relative to the anchor's first keyframe.
 
-
-def covariances_map_odom(
-    problem: Problem, trajectories: Mapping[LogId, Trajectory], solved: Solved, linear: LinearSolver
-) -> dict[LogId, Float]:
-    """Marginal covariance (6, 6) of every log's `T_map_odom`, in the tangent space of that pose.
-
-    `T_map_odom = T_map_keyframe T_odom_keyframe^-1`, so a tangent vector of the keyframe is moved by the adjoint of
-    `T_odom_keyframe`.
+    Returns:
+        Of every log's `T_map_odom` in the tangent space of that pose (None where not configured), and of the wanted
+        keyframes in their own tangent spaces. With `T_map_odom = T_map_keyframe T_odom_keyframe^-1`, a tangent
+        vector of the last keyframe is moved by the adjoint of its `T_odom_keyframe`.
     """
-    last = [problem.offsets[log] + len(trajectories[log]) - 1 for log in problem.logs]
-    moved = {}
-    for log, S in zip(problem.logs, keyframe_covariances(problem, solved, linear, last), strict=True):
-        Ad = adjoint(np.asarray(trajectories[log].T_odom_keyframe[-1]))
-        moved[log] = 0.5 * (Ad @ S @ Ad.T + (Ad @ S @ Ad.T).T)
-    return moved
+    of_logs: dict[LogId, Float | None] = dict.fromkeys(problem.logs)
+    if not objective.config.covariances:
+        return of_logs, {}
+    last = [KeyframeId(log, len(trajectories[log]) - 1) for log in problem.logs]
+    every = [*last, *(keyframe for keyframe in wanted if keyframe.index < len(trajectories[keyframe.log]))]
+    marginals = keyframe_covariances(objective, solved, [problem.index(keyframe) for keyframe in every])
+    for keyframe, S in zip(last, marginals, strict=False):
+        Ad = adjoint(np.asarray(trajectories[keyframe.log].T_odom_keyframe[-1], dtype=float))
+        of_logs[keyframe.log] = Ad @ S @ Ad.T
+    return of_logs, dict(zip(every[len(last) :], marginals[len(last) :], strict=True))
+
+
+def keyframe_covariances(objective: Objective, solved: Solved, indices: Sequence[int]) -> list[Float]:
+    """Marginal covariance (6, 6) of poses in their own tangent spaces; zero for the pose that does not move."""
+    at = residuals(objective.edges, solved.state)
+    jac = jacobians(objective.edges, at)
+    sqrt_weights = np.sqrt(np.maximum(solved.weights, WEIGHT_MIN))
+    graph = objective.linear.factors(objective.edges, solved.state, at, jac, sqrt_weights)
+    tree = graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
+    fixed = objective.linear.fixed
+    return [np.zeros((6, 6)) if n == fixed else _symmetric(tree.marginalCovariance(n)) for n in indices]
+
+
+def _symmetric(S: Float) -> Float:
+    return np.asarray(0.5 * (S + S.T))

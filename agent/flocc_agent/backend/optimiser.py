@@ -1,31 +1,30 @@
 """The back end's entry point: a pose graph in, every component optimised in the frame of its anchor out.
 
-The story of `optimise`: screen the input; for every connected component align the odom frames, filter closures by
-pairwise consistency, solve, and take components apart that only rejected closures held together. Bad measurements
-become exclusions with a reason; what cannot be solved keeps its odometry. Deterministic: no clock decides anything.
+The story: screen the input; for every connected component align the odom frames, filter closures by pairwise
+consistency, solve, and take components apart that only rejected closures held together. Bad measurements become
+exclusions with a reason; what cannot be solved keeps its odometry. Deterministic: no clock and no chance decide.
 """
 
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from flocc_agent.backend.covariance import covariances_map_odom
-from flocc_agent.backend.edges import residuals, scales_at, state_of
-from flocc_agent.backend.initial import initial_poses
+from flocc_agent.backend.consistency import inconsistent
+from flocc_agent.backend.edges import state_of
+from flocc_agent.backend.initial import initial_poses, initial_world
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
-from flocc_agent.backend.problem import Problem, build
-from flocc_agent.backend.scale_report import scale_warnings
+from flocc_agent.backend.problem import build
+from flocc_agent.backend.results import Outcome, Solution, collect, excluded, odometry_component, rejected
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Objective, Solved, solve
-from flocc_agent.config import BackendConfig, Solver
+from flocc_agent.backend.solvers import Objective, solve
+from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     AbsoluteFix,
     ClosureResult,
     ClosureState,
-    Component,
     GraphSolution,
     LoopClosure,
     OptimisationFailed,
@@ -33,24 +32,16 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
     components_of,
 )
-from flocc_agent.geometry import Float, inverse
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """What solving some logs together gave: their components, their closures' results by index, and sentences."""
-
-    components: tuple[Component, ...]
-    closures: Mapping[int, ClosureResult]
-    warnings: tuple[str, ...]
-    iterations: int
-
-
 def optimise(
-    graph: PoseGraph, config: BackendConfig, initial: GraphSolution | None = None
+    graph: PoseGraph,
+    config: BackendConfig,
+    initial: GraphSolution | None = None,
+    covariance_of: Sequence[KeyframeId] = (),
 ) -> GraphSolution | OptimisationFailed:
     """Optimise every connected component of a pose graph.
 
@@ -58,6 +49,7 @@ def optimise(
         graph: Odometry, closures and fixes; nothing in it is trusted.
         config: Formulation, solver, noise model and priors.
         initial: An earlier solution to start from; keyframes that it lacks follow their odometry.
+        covariance_of: Keyframes whose marginal covariance is wanted, beside every robot's `T_map_odom`.
 
     Returns:
         The solution, with one result per closure and a sentence for whatever was left out; or why there is none.
@@ -65,62 +57,90 @@ def optimise(
     began = time.perf_counter()
     screened = screen(graph)
     if not screened.trajectories:
-        reason = "; ".join(screened.warnings) or "the pose graph has no odometry"
-        return OptimisationFailed(reason)
+        return OptimisationFailed("; ".join(screened.warnings) or "the pose graph has no odometry")
     usable = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    after_screening = time.perf_counter()
     outcomes = [
-        _solve_logs(logs, usable, screened, config, initial)
+        _solve_group(logs, usable, screened, config, initial, covariance_of)
         for logs in components_of(list(screened.trajectories), list(usable.values()))
     ]
-    results = {k: _excluded(graph.closures[k], reason) for k, reason in screened.excluded.items()}
+    results = {k: excluded(graph.closures[k], reason) for k, reason in screened.excluded.items()}
     for outcome in outcomes:
         results.update(outcome.closures)
-    components = sorted((c for outcome in outcomes for c in outcome.components), key=lambda c: c.anchor)
-    warnings = [*screened.warnings, *screened.excluded.values(), *(w for o in outcomes for w in o.warnings)]
+    timings_s = {"screening": after_screening - began}
+    for name in sorted({name for outcome in outcomes for name in outcome.timings_s}):
+        timings_s[name] = sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes)
     return GraphSolution(
-        components=tuple(components),
+        components=tuple(sorted((c for outcome in outcomes for c in outcome.components), key=lambda c: c.anchor)),
         closures=tuple(results[k] for k in range(len(graph.closures))),
-        warnings=tuple(warnings),
+        warnings=(*screened.warnings, *screened.excluded.values(), *(w for o in outcomes for w in o.warnings)),
         iterations=sum(outcome.iterations for outcome in outcomes),
         solve_s=time.perf_counter() - began,
+        timings_s=timings_s,
     )
 
 
-def _excluded(closure: LoopClosure, reason: str) -> ClosureResult:
-    return ClosureResult(closure.query, closure.match, ClosureState.EXCLUDED, 0.0, None, 0.0, reason)
-
-
-def _solve_logs(
+def _solve_group(
     logs: Sequence[LogId],
     usable: Mapping[int, LoopClosure],
     screened: Screened,
     config: BackendConfig,
     initial: GraphSolution | None,
+    covariance_of: Sequence[KeyframeId],
 ) -> Outcome:
-    """Solve logs that closures connect; take them apart where only rejected closures did."""
+    """Solve logs that closures connect; where that fails, every log keeps its odometry."""
     trajectories = {log: screened.trajectories[log] for log in logs}
-    closures = {k: c for k, c in usable.items() if c.query.log in trajectories}
-    fixes = [f for f in screened.fixes if f.keyframe.log in trajectories]
+    closures = {k: c for k, c in usable.items() if c.query.log in trajectories and c.match.log in trajectories}
+    fixes = [fix for fix in screened.fixes if fix.keyframe.log in trajectories]
     if not closures and not fixes:
-        return Outcome((_odometry_component(logs[0], trajectories[logs[0]]),), {}, (), 0)
+        return Outcome(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
+    wanted = [keyframe for keyframe in covariance_of if keyframe.log in trajectories]
     try:
-        return _solve_connected(trajectories, closures, fixes, config, initial)
+        return _solve_and_split(trajectories, closures, fixes, config, initial, wanted)
     except (SingularSystem, np.linalg.LinAlgError, FloatingPointError) as error:
-        logger.error("component of %s could not be solved: %s", logs[0], error)
-        return _fallback(
-            trajectories, closures, f"component of {logs[0]} could not be solved and keeps odometry: {error}"
-        )
+        reason = f"the component of robot {logs[0]} could not be solved and keeps its odometry: {error}"
+        logger.error("%s", reason)
+        components = tuple(odometry_component(log, trajectories[log]) for log in logs)
+        return Outcome(components, {k: excluded(c, reason) for k, c in closures.items()}, (reason,))
 
 
-def _fallback(trajectories: Mapping[LogId, Trajectory], closures: Mapping[int, LoopClosure], reason: str) -> Outcome:
-    """Every log on its own odometry, every closure excluded for one reason."""
-    components = tuple(_odometry_component(log, trajectory) for log, trajectory in trajectories.items())
-    return Outcome(components, {k: _excluded(c, reason) for k, c in closures.items()}, (reason,), 0)
+def _solve_and_split(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    fixes: Sequence[AbsoluteFix],
+    config: BackendConfig,
+    initial: GraphSolution | None,
+    wanted: Sequence[KeyframeId],
+) -> Outcome:
+    """Solve; where rejections leave several components, solve each of them with the closures that it has left."""
+    began = time.perf_counter()
+    dropped = inconsistent(trajectories, closures, config) if config.pairwise_consistency else {}
+    kept = {k: c for k, c in closures.items() if k not in dropped}
+    outcome = _solve_connected(trajectories, kept, fixes, config, initial, wanted)
+    turned_away = {k: rejected(closures[k], reason) for k, reason in dropped.items()}
+    turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
+    left = {k: c for k, c in kept.items() if k not in turned_away}
+    groups = components_of(list(trajectories), list(left.values()))
+    if len(groups) == 1:
+        timings_s = {"consistency": time.perf_counter() - began - sum(outcome.timings_s.values()), **outcome.timings_s}
+        return replace(outcome, closures={**outcome.closures, **turned_away}, timings_s=timings_s)
+    screened = Screened(dict(trajectories), {}, tuple(fixes), ())
+    plain = config.model_copy(update={"pairwise_consistency": False})
+    parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in groups]
+    return _joined(parts, turned_away, outcome)
 
 
-def _odometry_component(log: LogId, trajectory: Trajectory) -> Component:
-    T = np.asarray(trajectory.T_odom_keyframe, dtype=float)
-    return Component((log,), {log: T.copy()}, {log: np.eye(4)}, {log: np.zeros((6, 6))})
+def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], before: Outcome) -> Outcome:
+    closures = dict(turned_away)
+    for part in parts:
+        closures.update(part.closures)
+    return Outcome(
+        tuple(c for part in parts for c in part.components),
+        closures,
+        tuple(w for part in parts for w in part.warnings),
+        before.iterations + sum(part.iterations for part in parts),
+        before.timings_s,
+    )
 
 
 def _solve_connected(
@@ -129,77 +149,23 @@ def _solve_connected(
     fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
     initial: GraphSolution | None,
+    wanted: Sequence[KeyframeId],
 ) -> Outcome:
+    times = [time.perf_counter()]
     T_initial = initial_poses(trajectories, closures, config.steepness, initial)
-    problem = build(trajectories, closures, fixes, config)
-    state = state_of(_stacked(problem, T_initial), problem.clusters)
+    T_map_world = initial_world(T_initial, fixes)
+    times.append(time.perf_counter())
+    problem = build(trajectories, closures, fixes, config, T_initial, T_map_world)
+    poses = [T_initial[log] for log in problem.logs] + ([T_map_world[None]] if fixes else [])
+    state = state_of(np.concatenate(poses), problem.clusters)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
-    solved = solve(Objective(problem.edges, problem.closure_rows, linear, config), state)
+    objective = Objective(problem.edges, problem.closure_rows, linear, config)
+    solved = solve(objective, state)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
-    return _collect(problem, trajectories, closures, solved, linear, config)
-
-
-def _stacked(problem: Problem, T: Mapping[LogId, Float]) -> Float:
-    return np.concatenate([T[log] for log in problem.logs])
-
-
-def _collect(
-    problem: Problem,
-    trajectories: Mapping[LogId, Trajectory],
-    closures: Mapping[int, LoopClosure],
-    solved: Solved,
-    linear: LinearSolver,
-    config: BackendConfig,
-) -> Outcome:
-    """Turn arrays back into components and closure results."""
-    rows = problem.closure_rows
-    weights = solved.weights[rows]
-    squared = residuals(problem.edges, solved.state).squared()[rows]
-    scales = scales_at(problem.edges, solved.state)[rows] * problem.scale_initial
-    results = {
-        k: _result(closures[k], float(weights[n]), float(scales[n]), float(np.sqrt(squared[n])), config)
-        for n, k in enumerate(problem.closure_ids)
-    }
-    used = [closures[k] for k in problem.closure_ids if results[k].state is ClosureState.USED]
-    T_all = solved.state.poses()
-    groups = components_of(problem.logs, used)
-    covariances = (
-        covariances_map_odom(problem, trajectories, solved, linear) if config.covariances and len(groups) == 1 else {}
-    )
-    cost = solved.cost if len(groups) == 1 else 0.0
-    components = tuple(_component(group, problem, trajectories, T_all, covariances, cost) for group in groups)
-    return Outcome(components, results, scale_warnings(problem, solved, closures), solved.iterations)
-
-
-def _result(closure: LoopClosure, weight: float, scale: float, residual: float, config: BackendConfig) -> ClosureResult:
-    rejects = config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
-    used = weight >= ACCEPTED_WEIGHT_MIN or not rejects
-    state = ClosureState.USED if used else ClosureState.REJECTED
-    estimated = used and not closure.metric
-    return ClosureResult(
-        closure.query,
-        closure.match,
-        state,
-        weight,
-        scale if estimated else None,
-        residual if np.isfinite(residual) else 0.0,
-    )
-
-
-def _component(
-    group: Sequence[LogId],
-    problem: Problem,
-    trajectories: Mapping[LogId, Trajectory],
-    T_all: Float,
-    covariances: Mapping[LogId, Float],
-    cost: float,
-) -> Component:
-    """A component in the frame of its own anchor, whose first keyframe lies at its odometry pose."""
-    anchor = group[0]
-    T_map_all = trajectories[anchor].T_odom_keyframe[0] @ inverse(T_all[problem.offsets[anchor]])
-    T_map_keyframe = {
-        log: T_map_all @ T_all[problem.offsets[log] : problem.offsets[log] + len(trajectories[log])] for log in group
-    }
-    T_map_odom = {log: T_map_keyframe[log][-1] @ inverse(trajectories[log].T_odom_keyframe[-1]) for log in group}
-    return Component(tuple(group), T_map_keyframe, T_map_odom, {log: covariances.get(log) for log in group}, cost)
+    times.append(time.perf_counter())
+    solution = Solution(problem, objective, state, solved, trajectories, closures)
+    outcome = collect(solution, wanted)
+    times.append(time.perf_counter())
+    spans_s = np.diff(times).tolist()
+    return replace(outcome, timings_s=dict(zip(("alignment", "solver", "results"), spans_s, strict=True)))

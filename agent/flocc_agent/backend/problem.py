@@ -18,6 +18,8 @@ from flocc_protocol.ids import KeyframeId, LogId
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+WORLD_ROTATION_SIGMA_RAD, WORLD_TRANSLATION_SIGMA_M = 10.0, 1e5
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
@@ -55,7 +57,8 @@ def build(
     closures: Mapping[int, LoopClosure],
     fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
-    scale_guesses: Mapping[int, float] | None = None,
+    T_initial: Mapping[LogId, Float],
+    T_map_world: Float,
 ) -> Problem:
     """Turn a component into arrays.
 
@@ -64,7 +67,8 @@ def build(
         closures: Usable closures between them, by their index in the graph.
         fixes: Usable fixes of them.
         config: The formulation, the noise model and the scale priors.
-        scale_guesses: Metres per network unit for closures without `scale_initial`.
+        T_initial: (N, 4, 4) first poses of each log, in one frame.
+        T_map_world: (4, 4) first pose of the fixes' world frame, in the same frame.
     """
     logs = tuple(sorted(trajectories))
     lengths = [len(trajectories[log]) for log in logs]
@@ -72,13 +76,14 @@ def build(
     offsets = {log: int(start) for log, start in zip(logs, starts[:-1], strict=True)}
     ids = tuple(sorted(closures))
     used = [closures[k] for k in ids]
-    scale_initial = np.array([initial_scale(closures[k], config, (scale_guesses or {}).get(k)) for k in ids])
+    scale_initial = np.array([initial_scale(closures[k], config) for k in ids])
     odometry = [odometry_edges(trajectories[log], offsets[log], config) for log in logs]
     closure_part, clusters = closure_edges(used, offsets, scale_initial, config)
     parts = [*odometry, closure_part]
     first = sum(len(part) for part in odometry)
     if fixes:
-        parts.append(fix_edges(fixes, offsets, int(starts[-1])))
+        T_first_world = inverse(T_initial[logs[0]][0]) @ T_map_world
+        parts += [fix_edges(fixes, offsets, int(starts[-1])), world_edge(T_first_world, int(starts[-1]))]
     rows = slice(first, first + len(used))
     return Problem(logs, offsets, int(starts[-1]), concatenate(parts), rows, ids, clusters, scale_initial, bool(fixes))
 
@@ -121,11 +126,11 @@ def odometry_edges(trajectory: Trajectory, offset: int, config: BackendConfig) -
     return plain_edges(i, i + 1, T_hat, L)
 
 
-def initial_scale(closure: LoopClosure, config: BackendConfig, guess: float | None) -> float:
+def initial_scale(closure: LoopClosure, config: BackendConfig) -> float:
     """Metres per network unit at which a closure starts."""
     if closure.metric or config.scale_initial is ScaleInitial.RAW:
         return 1.0
-    return closure.scale_initial or guess or 1.0
+    return closure.scale_initial or 1.0
 
 
 def closure_edges(
@@ -211,3 +216,9 @@ def fix_edges(fixes: Sequence[AbsoluteFix], offsets: Mapping[LogId, int], world:
         if R is not None:
             L[k, :3, :3] = np.eye(3) / fix.rotation_sigma_rad
     return plain_edges(np.full(len(j), world), j, T_hat, L)
+
+
+def world_edge(T_first_world: Float, world: int) -> Edges:
+    """A very weak edge that keeps the world frame where it started, in what the fixes leave open."""
+    S = diagonal_covariance(WORLD_ROTATION_SIGMA_RAD, WORLD_TRANSLATION_SIGMA_M)
+    return plain_edges(np.array([0]), np.array([world]), T_first_world[None], sqrt_informations(S[None]))

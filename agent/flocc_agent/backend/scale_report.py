@@ -1,25 +1,61 @@
 """Sentences about scales that the measurements do not fix, or that fell to their bound."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flocc_agent.backend.edges import GAMMA_MIN, scales_at
 from flocc_agent.backend.problem import Problem
-from flocc_agent.backend.solvers import Solved
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Solved
 from flocc_agent.core.pose_graph import LoopClosure
 
 NAMED_MAX = 5
+COLLAPSED_RATIO = 2.0
 
 
 def scale_warnings(problem: Problem, solved: Solved, closures: Mapping[int, LoopClosure]) -> tuple[str, ...]:
-    """Name the closures whose scale collapsed."""
+    """Name the closures whose scale collapsed to its bound, and the pairs whose scales nothing fixes."""
     rows = problem.closure_rows
     gamma = scales_at(problem.edges, solved.state)[rows]
     free = (problem.edges.sigma[rows] > 0) | (problem.edges.cluster[rows] >= 0)
-    collapsed = np.flatnonzero(free & (gamma <= 2 * GAMMA_MIN) & (solved.weights[rows] >= 0.5))
-    if len(collapsed) == 0:
-        return ()
-    names = [f"{closures[problem.closure_ids[n]].query} - {closures[problem.closure_ids[n]].match}" for n in collapsed]
-    more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
-    return (f"the scale collapsed to its bound: {', '.join(names[:NAMED_MAX])}{more}",)
+    used = solved.weights[rows] >= ACCEPTED_WEIGHT_MIN
+    collapsed = np.flatnonzero(free & used & (gamma <= COLLAPSED_RATIO * GAMMA_MIN))
+    sentences = []
+    if len(collapsed):
+        sentences.append(f"the scale collapsed to its bound: {_names(collapsed, problem, closures)}")
+    lonely = unobservable(problem, free, used)
+    if len(lonely):
+        sentences.append(f"the scale is not observable and stays at its prior: {_names(lonely, problem, closures)}")
+    return tuple(sentences)
+
+
+def unobservable(problem: Problem, free: NDArray[np.bool_], used: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Closures with a free scale that alone hold two groups of logs together: nothing else fixes their length."""
+    rows = problem.closure_rows
+    starts = np.array([problem.offsets[log] for log in problem.logs])
+    i, j = (np.searchsorted(starts, side[rows], side="right") - 1 for side in (problem.edges.i, problem.edges.j))
+    pairs = np.sort(np.stack([i, j], axis=1), axis=1)
+    joined, first, counts = np.unique(pairs[used], axis=0, return_index=True, return_counts=True)
+    lonely = [
+        int(n)
+        for (a, b), n, count in zip(joined.tolist(), np.flatnonzero(used)[first], counts, strict=True)
+        if count == 1 and a != b and free[n] and _is_bridge((a, b), joined.tolist())
+    ]
+    return np.array(sorted(lonely), dtype=np.int64)
+
+
+def _is_bridge(pair: tuple[int, int], joined: Sequence[Sequence[int]]) -> bool:
+    """Whether the two logs of a pair fall apart without it."""
+    reached = {pair[0]}
+    for _ in joined:
+        for a, b in joined:
+            if (a, b) != pair and (a in reached or b in reached):
+                reached |= {a, b}
+    return pair[1] not in reached
+
+
+def _names(chosen: Sequence[int] | NDArray[np.int64], problem: Problem, closures: Mapping[int, LoopClosure]) -> str:
+    pairs = [closures[problem.closure_ids[int(n)]] for n in chosen]
+    more = f" and {len(pairs) - NAMED_MAX} more" if len(pairs) > NAMED_MAX else ""
+    return ", ".join(f"{c.query} - {c.match}" for c in pairs[:NAMED_MAX]) + more

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph
 from flocc_agent.geometry import R_from_q_wxyz, pose, q_wxyz_from_R, so3_exp
-from flocc_launch.graph_files.graph_file import INDEX_BITS, GraphFile, GraphFileError, Measurement, pose_graph
+from flocc_launch.graph_files.graph_file import (
+    INDEX_BITS,
+    GraphFile,
+    GraphFileError,
+    Measurement,
+    distinct,
+    pose_graph,
+)
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -30,7 +37,7 @@ def read_g2o(path: Path) -> GraphFile:
         GraphFileError: A file is missing or a line is damaged; the message names both.
     """
     files = _robot_files(path) if path.is_dir() else [path]
-    measurements = [m for file in files for m in _measurements(file)]
+    measurements = distinct((m for file in files for m in _measurements(file)), add_up=True)
     if not measurements:
         raise GraphFileError(f"{path}: has no edges")
     graph = pose_graph(measurements, str(path))

@@ -1,6 +1,6 @@
 """What every graph file becomes: a pose graph, and what the file knows beyond it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,6 +60,39 @@ class GraphFile:
         closures = tuple(unit_length(c) if c.query.log != c.match.log else c for c in self.graph.closures)
         return replace(self, graph=replace(self.graph, closures=closures))
 
+    def with_isotropic_noise(self) -> "GraphFile":
+        """The same file with the noise model of SE-Sync: one number each for rotation and translation of an edge.
+
+        Twice the back end's cost is then SE-Sync's objective `sum kappa |R_j - R_i R|^2 + tau |t_j - t_i - R_i t|^2`.
+        """
+        trajectories = {
+            log: replace(trajectory, edge_covariances=_isotropic_all(trajectory.edge_covariances))
+            for log, trajectory in self.graph.trajectories.items()
+        }
+        closures = tuple(
+            c if c.covariance is None else replace(c, covariance=isotropic(c.covariance)) for c in self.graph.closures
+        )
+        return replace(self, graph=replace(self.graph, trajectories=trajectories, closures=closures))
+
+
+def isotropic(covariance: Float) -> Float:
+    """SE-Sync's isotropic noise (6, 6): `kappa = 3 / (2 tr)`, `tau = 3 / tr` of the inverse information blocks.
+
+    A planar edge (unit variance about x and y and along z, from `g2o._se2`) takes `kappa` of its one angle and
+    `tau = 2 / tr`. The back end's rotation residual is half of SE-Sync's squared, hence variance `1 / (2 kappa)`.
+    """
+    information = np.linalg.inv(covariance)
+    rotation, translation = np.linalg.inv(information[:3, :3]), np.linalg.inv(information[3:, 3:])
+    if np.array_equal(covariance[:2], np.eye(6)[:2]):
+        kappa, tau = information[2, 2], 2.0 / np.trace(translation[:2, :2])
+    else:
+        kappa, tau = 1.5 / np.trace(rotation), 3.0 / np.trace(translation)
+    return np.diag([0.5 / kappa] * 3 + [1.0 / tau] * 3)
+
+
+def _isotropic_all(covariances: Float | None) -> Float | None:
+    return None if covariances is None else np.array([isotropic(S) for S in covariances]).reshape(-1, 6, 6)
+
 
 def unit_length(closure: LoopClosure) -> LoopClosure:
     """A closure whose translation has length one and whose scale is free; a zero translation stays."""
@@ -76,22 +109,32 @@ def log_of(key: int) -> LogId:
     return LogId(letter if letter.isascii() and letter.isalnum() else f"robot-{number}")
 
 
+def distinct(measurements: Iterable[Measurement], add_up: bool) -> list[Measurement]:
+    """Measurements that occur several times, word for word, once.
+
+    Args:
+        measurements: In the order of the file.
+        add_up: Their information is added up (g2o: every line is a term of the sum); otherwise it is taken once
+            (JRL: both robots list what they share).
+    """
+    counts: dict[tuple[int, int, bytes], int] = {}
+    first: dict[tuple[int, int, bytes], Measurement] = {}
+    for m in measurements:
+        mark = (m.first, m.second, m.T_first_second.tobytes())
+        counts[mark] = counts.get(mark, 0) + 1
+        first.setdefault(mark, m)
+    return [replace(m, covariance=m.covariance / (counts[mark] if add_up else 1)) for mark, m in first.items()]
+
+
 def pose_graph(measurements: Sequence[Measurement], path: str) -> PoseGraph:
     """Sort measurements into odometry (consecutive keys of one robot, the first such) and closures.
-
-    Measurements that occur twice, word for word, are taken once.
 
     Raises:
         GraphFileError: A robot's keys have a gap that no measurement bridges.
     """
     odometry: dict[int, Measurement] = {}
     closures: list[Measurement] = []
-    seen: set[tuple[int, int, bytes]] = set()
     for m in measurements:
-        mark = (m.first, m.second, m.T_first_second.tobytes())
-        if mark in seen:
-            continue
-        seen.add(mark)
         if m.second == m.first + 1 and m.first not in odometry:
             odometry[m.first] = m
         else:

@@ -15,6 +15,7 @@ from flocc_launch.graph_files.graph_file import (
     GraphFile,
     GraphFileError,
     Measurement,
+    distinct,
     log_of,
     pose_graph,
 )
@@ -45,7 +46,7 @@ def read_jrl(path: Path) -> GraphFile:
 
 def _graph_file(data: Mapping[str, Any], path: Path) -> GraphFile:
     measurements: list[Measurement] = []
-    wrong: set[tuple[int, int, bytes]] = set()
+    wrong: set[bytes] = set()
     for robot, entries in data["measurements"].items():
         labelled = {(int(e), int(m)) for e, m in data.get("outlier_factors", {}).get(robot, ())}
         for e, entry in enumerate(entries):
@@ -55,31 +56,13 @@ def _graph_file(data: Mapping[str, Any], path: Path) -> GraphFile:
                 m = _measurement(item)
                 measurements.append(m)
                 if (e, n) in labelled:
-                    wrong.add(_mark(m))
+                    wrong.add(m.T_first_second.tobytes())
     if not measurements:
         raise GraphFileError(f"{path}: has no measurements of type {BETWEEN}")
-    graph = pose_graph(measurements, str(path))
-    outliers = frozenset(k for k, mark in enumerate(_closure_marks(measurements)) if mark in wrong)
+    graph = pose_graph(distinct(measurements, add_up=False), str(path))
+    outliers = frozenset(k for k, c in enumerate(graph.closures) if c.T_query_match_unscaled.tobytes() in wrong)
     truth = {log: T[:, :3, 3] for log, T in _values(data.get("groundtruth", {}), graph).items()}
     return GraphFile(graph, truth, _values(data.get("initialization", {}), graph), outliers)
-
-
-def _mark(m: Measurement) -> tuple[int, int, bytes]:
-    return (m.first, m.second, m.T_first_second.tobytes())
-
-
-def _closure_marks(measurements: list[Measurement]) -> list[tuple[int, int, bytes]]:
-    """Marks of closures in the order in which `pose_graph` lists them."""
-    marks, seen, odometry = [], set(), set()
-    for m in measurements:
-        if _mark(m) in seen:
-            continue
-        seen.add(_mark(m))
-        if m.second == m.first + 1 and m.first not in odometry:
-            odometry.add(m.first)
-        else:
-            marks.append(_mark(m))
-    return marks
 
 
 def _measurement(item: Mapping[str, Any]) -> Measurement:
