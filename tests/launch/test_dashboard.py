@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import socket
 import subprocess
 import urllib.error
 import urllib.request
@@ -13,7 +14,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
-from flocc_launch.dashboard import Dashboard, DashboardError
+from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard
 from flocc_launch.dashboard.source import RunSource
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import LineTail
@@ -134,6 +135,20 @@ def test_a_port_in_use_is_one_sentence(tmp_path: Path) -> None:
         port = int(dashboard.url.rsplit(":", 1)[1].strip("/"))
         with pytest.raises(DashboardError, match=rf"port {port} on 127\.0\.0\.1: Address already in use"):
             Dashboard(folder, port=port)
+
+
+def test_a_launch_is_shown_from_its_first_state_and_the_port_is_given_back(tmp_path: Path) -> None:
+    folder, seen = RunFolder(tmp_path / "run"), []
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with live_dashboard(folder, port, seen.append) as show:
+        start_swarm(growing(folder.path))
+        show("first state")
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/state.json") as answer:
+            assert len(json.load(answer)["robots"]) == 3
+    assert seen == ["first state"]
+    Dashboard(folder, port).close()
 
 
 def browse(url: str, profile: Path) -> str:

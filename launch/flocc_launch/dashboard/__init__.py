@@ -3,6 +3,6 @@
 The page reads the run folder, never the network, so that looking at a swarm cannot disturb it.
 """
 
-from flocc_launch.dashboard.server import Dashboard, DashboardError
+from flocc_launch.dashboard.server import Dashboard, DashboardError, live_dashboard
 
-__all__ = ["Dashboard", "DashboardError"]
+__all__ = ["Dashboard", "DashboardError", "live_dashboard"]

@@ -2,17 +2,21 @@
 
 import logging
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from flocc_launch.dashboard.source import RunSource
 from flocc_launch.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)
+
+W = TypeVar("W")
 
 PORT = 8642
 HEADERS = {
@@ -30,23 +34,23 @@ class DashboardError(FloccError):
 class Dashboard:
     """Serves the page of one run folder from a thread of its own, until it is closed.
 
-    Use it in a `with`; `url` is where the page is.
+    Making it takes the port; `with` starts to answer, and needs `run.json`. `url` is where the page is.
     """
 
     def __init__(self, folder: RunFolder, port: int = PORT, host: str = "127.0.0.1") -> None:
         """Bind the port.
 
         Args:
-            folder: The run folder; its `run.json` must be there.
+            folder: The run folder; its `run.json` need not be there yet.
             port: TCP port; 0 takes a free one.
             host: Address to listen on; 0.0.0.0 shows the page to the whole network.
 
         Raises:
             DashboardError: The port is in use or the address is not this machine's.
         """
-        handler = handler_of(RunSource(folder))
+        self._folder = folder
         try:
-            self._server = ThreadingHTTPServer((host, port), handler)
+            self._server = ThreadingHTTPServer((host, port), BaseHTTPRequestHandler)
         except OSError as error:
             raise DashboardError(f"dashboard: port {port} on {host}: {error.strerror}; choose another") from error
         self._server.daemon_threads = True
@@ -54,14 +58,59 @@ class Dashboard:
         self._thread = threading.Thread(target=self._server.serve_forever, name="dashboard", daemon=True)
 
     def __enter__(self) -> "Dashboard":
-        self._thread.start()
-        logger.info("dashboard at %s", self.url)
+        self.start()
         return self
 
+    def start(self) -> None:
+        """Begin to answer.
+
+        Raises:
+            RunFolderError: The folder has no `run.json`.
+        """
+        self._server.RequestHandlerClass = handler_of(RunSource(self._folder))
+        self._thread.start()
+        logger.info("dashboard at %s", self.url)
+
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._server.shutdown()
+        self.close()
+
+    def close(self) -> None:
+        """Stop answering and give the port back."""
+        if self._thread.is_alive():
+            self._server.shutdown()
+            self._thread.join()
         self._server.server_close()
-        self._thread.join()
+
+
+@contextmanager
+def live_dashboard(folder: RunFolder, port: int, on_watch: Callable[[W], None]) -> Iterator[Callable[[W], None]]:
+    """Serve the page of a launch from the first state that its launcher shows.
+
+    Args:
+        folder: Where the run will lie.
+        port: TCP port, taken at once, so that a port in use stops the launch before it begins.
+        on_watch: What the launcher shows its states to anyway.
+
+    Yields:
+        What to give the launcher in its place.
+
+    Raises:
+        DashboardError: The port is in use.
+    """
+    dashboard = Dashboard(folder, port)
+    started = False
+
+    def show(watch: W) -> None:
+        nonlocal started
+        if not started:
+            dashboard.start()
+            started = True
+        on_watch(watch)
+
+    try:
+        yield show
+    finally:
+        dashboard.close()
 
 
 def page() -> bytes:

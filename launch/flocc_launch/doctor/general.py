@@ -8,7 +8,6 @@ from flocc_launch.report.closures import Pair
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import seconds
 from flocc_launch.run_records import AgentDied, EncodingFailed, GraphOptimised, of_kind
-from flocc_protocol.ids import KeyframeId
 
 LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3
@@ -67,7 +66,7 @@ def unsteady_leaders(loaded: LoadedRun) -> list[Finding]:
 
 def weak_links(loaded: LoadedRun) -> list[Finding]:
     """Robots that hang on their common map by so few closures that one false one misplaces them."""
-    used = used_closures(loaded)
+    used = [robots_of(pair) for pair in loaded.pairs if pair.used]
     findings = []
     for robot, track in loaded.tracks.items():
         others = {name for name, other in loaded.tracks.items() if other.map_frame == track.map_frame} - {robot}
@@ -84,17 +83,6 @@ def weak_links(loaded: LoadedRun) -> list[Finding]:
         )
         findings.append(Finding("weak-link", Severity.HINDERS, sentence, advice, (robot,)))
     return findings
-
-
-def used_closures(loaded: LoadedRun) -> list[set[str]]:
-    """Robots of each closure whose scale a leader's last solution holds; empty where no scales are estimated."""
-    used: dict[tuple[str, str], set[str]] = {}
-    for result in loaded.results.values():
-        for closure in result.closures:
-            if closure.scale is not None:
-                ends = {KeyframeId.parse(keyframe).log.robot for keyframe in (closure.query, closure.match)}
-                used[closure.query, closure.match] = ends
-    return list(used.values())
 
 
 def robots_of(pair: Pair) -> set[str]:

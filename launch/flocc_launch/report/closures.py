@@ -20,6 +20,7 @@ class Pair:
         accepted: Whether some robot accepted it.
         reason: Why it was rejected last, None where it was not.
         at_s: When it was accepted or rejected first, None where neither.
+        used: Whether the last solution used it; None where it is not known (no scales are estimated).
     """
 
     query: KeyframeId
@@ -30,6 +31,7 @@ class Pair:
     accepted: bool = False
     reason: str | None = None
     at_s: float | None = None
+    used: bool | None = None
 
     @property
     def rejected(self) -> bool:
@@ -50,12 +52,14 @@ def pairs_of(events: Iterable[Event], results: Iterable[RobotResult]) -> list[Pa
             query, match = KeyframeId.parse(event.query), KeyframeId.parse(event.match)
             key = (min(query, match), max(query, match))
             pairs[key] = updated(pairs.get(key, Pair(query, match)), event)
-    for result in results:
-        for closure in result.closures:
-            query, match = KeyframeId.parse(closure.query), KeyframeId.parse(closure.match)
-            key = (min(query, match), max(query, match))
-            known = pairs.get(key, Pair(query, match, ratio=closure.match_ratio))
-            pairs[key] = replace(known, accepted=True)
+    closures = [closure for result in results for closure in result.closures]
+    scales_known = any(closure.scale is not None for closure in closures)
+    for closure in closures:
+        query, match = KeyframeId.parse(closure.query), KeyframeId.parse(closure.match)
+        key = (min(query, match), max(query, match))
+        known = pairs.get(key, Pair(query, match, ratio=closure.match_ratio))
+        used = (known.used or closure.scale is not None) if scales_known else None
+        pairs[key] = replace(known, accepted=True, used=used)
     return [pairs[key] for key in sorted(pairs)]
 
 

@@ -195,8 +195,15 @@ def closure_mark(pair: Pair, query_px: tuple[float, float], match_px: tuple[floa
     """A line between both keyframes and a dot at its middle."""
     (x1, y1), (x2, y2) = query_px, match_px
     said = f"{pair.query} – {pair.match}: match ratio {number(pair.ratio)}, probability {number(pair.probability)}"
+    said += ", not used by the solver" if pair.used is False else ""
     dot = element("circle", cx=(x1 + x2) / 2, cy=(y1 + y2) / 2, r=3.6, class_=f"q{step_of(pair.probability)}")
-    return element("g", title(said), element("line", x1=x1, y1=y1, x2=x2, y2=y2), dot, class_="closure")
+    return element(
+        "g",
+        title(said),
+        element("line", x1=x1, y1=y1, x2=x2, y2=y2),
+        dot,
+        class_="closure unused" if pair.used is False else "closure",
+    )
 
 
 def step_of(probability: float | None) -> int:

@@ -38,10 +38,17 @@ def tiles(report: Report) -> str:
         (count_of(report.closures.accepted_inter_robot), "closures between robots accepted"),
         (count_of(report.closures.rejected), "candidates rejected"),
         (size_of(sum(report.bytes.values())) if report.bytes else "–", "sent by all robots"),
-        (seconds(report.duration_s), f"run; {seconds(report.wall_s)} of wall time"),
+        (seconds(report.duration_s), duration_text(report)),
     ]
     made = [element("div", element("b", text_of(v)), element("span", text_of(t)), class_="tile") for v, t in shown]
     return element("div", *made, class_="tiles")
+
+
+def duration_text(report: Report) -> str:
+    """On which clock the run was that long."""
+    if report.wall_s is None:
+        return "run, virtual time" if report.driver == "simulate" else "run"
+    return f"run; {seconds(report.wall_s)} of wall time"
 
 
 def ate_tile(report: Report) -> tuple[str, str]:
@@ -109,10 +116,15 @@ def trajectories(report: Report, loaded: LoadedRun) -> str:
     ]
     errors = error_figure(loaded)
     below = "" if errors is None else errors_part(report, errors)
-    return heading + map_legend(report, bool(shown[0].truth_m)) + element("div", *figures, class_="pair") + below
+    return (
+        heading
+        + map_legend(report, bool(shown[0].truth_m), any(pair.used is False for pair in loaded.pairs))
+        + element("div", *figures, class_="pair")
+        + below
+    )
 
 
-def map_legend(report: Report, with_truth: bool) -> str:
+def map_legend(report: Report, with_truth: bool, unused: bool) -> str:
     """Colours and marks, with switches for the layers."""
     robots = [
         element("li", key(f'<line x1="0" x2="26" y1="6" y2="6" class="track {colour(report.robots, robot)}"/>'), robot)
@@ -120,10 +132,12 @@ def map_legend(report: Report, with_truth: bool) -> str:
     ]
     truth = '<line x1="0" x2="26" y1="6" y2="6" class="truth"/>'
     dots = "".join(f'<circle cx="{5 + 11 * k}" cy="6" r="3.6" class="q{k}"/>' for k in range(5))
+    ring = '<g class="closure unused"><circle cx="13" cy="6" r="3.6"/></g>'
     cross = '<path d="M9 2l8 8m0 -8l-8 8" class="cross"/>'
     switches = [
         switch("truth", key(truth), "ground truth", True) if with_truth else "",
         switch("accepted", key(f'<g class="closure">{dots}</g>', 54), "closure, probability 0 to 1", True),
+        element("li", key(ring), "not used by the solver") if unused else "",
         switch("rejected", key(cross), "rejected candidate", False),
     ]
     return element("ul", *robots, *switches, class_="legend")
