@@ -3,6 +3,7 @@
 Parameters of the core are plain dataclasses in `core/parameters.py`; pydantic checks them here like the rest.
 """
 
+import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -338,7 +339,7 @@ class TransportConfig(Section):
     tls: TlsConfig | None = None
     """Mutual TLS and one writer per key; None is for trusted networks and emulation."""
     chaos: bool = False
-    """Take orders of `flocc chaos`: partitions, loss, kills. For tests; without tls anybody on the network may order."""
+    """Take orders of `flocc chaos`: partitions, loss, kills. For tests; without tls anybody in reach may order."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "TransportConfig":
@@ -527,6 +528,21 @@ def read_toml(path: Path) -> dict[str, object]:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        ConfigError: It is missing, unreadable or no such file; the message names it.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: holds no JSON object")
+    return content
 
 
 def first_error(error: ValidationError, source: str) -> str:

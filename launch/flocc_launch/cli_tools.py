@@ -1,4 +1,4 @@
-"""Commands that look: doctor, status, dashboard, view. `add_tools` puts them into the command line."""
+"""Commands on what runs: doctor, status, dashboard, view, chaos. `add_tools` puts them into the command line."""
 
 import json
 import sys
@@ -22,7 +22,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for script
 
 def add_tools(app: typer.Typer) -> None:
     """Register the commands."""
-    for command in (doctor, status, dashboard, view):
+    for command in (doctor, status, dashboard, view, chaos):
         app.command()(command)
 
 
@@ -99,16 +99,30 @@ def view(
     typer.echo(f"view: {show(RunFolder.open(run), save)}")
 
 
+def chaos(
+    order: Annotated[list[str], typer.Argument(help="Such as: loss 0.3, 'partition r1,r2 | r3', heal, kill r2.")],
+    config: ConfigOption = None,
+    swarm: SwarmOption = None,
+) -> None:
+    """Cause a fault in a running swarm whose agents allow it (transport.chaos), or take faults back."""
+    from flocc_launch.chaos import disturb, parse_order
+
+    parsed = parse_order(" ".join(order))
+    for robot, answer in disturb(*_reach(config, swarm), parsed).items():
+        typer.echo(f"{robot}: {answer}")
+
+
 def _reach(config: Path | None, swarm: str | None) -> "tuple[TransportConfig, str]":
     """How to reach a swarm, and its name.
 
     Raises:
         ConfigError: The configuration cannot be read, or nothing says which swarm.
     """
-    from flocc_agent.config import AgentConfig, ConfigError, TransportConfig
+    from flocc_agent.config import AgentConfig, ConfigError, TransportConfig, read_json, validated
 
     if config is not None:
-        read = AgentConfig.read(config)
+        is_json = config.suffix == ".json"  # as `flocc launch` leaves it in a run folder
+        read = validated(AgentConfig, read_json(config), str(config)) if is_json else AgentConfig.read(config)
         return read.transport, swarm or read.swarm
     if swarm is None:
         raise ConfigError("give a run folder, --swarm NAME, or --config of an agent")

@@ -136,6 +136,7 @@ def loopback_transports(names: list[str]) -> dict[str, TransportConfig]:
             roster={other: peer for other, peer in roster.items() if other != name},
             multicast=False,
             gossip=False,
+            chaos=True,
         )
         for name in names
     }

@@ -114,10 +114,11 @@ async def ask(
 def _ask_blocking(
     config: TransportConfig, swarm: str, admin: keys.Admin, request: bytes, robot: str, timeout_s: float
 ) -> dict[str, bytes]:
-    settings = session_settings(config, swarm, OPERATOR, Plane.CONTROL, dials_all=True) | {"listen/endpoints": []}
-    session = open_session(settings, OPERATOR)
+    settings = session_settings(config, swarm, OPERATOR, Plane.CONTROL, dials_all=True)
+    dialled = sorted({*settings["connect/endpoints"], *_on_this_machine(config)})
+    session = open_session(settings | {"listen/endpoints": [], "connect/endpoints": dialled}, OPERATOR)
     try:
-        _find(session, len(config.roster), timeout_s)
+        _find(session, len(dialled), timeout_s)
         replies = session.get(
             keys.admin_key(swarm, robot, admin),
             zenoh.handlers.FifoChannel(256),
@@ -131,8 +132,14 @@ def _ask_blocking(
         session.close()
 
 
+def _on_this_machine(config: TransportConfig) -> list[str]:
+    """Where the agent listens whose configuration this is; the operator may well sit at its side."""
+    named = [endpoint for endpoint in config.control_listen if not endpoint.endswith(":0")]
+    return [endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for endpoint in named]
+
+
 def _find(session: zenoh.Session, count: int, timeout_s: float) -> None:
-    """Wait until as many agents as the roster names are linked, or without a roster for half of the time."""
+    """Wait until as many agents as are dialled are linked, or where nobody is dialled for half of the time."""
     deadline_s = time.monotonic() + (timeout_s if count else timeout_s / 2)
     while time.monotonic() < deadline_s and (not count or len(session.info.peers_zid()) < count):
         time.sleep(LOOK_PERIOD_S)
