@@ -138,7 +138,8 @@ def test_a_port_in_use_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_launch_is_shown_from_its_first_state_and_the_port_is_given_back(tmp_path: Path) -> None:
-    folder, seen = RunFolder(tmp_path / "run"), []
+    folder = RunFolder(tmp_path / "run")
+    seen: list[str] = []
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
