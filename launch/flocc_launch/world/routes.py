@@ -15,12 +15,13 @@ from flocc_launch.world.spec import WorldSpec
 Float = NDArray[np.float64]
 Node = tuple[int, int]
 
-# alpha and bravo share (2,1) to (1,1); bravo and charlie share (1,1) to (1,2) to (2,2); alpha and charlie meet head on
-# between (1,0) and (2,0) and never walk one street in the same direction.
+# alpha and charlie share (1,0) to (2,0) early; charlie and bravo (3,1) to (2,1); alpha and bravo (2,1) to (1,1) to (1,2)
+# to (2,2) late: every stretch of drift lies in a loop over several robots. charlie comes back down the street that alpha
+# walked up, so these two meet head on as well.
 ROUTES: tuple[tuple[Node, ...], ...] = (
-    ((0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1), (0, 0), (1, 0)),
-    ((3, 2), (3, 1), (2, 1), (1, 1), (1, 2), (2, 2), (3, 2), (3, 1)),
-    ((3, 0), (2, 0), (1, 0), (1, 1), (1, 2), (2, 2), (2, 1), (3, 1)),
+    ((0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (1, 2), (2, 2)),
+    ((3, 2), (3, 1), (2, 1), (1, 1), (1, 2), (2, 2), (3, 2)),
+    ((1, 1), (1, 0), (2, 0), (3, 0), (3, 1), (2, 1), (2, 0)),
 )
 CORNER_M = 1.7
 LATERAL_M = 0.55
