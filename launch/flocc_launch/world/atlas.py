@@ -58,7 +58,7 @@ def pack(textures: list[Pixels], levels: int = LEVELS) -> Atlas:
 
 def _padding(length: int) -> int:
     """Texels after a texture, so that its slot ends on a cell."""
-    return PAD + (-length) % CELL
+    return PAD + (CELL - length % CELL) % CELL
 
 
 def _shelves(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], int]:

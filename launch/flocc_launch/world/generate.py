@@ -4,8 +4,11 @@ import logging
 import multiprocessing
 import os
 import shutil
+import tempfile
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -107,50 +110,30 @@ def _prepare(spec: WorldSpec, index: int, folder: Path, truth: Trajectory) -> li
 
 
 def _render(spec: WorldSpec, shots: list[_Shot], processes: int, progress: Progress | None) -> None:
-    done = 0
     chunks = [shots[i : i + CHUNK_IMAGES] for i in range(0, len(shots), CHUNK_IMAGES)]
-    processes = min(processes, len(chunks))
-    if processes == 1:
-        painter = _Painter(spec)
-        for chunk in chunks:
-            done += painter.paint(chunk)
-            if progress is not None:
-                progress(done, len(shots))
-        return
-    with multiprocessing.get_context("spawn").Pool(processes, _start_painter, (spec,)) as pool:
-        for count in pool.imap_unordered(_paint_chunk, chunks):
-            done += count
-            if progress is not None:
-                progress(done, len(shots))
+    done = 0
+    with tempfile.TemporaryDirectory(prefix="flocc-world-") as folder:
+        baked_world(spec).save(Path(folder))
+        with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+            for count in pool.map(_paint, [spec] * len(chunks), chunks, [Path(folder)] * len(chunks)):
+                done += count
+                if progress is not None:
+                    progress(done, len(shots))
 
 
-class _Painter:
-    """Renders shots; every process has one, of the same world."""
-
-    def __init__(self, spec: WorldSpec) -> None:
-        cv2.setNumThreads(1)
-        self._spec = spec
-        self._camera = world_camera(spec)
-        self._renderer = Renderer(baked_world(spec), self._camera)
-
-    def paint(self, shots: list[_Shot]) -> int:
-        for shot in shots:
-            clean = self._renderer.render(shot.T_world_camera, light_at(self._spec, shot.stamp_s))
-            sensor = Sensor(self._spec, self._camera, shot.robot)
-            pixels = sensor.expose(clean, shot.stamp_s, shot.frame, shot.T_world_camera, shot.T_later)
-            quality = [cv2.IMWRITE_JPEG_QUALITY, self._spec.jpeg_quality]
-            cv2.imwrite(str(shot.path), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), quality)
-        return len(shots)
+def _paint(spec: WorldSpec, shots: list[_Shot], folder: Path) -> int:
+    """Render some shots in a process of its own; returns how many."""
+    cv2.setNumThreads(1)
+    camera, renderer = world_camera(spec), _renderer(spec, folder)
+    for shot in shots:
+        clean = renderer.render(shot.T_world_camera, light_at(spec, shot.stamp_s))
+        sensor = Sensor(spec, camera, shot.robot)
+        pixels = sensor.expose(clean, shot.stamp_s, shot.frame, shot.T_world_camera, shot.T_later)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, spec.jpeg_quality]
+        cv2.imwrite(str(shot.path), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), quality)
+    return len(shots)
 
 
-_painter: _Painter | None = None
-
-
-def _start_painter(spec: WorldSpec) -> None:
-    global _painter
-    _painter = _Painter(spec)
-
-
-def _paint_chunk(shots: list[_Shot]) -> int:
-    assert _painter is not None
-    return _painter.paint(shots)
+@lru_cache(maxsize=1)
+def _renderer(spec: WorldSpec, folder: Path) -> Renderer:
+    return Renderer(Baked.load(folder), world_camera(spec))

@@ -40,7 +40,10 @@ class _Solids:
         return _Solids(self.centres_m[chosen], self.halves_m[chosen], self.yaws_rad[chosen])
 
     def without(self, index: int | None) -> NDArray[np.bool_]:
-        return np.arange(len(self.yaws_rad)) != (-1 if index is None else index)
+        kept = np.ones(len(self.yaws_rad), dtype=np.bool_)
+        if index is not None:
+            kept[index] = False
+        return kept
 
     def within(self, low_m: Float, high_m: Float) -> NDArray[np.bool_]:
         """Which solids may reach into a box."""
@@ -116,4 +119,5 @@ def _sunlit(points: Float, solids: _Solids) -> Float:
     rays = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     one, two = (-solids.halves_m[:, None] - starts) / rays, (solids.halves_m[:, None] - starts) / rays
     enters, leaves = np.minimum(one, two).max(axis=2), np.maximum(one, two).min(axis=2)
-    return 1.0 - ((leaves > np.maximum(enters, 0.0)) & (leaves > 0.02)).any(axis=0)
+    met = (leaves > np.maximum(enters, 0.0)) & (leaves > 0.02)
+    return np.where(met.any(axis=0), 0.0, 1.0)
