@@ -81,12 +81,13 @@ def launch(
     duration: Duration = None,
     seed: Seed = None,
     rate: Annotated[float | None, typer.Option(help="Playback speed of recordings.")] = None,
+    secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
 ) -> None:
     """Run a scenario with one process per robot on this machine, over real zenoh."""
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     if rate is not None:
         changes["rate"] = rate
-    _launch(_read(scenario, changes, agents), out)
+    _launch(_read(scenario, changes, agents), out, secure)
 
 
 @app.command()
@@ -238,7 +239,7 @@ def _changes(
     return {key: value for key, value in given.items() if value is not None}
 
 
-def _launch(scenario: "Scenario", out: Path) -> None:
+def _launch(scenario: "Scenario", out: Path, secure: bool = False) -> None:
     from rich.console import Console
 
     from flocc_launch.data import recordings
@@ -248,7 +249,7 @@ def _launch(scenario: "Scenario", out: Path) -> None:
     with _progress("preparing data") as progress:
         recordings(scenario, progress)
     with LiveTable(Console()) as table:
-        report = run(scenario, out, table.show)
+        report = run(scenario, out, table.show, secure=secure)
     _show(report, out)
 
 

@@ -18,6 +18,7 @@ from typing import Any
 from flocc_agent.config import RadioConfig, SourceConfig
 from flocc_launch.agent_process import recover_result
 from flocc_launch.data import recordings
+from flocc_launch.keys import make_keys
 from flocc_launch.processes import AgentProcess, loopback_transports
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
@@ -60,6 +61,7 @@ def launch(
     out: Path,
     on_watch: OnWatch | None = None,
     progress: Callable[[int, int], None] | None = None,
+    secure: bool = False,
 ) -> Report:
     """Run a scenario and write its run folder.
 
@@ -68,13 +70,14 @@ def launch(
         out: Run folder; an earlier run in it is replaced.
         on_watch: Called four times a second.
         progress: Called while data is generated, with (done, all).
+        secure: Make keys for this run, and let agents trust those who have them only.
 
     Raises:
         FloccError: The data cannot be used, or no agent could be started.
     """
     paths = recordings(scenario, progress)
     folder = fresh_folder(out)
-    return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None)).run())
+    return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure).run())
 
 
 def fresh_folder(out: Path) -> RunFolder:
@@ -93,11 +96,14 @@ def fresh_folder(out: Path) -> RunFolder:
 class _Launch:
     """One run."""
 
-    def __init__(self, scenario: Scenario, folder: RunFolder, paths: dict[str, Path], on_watch: OnWatch) -> None:
+    def __init__(
+        self, scenario: Scenario, folder: RunFolder, paths: dict[str, Path], on_watch: OnWatch, secure: bool
+    ) -> None:
         self._scenario = scenario
         self._folder = folder
         self._paths = paths
         self._on_watch = on_watch
+        self._secure = secure
         self._epoch_s = time.monotonic()
         self._events: list[dict[str, Any]] = []
         self._radio = scenario.radio
@@ -124,7 +130,8 @@ class _Launch:
 
     def _agents(self) -> list[AgentProcess]:
         names = self._scenario.names()
-        transports = loopback_transports(names)
+        keys = make_keys(self._folder.path / "keys", self._scenario.name, names) if self._secure else None
+        transports = loopback_transports(names, keys)
         agents = []
         for name in names:
             folder = self._folder.path / "robots" / name

@@ -8,11 +8,12 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flocc_agent.config import AgentConfig, PeerEndpoints, TransportConfig
+from flocc_agent.config import AgentConfig, PeerEndpoints, TlsConfig, TransportConfig
 
 STOP_TIMEOUT_S = 20.0
 LOG_TAIL_LINES = 5
@@ -119,13 +120,14 @@ class AgentProcess:
             os.killpg(self.process.pid, signal.SIGKILL)
 
 
-def loopback_transports(names: list[str]) -> dict[str, TransportConfig]:
-    """Explicit endpoints on this machine for all robots, on ports that are free now."""
+def loopback_transports(names: list[str], keys: Mapping[str, Path] | None = None) -> dict[str, TransportConfig]:
+    """Explicit endpoints on this machine for all robots, on ports that are free now; with keys over mutual TLS."""
     ports = free_ports(2 * len(names))
+    protocol = "tcp" if keys is None else "tls"
     roster = {
         name: PeerEndpoints(
-            control=(f"tcp/127.0.0.1:{ports[2 * i]}",),
-            bulk=(f"tcp/127.0.0.1:{ports[2 * i + 1]}",),
+            control=(f"{protocol}/127.0.0.1:{ports[2 * i]}",),
+            bulk=(f"{protocol}/127.0.0.1:{ports[2 * i + 1]}",),
         )
         for i, name in enumerate(names)
     }
@@ -137,6 +139,7 @@ def loopback_transports(names: list[str]) -> dict[str, TransportConfig]:
             multicast=False,
             gossip=False,
             chaos=True,
+            tls=None if keys is None else TlsConfig(folder=keys[name].resolve()),
         )
         for name in names
     }
