@@ -40,17 +40,7 @@ def test_prepares_pictures_as_the_official_code_and_swarm_slam() -> None:
     assert np.array_equal(place_input(pixels, "swarm-slam")[0], case["swarmslam_376_224"].numpy())
     assert np.array_equal(place_input(pixels, "shorter-side", 320)[0][:, ::7, ::7], case["resize320"].numpy())
     plain = place_input(pixels, "native")[0]
-    found = [
-        step
-        for step in range(1, 64)
-        if plain[:, ::step, ::step].shape == tuple(case["plain_probe"].shape)
-        and np.array_equal(plain[:, ::step, ::step], case["plain_probe"].numpy())
-    ]
-    steps = [(a, b) for a in range(25, 36) for b in range(25, 36)]
-    found_pairs = [
-        pair for pair in steps if np.array_equal(plain[:, :: pair[0], :: pair[1]], case["plain_probe"].numpy())
-    ]
-    assert found or found_pairs
+    assert np.array_equal(plain[:, ::31, ::29], case["plain_probe"].numpy())
 
 
 @pytest.mark.parametrize(("backbone", "dimension", "tensors", "parameters"), OFFICIAL)

@@ -111,17 +111,15 @@ class Scripted(Engine):
         self.decoded += len(pairs)
         if self.spoil == "memory":
             raise NotEnoughMemory("memory ran out on cpu while running MASt3R")
-        return [
-            self._views(inverse(self.T_1_2) if b is pairs[0][0] and k else self.T_1_2) for k, (_, b) in enumerate(pairs)
-        ]
+        reversed_order = [k > 0 and second is pairs[0][0] for k, (_, second) in enumerate(pairs)]
+        return [self._views(inverse(self.T_1_2) if back else self.T_1_2) for back in reversed_order]
 
     def _views(self, T_1_2: Any) -> tuple[View, View]:
-        size, f, c = 224, 0.8 * 160 * 299 / 160 * 224 / 224, 112.0
+        size, f, c = 224, 179.2, 112.0
         generator = torch.Generator().manual_seed(1)
         texture = torch.nn.functional.normalize(torch.randn(size, size, 24, generator=generator), dim=-1)
         v, u = np.mgrid[:size, :size].astype(float)
         z = 4.0 + 0.02 * u + 0.01 * v + np.random.default_rng(0).uniform(0, 2, u.shape)
-        f = 179.2
         p_1 = np.stack([(u - c) / f * z, (v - c) / f * z, z], axis=-1)
         p_2 = p_1 @ inverse(T_1_2)[:3, :3].T + inverse(T_1_2)[:3, 3]
         u_2, v_2 = (np.rint(p_2[..., k] / p_2[..., 2] * f + c).astype(int) for k in (0, 1))
@@ -286,13 +284,8 @@ def test_too_little_memory_is_said_before_anything_is_loaded() -> None:
 
 def test_formats_follow_what_the_machine_can_do(monkeypatch: pytest.MonkeyPatch) -> None:
     cuda = torch.device("cuda")
-    for capability, expected in (
-        ((9, 0), "bf16"),
-        ((8, 0), "bf16"),
-        ((7, 2), "fp16"),
-        ((7, 0), "fp16"),
-        ((6, 1), "fp32"),
-    ):
+    known = {(9, 0): "bf16", (8, 0): "bf16", (7, 2): "fp16", (7, 0): "fp16", (6, 1): "fp32"}
+    for capability, expected in known.items():
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _=None, found=capability: found)
         assert choose_dtype("auto", cuda) is device_module.DTYPES[expected]
     assert choose_dtype("auto", torch.device("mps")) is torch.float16

@@ -73,10 +73,11 @@ def test_union_of_two_decodes_and_its_confidences_equal_the_references() -> None
         assert np.allclose(confidences, case["conf"].numpy(), rtol=1e-6)
 
 
+DECODED = [("tiny_sq", 4), ("tiny_min", 4), ("tiny_portrait", 4), ("small_land", 8)]
+
+
 @pytest.mark.golden
-@pytest.mark.parametrize(
-    ("name", "subsample"), [("tiny_sq", 4), ("tiny_min", 4), ("tiny_portrait", 4), ("small_land", 8)]
-)
+@pytest.mark.parametrize(("name", "subsample"), DECODED)
 def test_matches_of_decoded_descriptors_equal_the_references(name: str, subsample: int) -> None:
     case = golden(f"{name}.pt")
     desc = [case["out"][f"res{k}"]["desc"][0] for k in (1, 2)]
