@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from flocc_launch.doctor import Finding
 
 EXIT_BLOCKED = 1
+WIDTH_PIPE = 140
 
 RunArgument = Annotated[Path | None, typer.Argument(help="Run folder.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="An agent's configuration: its swarm and how to reach it.")]
@@ -60,12 +61,15 @@ def status(
 
     from flocc_launch.status import status_json, status_of_run, status_of_swarm, status_table
 
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH_PIPE)
     while True:
         rows = status_of_run(run) if run is not None else status_of_swarm(*_reach(config, swarm))
         if json_out:
             typer.echo(status_json(rows))
         else:
-            Console().print(status_table(rows))
+            console.print(status_table(rows))
         if watch_s is None:
             return
         time.sleep(watch_s)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from flocc_agent.config import TransportConfig
@@ -95,7 +96,7 @@ def status_json(rows: Sequence[RobotStatus]) -> str:
 def status_table(rows: Sequence[RobotStatus], title: str = "") -> Table:
     """All rows as a table for the terminal."""
     cells = [cells_of(row) for row in rows]
-    table = Table(title=title or None, title_justify="left")
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for column in cells_of(RobotStatus(robot="")):
         table.add_column(column, justify="left" if column in LEFT else "right", no_wrap=column == "robot")
     for row in cells:
