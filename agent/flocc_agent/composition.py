@@ -4,7 +4,9 @@ Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is
 """
 
 import asyncio
+import json
 import os
+import signal
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable
@@ -24,20 +26,26 @@ from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import is_rigid
 from flocc_agent.radio import Radio
+from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver, Skills
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
+from flocc_protocol.keys import Admin
 
 Float = NDArray[np.float64]
+
+KILL_AFTER_S = 0.2
+"""Time for the answer to an operator's order to leave."""
 
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
 
@@ -270,10 +278,14 @@ class Agent:
         restored = restore(self._store)
         log = self._store.identity.log
         boot = int.from_bytes(os.urandom(6))
-        core = Robot(log, config.compute_class, boot, config.core, self._clock_s(), restored)
+        core = Robot(log, config.compute_class, boot, config.core, self._clock_s(), restored, _sealer(config))
+        transport = ZenohTransport(config.swarm, config.name, config.transport, self._radio, self._clock_s)
+        transport.serve_admin(Admin.STATUS, lambda _: json.dumps(self.status()).encode())
+        if config.transport.chaos:
+            transport.serve_admin(Admin.CHAOS, self._disturb)
         return Driver(
             core,
-            ZenohTransport(config.swarm, config.name, config.transport, self._radio, self._clock_s),
+            transport,
             self._store,
             self._workers,
             Skills(
@@ -285,6 +297,22 @@ class Agent:
             self._on_line,
             self._clock_s,
         )
+
+    def _disturb(self, request: bytes) -> bytes:
+        """Carry out an operator's order, and say so."""
+        try:
+            order = read_order(request)
+        except BadOrder as error:
+            return str(error).encode()
+        if not order.concerns(self.config.name):
+            return b"not concerned"
+        if self._radio is not None:
+            self._radio.parameters = disturbed(self._radio.parameters, order, self._clock_s())
+        if order.kind == "slow" and order.value is not None:
+            self.set_slowness(order.value)
+        if order.kind == "kill":
+            asyncio.get_running_loop().call_later(KILL_AFTER_S, os.kill, os.getpid(), signal.SIGKILL)
+        return b"done"
 
     async def _play(self, recording: Recording) -> None:
         source = self.config.source
@@ -317,10 +345,14 @@ def stored_result(config: AgentConfig) -> dict[str, Any]:
     T_body_camera = np.eye(4) if recording is None else recording.T_body_camera
     store = _open_store(config)
     try:
-        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restore(store))
+        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restore(store), _sealer(config))
     finally:
         store.close()
     return result_of(robot, T_body_camera)
+
+
+def _sealer(config: AgentConfig) -> RecordSealer | None:
+    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
 
 
 def _open_store(config: AgentConfig) -> Store:
