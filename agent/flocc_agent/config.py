@@ -67,6 +67,8 @@ class BackendConfig(Section):
     """lm is fastest and trusts every closure; gnc-* find and reject outliers."""
     pairwise_consistency: bool = True
     """Filter closures by pairwise consistency maximisation before solving."""
+    closures_to_join_min: int = Field(2, ge=1)
+    """Maps with fewer agreeing closures between them stay apart: a single wrong one would contradict nothing."""
     scale_initial: ScaleInitial = ScaleInitial.ODOMETRY
     """raw: network units are metres; odometry: Eq. (6); ground-truth: for ablations only."""
     steepness: float = Field(4.0, gt=0)
@@ -81,8 +83,10 @@ class BackendConfig(Section):
     """Standard deviation of a closure's translation at probability one, metres."""
     cluster_keyframes_max: int = Field(10, ge=1)
     """Closures whose keyframes are fewer than this apart on both sides share a scale cluster."""
-    scale_link_sigma_ratio: float = Field(0.1, gt=0)
-    """Standard deviation of the difference of two linked scales, relative to their size."""
+    scale_link_sigma_ratio: float = Field(0.2, gt=0)
+    """Standard deviation of a scale around its cluster's scale, both relative to their initial values by Eq. (6)."""
+    scale_link_unknown_sigma_ratio: float = Field(3.0, gt=0)
+    """The same where no initial scale makes the closures' network units comparable."""
     scale_prior_sigma_ratio: float = Field(3.0, gt=0)
     """Weak prior on a scale that Eq. (6) initialises: standard deviation relative to its initial value. It keeps
     unobservable scales finite; smaller rejects closures whose scale is far from its initial value."""
@@ -114,6 +118,8 @@ class ClassicalConfig(Section):
 
     features_max: int = Field(1000, ge=50, le=10_000)
     """Features per image; a latent has 136 bytes for each."""
+    pixels_max: int = Field(180_000, ge=10_000)
+    """Larger images are shrunk to this many pixels before features are sought (480x375); more cost more time."""
     contrast_threshold: float = Field(0.02, gt=0)
     """SIFT's contrast threshold; lower finds features in dim images, and more that do not repeat."""
     distance_ratio_max: float = Field(0.8, gt=0, le=1)

@@ -4,11 +4,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flocc_agent.backend.alignment import align
+from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.core.pose_graph import AbsoluteFix, Component, GraphSolution, LoopClosure, Trajectory
-from flocc_agent.geometry import Float, inverse, pose, umeyama
+from flocc_agent.geometry import Float, angle_rad, inverse, pose, umeyama
 from flocc_protocol.ids import LogId
+
+JUDGES_MIN = 2
 
 
 def initial_poses(
@@ -17,12 +19,36 @@ def initial_poses(
     steepness: float,
     earlier: GraphSolution | None,
 ) -> dict[LogId, Float]:
-    """Poses (N, 4, 4) of every log in one frame, from the earlier solution where it has all logs in one component."""
+    """Poses (N, 4, 4) of every log in one frame.
+
+    They come from the earlier solution where it has all logs in one component and most closures of every pair of robots
+    still agree with it. Otherwise the robots are placed anew: a first closure that was wrong must not outlive the right
+    ones that follow it.
+    """
+    T_map_odom, aligned = align(trajectories, closures, steepness)
     component = component_with(trajectories, earlier)
     if component is not None:
-        return {log: extended(component.T_map_keyframe[log], trajectories[log]) for log in trajectories}
-    T_map_odom, _ = align(trajectories, closures, steepness)
+        warm = {log: extended(component.T_map_keyframe[log], trajectories[log]) for log in trajectories}
+        judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
+        if all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
+            return warm
     return {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}
+
+
+def upheld(T_map_keyframe: Mapping[LogId, Float], closures: Sequence[LoopClosure]) -> bool:
+    """Whether most of these closures agree with the poses, in rotation and in the direction of their translation."""
+    return 2 * sum(_agrees(T_map_keyframe, closure) for closure in closures) > len(closures)
+
+
+def _agrees(T_map_keyframe: Mapping[LogId, Float], closure: LoopClosure) -> bool:
+    T_map_query = T_map_keyframe[closure.query.log][closure.query.index]
+    T_map_match = T_map_keyframe[closure.match.log][closure.match.index]
+    T = inverse(T_map_query) @ T_map_match
+    measured = np.asarray(closure.T_query_match_unscaled, dtype=float)
+    u = measured[:3, 3] / max(float(np.linalg.norm(measured[:3, 3])), 1e-12)
+    aside_m = float(np.linalg.norm(T[:3, 3] - max(float(T[:3, 3] @ u), 0.0) * u))
+    turned_rad = angle_rad(measured[:3, :3].T @ T[:3, :3])
+    return turned_rad < ROTATION_TOLERANCE_RAD and aside_m < TRANSLATION_TOLERANCE_M
 
 
 def component_with(logs: Mapping[LogId, Trajectory], earlier: GraphSolution | None) -> Component | None:

@@ -15,6 +15,7 @@ import numpy as np
 from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.edges import state_of
 from flocc_agent.backend.initial import initial_poses, initial_world
+from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.problem import build
 from flocc_agent.backend.results import Outcome, Solution, collect, excluded, odometry_component, rejected
@@ -120,6 +121,8 @@ def _solve_and_split(
     turned_away = {k: rejected(closures[k], reason) for k, reason in dropped.items()}
     turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
     left = {k: c for k, c in kept.items() if k not in turned_away}
+    for k in too_few(list(trajectories), left, config.closures_to_join_min):
+        turned_away[k] = rejected(left.pop(k), f"fewer than {config.closures_to_join_min} closures join these maps")
     groups = components_of(list(trajectories), list(left.values()))
     if len(groups) == 1:
         timings_s = {"consistency": time.perf_counter() - began - sum(outcome.timings_s.values()), **outcome.timings_s}
