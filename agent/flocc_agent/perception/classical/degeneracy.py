@@ -19,7 +19,9 @@ from flocc_agent.perception.classical.two_view import TwoView, usac_parameters
 Float = NDArray[np.float64]
 
 EXPLAINED_SHARE_MIN = 0.9
-"""A rotation or a plane that explains this share of the correspondences explains the pair."""
+"""A motion that explains this share of the correspondences explains the pair."""
+PLANE_SHARE_MIN = 0.6
+"""With fewer correspondences on one plane the others tell its two motions apart; wrong ones are among the others."""
 ROTATION_ROUNDS = 5
 COST_RATIO_MAX = 1.5
 """Two solutions whose costs differ by less are equally good."""
@@ -71,10 +73,10 @@ def rotation_share(points: Float, view: View, config: ClassicalConfig) -> float:
 
 
 def _plane_is_ambiguous(points: Float, pair: TwoView, config: ClassicalConfig) -> bool:
-    """Whether one plane holds nearly all correspondences and a second motion fits as well as the pair's."""
+    """Whether one plane holds most correspondences and a second motion fits as well as the pair's."""
     view = pair.view
     H, mask = cv2.findHomography(points, view.observed, usac_parameters(config, view.focal_px))
-    if H is None or mask is None or float(np.mean(mask)) < EXPLAINED_SHARE_MIN:
+    if H is None or mask is None or float(np.mean(mask)) < PLANE_SHARE_MIN:
         return False
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
     for R, t in zip(rotations, translations, strict=True):

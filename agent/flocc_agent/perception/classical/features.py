@@ -38,21 +38,34 @@ class FeatureExtractor:
     def __init__(self, config: ClassicalConfig) -> None:
         cv2.setNumThreads(1)  # global in OpenCV: one worker, one core
         self._features_max = config.features_max
+        self._pixels_max = config.pixels_max
         self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=config.contrast_threshold)
 
     def extract(self, image: Image) -> Features:
         """Find and describe the features of an image; an image of one colour has none."""
-        grey = cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
-        keypoints, sift = self._sift.detectAndCompute(grey, None)
+        grey = np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+        reduced = reduced_to(grey, self._pixels_max)
+        keypoints, sift = self._sift.detectAndCompute(reduced, None)
         focal_px = (image.camera.fx + image.camera.fy) / 2.0
         if sift is None or len(keypoints) == 0:
             empty = np.zeros((0, DESCRIPTOR_LENGTH), np.uint8)
             return Features(np.zeros((0, 2), np.float32), empty, focal_px)
-        pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64)[: self._features_max]
+        found = np.array([keypoint.pt for keypoint in keypoints], np.float64)[: self._features_max]
+        factors = np.array(grey.shape[::-1]) / reduced.shape[::-1]
+        pixels = (found + 0.5) * factors - 0.5
         points = undistorted(pixels, image.camera)
         return Features(
             points.astype(np.float32), root_sift(np.asarray(sift[: self._features_max], np.float32)), focal_px
         )
+
+
+def reduced_to(grey: NDArray[np.uint8], pixels_max: int) -> NDArray[np.uint8]:
+    """Shrink an image (H, W) to at most this many pixels; a smaller one stays."""
+    factor = float(np.sqrt(pixels_max / grey.size))
+    if factor >= 1.0:
+        return grey
+    height, width = (max(round(size * factor), 1) for size in grey.shape)
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def undistorted(pixels: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 
 PATCH_LENGTH = 128
-WIDTHS = (320, 226, 160)
-"""Widths in pixels that the image is reduced to; patches of three sizes."""
+SIDES_PX = (320, 226, 160)
+"""Longer sides that the image is brought to; patches of three sizes."""
 CELL_PX = 6
 STEP_PX = 8
 SMOOTHING_PX = 0.8
@@ -23,15 +23,15 @@ ORIENTATIONS = 8
 
 def dense_patches(grey: NDArray[np.uint8]) -> Float32:
     """Describe an image (H, W) uint8 by its patches (N, 128), each of unit length; none for a flat image."""
-    patches = np.concatenate([_patches_at(grey, width) for width in WIDTHS])
+    patches = np.concatenate([_patches_at(grey, side_px) for side_px in SIDES_PX])
     total = patches.sum(axis=1, keepdims=True)
     textured = total[:, 0] > CONTRAST_MIN
     return np.asarray(np.sqrt(patches[textured] / total[textured]))
 
 
-def _patches_at(grey: NDArray[np.uint8], width: int) -> Float32:
-    """Cells of gradient orientations around the points of a grid, of the image reduced to a width."""
-    height = max(round(grey.shape[0] * width / grey.shape[1]), 1)
+def _patches_at(grey: NDArray[np.uint8], side_px: int) -> Float32:
+    """Cells of gradient orientations around the points of a grid, of the image brought to a size."""
+    height, width = (max(round(size * side_px / max(grey.shape)), 1) for size in grey.shape)
     reduced = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     maps = _orientation_maps(cv2.GaussianBlur(reduced, (0, 0), SMOOTHING_PX).astype(np.float32))
     border = 2 * CELL_PX

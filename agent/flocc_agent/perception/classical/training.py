@@ -38,16 +38,16 @@ RIDGE = 1e-3
 """Variance within scenes that is added everywhere, relative to its trace."""
 
 
-def train(scenes: int, seed: int) -> Codebook:
+def train(scenes: int, seed: int, words_count: int = WORDS, dimension: int = DIMENSION) -> Codebook:
     """Learn a codebook from generated scenes."""
     rng = np.random.default_rng(seed)
     images = [[random_view(scene, rng) for _ in range(VIEWS)] for scene in (random_scene(rng) for _ in range(scenes))]
     sample = np.concatenate([_sample(dense_patches(views[0]), rng) for views in images])
     mean, projection = principal_components(sample, PATCH_COMPONENTS)
-    words = clustered((sample - mean) @ projection, WORDS, rng)
+    words = clustered((sample - mean) @ projection, words_count, rng)
     logger.info("%d words from %d patches", len(words), len(sample))
     aggregated = [[_aggregated(dense_patches(view), mean, projection, words) for view in views] for views in images]
-    vlad_mean, vlad_projection = discriminants(np.array(aggregated), DIMENSION)
+    vlad_mean, vlad_projection = discriminants(np.array(aggregated), dimension)
     return Codebook(mean, projection, words, vlad_mean, vlad_projection)
 
 
