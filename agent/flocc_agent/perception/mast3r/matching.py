@@ -1,12 +1,9 @@
 """Reciprocal nearest-neighbour matching of two dense descriptor fields, with the reference algorithm's result.
 
-The search is exact: every query is compared with every pixel. It is fast because each block of pixels is reduced to
-its largest score only (a product and a row maximum, both vectorised); the index is looked for once, in the winning
-block. Loop pairs and odometry pairs go through the same function with the same parameters, because Eq. (1) is a
-ratio of their counts.
+The search (`search.py`) is exact. Loop pairs and odometry pairs go through the same function with the same
+parameters, because Eq. (1) is a ratio of their counts.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-BLOCK_CPU = 1024
-BLOCK_ACCELERATOR = 8192
+from flocc_agent.perception.mast3r.search import Index, Search, exact_index
+
 ROUNDS_MAX = 10
 
 Int = NDArray[np.int64]
 Float32 = NDArray[np.float32]
-Search = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,27 +60,6 @@ class Matches:
         return Matches(self.xy1[keep], self.xy2[keep])
 
 
-def nearest(queries: Tensor, database: Tensor) -> Tensor:
-    """Index of the database row with the largest dot product, for each query; the first of equals.
-
-    Args:
-        queries: (Q, D).
-        database: (N, D).
-
-    Returns:
-        (Q,) int64.
-    """
-    block = BLOCK_CPU if database.device.type == "cpu" else BLOCK_ACCELERATOR
-    blocks = [database[k : k + block] for k in range(0, len(database), block)]
-    best_of_block = torch.stack([(queries @ rows.T).amax(dim=1) for rows in blocks])
-    winner = best_of_block.argmax(dim=0)
-    found = torch.empty(len(queries), dtype=torch.int64, device=database.device)
-    for k in np.unique(winner.cpu().numpy()).tolist():
-        chosen = (winner == k).nonzero()[:, 0]
-        found[chosen] = k * block + (queries[chosen] @ blocks[k].T).argmax(dim=1)
-    return found
-
-
 def seeds(height: int, width: int, subsample: int, device: torch.device) -> Tensor:
     """Linear indices of the grid of start pixels, ascending."""
     y = torch.arange(subsample // 2, height, subsample, device=device)
@@ -93,38 +68,42 @@ def seeds(height: int, width: int, subsample: int, device: torch.device) -> Tens
 
 
 def reciprocal_indices(
-    flat_1: Tensor, flat_2: Tensor, start: Tensor, rounds: int = ROUNDS_MAX, search: Search = nearest
+    desc_1: Tensor, desc_2: Tensor, start: Tensor, rounds: int = ROUNDS_MAX, index: Index = exact_index
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Walk from each start to its nearest neighbour and back until nothing changes.
 
     Args:
-        flat_1: (N1, D) descriptors of image 1.
-        flat_2: (N2, D) descriptors of image 2.
+        desc_1: (H1, W1, D) descriptors of image 1.
+        desc_2: (H2, W2, D) descriptors of image 2.
         start: (Q,) linear indices in image 1.
         rounds: Walks there and back at most.
-        search: Finds nearest neighbours; the default is exact.
+        index: Makes the search over an image; the default is exact.
 
     Returns:
         Last index in image 1 and in image 2, and whether the walk came to rest; each (Q,).
     """
+    flat_1, flat_2 = desc_1.flatten(0, 1), desc_2.flatten(0, 1)
+    search_1, search_2 = index(desc_1), index(desc_2)
     index_1, index_2 = start.clone(), torch.full_like(start, -1)
     active = torch.arange(len(start), device=start.device)
     for _ in range(rounds):
-        there = search(flat_1[index_1[active]], flat_2)
-        active_changed = there != index_2[active]
-        index_2[active] = there
-        active = active[active_changed]
-        if len(active) == 0:
-            break
-        back = search(flat_2[index_2[active]], flat_1)
-        active_changed = back != index_1[active]
-        index_1[active] = back
-        active = active[active_changed]
+        active = _step(search_2, flat_1, index_1, index_2, active)
+        active = _step(search_1, flat_2, index_2, index_1, active)
         if len(active) == 0:
             break
     converged = torch.ones(len(start), dtype=torch.bool, device=start.device)
     converged[active] = False
     return index_1, index_2, converged
+
+
+def _step(search: Search, flat_here: Tensor, here: Tensor, there: Tensor, active: Tensor) -> Tensor:
+    """Move the active walks to the other image, in place; gives those that moved."""
+    if len(active) == 0:
+        return active
+    found = search(flat_here[here[active]])
+    moved = found != there[active]
+    there[active] = found
+    return active[moved]
 
 
 def _pixels(index: Tensor, width: int) -> Int:
@@ -134,7 +113,7 @@ def _pixels(index: Tensor, width: int) -> Int:
 
 
 def reciprocal_matches(
-    desc_1: Tensor, desc_2: Tensor, subsample: int = 8, rounds: int = ROUNDS_MAX, search: Search = nearest
+    desc_1: Tensor, desc_2: Tensor, subsample: int = 8, rounds: int = ROUNDS_MAX, index: Index = exact_index
 ) -> Matches:
     """Reciprocal nearest neighbours from a grid of seeds in image 1, sorted and without repetition.
 
@@ -143,10 +122,10 @@ def reciprocal_matches(
         desc_2: (H2, W2, D) of image 2; sizes may differ.
         subsample: Distance of the seeds, pixels.
         rounds: Walks there and back at most.
-        search: Finds nearest neighbours.
+        index: Makes the search over an image.
     """
     start = seeds(desc_1.shape[0], desc_1.shape[1], subsample, desc_1.device)
-    index_1, index_2, converged = reciprocal_indices(desc_1.flatten(0, 1), desc_2.flatten(0, 1), start, rounds, search)
+    index_1, index_2, converged = reciprocal_indices(desc_1, desc_2, start, rounds, index)
     pairs = torch.unique(torch.stack([index_1[converged], index_2[converged]], dim=1), dim=0)
     return Matches(_pixels(pairs[:, 0], desc_1.shape[1]), _pixels(pairs[:, 1], desc_2.shape[1]))
 
@@ -162,7 +141,7 @@ def matches_near_starts(desc_1: Tensor, desc_2: Tensor, start_xy: Int, tolerance
     """
     width = desc_1.shape[1]
     start = torch.from_numpy(start_xy[:, 0] + width * start_xy[:, 1]).to(desc_1.device)
-    index_1, index_2, _ = reciprocal_indices(desc_1.flatten(0, 1), desc_2.flatten(0, 1), start, rounds=1)
+    index_1, index_2, _ = reciprocal_indices(desc_1, desc_2, start, rounds=1)
     distance = np.linalg.norm(_pixels(index_1, width) - start_xy, axis=1)
     return Matches(start_xy, _pixels(index_2, desc_2.shape[1])).where(distance < tolerance_px)
 
