@@ -44,7 +44,7 @@ def _walk(scenario: TracksScenario, drift: DriftSpec, rng: np.random.Generator) 
     points_m: Float = ring_m[(start + np.arange(steps + 1)) % len(ring_m)]
     ahead = np.diff(points_m, axis=0)
     heading_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
-    stamps_s: Float = np.arange(steps) * (STEP_M / scenario.speed_m_s)
+    stamps_s = np.arange(steps, dtype=np.float64) * (STEP_M / scenario.speed_m_s)
     truth = Trajectory(stamps_s, np.array([_standing(p, h) for p, h in zip(points_m, heading_rad, strict=False)]))
     return Walk(truth, drifted(truth, drift, rng))
 

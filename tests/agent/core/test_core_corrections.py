@@ -1,0 +1,178 @@
+"""Corrections are fenced by (term, round), passed on, and asked for."""
+
+import numpy as np
+from tests.agent.core.virtual_time import Robots
+
+from flocc_agent.core.corrections import Corrections, pose7
+from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Unicast
+from flocc_agent.core.events import MessageReceived
+from flocc_agent.core.gossip import REMEMBERED_MAX
+from flocc_agent.core.parameters import GossipParameters, RoundParameters
+from flocc_agent.core.pose_graph import Component, GraphSolution
+from flocc_agent.core.robot import Restored
+from flocc_agent.geometry import pose
+from flocc_protocol.arrays import Array
+from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
+from flocc_protocol.messages import CorrectionMessage, CorrectionRequest, CorrectionVersion, Envelope
+
+R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
+
+
+def corrections(own: LogId = R1) -> Corrections:
+    return Corrections(own, GossipParameters(), RoundParameters())
+
+
+def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> CorrectionMessage:
+    poses = Array.of(np.array([[0.0, 0, 0, 1, 0, 0, 0]]), "f4")
+    return CorrectionMessage(log, term, number, anchor, pose7(np.eye(4)), None, 0, 1, poses)
+
+
+def delivered(effects: list[Effect]) -> list[tuple[int, int, bool]]:
+    found = [e.correction for e in effects if isinstance(e, Deliver)]
+    return [(c.term.counter, c.round, c.frame_changed) for c in found]
+
+
+def solution(shift_m: float = 0.0, keyframes: int = 3) -> GraphSolution:
+    poses = np.array([pose(np.eye(3), np.array([k + shift_m, 0.0, 0.0])) for k in range(keyframes)])
+    component = Component((R1,), {R1: poses}, {R1: pose(np.eye(3), np.array([shift_m, 0.0, 0.0]))}, {R1: None})
+    return GraphSolution((component,), ())
+
+
+def test_a_newer_correction_is_applied_and_persisted_first() -> None:
+    effects = corrections().on_message(correction(Term(1, R2), 1))
+    kinds = [type(effect) for effect in effects]
+    assert delivered(effects) == [(1, 1, False)]
+    assert kinds.index(PersistCorrection) < kinds.index(Deliver)
+
+
+def test_an_older_or_equal_correction_is_not_applied() -> None:
+    machine = corrections()
+    machine.on_message(correction(Term(2, R2), 5))
+    for late in (correction(Term(2, R2), 5), correction(Term(2, R2), 4), correction(Term(1, R3), 9)):
+        assert machine.on_message(late) == []
+
+
+def test_of_one_counter_the_higher_leader_log_is_newer() -> None:
+    machine = corrections()
+    machine.on_message(correction(Term(2, R3), 1))
+    assert machine.on_message(correction(Term(2, R2), 9)) == []
+
+
+def test_a_jump_of_the_frame_is_told() -> None:
+    machine = corrections(R2)
+    machine.on_message(correction(Term(1, R2), 1, log=R2, anchor=R2))
+    assert delivered(machine.on_message(correction(Term(1, R2), 2, log=R2, anchor=R1))) == [(1, 2, True)]
+
+
+def test_what_was_applied_before_a_restart_still_fences() -> None:
+    machine = corrections()
+    machine.restore(correction(Term(4, R2), 3))
+    assert machine.on_message(correction(Term(4, R2), 2)) == []
+    assert delivered(machine.on_message(correction(Term(4, R2), 4, anchor=R2))) == [(4, 4, True)]
+
+
+def test_a_restarted_robot_bids_above_what_it_applied() -> None:
+    assert Restored(term_counter=2, correction=correction(Term(9, R3), 1)).counter_max() == 9
+
+
+def test_another_robots_correction_is_kept_and_passed_on() -> None:
+    machine, message = corrections(R1), correction(Term(1, R2), 1, log=R3)
+    assert machine.on_message(message) == []
+    assert machine.on_request("r3", CorrectionRequest(R3)) == [Unicast("r3", message)]
+
+
+def test_a_newer_version_elsewhere_is_asked_for_once_per_timeout() -> None:
+    machine, versions = corrections(), (CorrectionVersion(R1, Term(1, R2), 1),)
+    assert machine.on_versions("r2", versions, 0.0) == [Unicast("r2", CorrectionRequest(R1))]
+    assert machine.on_versions("r3", versions, 0.5) == []
+    assert machine.on_versions("r3", versions, 1.0) == [Unicast("r3", CorrectionRequest(R1))]
+
+
+def test_versions_of_strangers_do_not_fill_the_memory() -> None:
+    machine = corrections()
+    for t in range(2000):
+        machine.on_versions("r2", (CorrectionVersion(LogId("r9", t), Term(1, R2), 1),), float(t))
+    assert machine.sizes()["asked_corrections"] == (REMEMBERED_MAX, REMEMBERED_MAX)
+
+
+def test_what_did_not_move_is_not_sent_again_in_one_term() -> None:
+    machine = corrections()
+    first = machine.publish(Term(1, R1), 1, solution())
+    assert isinstance(first[0], Broadcast)
+    assert machine.publish(Term(1, R1), 2, solution()) == []
+    assert delivered(machine.publish(Term(1, R1), 3, solution(shift_m=0.5))) == [(1, 3, False)]
+    assert delivered(machine.publish(Term(2, R1), 1, solution(shift_m=0.5))) == [(2, 1, False)]
+
+
+def test_a_long_trajectory_is_thinned_and_keeps_its_last_keyframe() -> None:
+    machine = corrections()
+    machine.publish(Term(1, R1), 1, solution(keyframes=1001))
+    message = machine.applied
+    assert message is not None
+    count = message.T_map_camera.shape[0]
+    assert count <= RoundParameters().correction_keyframes_max
+    assert message.first + message.step * (count - 1) == 1000
+
+
+def test_a_correction_of_an_absurd_term_is_refused() -> None:
+    robots = Robots()
+    robots.add("r1")
+    hostile = correction(Term(TERM_COUNTER_MAX, R2), 1)
+    robots.put("r1", MessageReceived(Envelope(R2, hostile)))
+    assert robots.effects("r1", Deliver) == []
+    assert len(robots.reports("r1", "peer_refused")) == 1
+
+
+def test_a_lost_correction_is_repaired_by_heartbeats() -> None:
+    lost = {"count": 0}
+
+    def drops(sender: str, receiver: str, message: object) -> bool:
+        lost["count"] += isinstance(message, CorrectionMessage)
+        return isinstance(message, CorrectionMessage) and lost["count"] <= 4
+
+    robots = Robots(drops=drops)
+    robots.add("r1")
+    robots.add("r2")
+    robots.capture("r2", 0.0, look=1)
+    robots.run(12.0)
+    assert robots.frames() == {"r2": "map/r2"}
+
+
+def test_a_robot_without_closures_gets_a_frame_of_its_own() -> None:
+    robots = Robots()
+    for k, name in enumerate(("r1", "r2")):
+        robots.add(name)
+        robots.capture(name, 0.0, look=k)
+    robots.run(8.0)
+    assert robots.frames() == {"r1": "map/r1", "r2": "map/r2"}
+
+
+def test_robots_that_meet_end_in_the_frame_of_the_lowest_log() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+        for k in range(3):
+            robots.capture(name, float(k), look=k)
+    robots.run(15.0)
+    assert robots.frames() == {"r1": "map/r1", "r2": "map/r1", "r3": "map/r1"}
+    assert len({str(core.corrections.applied and core.corrections.applied.term) for core in robots.cores.values()}) == 1
+
+
+def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders_corrections() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3", "r4"):
+        robots.add(name)
+    robots.separate("r1 r2", "r3 r4")
+    for name in robots.cores:
+        for k in range(3):
+            robots.capture(name, float(k), look=k)
+    robots.run(15.0)
+    assert robots.frames() == {"r1": "map/r1", "r2": "map/r1", "r3": "map/r3", "r4": "map/r3"}
+    robots.separate()
+    robots.run(15.0)
+    assert set(robots.frames().values()) == {"map/r1"}
+    assert robots.reports("r4", "correction")[-1].fields["frame_changed"] in (True, False)
+    changes = [
+        report.fields["map_frame"] for report in robots.reports("r4", "correction") if report.fields["frame_changed"]
+    ]
+    assert changes == ["map/r1"]

@@ -1,0 +1,225 @@
+"""Bully election with terms, over several hops."""
+
+from tests.agent.core.virtual_time import Robots
+
+from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
+from flocc_agent.core.election import COUNTER_JUMP_MAX, LeaderElection, Role
+from flocc_agent.core.events import Leaving
+from flocc_agent.core.parameters import ElectionParameters
+from flocc_agent.core.robot import Restored
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import Answer, Coordinator, Election, Heartbeat, LeaderAdvert
+
+R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
+
+
+def heartbeat(leader: LeaderAdvert | None = None, counter: int = 0, compute_class: int = 0) -> Heartbeat:
+    return Heartbeat(1, 7, compute_class, leader, counter, 0, ())
+
+
+def election(own: LogId = R2, counter: int = 0) -> LeaderElection:
+    return LeaderElection(own, 0, counter, ElectionParameters(), 0.0)
+
+
+def claims(effects: list[Effect]) -> list[Term]:
+    return [e.message.advert.term for e in effects if isinstance(e, Broadcast) and isinstance(e.message, Coordinator)]
+
+
+def test_a_robot_alone_leads_after_listening() -> None:
+    robots = Robots()
+    robots.add("r1")
+    robots.run(1.4)
+    assert robots.leaders() == {"r1": "None"}
+    robots.run(0.2)
+    assert robots.leaders() == {"r1": "1:r1"}
+
+
+def test_the_lowest_log_of_one_class_leads() -> None:
+    robots = Robots()
+    for name in ("r3", "r1", "r2"):
+        robots.add(name)
+    robots.run(6.0)
+    assert set(robots.leaders().values()) == {"1:r1"}
+
+
+def test_a_higher_compute_class_outranks_a_lower_log() -> None:
+    robots = Robots()
+    robots.add("r1")
+    robots.add("server", compute_class=9)
+    robots.run(6.0)
+    assert {term.split(":")[1] for term in robots.leaders().values()} == {"server"}
+
+
+def test_a_better_robot_that_comes_later_takes_over() -> None:
+    robots = Robots()
+    robots.add("r2")
+    robots.run(3.0)
+    robots.add("r1")
+    robots.run(4.0)
+    assert robots.leaders() == {"r1": "2:r1", "r2": "2:r1"}
+
+
+def test_the_next_best_follows_a_killed_leader_within_two_timeouts() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+    robots.run(6.0)
+    robots.kill("r1")
+    robots.run(6.0)
+    assert robots.leaders() == {"r2": "2:r2", "r3": "2:r2"}
+
+
+def test_a_leader_that_leaves_in_order_is_followed_at_once() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+    robots.run(6.0)
+    robots.put("r1", Leaving())
+    robots.kill("r1")
+    robots.run(1.5)
+    assert robots.leaders() == {"r2": "2:r2", "r3": "2:r2"}
+
+
+def test_a_chain_of_robots_follows_one_leader() -> None:
+    robots = Robots()
+    names = [f"r{k}" for k in range(1, 6)]
+    for name in names:
+        robots.add(name)
+    robots.cut = {frozenset((a, b)) for i, a in enumerate(names) for b in names[i + 2 :]}
+    robots.run(20.0)
+    assert {term.split(":")[1] for term in robots.leaders().values()} == {"r1"}
+    assert len(set(robots.leaders().values())) == 1
+
+
+def test_a_chain_notices_that_a_far_leader_died() -> None:
+    robots = Robots()
+    names = ["r1", "r2", "r3", "r4"]
+    for name in names:
+        robots.add(name)
+    robots.cut = {frozenset((a, b)) for i, a in enumerate(names) for b in names[i + 2 :]}
+    robots.run(15.0)
+    robots.kill("r1")
+    robots.run(20.0)
+    assert len(set(robots.leaders().values())) == 1
+    assert robots.leaders()["r4"].endswith(":r2")
+
+
+def test_a_stale_advert_is_not_followed_twice() -> None:
+    machine = election(R3)
+    ghost = LeaderAdvert(Term(5, R1), 0, beat=9, hops=1)
+    machine.on_heartbeat(R2, heartbeat(ghost, 5), 0.0)
+    assert machine.term == Term(5, R1)
+    machine.tick(3.0)
+    machine.on_heartbeat(R2, heartbeat(ghost, 5), 3.1)
+    assert machine.term != Term(5, R1)
+
+
+def test_a_lost_leader_counts_again_when_its_beat_grows() -> None:
+    machine = election(R3)
+    machine.on_heartbeat(R2, heartbeat(LeaderAdvert(Term(5, R1), 0, 9, 1), 5), 0.0)
+    machine.tick(3.0)
+    machine.on_heartbeat(R2, heartbeat(LeaderAdvert(Term(5, R1), 0, 10, 1), 5), 3.1)
+    assert machine.term == Term(5, R1)
+
+
+def test_whoever_elects_follows_and_advertises_nobody() -> None:
+    machine = election(R3)
+    machine.on_heartbeat(R2, heartbeat(LeaderAdvert(Term(5, R1), 0, 9, 0), 5), 0.0)
+    machine.tick(3.0)
+    assert machine.role is Role.ELECTING
+    assert machine.advert() is None
+
+
+def test_a_follower_answers_an_election_without_starting_its_own() -> None:
+    machine = election(R2)
+    machine.on_heartbeat(R1, heartbeat(LeaderAdvert(Term(5, R1), 0, 9, 0), 5), 0.0)
+    machine.on_heartbeat(R3, heartbeat(), 0.0)
+    assert machine.on_election(R3, 0.1) == [Unicast("r3", Answer(5))]
+    assert machine.term == Term(5, R1)
+
+
+def test_an_election_of_a_better_robot_is_not_answered() -> None:
+    machine = election(R2)
+    machine.on_heartbeat(R1, heartbeat(), 0.0)
+    assert machine.on_election(R1, 0.1) == []
+
+
+def test_a_robot_asks_those_who_outrank_it_before_it_claims() -> None:
+    machine = election(R2)
+    machine.on_heartbeat(R1, heartbeat(), 0.0)
+    assert machine.tick(1.5) == [Unicast("r1", Election(0))]
+    assert claims(machine.tick(1.5 + ElectionParameters().answer_timeout_s)) == [Term(1, R2)]
+
+
+def test_an_answer_makes_a_robot_wait_and_ask_again() -> None:
+    machine = election(R2)
+    machine.on_heartbeat(R1, heartbeat(), 0.0)
+    machine.tick(1.5)
+    machine.on_answer(R1, 1.6)
+    assert machine.role is Role.WAITING
+    assert machine.tick(3.6) == [Unicast("r1", Election(0))]
+
+
+def test_a_claim_is_above_every_counter_heard_of() -> None:
+    machine = election(R1)
+    machine.on_heartbeat(R2, heartbeat(None, counter=41), 0.0)
+    assert claims(machine.tick(1.5)) == [Term(42, R1)]
+
+
+def test_a_claim_is_persisted_before_it_is_announced() -> None:
+    machine = election(R1)
+    kinds = [type(effect) for effect in machine.tick(1.5)]
+    assert kinds.index(PersistTerm) < kinds.index(Broadcast)
+
+
+def test_a_restarted_leader_claims_a_counter_above_its_last() -> None:
+    machine = election(R1, counter=Restored(term_counter=7).counter_max())
+    assert claims(machine.tick(1.5)) == [Term(8, R1)]
+
+
+def test_a_leader_claims_anew_when_it_hears_of_a_higher_counter() -> None:
+    machine = election(R1)
+    machine.tick(1.5)
+    assert claims(machine.on_heartbeat(R2, heartbeat(None, counter=9), 2.0)) == [Term(10, R1)]
+
+
+def test_a_leader_claims_anew_when_others_applied_an_equal_counter_of_another() -> None:
+    machine = election(R1)
+    machine.tick(1.5)
+    assert machine.on_applied(R3, Term(1, R3)) == []
+    assert machine.deadline() <= 2.0
+    assert claims(machine.tick(2.0)) == [Term(2, R1)]
+    assert machine.deadline() == float("inf")
+
+
+def test_nobody_claims_a_term_for_another() -> None:
+    machine = election(R3)
+    refused = machine.on_coordinator(R2, Coordinator(LeaderAdvert(Term(5, R1), 0, 1, 0)), 0.0)
+    assert [type(effect) for effect in refused] == [Report]
+    assert machine.term is None
+
+
+def test_an_absurd_counter_is_refused() -> None:
+    machine = election(R1)
+    refused = machine.on_heartbeat(R2, heartbeat(None, counter=COUNTER_JUMP_MAX + 1), 0.0)
+    assert [type(effect) for effect in refused] == [Report]
+    assert machine.counter_max == 0
+
+
+def test_no_leader_is_followed_beyond_the_greatest_number_of_hops() -> None:
+    machine = election(R3)
+    machine.on_heartbeat(R2, heartbeat(LeaderAdvert(Term(5, R1), 0, 1, hops=8), 5), 0.0)
+    assert machine.term is None
+
+
+def test_two_groups_that_merge_agree_on_a_term_above_both() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3", "r4"):
+        robots.add(name)
+    robots.separate("r1 r2", "r3 r4")
+    robots.run(6.0)
+    robots.cores["r3"].election.on_applied(LogId("r4"), Term(5, LogId("r3")))
+    robots.run(1.0)
+    robots.separate()
+    robots.run(5.0)
+    assert set(robots.leaders().values()) == {"7:r1"}

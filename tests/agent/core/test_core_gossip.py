@@ -1,0 +1,209 @@
+"""Replicated logs: digests, pulls, relays, forks."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+from tests.agent.core.virtual_time import Robots, keyframe
+
+from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
+from flocc_agent.core.gossip import REMEMBERED_MAX, Gossip
+from flocc_agent.core.parameters import GossipParameters
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import LogDigest, RecordBatch, RecordRequest
+from flocc_protocol.records import KeyframeRecord, RejectionRecord, encode_record
+
+R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
+PARAMETERS = GossipParameters()
+
+
+def record(index: int, x_m: float = 0.0) -> KeyframeRecord:
+    return KeyframeRecord(index, float(index), (x_m, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None)
+
+
+def writer(own: LogId, count: int, x_m: float = 0.0) -> Gossip:
+    gossip = Gossip(own, PARAMETERS)
+    for index in range(count):
+        gossip.append(record(index, x_m))
+    return gossip
+
+
+def batch(source: Gossip, log: LogId, first: int) -> RecordBatch:
+    answers = source.on_request(LogId("asker"), RecordRequest(log, first))
+    assert isinstance(answers[0], Unicast)
+    assert isinstance(answers[0].message, RecordBatch)
+    return answers[0].message
+
+
+def requests(effects: list[Effect]) -> list[tuple[str, int]]:
+    return [(e.to, e.message.first) for e in effects if isinstance(e, Unicast) and isinstance(e.message, RecordRequest)]
+
+
+def reports(effects: list[Effect]) -> list[str]:
+    return [effect.event for effect in effects if isinstance(effect, Report)]
+
+
+def test_a_longer_copy_elsewhere_is_asked_for_from_where_this_one_ends() -> None:
+    reader = Gossip(R2, PARAMETERS)
+    reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)
+    assert requests(reader.on_digests(R1, writer(R1, 5).digests(), 1.0)) == [("r1", 3)]
+
+
+def test_one_log_is_asked_of_one_peer_at_a_time() -> None:
+    reader, digests = Gossip(R3, PARAMETERS), writer(R1, 5).digests()
+    reader.on_digests(R1, digests, 0.0)
+    assert reader.on_digests(R2, digests, 0.5) == []
+
+
+def test_a_lost_answer_is_asked_of_another_peer() -> None:
+    reader, digests = Gossip(R3, PARAMETERS), writer(R1, 5).digests()
+    reader.on_digests(R1, digests, 0.0)
+    assert requests(reader.on_digests(R2, digests, 1.0)) == [("r2", 0)]
+
+
+def test_a_peer_that_does_not_deliver_is_asked_ever_more_rarely() -> None:
+    reader, claims = Gossip(R3, PARAMETERS), (LogDigest(R1, 5, 77),)
+    asked_s = [t / 10 for t in range(600) if requests(reader.on_digests(R2, claims, t / 10))]
+    pauses_s = [b - a for a, b in pairwise(asked_s)]
+    assert pauses_s[0] < 2.0
+    assert max(pauses_s) >= PARAMETERS.backoff_max_s
+    assert len(asked_s) < 15
+
+
+def test_a_repeated_or_late_batch_changes_nothing() -> None:
+    reader, source = Gossip(R2, PARAMETERS), writer(R1, 5)
+    reader.on_batch(R1, batch(source, R1, 0), 0.0)
+    before = reader.digests()
+    assert reader.on_batch(R1, batch(source, R1, 0), 1.0) == ([], [])
+    assert reader.on_batch(R1, batch(source, R1, 2), 1.0) == ([], [])
+    assert reader.digests() == before
+
+
+def test_a_gap_is_asked_for_at_once() -> None:
+    reader = Gossip(R2, PARAMETERS)
+    assert requests(reader.on_batch(R1, batch(writer(R1, 5), R1, 3), 0.0)[1]) == [("r1", 0)]
+
+
+def test_a_long_log_is_pulled_batch_after_batch() -> None:
+    reader, source = Gossip(R2, PARAMETERS), writer(R1, 150)
+    effects, now = reader.on_digests(R1, source.digests(), 0.0), 0.0
+    while requests(effects):
+        now += 0.01
+        first = requests(effects)[0][1]
+        effects = reader.on_batch(R1, batch(source, R1, first), now)[1]
+    assert reader.digests() == source.digests()
+    assert now < 0.1
+
+
+def test_new_records_are_persisted_in_order() -> None:
+    reader = Gossip(R2, PARAMETERS)
+    effects = reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)[1]
+    assert [(e.log, e.number) for e in effects if isinstance(e, PersistRecord)] == [(R1, 0), (R1, 1), (R1, 2)]
+
+
+def test_a_fork_is_reported_once_and_neither_side_is_damaged() -> None:
+    reader = Gossip(R3, PARAMETERS)
+    reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)
+    before = reader.digests()
+    other = writer(R1, 5, x_m=1.0)
+    assert reports(reader.on_batch(R2, batch(other, R1, 3), 1.0)[1]) == ["log_forked"]
+    assert reader.on_batch(R2, batch(other, R1, 3), 2.0) == ([], [])
+    assert reader.on_digests(R2, other.digests(), 3.0) == []
+    assert reader.digests() == before
+
+
+def test_a_batch_that_contradicts_the_copy_within_it_is_refused_whole() -> None:
+    reader = Gossip(R3, PARAMETERS)
+    reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)
+    new, effects = reader.on_batch(R2, batch(writer(R1, 5, x_m=1.0), R1, 0), 1.0)
+    assert (new, reports(effects)) == ([], ["log_forked"])
+    assert len(reader.logs[R1]) == 3
+
+
+def test_more_of_the_own_log_elsewhere_is_reported() -> None:
+    robot = writer(R1, 2)
+    assert reports(robot.on_digests(R2, writer(R1, 4).digests(), 0.0)) == ["log_forked"]
+    assert len(robot.logs[R1]) == 2
+
+
+def test_the_own_log_is_never_written_by_others() -> None:
+    robot = writer(R1, 2)
+    new, effects = robot.on_batch(R2, batch(writer(R1, 4), R1, 2), 0.0)
+    assert (new, reports(effects)) == ([], ["log_forked"])
+    assert len(robot.logs[R1]) == 2
+
+
+def test_a_damaged_record_is_refused_and_what_came_before_it_kept() -> None:
+    reader, good = Gossip(R2, PARAMETERS), batch(writer(R1, 3), R1, 0)
+    damaged = replace(good, records=(good.records[0], b"\x00", good.records[2]))
+    new, effects = reader.on_batch(R1, damaged, 0.0)
+    assert [entry.number for entry in new] == [0]
+    assert reports(effects) == ["peer_refused"]
+
+
+def test_keyframes_are_numbered_without_gaps() -> None:
+    reader = Gossip(R2, PARAMETERS)
+    skipped = RecordBatch(R1, 0, 0, (encode_record(record(1)),))
+    assert reader.on_batch(R1, skipped, 0.0)[0] == []
+
+
+def test_logs_beyond_the_maximum_are_refused_without_asking() -> None:
+    reader = Gossip(R1, GossipParameters(logs_max=2))
+    reader.on_batch(R2, batch(writer(R2, 1), R2, 0), 0.0)
+    digests = writer(R3, 4).digests()
+    assert reports(reader.on_digests(R3, digests, 0.0)) == ["peer_refused"]
+    assert reader.on_digests(R3, digests, 1.0) == []
+
+
+def test_claims_of_what_nobody_has_do_not_fill_the_memory() -> None:
+    reader = Gossip(R1, PARAMETERS)
+    for t in range(3000):
+        reader.on_digests(R2, (LogDigest(LogId("r9", t), 5, 1),), float(t))
+    assert all(size <= size_max for size, size_max in reader.sizes().values())
+    assert reader.sizes()["asked"] == (REMEMBERED_MAX, REMEMBERED_MAX)
+
+
+def test_records_cross_robots_that_never_meet() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+    robots.separate("r1", "r3")
+    for k in range(5):
+        robots.capture("r1", float(k), look=k)
+    robots.run(5.0)
+    assert len(robots.cores["r3"].gossip.logs[R1]) == 5
+
+
+def test_records_are_carried_by_a_robot_that_moves_from_one_to_the_other() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+    robots.separate("r1 r2", "r3")
+    for k in range(5):
+        robots.capture("r1", float(k), look=k)
+    robots.run(5.0)
+    robots.separate("r1", "r2 r3")
+    robots.run(5.0)
+    assert len(robots.cores["r3"].gossip.logs[R1]) == 5
+
+
+def test_everything_arrives_though_every_broadcast_of_records_is_lost() -> None:
+    lost: list[object] = []
+
+    def drops(sender: str, receiver: str, message: object) -> bool:
+        lost.extend([message] if isinstance(message, RecordBatch) else [])
+        return isinstance(message, RecordBatch) and len(lost) <= 6
+
+    robots = Robots(drops=drops)
+    robots.add("r1")
+    robots.add("r2")
+    for k in range(6):
+        robots.capture("r1", float(k), look=k)
+    robots.run(10.0)
+    assert robots.cores["r2"].gossip.logs[R1].encoded == robots.cores["r1"].gossip.logs[R1].encoded
+
+
+def test_rejections_travel_like_keyframes() -> None:
+    source, reader = Gossip(R1, PARAMETERS), Gossip(R2, PARAMETERS)
+    source.append(RejectionRecord(keyframe("r1/0"), keyframe("r2/0"), "few correspondences", 3, 9))
+    new = reader.on_batch(R1, batch(source, R1, 0), 0.0)[0]
+    assert [entry.record for entry in new] == source.logs[R1].records

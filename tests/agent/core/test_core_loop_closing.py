@@ -1,0 +1,396 @@
+"""Candidates to registrations: each pair by one robot, taken over, rejected when its latents are lost."""
+
+from typing import Any
+
+from tests.agent.core.virtual_time import Robots, answer, keyframe
+
+from flocc_agent.core.effects import Effect, Encode, FetchLatent, Register, Unicast
+from flocc_agent.core.events import (
+    LATENT_UNKNOWN,
+    Event,
+    KeyframeEncodingFailed,
+    LatentFetchFailed,
+    LatentMissing,
+)
+from flocc_agent.core.latents import Latents, Peer, Reach
+from flocc_agent.core.loop_closing import LoopClosing, registrar_of
+from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_agent.core.place_recognition import Candidate
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import CandidateOffer, CandidatePair
+from flocc_protocol.records import RejectionRecord
+
+R1, R2 = LogId("r1"), LogId("r2")
+PARAMETERS = LoopClosingParameters()
+ONE = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def pair_of(registrar: LogId) -> CandidatePair:
+    """A pair of r1 and r2 that the given robot is to register."""
+    return pairs_of(registrar, 1)[0]
+
+
+def pairs_of(registrar: LogId, count: int) -> list[CandidatePair]:
+    """The first few pairs of different keyframes of r1 with r2/1 that a robot is to register."""
+    pairs = (CandidatePair.of(KeyframeId(R1, i), KeyframeId(R2, 1)) for i in range(1, 100))
+    return [pair for pair in pairs if registrar_of(pair) == registrar][:count]
+
+
+def closing(compute_class: int = 0, own: LogId = R1, **changes: Any) -> LoopClosing:
+    def odometry_pair(k: KeyframeId) -> tuple[KeyframeId, Any]:
+        return KeyframeId(k.log, k.index - 1), ONE
+
+    return LoopClosing(own, compute_class, odometry_pair, LoopClosingParameters(**changes))
+
+
+def found(machine: LoopClosing, pair: CandidatePair, similarity: float = 0.9, now: float = 0.0) -> None:
+    machine.on_candidates([Candidate(pair, similarity)], now)
+
+
+def offers(effects: list[Effect]) -> list[tuple[str, bool]]:
+    found = [(e.to, e.message) for e in effects if isinstance(e, Unicast)]
+    return [(to, message.transferred) for to, message in found if isinstance(message, CandidateOffer)]
+
+
+def hold_all(machine: LoopClosing, pair: CandidatePair) -> None:
+    for end in (pair.low, pair.high):
+        machine.on_held(end)
+        machine.on_held(KeyframeId(end.log, end.index - 1))
+
+
+def meet(robots: Robots, *names: str, keyframes: int = 4) -> None:
+    """Each robot passes the same places, two metres apart."""
+    for name in names:
+        for k in range(keyframes):
+            robots.capture(name, 2.0 * k, look=k)
+
+
+def registrations(robots: Robots) -> list[CandidatePair]:
+    return [e.pair for _, _, e in robots.done if isinstance(e, Register)]
+
+
+def test_both_robots_agree_who_registers_a_pair_and_share_the_work() -> None:
+    pairs = [CandidatePair.of(KeyframeId(R1, i), KeyframeId(R2, j)) for i in range(20) for j in range(20)]
+    share = sum(registrar_of(pair) == R1 for pair in pairs) / len(pairs)
+    assert 0.4 < share < 0.6
+
+
+def test_a_pair_of_the_other_robot_is_offered_until_its_record_shows() -> None:
+    machine, pair = closing(), pair_of(R2)
+    machine.on_peer("r2", Peer(0))
+    found(machine, pair)
+    assert offers(machine.tick(0.0)) == [("r2", False)]
+    assert machine.deadline() == PARAMETERS.offer_period_s
+    assert offers(machine.tick(PARAMETERS.offer_period_s)) == [("r2", False)]
+    machine.on_resolved(pair)
+    assert machine.tick(100.0) == []
+
+
+def test_an_own_pair_waits_for_its_latents_and_is_then_registered() -> None:
+    machine, pair = closing(), pair_of(R1)
+    machine.on_peer("r2", Peer(0))
+    found(machine, pair)
+    machine.on_held(pair.low)
+    machine.on_held(KeyframeId(R1, pair.low.index - 1))
+    assert machine.tick(0.0) == [FetchLatent(pair.high, "r2", PARAMETERS.fetch_timeout_s)]
+    machine.on_held(pair.high)
+    assert machine.tick(1.0) == [Register(pair, pair.low, pair.high, KeyframeId(R1, pair.low.index - 1), ONE)]
+
+
+def test_the_most_similar_pair_comes_first() -> None:
+    machine = closing(registrations_max=1)
+    pairs = pairs_of(R1, 6)
+    for k, pair in enumerate(pairs):
+        found(machine, pair, similarity=0.5 + 0.01 * k)
+        hold_all(machine, pair)
+    started = [e.pair for e in machine.tick(0.0) if isinstance(e, Register)]
+    assert started == [pairs[-1]]
+
+
+def test_a_pair_is_handed_to_the_least_loaded_of_the_strongest_neighbours() -> None:
+    machine = closing()
+    for name, peer in (("s1", Peer(9, load=5)), ("s2", Peer(9, load=2)), ("r2", Peer(0))):
+        machine.on_peer(name, peer)
+    found(machine, pair_of(R1))
+    assert offers(machine.tick(0.0)) == [("s2", True)]
+
+
+def test_an_offer_of_the_other_owner_does_not_take_a_transferred_pair_back() -> None:
+    machine, pair = closing(), pair_of(R1)
+    machine.on_peer("s1", Peer(9))
+    found(machine, pair)
+    machine.on_offer(CandidateOffer((pair,)), 1.0)
+    hold_all(machine, pair)
+    assert [e for e in machine.tick(1.0) if isinstance(e, Register)] == []
+
+
+def test_an_offered_pair_is_handed_on_to_a_stronger_neighbour_too() -> None:
+    machine, pair = closing(), pair_of(R1)
+    machine.on_peer("s1", Peer(9))
+    machine.on_offer(CandidateOffer((pair,)), 0.0)
+    assert offers(machine.tick(0.0)) == [("s1", True)]
+
+
+def test_a_transferred_pair_is_taken_over_when_the_stronger_robot_is_gone() -> None:
+    machine, pair = closing(), pair_of(R1)
+    machine.on_peer("s1", Peer(9))
+    found(machine, pair)
+    machine.tick(0.0)
+    hold_all(machine, pair)
+    machine.on_lost("s1", 5.0)
+    assert machine.tick(5.0) == []
+    assert machine.deadline() == 5.0 + PARAMETERS.takeover_s
+    assert [type(e) for e in machine.tick(machine.deadline())] == [Register]
+
+
+def test_a_registrar_that_comes_back_in_time_keeps_its_pair() -> None:
+    machine, pair = closing(), pair_of(R2)
+    machine.on_peer("r2", Peer(0))
+    found(machine, pair)
+    machine.tick(0.0)
+    hold_all(machine, pair)
+    machine.on_lost("r2", 5.0)
+    machine.tick(6.0)
+    machine.on_peer("r2", Peer(0))
+    assert offers(machine.tick(5.0 + PARAMETERS.takeover_s)) == [("r2", False)]
+
+
+def test_an_offer_of_a_pair_that_is_neither_transferred_nor_own_is_ignored() -> None:
+    machine, pair = closing(), pair_of(R2)
+    machine.on_offer(CandidateOffer((pair,)), 0.0)
+    assert machine.open_pairs() == []
+
+
+def test_a_resolved_pair_is_never_taken_up_again() -> None:
+    machine, pair = closing(), pair_of(R1)
+    machine.on_resolved(pair)
+    found(machine, pair)
+    machine.on_offer(CandidateOffer((pair,), transferred=True), 0.0)
+    assert machine.open_pairs() == []
+
+
+def test_a_registration_without_an_answer_is_tried_again() -> None:
+    machine, pair = closing(), pair_of(R1)
+    found(machine, pair)
+    hold_all(machine, pair)
+    machine.tick(0.0)
+    assert machine.deadline() == PARAMETERS.registration_timeout_s
+    assert [type(e) for e in machine.tick(PARAMETERS.registration_timeout_s)] == [Register]
+
+
+def test_the_least_similar_candidates_are_dropped_beyond_the_maximum() -> None:
+    machine = closing(candidates_max=3)
+    pairs = pairs_of(R1, 6)
+    for k, pair in enumerate(pairs):
+        found(machine, pair, similarity=0.1 * k)
+    assert machine.open_pairs() == sorted(pairs[3:6])
+    assert machine.dropped == 3
+
+
+def test_where_a_log_has_one_keyframe_the_pair_is_registered_the_other_way_round() -> None:
+    pair = CandidatePair.of(KeyframeId(R1, 0), KeyframeId(R2, 3))
+    machine = LoopClosing(R1, 0, lambda k: None if k.log == R1 else (KeyframeId(R2, 2), ONE), PARAMETERS)
+    machine.on_offer(CandidateOffer((pair,), transferred=True), 0.0)
+    for k in ("r1/0", "r2/3", "r2/2"):
+        machine.on_held(keyframe(k))
+    assert machine.tick(0.0) == [Register(pair, keyframe("r2/3"), keyframe("r1/0"), keyframe("r2/2"), ONE)]
+
+
+# Latents
+
+
+def reach(**holds: tuple[KeyframeId, ...]) -> Reach:
+    made = Reach()
+    for name, held in holds.items():
+        made.update(name, Peer(0, holds=held))
+    return made
+
+
+def test_a_failed_fetch_waits_longer_each_time_up_to_the_maximum() -> None:
+    latents, wanted, now, pauses = Latents(R1, PARAMETERS), keyframe("r2/1"), 0.0, []
+    for _ in range(7):
+        assert len(latents.fetch([wanted], reach(r2=()), now)) == 1
+        latents.on_failed(wanted, now)
+        pauses.append(latents.due_s(now) - now)
+        now = latents.due_s(now)
+    assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 16.0, 16.0]
+
+
+def test_a_fetch_without_an_answer_is_given_up() -> None:
+    latents, wanted = Latents(R1, PARAMETERS), keyframe("r2/1")
+    latents.fetch([wanted], reach(r2=()), 0.0)
+    latents.give_up(PARAMETERS.fetch_timeout_s)
+    assert latents.due_s(PARAMETERS.fetch_timeout_s) == PARAMETERS.fetch_timeout_s + PARAMETERS.retry_s
+
+
+def test_a_robot_that_comes_back_is_asked_at_once() -> None:
+    latents, wanted = Latents(R1, PARAMETERS), keyframe("r2/1")
+    latents.fetch([wanted], reach(r2=()), 0.0)
+    latents.on_failed(wanted, 0.0)
+    latents.on_reached("r2")
+    assert len(latents.fetch([wanted], reach(r2=()), 0.1)) == 1
+
+
+def test_no_more_fetches_than_allowed_are_in_flight() -> None:
+    latents, wanted = Latents(R1, PARAMETERS), [keyframe(f"r2/{k}") for k in range(9)]
+    assert len(latents.fetch(wanted, reach(r2=()), 0.0)) == PARAMETERS.fetches_max
+    assert latents.fetch(wanted, reach(r2=()), 0.1) == []
+
+
+def test_a_latent_out_of_reach_is_asked_of_relays_and_fetched_from_one() -> None:
+    latents, wanted = Latents(R1, PARAMETERS), keyframe("r3/1")
+    assert latents.fetch([wanted], reach(r2=()), 0.0) == []
+    assert latents.wants([wanted], reach(r2=()), 0.0) == (wanted,)
+    assert latents.fetch([wanted], reach(r2=(wanted,)), 1.0) == [FetchLatent(wanted, "r2", PARAMETERS.fetch_timeout_s)]
+
+
+def test_wishes_that_nobody_can_grant_do_not_keep_others_waiting() -> None:
+    latents, needed = Latents(R1, PARAMETERS), [keyframe(f"r3/{k}") for k in range(20)]
+    turns = {wish for t in range(0, 40, 5) for wish in latents.wants(needed, reach(r2=()), float(t))}
+    assert turns == set(needed)
+
+
+def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
+    latents = Latents(R1, PARAMETERS)
+    for k in range(50):
+        latents.on_wants([keyframe(f"r3/{k}")])
+        latents.add(keyframe(f"r3/{k}"))
+    assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - PARAMETERS.relays_max, 50))
+
+
+# Whole robots
+
+
+def test_every_pair_is_registered_once() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+    meet(robots, "r1", "r2", "r3")
+    robots.run(30.0)
+    pairs = registrations(robots)
+    assert len(pairs) == len(set(pairs)) == 12
+    assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
+
+
+def test_a_server_without_a_camera_registers_for_the_others() -> None:
+    robots = Robots()
+    for name in ("r1", "r2"):
+        robots.add(name)
+    robots.add("server", compute_class=9)
+    robots.run(3.0)
+    meet(robots, "r1", "r2")
+    robots.run(30.0)
+    by = {name for _, name, effect in robots.done if isinstance(effect, Register)}
+    assert by == {"server"}
+    assert len(registrations(robots)) == 4
+
+
+def test_pairs_of_a_server_that_dies_are_taken_over() -> None:
+    robots = Robots()
+    for name in ("r1", "r2"):
+        robots.add(name)
+    robots.add("server", compute_class=9)
+    robots.run(3.0)
+    robots.work = lambda robots, name, effect: (
+        None if name == "server" and isinstance(effect, Register) else answer(effect)
+    )
+    meet(robots, "r1", "r2")
+    robots.run(4.0)
+    robots.kill("server")
+    robots.run(40.0)
+    assert robots.cores["r1"].assembly.closures == 4
+
+
+def test_closures_join_robots_that_never_meet() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        robots.add(name)
+    robots.separate("r1", "r3")
+    meet(robots, "r1", "r3")
+    robots.run(90.0)
+    assert robots.cores["r2"].assembly.closures == 4
+    assert robots.frames() == {"r1": "map/r1", "r3": "map/r1"}
+
+
+def test_a_latent_that_its_owner_lost_rejects_its_pairs_for_everybody() -> None:
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, FetchLatent):
+            return LatentFetchFailed(effect.keyframe, effect.holder, LATENT_UNKNOWN)
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2"):
+        robots.add(name)
+    meet(robots, "r1", "r2")
+    robots.run(30.0)
+    assert registrations(robots) == []
+    assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
+    reasons = {
+        record.reason
+        for log in robots.cores["r1"].gossip.logs.values()
+        for record in log.records
+        if isinstance(record, RejectionRecord)
+    }
+    assert reasons == {"a latent was lost"}
+
+
+def test_an_own_latent_that_the_store_evicted_rejects_its_pair() -> None:
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, Register):
+            return LatentMissing(effect.pair, effect.query)
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2"):
+        robots.add(name)
+    meet(robots, "r1", "r2")
+    robots.run(30.0)
+    assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
+
+
+def test_an_evicted_latent_of_another_robot_is_fetched_again() -> None:
+    evicted: list[KeyframeId] = []
+
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, Register) and not evicted:
+            evicted.append(effect.match)
+            return LatentMissing(effect.pair, effect.match)
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2"):
+        robots.add(name)
+    meet(robots, "r1", "r2")
+    robots.run(30.0)
+    fetched = [e.keyframe for _, _, e in robots.done if isinstance(e, FetchLatent)]
+    assert fetched.count(evicted[0]) == 2
+    assert robots.cores["r1"].assembly.closures == 4
+
+
+def test_a_keyframe_that_cannot_be_encoded_still_carries_odometry() -> None:
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, Encode) and effect.keyframe == keyframe("r1/1"):
+            return KeyframeEncodingFailed(effect.keyframe, "damaged image")
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2"):
+        robots.add(name)
+    meet(robots, "r1", "r2")
+    robots.run(30.0)
+    assert robots.cores["r2"].gossip.logs[R1].keyframes == 4
+    assert robots.cores["r2"].assembly.closures == 3
+
+
+def test_a_result_for_a_pair_that_another_robot_resolved_is_not_recorded_again() -> None:
+    robots = Robots()
+    for name in ("r1", "r2"):
+        robots.add(name)
+    meet(robots, "r1", "r2", keyframes=2)
+    robots.run(20.0)
+    done = next(e for _, name, e in robots.done if isinstance(e, Register) and name == "r1")
+    before = len(robots.cores["r1"].gossip.logs[R1])
+    event = answer(done)
+    assert event is not None
+    robots.put("r1", event)
+    assert len(robots.cores["r1"].gossip.logs[R1]) == before

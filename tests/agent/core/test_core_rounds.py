@@ -1,0 +1,169 @@
+"""Optimisation rounds and the graph they are about."""
+
+import numpy as np
+from tests.agent.core.virtual_time import Robots, answer, descriptor, keyframe
+
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.effects import Effect, Optimise, Report
+from flocc_agent.core.gossip import NewRecord
+from flocc_agent.core.parameters import RoundParameters
+from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.rounds import Rounds
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.records import ClosureRecord, KeyframeRecord
+
+R1, R2 = LogId("r1"), LogId("r2")
+TERM = Term(1, R1)
+SOLUTION = GraphSolution((), ())
+PARAMETERS = RoundParameters()
+
+
+def add_keyframes(assembly: GraphAssembly, log: LogId, first: int, last: int, encoded: bool = True) -> None:
+    for k in range(first, last):
+        look = descriptor(k) if encoded else None
+        record = KeyframeRecord(k, float(k), (float(k), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), look)
+        assembly.add(NewRecord(log, k, record))
+
+
+def closure(query: str, match: str, ratio: float = 1.0) -> ClosureRecord:
+    return ClosureRecord(keyframe(query), keyframe(match), (0, 0, 0, 1, 0, 0, 0), 100, 100, ratio)
+
+
+def leading(keyframes: int = 1) -> tuple[Rounds, GraphAssembly]:
+    assembly = GraphAssembly()
+    add_keyframes(assembly, R1, 0, keyframes)
+    rounds = Rounds(assembly, PARAMETERS)
+    rounds.on_term(TERM)
+    return rounds, assembly
+
+
+def started(effects: list[Effect]) -> list[int]:
+    return [effect.round for effect in effects if isinstance(effect, Optimise)]
+
+
+def test_a_new_leader_optimises_at_once() -> None:
+    rounds, _ = leading()
+    assert started(rounds.tick(0.0)) == [1]
+
+
+def test_nobody_optimises_who_does_not_lead() -> None:
+    rounds, _ = leading()
+    rounds.on_term(None)
+    assert rounds.tick(0.0) == []
+    assert rounds.deadline() == float("inf")
+
+
+def test_nothing_new_calls_for_no_round() -> None:
+    rounds, _ = leading()
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, SOLUTION)
+    assert rounds.tick(100.0) == []
+
+
+def test_a_new_closure_calls_for_a_round_after_the_period() -> None:
+    rounds, assembly = leading()
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, SOLUTION)
+    add_keyframes(assembly, R2, 0, 1)
+    assembly.add(NewRecord(R1, 1, closure("r1/0", "r2/0")))
+    assert rounds.deadline() == PARAMETERS.period_s
+    assert started(rounds.tick(PARAMETERS.period_s)) == [2]
+
+
+def test_many_new_keyframes_call_for_a_round() -> None:
+    rounds, assembly = leading()
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, SOLUTION)
+    add_keyframes(assembly, R1, 1, PARAMETERS.keyframes_per_round)
+    assert rounds.tick(10.0) == []
+    add_keyframes(assembly, R1, PARAMETERS.keyframes_per_round, PARAMETERS.keyframes_per_round + 1)
+    assert started(rounds.tick(10.0)) == [2]
+
+
+def test_a_late_solution_counts_for_nothing() -> None:
+    rounds, _ = leading()
+    rounds.tick(0.0)
+    assert not rounds.on_solution(Term(9, R2), 1, SOLUTION)
+    rounds.tick(PARAMETERS.timeout_s)
+    assert not rounds.on_solution(TERM, 1, SOLUTION)
+
+
+def test_a_round_that_gives_no_answer_is_given_up_and_tried_again() -> None:
+    rounds, _ = leading()
+    rounds.tick(0.0)
+    effects = rounds.tick(PARAMETERS.timeout_s)
+    assert [e.event for e in effects if isinstance(e, Report)] == ["round_timeout"]
+    assert rounds.deadline() > PARAMETERS.timeout_s
+    assert started(rounds.tick(rounds.deadline())) == [2]
+
+
+def test_a_failed_round_is_tried_again_ever_more_rarely() -> None:
+    rounds, _ = leading()
+    now, starts = 0.0, [0.0]
+    rounds.tick(now)
+    for number in range(1, 6):
+        rounds.on_failed(TERM, number, now)
+        now = rounds.deadline()
+        assert started(rounds.tick(now)) == [number + 1]
+        starts.append(now)
+    pauses_s = np.diff(starts)
+    assert np.all(np.diff(pauses_s) > 0)
+    assert pauses_s[0] == 2 * PARAMETERS.period_s
+
+
+def test_a_silent_optimiser_does_not_block_the_swarm() -> None:
+    robots = Robots(
+        work=lambda robots, name, effect: None if isinstance(effect, Optimise) and effect.round == 1 else answer(effect)
+    )
+    robots.add("r1")
+    robots.capture("r1", 0.0, look=1)
+    robots.run(PARAMETERS.timeout_s + 10.0)
+    assert robots.frames() == {"r1": "map/r1"}
+
+
+def test_a_closure_counts_when_its_keyframe_comes_later() -> None:
+    assembly = GraphAssembly()
+    add_keyframes(assembly, R1, 0, 2)
+    add_keyframes(assembly, R2, 0, 1)
+    assembly.add(NewRecord(R1, 2, closure("r1/0", "r2/1")))
+    assert len(assembly.graph().closures) == 0
+    revision = assembly.revision
+    add_keyframes(assembly, R2, 1, 2)
+    assert len(assembly.graph().closures) == 1
+    assert assembly.revision > revision
+
+
+def test_of_two_registrations_of_one_pair_every_robot_takes_the_same() -> None:
+    graphs = []
+    for order in ((R1, R2), (R2, R1)):
+        assembly = GraphAssembly()
+        add_keyframes(assembly, R1, 0, 1)
+        add_keyframes(assembly, R2, 0, 1)
+        for log in order:
+            assembly.add(NewRecord(log, 1, closure("r1/0", "r2/0", ratio=1.0 if log == R1 else 2.0)))
+        graphs.append([c.match_ratio for c in assembly.graph().closures])
+    assert graphs == [[1.0], [1.0]]
+
+
+def test_the_odometry_pair_is_the_keyframe_before() -> None:
+    assembly = GraphAssembly()
+    add_keyframes(assembly, R1, 0, 3)
+    assert assembly.odometry_pair(keyframe("r1/2")) == (keyframe("r1/1"), (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+
+
+def test_the_odometry_pair_of_a_first_keyframe_is_the_one_after() -> None:
+    assembly = GraphAssembly()
+    add_keyframes(assembly, R1, 0, 1)
+    assert assembly.odometry_pair(keyframe("r1/0")) is None
+    add_keyframes(assembly, R1, 1, 2)
+    assert assembly.odometry_pair(keyframe("r1/0")) == (keyframe("r1/1"), (-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+
+
+def test_a_keyframe_that_could_not_be_encoded_is_no_partner_of_an_odometry_pair() -> None:
+    assembly = GraphAssembly()
+    add_keyframes(assembly, R1, 0, 1)
+    add_keyframes(assembly, R1, 1, 2, encoded=False)
+    add_keyframes(assembly, R1, 2, 3)
+    pair = assembly.odometry_pair(keyframe("r1/2"))
+    assert pair is not None
+    assert pair[0] == keyframe("r1/0")
