@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from flocc_launch.cli_common import EXIT_BAD_INPUT, progress_bar, show_report
+from flocc_launch.cli_data import add_data
+from flocc_launch.cli_measure import add_measures, run_campaign
 from flocc_launch.cli_tools import add_tools
 from flocc_protocol.errors import FloccError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-    from flocc_launch.report.model import Report
+    from flocc_launch.launching import OnWatch
     from flocc_launch.scenario import Scenario
-
-EXIT_MISSED = 1
-EXIT_BAD_INPUT = 2
 
 app = typer.Typer(
     name="flocc",
@@ -28,6 +28,8 @@ app = typer.Typer(
     add_completion=False,
 )
 add_tools(app)
+add_data(app)
+add_measures(app)
 
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
@@ -81,18 +83,19 @@ def launch(
     duration: Duration = None,
     seed: Seed = None,
     rate: Annotated[float | None, typer.Option(help="Playback speed of recordings.")] = None,
+    dashboard: Annotated[int | None, typer.Option(help="Serve a live page on this port of this machine.")] = None,
     secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
 ) -> None:
     """Run a scenario with one process per robot on this machine, over real zenoh."""
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     if rate is not None:
         changes["rate"] = rate
-    _launch(_read(scenario, changes, agents), out, secure)
+    _launch(_read(scenario, changes, agents), out, secure, dashboard)
 
 
 @app.command()
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="Scenario file (TOML), or the name of a shipped one.")],
+    scenario: Annotated[str | None, typer.Argument(help="Scenario file (TOML), or the name of a shipped one.")] = None,
     out: Out = Path("runs/simulate"),
     agents: Annotated[int | None, typer.Option(min=1, help="Number of robots.")] = None,
     seed: Seed = None,
@@ -101,18 +104,25 @@ def simulate(
     bandwidth: Bandwidth = None,
     range_m: Range = None,
     duration: Duration = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
+    shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
 ) -> None:
     """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
+    if seeds is not None:
+        run_campaign(seeds, seed or 0, shrink, out)
+        return
+    if scenario is None:
+        fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
     from flocc_launch.data import cache_folder, recordings
     from flocc_launch.launching import fresh_folder
     from flocc_launch.simulation.simulate import simulate as run
 
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     read = _read(scenario, changes, agents)
-    with _progress("preparing data") as progress:
+    with progress_bar("preparing data") as progress:
         paths = recordings(read, progress)
     fresh_folder(out)
-    _show(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out)
+    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out)
 
 
 @app.command()
@@ -145,74 +155,6 @@ def evaluate(
     typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
 
 
-@app.command()
-def keys(
-    folder: Annotated[Path, typer.Argument(help="Where the authority and a folder per robot stand or will stand.")],
-    robots: Annotated[list[str], typer.Argument(help="Names of the robots to admit.")],
-    swarm: Annotated[str, typer.Option(help="Name of the swarm; one authority certifies one swarm.")] = "swarm",
-) -> None:
-    """Make a swarm's certificate authority, and a certificate and a signing key per robot."""
-    from flocc_launch.keys import make_keys
-
-    for name, path in make_keys(folder, swarm, robots).items():
-        typer.echo(f"{name}: {path}")
-
-
-dataset = typer.Typer(help="Look at data sets, turn them into recordings, cut them into robots.", rich_markup_mode=None)
-app.add_typer(dataset, name="dataset")
-
-Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
-Format = Annotated[str | None, typer.Option("--format", help="Name of the format where it is not recognised.")]
-CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML) for a data set that has none.")]
-
-
-@dataset.command()
-def info(source: Source, format_name: Format = None) -> None:
-    """Say what a data set holds, without writing anything."""
-    from dataclasses import fields
-
-    from flocc_launch.datasets.commands import info as look
-
-    found = look(source, format_name)
-    for field in fields(found):
-        value = getattr(found, field.name)
-        typer.echo(f"{field.name:14} {value if value is not None else 'not known'}")
-
-
-@dataset.command()
-def convert(
-    source: Source,
-    out: Annotated[Path, typer.Option(help="Folder of the recording.")],
-    format_name: Format = None,
-    camera: CameraFile = None,
-    odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
-) -> None:
-    """Write a data set as one recording; a conversion that was cut short goes on where it ended."""
-    from flocc_launch.datasets.commands import convert as run
-
-    with _progress("converting") as progress:
-        path = run(source, out, format_name=format_name, camera=camera, odometry=odometry, progress=progress)
-    typer.echo(f"recording: {path}")
-
-
-@dataset.command()
-def split(
-    source: Source,
-    out: Annotated[Path, typer.Option(help="Folder of the recordings.")],
-    robots: Annotated[int, typer.Option(min=1, help="Pieces, one per robot.")] = 3,
-    seed: Annotated[int, typer.Option(help="Seed of the odometry drift.")] = 0,
-    format_name: Format = None,
-    camera: CameraFile = None,
-) -> None:
-    """Cut a data set by time into recordings of several robots, with seeded odometry drift."""
-    from flocc_launch.datasets.commands import split as run
-
-    with _progress("cutting") as progress:
-        paths = run(source, out, robots, seed=seed, format_name=format_name, camera=camera, progress=progress)
-    for path in paths:
-        typer.echo(f"recording: {path}")
-
-
 def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
     from flocc_launch.shipped import read_scenario
 
@@ -239,38 +181,32 @@ def _changes(
     return {key: value for key, value in given.items() if value is not None}
 
 
-def _launch(scenario: "Scenario", out: Path, secure: bool = False) -> None:
+def _launch(scenario: "Scenario", out: Path, secure: bool = False, dashboard: int | None = None) -> None:
     from rich.console import Console
 
     from flocc_launch.data import recordings
     from flocc_launch.launching import launch as run
     from flocc_launch.live_table import LiveTable
 
-    with _progress("preparing data") as progress:
+    with progress_bar("preparing data") as progress:
         recordings(scenario, progress)
-    with LiveTable(Console()) as table:
-        report = run(scenario, out, table.show, secure=secure)
-    _show(report, out)
+    with LiveTable(Console()) as table, _dashboard(out, dashboard, table.show) as show:
+        report = run(scenario, out, show, secure=secure)
+    show_report(report, out)
 
 
 @contextmanager
-def _progress(what: str) -> "Iterator[Callable[[int, int], None]]":
-    """A progress bar that takes (done, all)."""
-    from rich.progress import Progress
+def _dashboard(out: Path, port: int | None, show: "OnWatch") -> "Iterator[OnWatch]":
+    """Serve the dashboard beside the table, where a port is given."""
+    if port is None:
+        yield show
+        return
+    from flocc_launch.dashboard import live_dashboard
+    from flocc_launch.run_folder import RunFolder
 
-    with Progress(transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _show(report: "Report", out: Path) -> None:
-    from flocc_launch.report.text import sentences
-
-    for sentence in sentences(report):
-        typer.echo(sentence)
-    typer.echo(f"report: {(out / 'report.html').resolve()}")
-    if any(expectation.met is False for expectation in report.expectations):
-        sys.exit(EXIT_MISSED)
+    with live_dashboard(RunFolder(out), port, show) as both:
+        typer.echo(f"dashboard: http://127.0.0.1:{port}/")
+        yield both
 
 
 if __name__ == "__main__":

@@ -1,0 +1,130 @@
+"""Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flocc_launch.cli_common import progress_bar
+
+dataset = typer.Typer(help="Look at data sets, turn them into recordings, cut them into robots.", rich_markup_mode=None)
+weights = typer.Typer(help="Checkpoints of the mast3r front end: needed, checked, fetched.", rich_markup_mode=None)
+
+Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
+Format = Annotated[str | None, typer.Option("--format", help="Name of the format where it is not recognised.")]
+CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML) for a data set that has none.")]
+
+
+def add_data(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.add_typer(dataset, name="dataset")
+    app.add_typer(weights, name="weights")
+    app.command()(keys)
+
+
+@dataset.command()
+def info(source: Source, format_name: Format = None) -> None:
+    """Say what a data set holds, without writing anything."""
+    from flocc_launch.datasets.commands import info as look
+
+    found = look(source, format_name)
+    for field in fields(found):
+        value = getattr(found, field.name)
+        shown = "not known" if value is None else "none" if value == () else value
+        typer.echo(f"{field.name.replace('_', ' '):16} {shown}")
+
+
+@dataset.command()
+def convert(
+    source: Source,
+    out: Annotated[Path, typer.Option(help="Folder of the recording.")],
+    format_name: Format = None,
+    camera: CameraFile = None,
+    odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
+) -> None:
+    """Write a data set as one recording; a conversion that was cut short goes on where it ended."""
+    from flocc_launch.datasets.commands import convert as run
+
+    with progress_bar("converting") as progress:
+        path = run(source, out, format_name=format_name, camera=camera, odometry=odometry, progress=progress)
+    typer.echo(f"recording: {path}")
+
+
+@dataset.command()
+def split(
+    source: Source,
+    out: Annotated[Path, typer.Option(help="Folder of the recordings.")],
+    robots: Annotated[int, typer.Option(min=1, help="Pieces, one per robot.")] = 3,
+    seed: Annotated[int, typer.Option(help="Seed of the odometry drift.")] = 0,
+    format_name: Format = None,
+    camera: CameraFile = None,
+) -> None:
+    """Cut a data set by time into recordings of several robots, with seeded odometry drift."""
+    from flocc_launch.datasets.commands import split as run
+
+    with progress_bar("cutting") as progress:
+        paths = run(source, out, robots, seed=seed, format_name=format_name, camera=camera, progress=progress)
+    for path in paths:
+        typer.echo(f"recording: {path}")
+
+
+@weights.command()
+def status(
+    config: Annotated[Path | None, typer.Option(help="An agent's configuration that names the files.")] = None,
+) -> None:
+    """Say which files are needed, under which licence, and whether they are there."""
+    from flocc_agent.config import AgentConfig, Mast3rConfig
+    from flocc_launch.weights import status as look
+
+    for needed in look(Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r):
+        for key, value in needed.items():
+            typer.echo(f"{key:12} {'not configured' if value is None else value}")
+        typer.echo("")
+
+
+@weights.command()
+def check(file: Annotated[Path, typer.Argument(help="Checkpoint.")]) -> None:
+    """Verify a checkpoint: names, shapes, hash, and a small run of the network."""
+    from flocc_launch.weights import check as run
+
+    found = run(file)
+    for field in fields(found):
+        typer.echo(f"{field.name.replace('_', ' '):14} {getattr(found, field.name)}")
+
+
+@weights.command()
+def synthesize(
+    folder: Annotated[Path, typer.Argument(help="Where the files go.")],
+    network: Annotated[str, typer.Option(help="Size of the network: tiny, small or full (2.8 GB).")] = "tiny",
+) -> None:
+    """Write keyed random weights in the official formats, for tests and timings; they recognise nothing."""
+    from flocc_launch.weights import synthesize as run
+
+    for kind, path in run(folder, network).items():  # type: ignore[arg-type]
+        typer.echo(f"{kind}: {path}")
+
+
+@weights.command()
+def fetch(
+    url: Annotated[str, typer.Argument(help="Address of the file; flocc knows none by itself.")],
+    target: Annotated[Path, typer.Argument(help="Where the file goes.")],
+    accept_licence: Annotated[bool, typer.Option("--accept-licence", help="You accept the weights' licence.")] = False,
+    sha256: Annotated[str | None, typer.Option(help="Expected hash.")] = None,
+) -> None:
+    """Download a checkpoint that you name, going on with an earlier attempt, and verify it."""
+    from flocc_launch.weights import fetch as run
+
+    typer.echo(f"fetched: {run(url, target, accept_licence, sha256)}")
+
+
+def keys(
+    folder: Annotated[Path, typer.Argument(help="Where the authority and a folder per robot stand or will stand.")],
+    robots: Annotated[list[str], typer.Argument(help="Names of the robots to admit.")],
+    swarm: Annotated[str, typer.Option(help="Name of the swarm; one authority certifies one swarm.")] = "swarm",
+) -> None:
+    """Make a swarm's certificate authority, and a certificate and a signing key per robot."""
+    from flocc_launch.keys import make_keys
+
+    for name, path in make_keys(folder, swarm, robots).items():
+        typer.echo(f"{name}: {path}")
