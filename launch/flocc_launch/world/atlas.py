@@ -13,7 +13,7 @@ Float32 = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 
 LEVELS = 6
-CELL = 2 ** (LEVELS - 1)
+CELL: int = 2 ** (LEVELS - 1)
 PAD = CELL
 WIDTH_MAX = 12288
 

@@ -1,6 +1,6 @@
 """`generate`: a world's recordings, one per robot, rendered by a few processes and kept for the next time."""
 
-import logging
+import hashlib
 import multiprocessing
 import os
 import shutil
@@ -19,6 +19,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import pose
 from flocc_agent.runtime.recording import write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_launch import datasets
 from flocc_launch.datasets.drift import drifted
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.world.exposure import SHUTTER_S, Sensor, light_at
@@ -28,12 +29,9 @@ from flocc_launch.world.shade import light_maps
 from flocc_launch.world.spec import WorldSpec
 from flocc_launch.world.town import build_town
 
-logger = logging.getLogger(__name__)
-
 Float = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
-FORMAT_VERSION = 1
 CHUNK_IMAGES = 12
 T_BODY_CAMERA = pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.12, 0.0, 0.18]))
 
@@ -65,8 +63,8 @@ def generate(
         The recordings' folders, one per robot.
     """
     folders = [out / name for name in robot_names(spec.robots)]
-    stamp = f"version {FORMAT_VERSION}\n{spec.model_dump_json(indent=1)}\n"
-    marker = out / "world.json"
+    stamp = f"{spec.model_dump_json(indent=1)}\nprogram {_program_digest()}\n"
+    marker = out / "world.txt"
     if marker.exists() and marker.read_text(encoding="utf-8") == stamp:
         return folders
     marker.unlink(missing_ok=True)
@@ -88,6 +86,12 @@ def baked_world(spec: WorldSpec) -> Baked:
     """Build the town of a spec and compute its light."""
     scene = build_town(np.random.default_rng([spec.seed, 0]))
     return bake(scene, light_maps(scene))
+
+
+def _program_digest() -> str:
+    """Changes with the program that makes the world, so that what an older one rendered is not taken for new."""
+    files = sorted([*Path(__file__).parent.glob("*.py"), *Path(datasets.__file__).parent.glob("drift.py")])
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def _prepare(spec: WorldSpec, index: int, folder: Path, truth: Trajectory) -> list[_Shot]:

@@ -15,9 +15,9 @@ from flocc_launch.world.spec import WorldSpec
 Float = NDArray[np.float64]
 Node = tuple[int, int]
 
-# alpha and charlie share (1,0) to (2,0) early; charlie and bravo (3,1) to (2,1); alpha and bravo (2,1) to (1,1) to (1,2)
-# to (2,2) late: every stretch of drift lies in a loop over several robots. charlie comes back down the street that alpha
-# walked up, so these two meet head on as well.
+# alpha and charlie share (1,0) to (2,0) early; charlie and bravo (3,1) to (2,1); alpha and bravo (2,1) to (1,1) to
+# (1,2) to (2,2) late: every stretch of drift lies in a loop over several robots. charlie comes back down the street
+# that alpha walked up, so these two meet head on as well.
 ROUTES: tuple[tuple[Node, ...], ...] = (
     ((0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (1, 2), (2, 2)),
     ((3, 2), (3, 1), (2, 1), (1, 1), (1, 2), (2, 2), (3, 2)),
