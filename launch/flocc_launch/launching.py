@@ -258,7 +258,7 @@ class _Launch:
             driver="launch",
             recordings={name: str(path.resolve()) for name, path in self._paths.items()},
             radio=json.loads(scenario.radio.model_dump_json(), parse_constant=lambda _: None),
-            settings=settings_of(scenario),
+            settings=scenario.settings(),
             expectations=limits,
             duration_s=wall_s,
             wall_s=wall_s,
@@ -275,19 +275,6 @@ class _Launch:
 
     def _now_s(self) -> float:
         return time.monotonic() - self._epoch_s
-
-
-def settings_of(scenario: Scenario) -> dict[str, Any]:
-    """Settings worth reading beside a result."""
-    return {
-        "perception": scenario.perception.method,
-        "similarity_min": scenario.core.place_recognition.similarity_threshold,
-        "match_ratio_min": scenario.core.loop_closing.match_ratio_threshold,
-        "formulation": scenario.backend.formulation.value,
-        "solver": scenario.backend.solver.value,
-        "keyframe_distance_m": scenario.keyframes.distance_m,
-        "rate": scenario.rate,
-    }
 
 
 def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig:

@@ -203,6 +203,18 @@ class Scenario(Section):
             raise ValueError(f"a fault names robot '{min(unknown)}', which is not in the scenario")
         return self
 
+    def settings(self) -> dict[str, object]:
+        """Settings worth reading beside a result."""
+        return {
+            "perception": self.perception.method,
+            "similarity_min": self.core.place_recognition.similarity_threshold,
+            "match_ratio_min": self.core.loop_closing.match_ratio_threshold,
+            "formulation": self.backend.formulation.value,
+            "solver": self.backend.solver.value,
+            "keyframe_distance_m": self.keyframes.distance_m,
+            "rate": self.rate,
+        }
+
     def names(self) -> list[str]:
         """Names of all robots, sorted."""
         source = self.world or self.dataset or self.tracks

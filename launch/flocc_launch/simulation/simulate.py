@@ -108,6 +108,7 @@ def write(folder: RunFolder, swarm: Swarm, seed: int, end_s: float) -> None:
             robots=list(swarm.stations),
             driver="simulate",
             radio=scenario.radio.model_dump(mode="json", exclude_defaults=True),
+            settings=scenario.settings(),
             expectations={name: float(limit) for name, limit in limits.items()},
             duration_s=end_s,
         )
