@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from flocc_agent.config import RadioConfig, SourceConfig
-from flocc_launch.agent_process import recover_result
+from flocc_launch.agent_process import Lines, recover_result
 from flocc_launch.data import recordings
 from flocc_launch.keys import make_keys
 from flocc_launch.processes import AgentProcess, loopback_transports
@@ -26,6 +26,7 @@ from flocc_launch.run_folder import Run, RunFolder
 from flocc_launch.scenario import Fault, FaultKind, Scenario, agent_config
 from flocc_protocol.errors import FloccError
 
+LAUNCHER_EVENTS = "launcher.events.jsonl"
 PERIOD_S = 0.25
 UNSETTLED_MAX_S = 120.0
 STOP_NOW_S = 5.0
@@ -105,7 +106,7 @@ class _Launch:
         self._on_watch = on_watch
         self._secure = secure
         self._epoch_s = time.monotonic()
-        self._events: list[dict[str, Any]] = []
+        self._lines = Lines(folder.path / LAUNCHER_EVENTS)
         self._radio = scenario.radio
         self._faults = sorted(scenario.faults, key=lambda fault: fault.at_s)
         self._interrupted = False
@@ -227,7 +228,7 @@ class _Launch:
             agent.asked = True
             code = agent.exit_code
             event = {"signal": -code, "exit_code": None} if code < 0 else {"signal": None, "exit_code": code}
-            self._events.append(self._event(agent.name, "agent_died", event))
+            self._lines.write(self._event(agent.name, "agent_died", event))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
         died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.status]
@@ -237,8 +238,9 @@ class _Launch:
     # Files
 
     def _collect(self) -> None:
-        """Merge all robots' events, in order of time."""
-        events = list(self._events)
+        """Merge all robots' events and the launcher's own, in order of time."""
+        self._lines.close()
+        events = _read_lines(self._folder.path / LAUNCHER_EVENTS)
         for agent in self._watch.agents:
             if agent.exit_code != 0:
                 recover_result(agent.config)
