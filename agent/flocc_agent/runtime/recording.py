@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import ConfigError, read_toml
 from flocc_agent.core.interfaces import Camera, Image
-from flocc_agent.runtime.trajectory import RecordingError, Trajectory, checked_pose, read_tum, text_lines
+from flocc_agent.runtime.trajectory import GAP_MAX_S, RecordingError, Trajectory, checked_pose, read_tum, text_lines
 
 __all__ = ["Frame", "Recording", "RecordingError", "read_camera", "read_image_list", "write_camera"]
 
@@ -163,8 +163,8 @@ def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
     frames = tuple(Frame(stamp_s, image, T) for stamp_s, image, T in posed if T is not None)
     if not frames:
         raise RecordingError(
-            f"{path / 'odometry.tum'}: is from {odometry.stamps_s[0]:.3f} s to {odometry.stamps_s[-1]:.3f} s, but "
-            f"the images of {path / 'images.txt'} are from {images[0][0]:.3f} s to {images[-1][0]:.3f} s"
+            f"{path / 'odometry.tum'}: is from {odometry.stamps_s[0]:.3f} s to {odometry.stamps_s[-1]:.3f} s, and has "
+            f"no pose (or gaps of more than {GAP_MAX_S:g} s) where the images of {path / 'images.txt'} are from {images[0][0]:.3f} s to {images[-1][0]:.3f} s"
         )
     if len(frames) < len(images):
         logger.warning("%s: %d of %d images lie outside of the odometry", path, len(images) - len(frames), len(images))

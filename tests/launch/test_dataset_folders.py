@@ -1,0 +1,319 @@
+"""Every folder format is read as its publisher describes it, and what is wrong with one is said in one sentence."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.geometry import inverse, pose, so3_exp
+from flocc_agent.runtime.recording import Recording, write_camera
+from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_launch.datasets.commands import convert, info, split
+from flocc_launch.datasets.detect import detect_format, read_source
+from flocc_launch.datasets.drift import DriftSpec
+from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.source import DatasetError
+
+Float = NDArray[np.float64]
+
+CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+SHARED = Path(os.environ.get("FLOCC_SHARED", Path(__file__).parents[3] / "shared"))
+
+
+def moving(count: int) -> Float:
+    """Poses that start away from the identity, drive on and turn."""
+    return np.array([pose(so3_exp(np.array([0.1, 0.0, 0.1 * k])), np.array([5.0 + k, 2.0, 0.5])) for k in range(count)])
+
+
+def write_image(path: Path, grey: int = 100) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((24, 32, 3), grey, dtype=np.uint8))
+
+
+def write_plain(path: Path, count: int = 6) -> Path:
+    for k in range(count):
+        write_image(path / "images" / f"{100 + 0.5 * k:.3f}.png", 10 * k)
+    write_tum(path / "groundtruth.tum", Trajectory(np.linspace(100, 99.5 + 0.5 * count, count), moving(count)))
+    write_camera(path / "camera.toml", CAMERA, np.eye(4))
+    return path
+
+
+def write_sevenscenes(path: Path, count: int = 6) -> Path:
+    for k in range(count):
+        write_image(path / f"frame-{2 * k:06d}.color.jpg")
+        np.savetxt(path / f"frame-{2 * k:06d}.pose.txt", moving(count)[k])
+    return path
+
+
+def write_kitti(path: Path, images: int = 4, poses: int = 4) -> Path:
+    for k in range(images):
+        write_image(path / "image_0" / f"{k:06d}.png")
+    (path / "calib.txt").write_text("P0: 7 0 3 0 0 8 4 0 0 0 1 0\nP1: 7 0 3 -2 0 8 4 0 0 0 1 0\n")
+    (path / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(images)))
+    np.savetxt(path / "poses.txt", moving(poses)[:, :3].reshape(poses, 12))
+    return path
+
+
+def write_tum_rgbd(path: Path) -> Path:
+    for k in range(3):
+        write_image(path / "rgb" / f"{1305.0 + k / 30:.6f}.png")
+    names = sorted(file.name for file in (path / "rgb").iterdir())
+    (path / "rgb.txt").write_text("# color images\n" + "".join(f"{name[:-4]} rgb/{name}\n" for name in names))
+    write_tum(path / "groundtruth.txt", Trajectory(np.linspace(1304.9, 1305.2, 4), moving(4)))
+    return path
+
+
+def write_euroc(path: Path) -> Path:
+    cam = path / "mav0" / "cam0"
+    for k in range(3):
+        write_image(cam / "data" / f"{1403636579763555584 + k * 50000000}.png")
+    (cam / "sensor.yaml").write_text(
+        "# General sensor definitions.\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n"
+        "  data: [0.0, -1.0, 0.0, 0.1,\n         1.0, 0.0, 0.0, 0.2,\n         0.0, 0.0, 1.0, 0.3,\n"
+        "         0.0, 0.0, 0.0, 1.0]\nrate_hz: 20\nresolution: [32, 24]\ncamera_model: pinhole\n"
+        "intrinsics: [45.8, 45.7, 16.7, 12.4] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+    )
+    truth = path / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir(parents=True)
+    rows = [f"{1403636579763555584 + k * 50000000},{k},2,3,1,0,0,0,0,0,0,0,0,0,0,0,0" for k in range(3)]
+    (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def test_sevenscenes_is_stamped_by_its_frame_numbers(tmp_path: Path) -> None:
+    source = read_source(write_sevenscenes(tmp_path / "s"))
+    assert source.format == "7scenes"
+    assert [stamp_s for stamp_s, _ in source.images] == pytest.approx([k / 15 for k in range(6)])
+    assert source.truth is not None
+    np.testing.assert_allclose(source.truth.T_fixed_body, moving(6), atol=1e-9)
+    assert source.lens is not None
+    assert source.lens.camera == Camera(32, 24, 585.0, 585.0, 16.0, 12.0)
+
+
+def test_kitti_takes_calibration_times_and_poses(tmp_path: Path) -> None:
+    source = read_source(write_kitti(tmp_path / "00"))
+    assert source.format == "kitti"
+    assert source.lens is not None
+    assert source.lens.camera == Camera(32, 24, 7.0, 8.0, 3.0, 4.0)
+    assert source.truth is not None
+    np.testing.assert_allclose(source.truth.T_fixed_body, moving(4), atol=1e-9)
+    assert source.faults == ()
+
+
+def test_tum_needs_a_calibration_unless_its_name_says_which_camera(tmp_path: Path) -> None:
+    assert read_source(write_tum_rgbd(tmp_path / "desk")).lens is None
+    lens = read_source(write_tum_rgbd(tmp_path / "rgbd_dataset_freiburg1_desk")).lens
+    assert lens is not None
+    assert (lens.camera.fx, lens.k3) == (517.3, 1.1633)
+
+
+def test_euroc_takes_the_left_camera_in_the_body(tmp_path: Path) -> None:
+    source = read_source(write_euroc(tmp_path / "MH_01"))
+    assert source.format == "euroc"
+    assert source.images[1][0] - source.images[0][0] == pytest.approx(0.05)
+    assert source.lens is not None
+    assert source.lens.camera == Camera(32, 24, 45.8, 45.7, 16.7, 12.4, (-0.28, 0.07, 0.0002, 1.8e-05))
+    assert source.lens.T_body_camera[:3, 3].tolist() == [0.1, 0.2, 0.3]
+    assert source.truth is not None
+    assert source.truth.T_fixed_body[2, :3, 3].tolist() == [2, 2, 3]
+
+
+def test_a_plain_folder_takes_stamps_from_names(tmp_path: Path) -> None:
+    found = info(write_plain(tmp_path / "p"))
+    assert (found.format, found.images, found.from_s, found.to_s) == ("plain", 6, 100.0, 102.5)
+    assert (found.truth_poses, found.odometry_poses, found.camera) == (6, None, CAMERA)
+    assert found.length_m == pytest.approx(5.0)
+
+
+def test_a_folder_of_numbered_images_takes_stamps_from_its_trajectory(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p", 4)
+    for k, file in enumerate(sorted((path / "images").iterdir())):
+        file.rename(path / "images" / f"{k:06d}.png")
+    assert [stamp_s for stamp_s, _ in read_source(path).images] == [100.0, 100.5, 101.0, 101.5]
+
+
+def test_convert_writes_a_recording_with_odometry_from_its_own_start(tmp_path: Path) -> None:
+    out = convert(write_kitti(tmp_path / "00"), tmp_path / "out")
+    recording = Recording.open(out)
+    assert len(recording.frames) == 4
+    np.testing.assert_allclose(recording.frames[3].T_odom_body, inverse(moving(4)[0]) @ moving(4)[3], atol=1e-8)
+    T_world_body = recording.ground_truth(0.3)
+    assert T_world_body is not None
+    np.testing.assert_allclose(T_world_body, moving(4)[3], atol=1e-8)
+
+
+def test_convert_goes_on_where_it_was_cut_short(tmp_path: Path) -> None:
+    source, out = write_plain(tmp_path / "p"), tmp_path / "out"
+    convert(source, out)
+    first = (out / "images" / "000000.png").stat().st_mtime_ns
+    lines = (out / "images.txt").read_text().splitlines(keepends=True)
+    (out / "images.txt").write_text("".join(lines[:3]) + lines[3][:9])
+    convert(source, out)
+    assert (out / "images.txt").read_text() == "".join(lines)
+    assert (out / "images" / "000000.png").stat().st_mtime_ns == first
+
+
+def test_convert_does_not_write_into_another_recording(tmp_path: Path) -> None:
+    convert(write_plain(tmp_path / "p"), tmp_path / "out")
+    with pytest.raises(DatasetError, match="out: holds another recording"):
+        convert(write_kitti(tmp_path / "00"), tmp_path / "out")
+
+
+def test_convert_takes_odometry_of_its_own(tmp_path: Path) -> None:
+    source = write_plain(tmp_path / "p")
+    write_tum(tmp_path / "vio.tum", Trajectory(np.array([99.0, 100.5, 102.0]), moving(3)))
+    recording = Recording.open(convert(source, tmp_path / "out", odometry=tmp_path / "vio.tum"))
+    assert [frame.stamp_s for frame in recording.frames] == [100.0, 100.5, 101.0, 101.5, 102.0]
+    np.testing.assert_allclose(recording.frames[1].T_odom_body, inverse(moving(3)[0]) @ moving(3)[1], atol=1e-8)
+
+
+def test_images_are_undistorted_where_the_camera_has_a_third_coefficient(tmp_path: Path) -> None:
+    path = write_tum_rgbd(tmp_path / "t")
+    (path / "camera.yaml").write_text(
+        "image_width: 32\nimage_height: 24\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        "  data: [30, 0, 16, 0, 31, 12, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+        "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.2, -0.9, -0.005, 0.002, 1.1]\n"
+    )
+    recording = Recording.open(convert(path, tmp_path / "out"))
+    assert recording.camera == Camera(32, 24, 30.0, 31.0, 16.0, 12.0)
+    assert recording.frames[0].image_path.suffix == ".jpg"
+
+
+def test_split_gives_each_robot_its_part_and_its_own_drift(tmp_path: Path) -> None:
+    source = write_sevenscenes(tmp_path / "s", 12)
+    folders = split(source, tmp_path / "out", 3, seed=4)
+    assert [folder.name for folder in folders] == ["alpha", "bravo", "charlie"]
+    recordings = [Recording.open(folder) for folder in folders]
+    assert [len(recording.frames) for recording in recordings] == [4, 4, 4]
+    for k, recording in enumerate(recordings):
+        assert recording.frames[0].stamp_s < 0.08
+        T_world_body = recording.ground_truth(recording.frames[0].stamp_s)
+        assert T_world_body is not None
+        np.testing.assert_allclose(T_world_body, moving(12)[4 * k], atol=1e-6)
+    steps = [recording.frames[1].T_odom_body[:3, 3] for recording in recordings]
+    assert not np.allclose(np.linalg.norm(steps[0]), np.linalg.norm(steps[1]), atol=1e-4)
+
+
+def test_split_is_repeatable(tmp_path: Path) -> None:
+    source = write_plain(tmp_path / "p", 12)
+    texts = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        folders = split(source, tmp_path / name, 2, seed=seed, drift=DriftSpec())
+        texts.append((folders[1] / "odometry.tum").read_text())
+    assert texts[0] == texts[1] != texts[2]
+
+
+def test_overlap_lengthens_all_parts_but_the_last(tmp_path: Path) -> None:
+    folders = split(write_plain(tmp_path / "p", 12), tmp_path / "out", 2, overlap_s=1.0)
+    assert [len(Recording.open(folder).frames) for folder in folders] == [8, 6]
+
+
+def test_progress_counts_images(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    convert(write_kitti(tmp_path / "00"), tmp_path / "out", progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_one_image_fewer_than_poses_is_said_and_the_rest_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"poses.txt: has 5 poses, but the sequence has 4 images.*4 images.*kept in"):
+        convert(write_kitti(tmp_path / "00", images=4, poses=5), tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out").frames) == 4
+
+
+def test_a_pose_without_its_image_is_said(tmp_path: Path) -> None:
+    path = write_sevenscenes(tmp_path / "s")
+    (path / "frame-000004.color.jpg").unlink()
+    assert info(path).faults == (f"{path}: has 1 poses more than images",)
+
+
+def test_a_listed_image_that_is_missing_is_said_with_its_line(tmp_path: Path) -> None:
+    path = write_tum_rgbd(tmp_path / "t")
+    next((path / "rgb").glob("*033333.png")).unlink()
+    faults = info(path).faults
+    assert "rgb.txt:3: the image" in faults[0]
+    assert faults[1].endswith("intrinsics are missing")
+
+
+def test_missing_intrinsics_are_said_with_what_to_do(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    (path / "camera.toml").unlink()
+    with pytest.raises(DatasetError, match=r"p: intrinsics are missing; put a camera.toml .* --camera"):
+        convert(path, tmp_path / "out")
+
+
+def test_intrinsics_of_another_size_are_refused(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    write_camera(tmp_path / "other.toml", Camera(64, 48, 30.0, 30.0, 32.0, 24.0), np.eye(4))
+    with pytest.raises(DatasetError, match="the image is 32x24, but the intrinsics are for 64x48"):
+        convert(path, tmp_path / "out", camera=tmp_path / "other.toml")
+
+
+def test_a_folder_without_motion_is_refused(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    (path / "groundtruth.tum").unlink()
+    with pytest.raises(DatasetError, match="neither odometry nor ground truth"):
+        convert(path, tmp_path / "out")
+
+
+def test_more_robots_than_images_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="6 images cannot be cut into 9 robots"):
+        split(write_plain(tmp_path / "p"), tmp_path / "out", 9)
+
+
+@pytest.mark.parametrize(("make", "sentence"), [(False, "does not exist"), (True, "is none of the known data sets")])
+def test_an_unknown_folder_is_refused(tmp_path: Path, make: bool, sentence: str) -> None:
+    if make:
+        (tmp_path / "x").mkdir()
+    with pytest.raises(DatasetError, match=sentence):
+        detect_format(tmp_path / "x")
+
+
+def test_kalibr_gives_the_inverse_of_its_mounting(tmp_path: Path) -> None:
+    T_camera_imu = pose(so3_exp(np.array([0.3, -0.2, 1.0])), np.array([0.1, 0.2, 0.3]))
+    rows = "".join("  - [" + ", ".join(str(value) for value in row) + "]\n" for row in T_camera_imu)
+    (tmp_path / "camchain.yaml").write_text(
+        f"cam0:\n  T_cam_imu:\n{rows}  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.2, 0.3, 0.4]\n"
+        "  distortion_model: radtan\n  intrinsics: [30.0, 31.0, 16.0, 12.0]\n  resolution: [32, 24]\n"
+    )
+    lens = read_lens(tmp_path / "camchain.yaml")
+    assert lens.camera == Camera(32, 24, 30.0, 31.0, 16.0, 12.0, (0.1, 0.2, 0.3, 0.4))
+    np.testing.assert_allclose(lens.T_body_camera, inverse(T_camera_imu), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("fx: 1\n", "the image size is missing"),
+        ("width: 3\nheight: 4\n", "the intrinsics are missing"),
+        ("resolution: [3, 4]\nintrinsics: [1, 1, 1, 1]\ndistortion_model: equidistant\n", "'equidistant'"),
+    ],
+)
+def test_a_camera_file_of_no_use_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(DatasetError, match=f"camera.yaml: .*{sentence}"):
+        read_lens(tmp_path / "camera.yaml")
+
+
+@pytest.mark.data
+def test_the_real_sevenscenes_sequence_splits_into_three(tmp_path: Path) -> None:
+    path = SHARED / "data" / "sevenscenes"
+    if not path.is_dir():
+        pytest.skip(f"{path} is not here")
+    folders = split(path, tmp_path / "out", 3, seed=1)
+    recordings = [Recording.open(folder) for folder in folders]
+    assert [len(recording.frames) for recording in recordings] == [167, 166, 167]
+    assert sum(recording.truth.length_m() for recording in recordings if recording.truth) == pytest.approx(7.1, abs=0.1)
+
+
+@pytest.mark.data
+def test_real_kitti_and_euroc_files_are_read(tmp_path: Path) -> None:
+    if not (SHARED / "data" / "kitti_short").is_dir():
+        pytest.skip(f"{SHARED / 'data' / 'kitti_short'} is not here")
+    found = info(SHARED / "data" / "kitti_short" / "KITTI_sequence_1")
+    assert (found.format, found.images, found.truth_poses, found.faults) == ("kitti", 51, 51, ())
+    assert len(read_tum(SHARED / "data" / "euroc" / "vio" / "MH_01.vislam.txt")) > 1000
