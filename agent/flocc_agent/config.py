@@ -101,7 +101,7 @@ class BackendConfig(Section):
     """Control parameter at which GNC starts at the latest; smaller starts more convex and takes more solves."""
     gnc_step: float = Field(2.0, gt=1)
     """Factor of the control parameter per GNC round; smaller is more careful and slower."""
-    gnc_inner_steps: int = Field(2, ge=1)
+    gnc_inner_steps: int = Field(1, ge=1)
     """Linear solves per GNC round; more follows each round's optimum more closely."""
     relative_tolerance: float = Field(1e-5, gt=0)
     """Stop when a step lowers the cost by less than this part of it."""

@@ -191,16 +191,22 @@ def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple
     renumbered = np.cumsum(sizes > 1) - 1
     together = free & (sizes[np.maximum(raw, 0)] > 1)
     labels[together] = renumbered[raw[together]]
-    link = config.scale_link_sigma_ratio
+    link = np.where(comparable(closures, config), config.scale_link_sigma_ratio, config.scale_link_unknown_sigma_ratio)
     sigma[free] = np.where(together, link, np.hypot(prior, link))[free]
     return labels, sigma, int(np.sum(sizes > 1))
 
 
 def prior_sigmas(closures: Sequence[LoopClosure], config: BackendConfig) -> Float:
     """Relative standard deviation (L,) of the prior on each closure's scale."""
-    raw = config.scale_initial is ScaleInitial.RAW
-    known = np.array([c.scale_initial is not None and not raw for c in closures], dtype=bool)
+    known = np.array([c.scale_initial is not None for c in closures], dtype=bool)
+    known &= config.scale_initial is not ScaleInitial.RAW
     return np.where(known, config.scale_prior_sigma_ratio, config.scale_prior_unknown_sigma_ratio)
+
+
+def comparable(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:
+    """Whether each closure's network unit compares with others': by Eq. (6), or because units are taken as metres."""
+    raw = config.scale_initial is ScaleInitial.RAW
+    return np.array([raw or c.scale_initial is not None for c in closures], dtype=bool)
 
 
 def fix_edges(fixes: Sequence[AbsoluteFix], offsets: Mapping[LogId, int], world: int) -> Edges:

@@ -1,5 +1,6 @@
 """What must not reach the solver: broken odometry, closures that cannot be right, each with its reason."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -7,15 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import angle_rad, between, inverse, is_rigid
+from flocc_agent.geometry import angle_rad, between, inverse
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 TRANSLATION_UNSCALED_MIN = 1e-9
 SAME_ROTATION_RAD = 0.02
 SAME_TRANSLATION_RATIO = 0.05
 CONDITION_MAX = 1e14
+SYMMETRY_RATIO = 1e-6
+RIGID_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +49,7 @@ def screen(graph: PoseGraph) -> Screened:
             warnings.append(complaint)
         if usable is not None:
             trajectories[log] = usable
-    excluded: dict[int, str] = {}
-    for k, closure in enumerate(graph.closures):
-        complaint = closure_complaint(closure, trajectories)
-        if complaint:
-            excluded[k] = complaint
+    excluded = closure_complaints(graph.closures, trajectories)
     excluded.update(_duplicates(graph.closures, excluded))
     fixes = []
     for fix in graph.fixes:
@@ -61,15 +61,22 @@ def screen(graph: PoseGraph) -> Screened:
     return Screened(trajectories, excluded, tuple(fixes), tuple(warnings))
 
 
+def are_covariances(matrices: Float) -> Bool:
+    """Whether each of (N, n, n) matrices is finite, symmetric, positive definite and not hopelessly conditioned."""
+    finite: Bool = np.isfinite(matrices).all(axis=(1, 2))
+    safe = np.where(finite[:, None, None], matrices, np.eye(matrices.shape[-1]))
+    transposed = np.swapaxes(safe, 1, 2)
+    slack = SYMMETRY_RATIO * np.abs(safe).max(axis=(1, 2))
+    symmetric = np.abs(safe - transposed).max(axis=(1, 2)) <= slack
+    eigenvalues = np.linalg.eigvalsh(0.5 * (safe + transposed))
+    low, high = eigenvalues[:, 0], eigenvalues[:, -1]
+    return np.asarray(finite & symmetric & (low > 0) & (high < CONDITION_MAX * low))
+
+
 def is_covariance(matrix: Float, size: int) -> bool:
-    """Whether a matrix is finite, symmetric and positive definite, and not hopelessly conditioned."""
+    """Whether one matrix is a usable covariance of the given size."""
     matrix = np.asarray(matrix, dtype=float)
-    if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
-        return False
-    if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12 * float(np.max(np.abs(matrix)))):
-        return False
-    eigenvalues = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
-    return bool(eigenvalues[0] > 0 and eigenvalues[-1] < CONDITION_MAX * eigenvalues[0])
+    return matrix.shape == (size, size) and bool(are_covariances(matrix[None])[0])
 
 
 def _usable_trajectory(log: LogId, trajectory: Trajectory) -> tuple[Trajectory | None, str]:
@@ -84,11 +91,13 @@ def _usable_trajectory(log: LogId, trajectory: Trajectory) -> tuple[Trajectory |
         return trajectory, ""
     if len(covariances) != len(T) - 1:
         return Trajectory(T), f"robot {log} gives {len(covariances)} odometry covariances for {len(T) - 1} edges"
-    wrong = [k for k, S in enumerate(covariances) if not is_covariance(S, 6)]
-    if not wrong:
+    covariances = np.asarray(covariances, dtype=float)
+    sized = covariances.shape[1:] == (6, 6)
+    wrong = np.flatnonzero(~are_covariances(covariances)).tolist() if sized and len(covariances) else []
+    if sized and not wrong:
         return trajectory, ""
     return Trajectory(T), (
-        f"odometry covariance of robot {log} at edge {wrong[0]} is not positive definite; the configured one is used"
+        f"odometry covariance of robot {log} at edge {wrong[0] if wrong else 0} is not positive definite; the configured one is used"
     )
 
 
@@ -96,36 +105,57 @@ def first_not_rigid(T: Float) -> int | None:
     """Index of the first pose of (N, 4, 4) that is not finite and rigid, or None."""
     if T.ndim != 3 or T.shape[1:] != (4, 4):
         return 0
-    R = T[:, :3, :3]
-    with np.errstate(all="ignore"):
-        orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) < 2e-3
-        good = np.isfinite(T).all(axis=(1, 2)) & orthonormal & (np.linalg.det(R) > 0)
-        good &= np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) < 1e-3
+    good = are_rigid(T)
     return None if good.all() else int(np.argmin(good))
 
 
-def closure_complaint(closure: LoopClosure, trajectories: Mapping[LogId, Trajectory]) -> str:
-    """Why a closure cannot be used, in one sentence; empty where it can."""
-    name = f"closure {closure.query} - {closure.match}"
+def are_rigid(T: Float) -> Bool:
+    """Whether each of (N, 4, 4) arrays is a finite rigid pose."""
+    finite: Bool = np.isfinite(T).all(axis=(1, 2))
+    T = np.where(finite[:, None, None], T, np.eye(4))
+    R = T[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        orthonormal = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) < RIGID_TOLERANCE
+        last_row = np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1) < RIGID_TOLERANCE
+        return np.asarray(finite & orthonormal & last_row & (np.linalg.det(R) > 0))
+
+
+def closure_complaints(closures: Sequence[LoopClosure], trajectories: Mapping[LogId, Trajectory]) -> dict[int, str]:
+    """Why closures cannot be used, by index, in one sentence each; those that can are not named."""
+    complaints = {k: text for k, c in enumerate(closures) if (text := _plain_complaint(c, trajectories))}
+    rest = [k for k in range(len(closures)) if k not in complaints]
+    if rest:
+        T = np.array([closures[k].T_query_match_unscaled for k in rest], dtype=float)
+        rigid, finite = are_rigid(T), np.isfinite(T).all(axis=(1, 2))
+        for n in np.flatnonzero(~rigid):
+            complaints[rest[n]] = f"the measurement is {'not a rigid pose' if finite[n] else 'not finite'}"
+    weighed = [k for k in rest if k not in complaints and closures[k].covariance is not None]
+    if weighed:
+        good = are_covariances(np.array([closures[k].covariance for k in weighed], dtype=float))
+        complaints |= {weighed[n]: "the covariance is not positive definite" for n in np.flatnonzero(~good)}
+    return {k: f"closure {closures[k].query} - {closures[k].match}: {complaints[k]}" for k in sorted(complaints)}
+
+
+def _plain_complaint(closure: LoopClosure, trajectories: Mapping[LogId, Trajectory]) -> str:
+    """What is wrong with a closure's fields one by one; empty where nothing is."""
     for keyframe in (closure.query, closure.match):
         complaint = _missing(keyframe, trajectories)
         if complaint:
-            return f"{name}: {complaint}"
+            return complaint
     if closure.query == closure.match:
-        return f"{name}: joins a keyframe with itself"
-    T = np.asarray(closure.T_query_match_unscaled, dtype=float)
-    if not np.all(np.isfinite(T)):
-        return f"{name}: the measurement is not finite"
-    if not is_rigid(T):
-        return f"{name}: the measurement is not a rigid pose"
-    if not np.isfinite(closure.match_ratio) or closure.match_ratio < 0:
-        return f"{name}: the match ratio {closure.match_ratio} is not a ratio"
-    if closure.covariance is not None and not is_covariance(closure.covariance, 6):
-        return f"{name}: the covariance is not positive definite"
-    if closure.scale_initial is not None and not (np.isfinite(closure.scale_initial) and closure.scale_initial > 0):
-        return f"{name}: the initial scale {closure.scale_initial} is not positive"
-    if not closure.metric and float(np.linalg.norm(T[:3, 3])) < TRANSLATION_UNSCALED_MIN:
-        return f"{name}: a translation of zero length has no direction to scale"
+        return "joins a keyframe with itself"
+    if np.shape(closure.T_query_match_unscaled) != (4, 4):
+        return "the measurement is not a rigid pose"
+    if not math.isfinite(closure.match_ratio) or closure.match_ratio < 0:
+        return f"the match ratio {closure.match_ratio} is not a ratio"
+    if closure.covariance is not None and np.shape(closure.covariance) != (6, 6):
+        return "the covariance is not positive definite"
+    scale = closure.scale_initial
+    if scale is not None and not (math.isfinite(scale) and scale > 0):
+        return f"the initial scale {scale} is not positive"
+    x, y, z = closure.T_query_match_unscaled[:3, 3].tolist()
+    if not closure.metric and math.hypot(x, y, z) < TRANSLATION_UNSCALED_MIN:
+        return "a translation of zero length has no direction to scale"
     return ""
 
 

@@ -177,7 +177,7 @@ def graduated(objective: Objective, state: State) -> Solved:
         squared = objective.closure_residuals(state)
         if gnc_finished(config.solver, of_closures, control):
             break
-        control = control * config.gnc_step if config.solver is Solver.GNC_TLS else control / config.gnc_step
+        control = next_control(config, squared, bound, control)
     return selected(objective, state, iterations)
 
 
@@ -202,6 +202,14 @@ def initial_control(solver: Solver, squared: Float, bound: Float, start_ratio: f
     if solver is Solver.GNC_TLS:
         return max(1.0 / max(2.0 * worst - 1.0, 1e-3), start_ratio)
     return max(min(2.0 * worst, 1.0 / start_ratio), 1.0)
+
+
+def next_control(config: BackendConfig, squared: Float, bound: Float, control: float) -> float:
+    """One step on, or as far as the largest residual that is left allows without losing convexity."""
+    allowed = initial_control(config.solver, squared, bound, config.gnc_start_ratio)
+    if config.solver is Solver.GNC_TLS:
+        return max(control * config.gnc_step, allowed)
+    return min(control / config.gnc_step, allowed)
 
 
 def gnc_weights(solver: Solver, squared: Float, bound: Float, control: float) -> Float:
