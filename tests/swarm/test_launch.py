@@ -1,6 +1,11 @@
 """Whole swarms: one process per robot, real zenoh on loopback, synthetic perception."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -90,3 +95,36 @@ def test_a_robot_comes_back_from_its_disk_with_its_numbering(tmp_path: Path) -> 
     assert [keyframe["index"] for keyframe in keyframes] == list(range(len(keyframes)))
     assert known["r2"]["incarnation"] == 0
     assert known["r1"]["logs"] == known["r2"]["logs"]
+
+
+def test_ctrl_c_stops_every_agent_in_order_and_still_reports(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "flocc_launch.cli", "launch", "meeting", "--out", str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    wait_until(lambda: any(out.glob("robots/*/events.jsonl")) and '"leader"' in events_of(out), 60.0)
+    process.send_signal(signal.SIGINT)
+    text, _ = process.communicate(timeout=60.0)
+    assert "Traceback" not in text
+    report = json.loads((out / "report.json").read_text())
+    assert [robot["end"] for robot in report["robot_details"]] == ["stopped"] * 3
+    left = [path for path in Path("/proc").glob("[0-9]*/cmdline") if str(out).encode() in read_or_nothing(path)]
+    assert left == []
+
+
+def events_of(out: Path) -> str:
+    return "".join(path.read_text() for path in out.glob("robots/*/events.jsonl"))
+
+
+def read_or_nothing(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def wait_until(is_so: Callable[[], bool], timeout_s: float) -> None:
+    """Look every 50 ms; fail when it does not become so in time."""
+    end_s = time.monotonic() + timeout_s
+    while not is_so():
+        assert time.monotonic() < end_s, "it did not happen in time"
+        time.sleep(0.05)
