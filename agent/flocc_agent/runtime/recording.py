@@ -162,9 +162,11 @@ def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
     posed = [(stamp_s, image, odometry.at(stamp_s)) for stamp_s, image in images]
     frames = tuple(Frame(stamp_s, image, T) for stamp_s, image, T in posed if T is not None)
     if not frames:
+        first_s, last_s = odometry.stamps_s[0], odometry.stamps_s[-1]
         raise RecordingError(
-            f"{path / 'odometry.tum'}: is from {odometry.stamps_s[0]:.3f} s to {odometry.stamps_s[-1]:.3f} s, and has "
-            f"no pose (or gaps of more than {GAP_MAX_S:g} s) where the images of {path / 'images.txt'} are from {images[0][0]:.3f} s to {images[-1][0]:.3f} s"
+            f"{path / 'odometry.tum'}: is from {first_s:.3f} s to {last_s:.3f} s, and has no pose (or gaps of more than "
+            f"{GAP_MAX_S:g} s) where the images of {path / 'images.txt'} are, from {images[0][0]:.3f} s to "
+            f"{images[-1][0]:.3f} s"
         )
     if len(frames) < len(images):
         logger.warning("%s: %d of %d images lie outside of the odometry", path, len(images) - len(frames), len(images))
