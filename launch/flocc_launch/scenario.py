@@ -6,7 +6,7 @@ The same file runs under `flocc launch` (processes over zenoh) and `flocc simula
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -134,6 +134,19 @@ class Fault(Section):
         return self
 
 
+class SimulationScenario(Section):
+    """What only virtual time has: workers that are faster or slower than real ones."""
+
+    optimiser: Literal["backend", "quick"] = "backend"
+    """backend: the real one; quick: rigid odometry hung onto closures, where only who and when matter."""
+    encode_s: float = Field(0.1, gt=0)
+    """Mean time to encode an image; drawn between half and one and a half of it."""
+    register_s: float = Field(0.25, gt=0)
+    """Mean time of a registration."""
+    optimise_s: float = Field(0.15, gt=0)
+    """Mean time of an optimisation."""
+
+
 class Expectations(Section):
     """What must come true; a run that misses one ends with exit code 1."""
 
@@ -184,6 +197,8 @@ class Scenario(Section):
     """Back end of all robots."""
     store: StoreConfig = StoreConfig()
     """Bounds of all robots' disks."""
+    simulation: SimulationScenario = SimulationScenario()
+    """Workers on virtual time."""
     faults: tuple[Fault, ...] = ()
     """What goes wrong, and when."""
     expectations: Expectations = Expectations()

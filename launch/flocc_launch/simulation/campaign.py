@@ -8,14 +8,19 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
 
 from flocc_agent.composition import build_perception
-from flocc_launch.scenario import FaultKind, Scenario
+from flocc_agent.config import KeyframeConfig
+from flocc_launch.run_folder import write_json
+from flocc_launch.scenario import FaultKind, Scenario, TracksScenario
 from flocc_launch.simulation.alignment import align
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.faults import schedule
-from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
 from flocc_launch.simulation.invariants import Invariant, Violation, Watch
+from flocc_launch.simulation.playback import Playback
 from flocc_launch.simulation.safety import all_invariants
 from flocc_launch.simulation.simulate import playbacks_of
 from flocc_launch.simulation.swarm import Equipment, Swarm
@@ -67,6 +72,11 @@ def campaign(seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[Out
     return Campaign(tuple(outcomes))
 
 
+def write_campaign(result: Campaign, path: Path) -> None:
+    """Write `campaign.json`."""
+    write_json(path, result.as_json())
+
+
 def _outcomes(seeds: list[int], processes: int) -> Iterator[Outcome]:
     if processes == 1:
         yield from map(run_seed, seeds)
@@ -106,9 +116,20 @@ def invariants_of(scenario: Scenario) -> list[Invariant]:
 def prepared(scenario: Scenario) -> Swarm:
     """A swarm with quick stand-ins for perception and back end, and its faults to come."""
     eyes = ImageEyes(build_perception(scenario.perception, scenario.seed), scenario.perception, None)
-    swarm = Swarm(scenario, playbacks_of(scenario, {}), Equipment(eyes, align), scenario.seed)
+    swarm = Swarm(scenario, _playbacks(scenario), Equipment(eyes, align), scenario.seed)
     schedule(swarm, scenario.faults)
     return swarm
+
+
+def _playbacks(scenario: Scenario) -> dict[str, Playback]:
+    assert scenario.tracks is not None
+    drawn = _walked(scenario.tracks.model_copy(update={"robots": ROBOTS_MAX}), scenario.keyframes)
+    return {name: drawn[name] for name in scenario.names()}
+
+
+@lru_cache(maxsize=64)
+def _walked(tracks: TracksScenario, keyframes: KeyframeConfig) -> dict[str, Playback]:
+    return playbacks_of(Scenario(tracks=tracks, keyframes=keyframes), {})
 
 
 def shrink(scenario: Scenario, fails: Callable[[Scenario], bool] | None = None) -> Scenario:

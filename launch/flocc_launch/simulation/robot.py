@@ -164,8 +164,11 @@ class Station:
         self._tick_s = float("inf")
         if self.core is None:
             return
-        if self.core.deadline() <= self.now_s():
-            self._carry_out(None, self.core.tick(self.now_s()))
+        now_s = self.now_s()
+        if self.core.deadline() <= now_s:
+            effects = self.core.tick(now_s)
+            assert self.core.deadline() > now_s, f"{self.name} spins: its deadline stays at {self.core.deadline()} s"
+            self._carry_out(None, effects)
         else:
             self._arm()
 

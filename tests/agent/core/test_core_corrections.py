@@ -171,7 +171,6 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
     robots.separate()
     robots.run(15.0)
     assert set(robots.frames().values()) == {"map/r1"}
-    assert robots.reports("r4", "correction")[-1].fields["frame_changed"] in (True, False)
     changes = [
         report.fields["map_frame"] for report in robots.reports("r4", "correction") if report.fields["frame_changed"]
     ]

@@ -1,0 +1,64 @@
+"""Campaigns: seeds that hold, replay exactly, and shrink."""
+
+import json
+
+import pytest
+
+from flocc_launch.scenario import Fault, FaultKind, Scenario
+from flocc_launch.simulation.campaign import Campaign, Outcome, campaign, prepared, run_seed, shrink
+from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_launch.simulation.invariants import Violation
+
+FOUND_BY_SEEDS = (54, 61, 64, 80, 81, 90, 159, 206, 304, 336, 357)
+"""Seeds that failed before a bug was fixed (docs/reliability.md)."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", FOUND_BY_SEEDS)
+def test_seeds_that_found_bugs_hold(seed: int) -> None:
+    assert run_seed(seed).violations == ()
+
+
+@pytest.mark.slow
+def test_a_small_campaign_on_two_processes_holds() -> None:
+    result = campaign(range(5000, 5024), processes=2)
+    assert [outcome.seed for outcome in result.outcomes] == list(range(5000, 5024))
+    assert result.as_json()["violations"] == []
+
+
+def test_a_seed_replays_exactly() -> None:
+    lines = []
+    for _ in range(2):
+        swarm = prepared(drawn_scenario(7))
+        swarm.run_until(20.0)
+        lines.append(json.dumps(swarm.lines))
+    assert lines[0] == lines[1]
+
+
+def test_other_seeds_draw_other_faults() -> None:
+    assert drawn_scenario(1) != drawn_scenario(2)
+    assert drawn_scenario(1) == drawn_scenario(1)
+
+
+def test_from_the_end_of_the_faults_on_nothing_is_drawn() -> None:
+    faults = [fault for seed in range(200) for fault in drawn_scenario(seed).faults]
+    assert max(fault.at_s for fault in faults) <= FAULTS_END_S
+    assert {fault.kind for fault in faults} >= set(FaultKind) - {FaultKind.LATENCY, FaultKind.RANGE}
+
+
+def test_shrinking_leaves_the_fault_that_matters() -> None:
+    culprit = Fault(at_s=3.0, kind=FaultKind.SLOW, robots=("r1",), value=3.0)
+    others = tuple(Fault(at_s=float(k), kind=FaultKind.LOSS, value=0.1) for k in range(4))
+    scenario = drawn_scenario(1).model_copy(update={"faults": (*others[:2], culprit, *others[2:])})
+
+    def fails(smaller: Scenario) -> bool:
+        return culprit in smaller.faults
+
+    assert shrink(scenario, fails).faults == (culprit,)
+
+
+def test_the_json_of_a_campaign_names_seed_invariant_and_time() -> None:
+    outcome = Outcome(9, (Violation("agreement", 92.5, "two lead"),), None)
+    fields = Campaign((outcome, Outcome(10, (), 2.5))).as_json()
+    assert fields["runs"] == 2
+    assert fields["violations"] == [{"seed": 9, "invariant": "agreement", "at_s": 92.5, "detail": "two lead"}]

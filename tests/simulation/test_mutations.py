@@ -1,0 +1,179 @@
+"""Each invariant's checker catches a core that is broken in one place."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from flocc_agent.core import corrections as corrections_module
+from flocc_agent.core.corrections import Corrections, correction_of
+from flocc_agent.core.effects import Broadcast, Effect, Unicast
+from flocc_agent.core.election import LeaderElection
+from flocc_agent.core.gossip import Gossip
+from flocc_agent.core.latents import Latents
+from flocc_agent.core.loop_closing import LoopClosing
+from flocc_agent.core.neighbours import Neighbours
+from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.robot import Restored
+from flocc_launch.scenario import Fault, FaultKind, Scenario
+from flocc_launch.simulation.campaign import run_checked
+from flocc_launch.simulation.disk import Disk
+from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_protocol.ids import KeyframeId, LogId, Term
+from flocc_protocol.messages import Coordinator
+
+CALM = Fault(at_s=FAULTS_END_S, kind=FaultKind.CALM)
+
+
+def scenario(*faults: Fault, **changes: Any) -> Scenario:
+    """Three robots that meet, with faults."""
+    fields: dict[str, Any] = {
+        "seed": 5,
+        "tracks": {"robots": 3, "seed": 1, "area_m": 12.0, "speed_m_s": 0.8, "length_m": 14.0},
+        "keyframes": {"distance_m": 1.5, "rotation_rad": 1.2},
+        "core": {"place_recognition": {"similarity_threshold": 0.5}},
+        "perception": {
+            "method": "synthetic",
+            "synthetic": {"dimension": 16, "outlier_probability": 0.0, "alias_probability": 0.0},
+        },
+        "faults": [fault.model_dump() for fault in (*faults, CALM)],
+        **changes,
+    }
+    return Scenario.model_validate(fields)
+
+
+def killed_and_back(name: str) -> tuple[Fault, ...]:
+    return (
+        Fault(at_s=10.0, kind=FaultKind.KILL, robots=(name,)),
+        Fault(at_s=11.0, kind=FaultKind.START, robots=(name,)),
+    )
+
+
+LOSSY = {"radio": {"loss_ratio": 0.4}}
+
+
+def broken(run: Scenario) -> set[str]:
+    """Names of the invariants that did not hold."""
+    return {violation.invariant for violation in run_checked(run).violations}
+
+
+@pytest.mark.parametrize("run", [scenario(), scenario(*killed_and_back("r1")), scenario(**LOSSY)])
+def test_the_core_as_it_is_breaks_nothing(run: Scenario) -> None:
+    assert broken(run) == set()
+
+
+def test_a_robot_that_never_follows_breaks_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LeaderElection, "_prefers", lambda self, heard: False)
+    assert "agreement" in broken(scenario())
+
+
+def test_a_robot_that_applies_whatever_comes_breaks_fencing(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Corrections.on_message
+
+    def careless(self: Corrections, message: Any) -> list[Effect]:
+        self._newest.pop(message.log, None)
+        return original(self, message)
+
+    monkeypatch.setattr(Corrections, "on_message", careless)
+    late = {"radio": {"jitter_s": 0.3, "duplicate_ratio": 0.5, "reorder_ratio": 0.5, "reorder_delay_s": 4.0}}
+    assert "fencing" in broken(scenario(**late))
+
+
+def test_a_jump_that_is_not_told_breaks_fencing(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = corrections_module.delivered
+    monkeypatch.setattr(corrections_module, "delivered", lambda message, frame_changed: original(message, False))
+    assert "fencing" in broken(scenario())
+
+
+def test_a_leader_that_forgets_its_counter_breaks_one_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Restored, "counter_max", lambda self: 0)
+    assert "one claim" in broken(scenario(*killed_and_back("r1"), tracks={"robots": 1}))
+
+
+def test_a_leader_that_leaves_lonely_robots_out_starves_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Corrections.publish
+
+    def only_groups(self: Corrections, term: Term, number: int, solution: GraphSolution) -> list[Effect]:
+        groups = tuple(component for component in solution.components if len(component.logs) > 1)
+        return original(self, term, number, GraphSolution(groups, solution.closures))
+
+    monkeypatch.setattr(Corrections, "publish", only_groups)
+    far = {"tracks": {"robots": 2, "seed": 3, "area_m": 4000.0, "length_m": 14.0}}
+    assert "no starvation" in broken(scenario(**far))
+
+
+def test_robots_that_all_take_a_pair_break_registered_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def greedy(self: LoopClosing, candidate: Candidate, now: float) -> None:
+        self._add(candidate)
+
+    monkeypatch.setattr(LoopClosing, "_assign", greedy)
+    assert "registered once" in broken(scenario())
+
+
+def test_a_robot_that_does_not_offer_leaves_pairs_unregistered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LoopClosing, "_tell", lambda self, now: [])
+    assert "registered once" in broken(drawn_scenario(0))
+
+
+def test_corrections_in_frames_of_their_own_break_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    def own_frame(component: Any, log: Any, *rest: Any) -> Any:
+        return replace(correction_of(component, log, *rest), anchor=log)
+
+    monkeypatch.setattr(corrections_module, "correction_of", own_frame)
+    assert "one frame" in broken(scenario())
+
+
+def test_logs_that_are_not_repaired_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Gossip, "_ask", lambda self, peer, log, first, now: [])
+    assert "nothing lost" in broken(scenario(**LOSSY))
+
+
+def test_a_disk_that_forgets_what_was_published_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Disk.restored
+
+    def forgetful(self: Disk) -> Restored:
+        for log, records in self.records.items():
+            self.records[log] = records[:-1]
+        return original(self)
+
+    monkeypatch.setattr(Disk, "restored", forgetful)
+    assert "nothing lost" in broken(scenario(*killed_and_back("r1")))
+
+
+def test_a_table_without_a_maximum_breaks_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hoard(self: Latents, wants: Any) -> bool:
+        self._relayed.update(dict.fromkeys(KeyframeId(self._own, k) for k in range(99)))
+        return True
+
+    monkeypatch.setattr(Latents, "on_wants", hoard)
+    assert "bounded" in broken(scenario())
+
+
+def test_a_deadline_in_the_past_is_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Neighbours, "deadline", lambda self: 0.0)
+    assert "no crash" in broken(scenario())
+
+
+def test_an_exception_of_the_core_is_a_crash_that_names_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: LeaderElection, now: float) -> list[Effect]:
+        raise KeyError("made to fail")
+
+    monkeypatch.setattr(LeaderElection, "tick", fail)
+    violations = run_checked(scenario()).violations
+    assert [v.invariant for v in violations] == ["no crash"]
+    assert "made to fail" in violations[0].detail
+
+
+def test_a_claim_of_another_robots_term_breaks_one_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    original: Callable[..., list[Effect]] = LeaderElection._claim
+
+    def steal(self: LeaderElection) -> list[Effect]:
+        effects = original(self)
+        assert self._leader is not None
+        stolen = replace(self._leader, term=Term(self._leader.term.counter, LogId("r9")))
+        return [*effects, Broadcast(Coordinator(stolen)), Unicast("r2", Coordinator(stolen))]
+
+    monkeypatch.setattr(LeaderElection, "_claim", steal)
+    assert "one claim" in broken(scenario())

@@ -1,0 +1,67 @@
+"""`simulate`: the same bytes for the same seed, and a whole run folder."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flocc_launch.run_folder import RunFolder, RunFolderError
+from flocc_launch.scenario import Scenario
+from flocc_launch.simulation.simulate import simulate
+
+
+def scenario(**changes: Any) -> Scenario:
+    fields: dict[str, Any] = {
+        "name": "small",
+        "tracks": {"robots": 3, "seed": 4, "area_m": 16.0, "length_m": 30.0},
+        "keyframes": {"distance_m": 1.0},
+        "perception": {"method": "synthetic", "synthetic": {"outlier_probability": 0.0, "alias_probability": 0.0}},
+        "simulation": {"optimiser": "quick"},
+        "radio": {"loss_ratio": 0.2, "latency_s": 0.05, "jitter_s": 0.05},
+        "expectations": {"merged_within_s": 60.0, "closures_min": 5},
+    }
+    return Scenario.model_validate({**fields, **changes})
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_differs(tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        simulate(scenario(), tmp_path / name, seed)
+    a, b, c = ((tmp_path / name / "events.jsonl").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_robots_on_virtual_time_merge_and_meet_their_expectations(tmp_path: Path) -> None:
+    report = simulate(scenario(), tmp_path / "run")
+    assert report.map_frames == ["map/r1"]
+    assert all(expectation.met for expectation in report.expectations)
+    assert report.driver == "simulate"
+    assert report.ate_joint_m is not None
+
+
+def test_a_run_folder_is_whole(tmp_path: Path) -> None:
+    simulate(scenario(), tmp_path / "run")
+    names = {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    wanted = {"run.json", "events.jsonl", "report.json", "report.html", "pose_graph.g2o", "groundtruth/r1.tum"}
+    assert wanted <= names
+    assert {event.event for event in RunFolder.open(tmp_path / "run").events()} >= {"keyframe", "leader", "correction"}
+
+
+def test_no_wall_clock_is_in_the_events(tmp_path: Path) -> None:
+    simulate(scenario(), tmp_path / "run")
+    lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    assert {line["solve_s"] for line in lines if line["event"] == "optimised"} == {0.0}
+
+
+def test_a_killed_robot_is_reported_and_the_rest_goes_on(tmp_path: Path) -> None:
+    report = simulate(scenario(faults=[{"at_s": 20.0, "kind": "kill", "robots": ["r1"]}]), tmp_path / "run")
+    events = RunFolder.open(tmp_path / "run").events()
+    assert [(event.robot, event.t) for event in events if event.event == "agent_died"] == [("r1", 20.0)]
+    assert [span.leader for span in report.leaders][-1] == "r2"
+
+
+def test_a_folder_that_holds_a_run_is_left_alone(tmp_path: Path) -> None:
+    simulate(scenario(), tmp_path / "run")
+    with pytest.raises(RunFolderError, match="holds a run already"):
+        simulate(scenario(), tmp_path / "run")
