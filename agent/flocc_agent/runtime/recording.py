@@ -164,7 +164,7 @@ def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
     if not frames:
         first_s, last_s = odometry.stamps_s[0], odometry.stamps_s[-1]
         raise RecordingError(
-            f"{path / 'odometry.tum'}: is from {first_s:.3f} s to {last_s:.3f} s, and has no pose (or gaps of more than "
+            f"{path / 'odometry.tum'}: is from {first_s:.3f} s to {last_s:.3f} s, and has no pose (or a gap of over "
             f"{GAP_MAX_S:g} s) where the images of {path / 'images.txt'} are, from {images[0][0]:.3f} s to "
             f"{images[-1][0]:.3f} s"
         )
