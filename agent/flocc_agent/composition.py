@@ -258,7 +258,9 @@ class Agent:
         """What the agent does now, for tables and dashboards."""
         status = self._started.status()
         playing = self._playing is not None and not self._playing.done()
-        return {**status, "playing": playing, "busy": status["busy"] or playing}
+        failure = None if self._store is None else self._store.failure
+        disk = None if failure is None else str(failure)
+        return {**status, "playing": playing, "busy": status["busy"] or playing, "disk_failure": disk}
 
     @property
     def _started(self) -> Driver:

@@ -32,7 +32,7 @@ async def running(folder: Path, **options: object) -> AsyncIterator[list[RobotPr
         await asyncio.gather(*(robot.close() for robot in robots))
 
 
-async def test_a_killed_leader_is_replaced_and_comes_back_with_its_log(tmp_path: Path) -> None:
+async def test_a_killed_leader_is_replaced_and_comes_back_with_its_log_and_all_end_in_order(tmp_path: Path) -> None:
     async with running(tmp_path) as robots:
         first, *rest = robots
         before = first.status["logs"]["r1"][0]
@@ -60,6 +60,9 @@ async def test_a_killed_leader_is_replaced_and_comes_back_with_its_log(tmp_path:
         )
         assert set(first.status["logs"]) == set(NAMES)
         assert all(robot.status["refused"] == {} for robot in rest)
+        assert await asyncio.gather(*(robot.close() for robot in robots)) == [0, 0, 0]
+        said = "".join(robot.log() for robot in robots)
+        assert [bad for bad in ("Traceback", "never retrieved") if bad in said] == []
 
 
 async def test_an_operator_partitions_heals_and_kills(tmp_path: Path) -> None:
@@ -75,12 +78,3 @@ async def test_an_operator_partitions_heals_and_kills(tmp_path: Path) -> None:
         await reached(robots, lambda: leaders(robots) == {"r1"} and logs_equal(robots), 15.0, "healed")
         assert await order("kill r3") == {"r1": "not concerned", "r2": "not concerned", "r3": "done"}
         await reached(robots, lambda: "r3" not in neighbours(robots[0]), 15.0, "r3 is gone")
-
-
-async def test_agents_end_in_order_and_say_nothing_bad(tmp_path: Path) -> None:
-    async with running(tmp_path) as robots:
-        codes = await asyncio.gather(*(robot.close() for robot in robots))
-    assert codes == [0, 0, 0]
-    for robot in robots:
-        assert "Traceback" not in robot.log()
-        assert "never retrieved" not in robot.log()

@@ -186,21 +186,27 @@ def test_a_folder_that_cannot_be_made_means_memory(tmp_path: Path) -> None:
     assert store.records(OWN) == [StoredRecord(OWN, 0, b"a")]
 
 
+SEEDS = (20261122, 20261123, 20261124, 20261125)
 NURSERY = Path(__file__).with_name("store_killing.py")
 
 
 @pytest.mark.slow
 def test_killed_at_any_point_no_published_record_is_lost(tmp_path: Path) -> None:
-    """200 processes, each killed with SIGKILL at a random moment, on one folder of real files."""
-    finished = subprocess.run(
-        [sys.executable, str(NURSERY), str(tmp_path), "200", "20261122"],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert finished.returncode == 0, finished.stderr[-3000:]
-    told = json.loads(finished.stdout)
-    assert told["kills"] == 200
-    assert told["published"] > 200
-    assert told["kills_while_writing"] > 50
+    """200 processes, each killed with SIGKILL at a random moment, on four folders of real files."""
+    nurseries = [
+        subprocess.Popen(
+            [sys.executable, str(NURSERY), str(tmp_path / str(seed)), "50", str(seed)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for seed in SEEDS
+    ]
+    told = []
+    for nursery in nurseries:
+        output, errors = nursery.communicate(timeout=240)
+        assert nursery.returncode == 0, errors[-3000:]
+        told.append(json.loads(output))
+    assert sum(each["kills"] for each in told) == 200
+    assert sum(each["published"] for each in told) > 200
+    assert sum(each["kills_while_writing"] for each in told) > 50
