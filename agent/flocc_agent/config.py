@@ -260,7 +260,8 @@ class PerceptionConfig(Section):
     mast3r: Mast3rConfig = Mast3rConfig()
 
 
-ENDPOINT_PATTERN = re.compile(r"(tcp|tls|quic|udp)/(\[[0-9a-fA-F:.]+\]|[^/:#?\s]+):[0-9]{1,5}([#?]\S*)?")
+ENDPOINT_PATTERN = re.compile(r"(tcp|tls|quic|udp)/(\[[0-9a-fA-F:.]+\]|[^/:#?\s]+):([0-9]{1,5})([#?]\S*)?")
+PORT_MAX = 65535
 
 
 def checked_endpoint(text: str) -> str:
@@ -269,7 +270,8 @@ def checked_endpoint(text: str) -> str:
     Raises:
         ValueError: Not PROTOCOL/HOST:PORT.
     """
-    if not ENDPOINT_PATTERN.fullmatch(text):
+    match = ENDPOINT_PATTERN.fullmatch(text)
+    if match is None or int(match[3]) > PORT_MAX:
         raise ValueError(f"{text!r} is no endpoint; one looks like tcp/10.0.0.7:7447 or tls/[::]:0#iface=wlan0")
     return text
 
@@ -559,7 +561,7 @@ def first_error(error: ValidationError, source: str) -> str:
         return f"{source}: the key '{key}' does not exist"
     if complaint["type"] in ("missing", "missing_argument"):
         return f"{source}: the key '{key}' is missing"
-    return f"{source}: {key}: {complaint['msg']}"
+    return f"{source}: {key}: {complaint['msg'].removeprefix('Value error, ')}"
 
 
 M = TypeVar("M", bound=BaseModel)

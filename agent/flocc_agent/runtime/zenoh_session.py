@@ -88,13 +88,16 @@ def open_session(settings: dict[str, Any], whose: str) -> zenoh.Session:
     try:
         return zenoh.open(zenoh_config)
     except zenoh.ZError as error:
-        raise TransportError(f"{whose}: {first_cause(str(error))}") from error
+        cause = first_cause(str(error), settings.get("listen/endpoints", []))
+        raise TransportError(f"{whose}: {cause}") from error
 
 
-def first_cause(text: str) -> str:
-    """Reduce zenoh's chain of causes to one sentence without source paths."""
+def first_cause(text: str, listened: list[str]) -> str:
+    """Reduce zenoh's chain of causes to one sentence without source paths; it names where was to be listened."""
     if locator := re.search(r"\[?(\S+): Address already in use", text):
         return f"the address {locator[1].lstrip('[')} is in use by another process"
     if locator := re.search(r"\[?(\S+): Cannot assign requested address", text):
         return f"the address {locator[1].lstrip('[')} is not one of this machine"
-    return "zenoh cannot open a session: " + re.sub(r"\s+at /\S+", "", text).rstrip(". ")
+    if "lookup address" in text:
+        return f"the host of {' or '.join(listened)} is not known"
+    return f"zenoh cannot listen on {' or '.join(listened)}: " + re.sub(r"\s+at /\S+", "", text).rstrip(". ")
