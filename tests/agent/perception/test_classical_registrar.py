@@ -218,3 +218,43 @@ def test_a_latent_of_no_features_is_read_and_not_registered() -> None:
     assert result.failure is RegistrationFailure.FEW_CORRESPONDENCES
     with pytest.raises(BadLatent):
         decode_features(b"x")
+
+
+def _odd_positions(kind: str, rng: np.random.Generator, count: int) -> Float:
+    """Feature positions (N, 2) that no sensible scene gives."""
+    t = rng.uniform(-0.5, 0.5, count)
+    few = rng.uniform(-0.5, 0.5, (3, 2))
+    return {
+        "one point": np.zeros((count, 2)),
+        "a line": np.column_stack([t, 0.3 * t]),
+        "three points": few[rng.integers(0, 3, count)],
+        "far out": np.column_stack([t * 190, t * 10]),
+        "noise": rng.uniform(-0.5, 0.5, (count, 2)),
+        "a conic": np.column_stack([t, t**2]),
+    }[kind]
+
+
+KINDS = ("one point", "a line", "three points", "far out", "noise", "a conic")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_odd_features_give_a_result_or_a_failure_and_no_exception(kind: str) -> None:
+    rng = np.random.default_rng(14)
+    descriptors = rng.integers(0, 256, (60, 128), dtype=np.uint8)
+
+    def latent(of_kind: str) -> bytes:
+        points = _odd_positions(of_kind, rng, 60).astype(np.float32)
+        return pack(MODEL, {"focal_px": 400.0}, {"points": points, "descriptors": descriptors})
+
+    query = latent(kind)
+    for other in KINDS:
+        match = latent(other)
+        for T in (NEIGHBOUR, QUERY):
+            odometry = OdometryPair(latent(other), between(T, QUERY), other)
+            result = ClassicalRegistrar(ClassicalConfig()).register(query, match, odometry)
+            same = ClassicalRegistrar(ClassicalConfig()).register(query, query, odometry)
+            for found in (result, same):
+                if isinstance(found, Registration):
+                    assert np.all(np.isfinite(found.T_query_match_unscaled))
+                    assert found.covariance is not None
+                    assert np.all(np.linalg.eigvalsh(found.covariance) > 0)

@@ -21,6 +21,10 @@ INVERSE_DEPTH_SIGMA = 1e3
 """Weak prior that keeps an unobservable inverse depth finite, in 1 / unit of the translations."""
 
 
+INFORMATION_MIN = 1e-2
+"""What the images do not fix has a standard deviation of ten (rad, units), not none."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionPrior:
     """What odometry says of a view: its pose, and how far off rotation and direction may be."""
@@ -250,7 +254,9 @@ def covariance_of_view(refined: Refined, k: int, sigma_floor: Float) -> Float:
     """
     basis = free_directions(refined.views)
     information = basis.T @ refined.information @ basis
-    full = basis @ np.linalg.pinv(information, hermitian=True) @ basis.T
+    values, vectors = np.linalg.eigh(information)
+    vectors = basis @ vectors
+    full = (vectors / np.maximum(values, INFORMATION_MIN)) @ vectors.T
     block = full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
     A = -np.eye(6)
     A[3:, :3] = -hat(refined.views[k].T_view_query[:3, 3])

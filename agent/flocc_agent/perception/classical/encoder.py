@@ -11,7 +11,7 @@ from flocc_agent.perception.classical.features import DESCRIPTOR_LENGTH, Feature
 from flocc_agent.perception.latent import BadLatent, pack, unpack
 
 MODEL = "classical/sift-1"
-FEATURES_MAX = 20_000
+FEATURES_MAX = 10_000
 POINT_MAX = 100.0
 """Largest |x/z| of a feature; beyond it lies 90 degrees off the axis."""
 
