@@ -65,6 +65,7 @@ logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
+INBOX_MAX = 8192
 IMAGES_MAX = 8
 CORRECTIONS_MAX = 16
 BYTES_PERIOD_S = 1.0
@@ -300,6 +301,9 @@ class Driver:
             return
         if envelope.sender.robot != sender or kind_of(envelope.message) != kind:
             self._refuse(sender, "message of another robot or kind than its key")
+            return
+        if len(self._inbox) >= INBOX_MAX:
+            self._refuse(sender, "too many messages wait")
             return
         self.put(MessageReceived(envelope))
 
