@@ -260,4 +260,4 @@ def covariance_of_view(refined: Refined, k: int, sigma_floor: Float) -> Float:
     block = full[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
     A = -np.eye(6)
     A[3:, :3] = -hat(refined.views[k].T_view_query[:3, 3])
-    return A @ block @ A.T + np.diag(sigma_floor**2)
+    return np.asarray(A @ block @ A.T + np.diag(sigma_floor**2))
