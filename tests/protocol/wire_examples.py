@@ -60,12 +60,14 @@ def descriptor(dimension: int = 512, seed: int = 0) -> Array:
     return Array.int8(values / np.linalg.norm(values))
 
 
+EXACT_DESCRIPTOR = Array("i1", (512,), bytes(k * 37 % 256 for k in range(512)), 0.0078125)
+EXACT_POSES = Array.of(np.array([[k, 0.5 * k, -k, 0.5, 0.5, -0.5, 0.5] for k in range(6)]), "f4")
 ALICE, BOB = LogId("alice"), LogId("bob-2", 0x18F0A1B2C3D)
 TERM = Term(7, ALICE)
 ADVERT = LeaderAdvert(TERM, 5, 123_456, 2)
 
 RECORDS: tuple[Record, ...] = (
-    KeyframeRecord(12, 1_700_000_000.25, (1.5, -2.0, 0.25, 0.5, 0.5, -0.5, 0.5), descriptor()),
+    KeyframeRecord(12, 1_700_000_000.25, (1.5, -2.0, 0.25, 0.5, 0.5, -0.5, 0.5), EXACT_DESCRIPTOR),
     KeyframeRecord(13, 0.0, IDENTITY, None),
     ClosureRecord(
         KeyframeId(ALICE, 3), KeyframeId(BOB, 8), IDENTITY, 480, 510, 480 / 510, 1.7, Array.of(np.arange(21.0))
@@ -97,7 +99,7 @@ MESSAGES: tuple[Message, ...] = (
     RecordBatch(ALICE, 12, 0x1234, ENCODED),
     RecordRequest(BOB, 41),
     CorrectionMessage(
-        ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), Array.of(np.ones(21)), 3, 2, poses_array(6)
+        ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), Array.of(np.ones(21)), 3, 2, EXACT_POSES
     ),
     CorrectionMessage(BOB, TERM, 0, ALICE, IDENTITY, None, 0, 1, poses_array(0)),
     CorrectionRequest(BOB),

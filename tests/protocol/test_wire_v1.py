@@ -1,0 +1,42 @@
+"""Claim: the bytes of protocol version 1 never change. They lie in `wire_v1.txt`, one example of everything.
+
+A change that breaks this needs a new protocol version; then write a new file beside the old one:
+`python -m tests.protocol.test_wire_v1 > tests/protocol/wire_v2.txt`.
+"""
+
+import sys
+from pathlib import Path
+
+import pytest
+from tests.protocol.wire_examples import ENCODED, ENVELOPES, RECORDS
+
+from flocc_protocol.messages import PROTOCOL_VERSION, decode, encode, kind_of
+from flocc_protocol.records import decode_record
+
+NAMES = [kind_of(e.message) for e in ENVELOPES] + [type(record).__name__ for record in RECORDS]
+LINES = (Path(__file__).parent / f"wire_v{PROTOCOL_VERSION}.txt").read_text().splitlines()
+FIRST_RECORD = len(ENVELOPES)
+
+
+def today() -> list[str]:
+    """Every example as `name hex`."""
+    data = [*map(encode, ENVELOPES), *ENCODED]
+    return [f"{name} {one.hex()}" for name, one in zip(NAMES, data, strict=True)]
+
+
+@pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
+def test_an_example_is_written_as_ever(number: int) -> None:
+    assert today()[number] == LINES[number]
+
+
+@pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
+def test_an_example_is_read_as_ever(number: int) -> None:
+    data = bytes.fromhex(LINES[number].split()[1])
+    if number < FIRST_RECORD:
+        assert decode(data) == ENVELOPES[number]
+    else:
+        assert decode_record(data) == RECORDS[number - FIRST_RECORD]
+
+
+if __name__ == "__main__":
+    sys.stdout.write("\n".join(today()) + "\n")
