@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
 LEADER_TIMEOUT_S = 3.0
-START_S = 30.0
+START_S = 60.0
 
 
 @asynccontextmanager

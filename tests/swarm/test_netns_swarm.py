@@ -47,7 +47,7 @@ async def running(folder: Path, machines: Sequence[Host], multicast: bool = Fals
     ]
     try:
         await asyncio.gather(*(robot.start(15, phase_rad=0.6 * i) for i, robot in enumerate(robots)))
-        await reached(robots, lambda: frames(robots) == {"map/r1"} and leaders(robots) == {"r1"}, 60.0, "one frame")
+        await reached(robots, lambda: frames(robots) == {"map/r1"} and leaders(robots) == {"r1"}, 90.0, "one frame")
         yield robots
     finally:
         await asyncio.gather(*(robot.close() for robot in robots))
