@@ -19,6 +19,7 @@ HEADER = struct.Struct(">BQQ32s")
 FORMAT = 1
 PARTIALS_MAX = 8
 SERVED_MAX = 4
+PIECE_BYTES_MIN = 16 * 1024
 DIGITS_MAX = 12
 
 UNKNOWN = b"flocc: unknown latent"
@@ -56,8 +57,9 @@ class Piece:
 
 @dataclass(slots=True)
 class Partial:
-    """What came so far of one latent."""
+    """What came so far of one latent, and how long a piece to ask for next; shorter on links that prove slow."""
 
+    piece_bytes: int
     sha256: bytes = b""
     total_bytes: int | None = None
     received: bytearray = field(default_factory=bytearray)
@@ -66,6 +68,10 @@ class Partial:
     def is_complete(self) -> bool:
         """Whether nothing is missing."""
         return self.total_bytes is not None and len(self.received) >= self.total_bytes
+
+    def ask_for_less(self) -> None:
+        """A piece did not come in time: a shorter one may."""
+        self.piece_bytes = max(self.piece_bytes // 2, min(PIECE_BYTES_MIN, self.piece_bytes))
 
     def add(self, piece: Piece, latent_bytes_max: int, expected_sha256: bytes | None) -> FetchProblem | None:
         """Append a piece, or say why the latent cannot be had.
@@ -89,12 +95,13 @@ class Partial:
 class Partials:
     """Unfinished fetches, the most recent few."""
 
-    def __init__(self) -> None:
+    def __init__(self, piece_bytes: int) -> None:
+        self._piece_bytes = piece_bytes
         self._partials: OrderedDict[str, Partial] = OrderedDict()
 
     def of(self, latent: str) -> Partial:
         """What came so far of a latent; the least recently asked is forgotten when there are too many."""
-        partial = self._partials.setdefault(latent, Partial())
+        partial = self._partials.setdefault(latent, Partial(self._piece_bytes))
         self._partials.move_to_end(latent)
         while len(self._partials) > PARTIALS_MAX:
             self._partials.popitem(last=False)

@@ -51,7 +51,7 @@ class BulkService:
         self._servers = ThreadPoolExecutor(SERVERS, thread_name_prefix=f"{robot}-serve")
         self._fetchers = ThreadPoolExecutor(config.fetches_max, thread_name_prefix=f"{robot}-fetch")
         self._slots = asyncio.Semaphore(config.fetches_max)
-        self._partials = Partials()
+        self._partials = Partials(config.chunk_bytes)
         self._in_flight: set[zenoh.CancellationToken] = set()
 
     def serve(self, lookup: LatentLookup) -> None:
@@ -144,13 +144,15 @@ class BulkService:
                 return answer
             if tries >= TRIES_MAX:
                 return FetchProblem.NO_ANSWER
+            if not isinstance(answer, Piece):
+                partial.ask_for_less()
             await asyncio.sleep(PAUSE_S * 2 ** (tries - 1))
         return None
 
     async def _ask(self, owner: str, latent: str, partial: Partial) -> Piece | FetchProblem:
         """Ask for the next piece, on a thread."""
         key = keys.latent_key(self._swarm, owner, latent)
-        selector = f"{key}?offset={len(partial.received)};length={self._config.chunk_bytes}"
+        selector = f"{key}?offset={len(partial.received)};length={partial.piece_bytes}"
         token = zenoh.CancellationToken()
         self._in_flight.add(token)
         try:

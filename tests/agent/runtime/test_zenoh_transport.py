@@ -16,9 +16,11 @@ from tests.agent.runtime.loopback import loopback_configs, until
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import LinkParameters, Partition, Radio, RadioParameters
+from flocc_agent.runtime.latent_transfer import Piece, Server
 from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, TransportError
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.keys import Admin
 
 pytestmark = pytest.mark.swarm
@@ -175,6 +177,20 @@ async def test_lost_pieces_are_asked_for_again() -> None:
         assert one.transport.counters().dropped["radio-loss"] > 0
 
 
+async def test_asks_for_less_at_a_time_where_long_pieces_do_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Server.piece
+
+    def piece(server: Server, latent: str, offset: int, length: int) -> Piece | None:
+        if length > 40_000:
+            raise DecodeError("no answer, as on a link that is too slow")
+        return whole(server, latent, offset, length)
+
+    monkeypatch.setattr(Server, "piece", piece)
+    async with swarm(ROBOTS[:2], chunk_bytes=160_000) as (one, two):
+        two.held["r2/7"] = LATENT
+        assert await one.transport.fetch_latent("r2", "r2/7", 20.0) == Fetched(LATENT)
+
+
 async def test_heartbeats_are_on_time_while_latents_flow() -> None:
     async with swarm(ROBOTS[:2]) as (one, two):
         two.held["r2/7"] = LATENT * 7
@@ -319,6 +335,7 @@ import asyncio
 from flocc_agent.config import TransportConfig
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.keys import Admin
 async def main():
     async with ZenohTransport("test", "r1", TransportConfig(multicast=False)):
