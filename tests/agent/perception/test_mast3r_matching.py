@@ -18,7 +18,7 @@ from flocc_agent.perception.mast3r.matching import (  # noqa: E402
     reciprocal_matches_both_ways,
     symmetric_matches,
 )
-from flocc_agent.perception.mast3r.search import coarse_to_fine_index, nearest  # noqa: E402
+from flocc_agent.perception.mast3r.search import TileIndex, nearest  # noqa: E402
 
 
 def records() -> tuple[dict[str, Any], list[Any]]:
@@ -100,23 +100,25 @@ def test_nearest_equals_a_plain_search_for_any_size(rows: int) -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 1.0])
 @pytest.mark.parametrize("size", [(70, 90), (32, 64)])
-def test_the_coarse_pass_never_loses_the_winner(noise: float, size: tuple[int, int]) -> None:
+@pytest.mark.parametrize("fast", [False, True])
+def test_the_sieves_never_lose_the_winner(noise: float, size: tuple[int, int], fast: bool) -> None:
     generator = torch.Generator().manual_seed(5)
     field = unit_field(6, *size)
     queries = field.flatten(0, 1)[::3] + noise * torch.randn(len(field.flatten(0, 1)[::3]), 24, generator=generator)
     queries = queries / queries.norm(dim=-1, keepdim=True)
     exact = (queries.double() @ field.flatten(0, 1).double().T).argmax(dim=1)
-    assert torch.equal(coarse_to_fine_index(field)(queries), exact)
+    assert torch.equal(TileIndex(field, fast)(queries), exact)
 
 
-def test_the_coarse_pass_is_exact_where_all_scores_are_negative_or_nearly_equal() -> None:
+@pytest.mark.parametrize("fast", [False, True])
+def test_the_sieves_are_exact_where_scores_are_negative_or_equal(fast: bool) -> None:
     field = unit_field(7, 64, 64).abs()
     field = field / field.norm(dim=-1, keepdim=True)
     queries = -field.flatten(0, 1)[:200]
     exact = (queries.double() @ field.flatten(0, 1).double().T).argmax(dim=1)
-    assert torch.equal(coarse_to_fine_index(field)(queries), exact)
+    assert torch.equal(TileIndex(field, fast)(queries), exact)
     flat = torch.ones(64, 64, 24) / 24**0.5
-    assert coarse_to_fine_index(flat)(flat[0, :5]).tolist() == [0] * 5
+    assert TileIndex(flat, fast)(flat[0, :5]).tolist() == [0] * 5
 
 
 def test_nearest_takes_the_first_of_equals() -> None:
