@@ -34,7 +34,7 @@ from flocc_protocol.codec import (
 )
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
-from flocc_protocol.records import RECORD_BYTES_MAX, UPPER_TRIANGLE
+from flocc_protocol.records import SEALED_RECORD_BYTES_MAX, UPPER_TRIANGLE
 
 PROTOCOL_VERSION = 1
 VERSION_MAX = 127
@@ -154,7 +154,7 @@ class RecordBatch:
         log: Whose log.
         first: Number of the first record.
         checksum_before: The sender's chained checksum of the records before `first`.
-        records: Encoded records, in order.
+        records: Encoded records, in order; each ends in its writer's signature where the swarm signs records.
     """
 
     log: LogId
@@ -330,7 +330,7 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             log=LOG_ID,
             first=COUNT,
             checksum_before=_CHECKSUM,
-            records=sequence(blob(RECORD_BYTES_MAX), RECORDS_BATCH_MAX),
+            records=sequence(blob(SEALED_RECORD_BYTES_MAX), RECORDS_BATCH_MAX),
         ),
     ),
     "want-records": (RecordRequest, struct(RecordRequest, log=LOG_ID, first=COUNT)),

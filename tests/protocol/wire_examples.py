@@ -35,7 +35,7 @@ from flocc_protocol.messages import (
 )
 from flocc_protocol.records import (
     REASON_LENGTH_MAX,
-    RECORD_BYTES_MAX,
+    SEALED_RECORD_BYTES_MAX,
     ClosureRecord,
     FixRecord,
     KeyframeRecord,
@@ -136,7 +136,7 @@ def largest_messages() -> list[Message]:
         Answer(TERM_COUNTER_MAX),
         Coordinator(advert),
         Handover(leader),
-        RecordBatch(_long(0), INDEX_MAX - 4, 2**32 - 1, (bytes(RECORD_BYTES_MAX),) * 4),
+        RecordBatch(_long(0), INDEX_MAX - 4, 2**32 - 1, (bytes(SEALED_RECORD_BYTES_MAX),) * 3 + (bytes(8000),)),
         RecordBatch(
             _long(0),
             INDEX_MAX - RECORDS_BATCH_MAX,
