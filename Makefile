@@ -19,7 +19,6 @@ DESCRIPTION := pyproject.toml constraints.txt
 
 demo: $(VENV)/.demo
 	$(BIN)/flocc demo --out $(DEMO_OUT)
-	@echo "The report lies at $(abspath $(DEMO_OUT))/report.html, its numbers in report.json beside it."
 
 test: $(VENV)/.test
 	@$(MAKE) --no-print-directory check
