@@ -63,7 +63,7 @@ def screen(graph: PoseGraph) -> Screened:
 
 def are_covariances(matrices: Float) -> Bool:
     """Whether each of (N, n, n) matrices is finite, symmetric, positive definite and not hopelessly conditioned."""
-    finite: Bool = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], matrices, np.eye(matrices.shape[-1]))
     transposed = np.swapaxes(safe, 1, 2)
     slack = SYMMETRY_RATIO * np.abs(safe).max(axis=(1, 2))
@@ -97,7 +97,8 @@ def _usable_trajectory(log: LogId, trajectory: Trajectory) -> tuple[Trajectory |
     if sized and not wrong:
         return trajectory, ""
     return Trajectory(T), (
-        f"odometry covariance of robot {log} at edge {wrong[0] if wrong else 0} is not positive definite; the configured one is used"
+        f"odometry covariance of robot {log} at edge {wrong[0] if wrong else 0} is not positive definite; "
+        "the configured one is used"
     )
 
 
@@ -111,7 +112,7 @@ def first_not_rigid(T: Float) -> int | None:
 
 def are_rigid(T: Float) -> Bool:
     """Whether each of (N, 4, 4) arrays is a finite rigid pose."""
-    finite: Bool = np.isfinite(T).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
     T = np.where(finite[:, None, None], T, np.eye(4))
     R = T[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
