@@ -7,6 +7,9 @@ import numpy as np
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
+from flocc_launch.datasets.bag_messages import IMAGE_TYPES
+from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import read_source
 from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
@@ -30,6 +33,7 @@ class Info:
         truth_poses: Poses that the ground truth has.
         length_m: Distance travelled, by ground truth or else by odometry.
         faults: What is wrong with it, one sentence each.
+        topics: Of a bag, with types and numbers of messages.
     """
 
     path: Path
@@ -42,6 +46,7 @@ class Info:
     truth_poses: int | None
     length_m: float | None
     faults: tuple[str, ...]
+    topics: tuple[str, ...] = ()
 
 
 def info(path: Path, format_name: str | None = None) -> Info:
@@ -50,6 +55,8 @@ def info(path: Path, format_name: str | None = None) -> Info:
     Raises:
         DatasetError: Unknown, or nothing in it can be used.
     """
+    if is_bag(path):
+        return _bag_info(path)
     source = read_source(path, format_name)
     travelled = source.truth or source.odometry
     return Info(
@@ -66,6 +73,24 @@ def info(path: Path, format_name: str | None = None) -> Info:
     )
 
 
+def _bag_info(path: Path) -> Info:
+    with Bag(path) as bag:
+        images = [topic.count for topic in bag.topics.values() if topic.type in IMAGE_TYPES and topic.count is not None]
+        return Info(
+            path=path,
+            format="bag",
+            images=sum(images),
+            from_s=(bag.start_ns or 0) * 1e-9,
+            to_s=(bag.end_ns or 0) * 1e-9,
+            camera=None,
+            odometry_poses=None,
+            truth_poses=None,
+            length_m=None,
+            faults=(bag.damage,) if bag.damage else (),
+            topics=tuple(str(topic) for topic in bag.topics.values()),
+        )
+
+
 def convert(
     path: Path,
     out: Path,
@@ -75,9 +100,14 @@ def convert(
     odometry: Path | None = None,
     drift: DriftSpec | None = None,
     seed: int = 0,
+    image_topic: str | None = None,
+    odometry_topic: str | None = None,
+    truth: Path | None = None,
+    every: int = 1,
+    jpeg: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a data set as one recording; a conversion that was cut short goes on where it ended.
+    """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
 
     Args:
         path: The data set.
@@ -87,6 +117,11 @@ def convert(
         odometry: TUM trajectory of the robot's odometry, in place of the folder's.
         drift: Makes odometry from the ground truth; None takes the folder's odometry, else the truth itself.
         seed: Of the drift.
+        image_topic: Of a bag; None takes the only one there is.
+        odometry_topic: Of a bag; None takes the only one there is.
+        truth: TUM file with ground truth, for a bag.
+        every: Of a bag, keeps one image of so many.
+        jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         progress: Called with images done and images in all.
 
     Returns:
@@ -95,6 +130,9 @@ def convert(
     Raises:
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
+    if is_bag(path):
+        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg)
+        return convert_bag(path, out, options, progress)
     source = read_source(path, format_name, camera)
     identity = _identity("convert", path, source, drift, seed)
     moved = _odometry(source, odometry, drift, np.random.default_rng([seed, 0]))

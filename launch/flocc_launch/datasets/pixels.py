@@ -64,7 +64,16 @@ def written_image(file: Path, lens: Lens) -> tuple[bytes, str]:
     encoded = read_bytes(file)
     if lens.k3 == 0.0:
         return encoded, file.suffix.lower()
+    return undistorted(encoded, str(file), lens)
+
+
+def undistorted(encoded: bytes, where: str, lens: Lens) -> tuple[bytes, str]:
+    """Bytes and suffix of an image without its distortion, as JPEG.
+
+    Raises:
+        DatasetError: The image is damaged.
+    """
     import cv2
 
-    straight = cv2.undistort(decoded(encoded, str(file)), lens.camera.K(), np.array([*lens.camera.distortion, lens.k3]))
+    straight = cv2.undistort(decoded(encoded, where), lens.camera.K(), np.array([*lens.camera.distortion, lens.k3]))
     return cv2.imencode(".jpg", straight, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes(), ".jpg"

@@ -23,7 +23,13 @@ Progress = Callable[[int, int], None]
 
 
 class RecordingWriter:
-    """Appends images to a recording; the trajectories and the camera are written whole."""
+    """Appends images to a recording; the trajectories and the camera are written whole.
+
+    Attributes:
+        path: The folder.
+        count: Images that it holds.
+        last_stamp_s: Stamp of the last one, or None; a resumed conversion goes on after it.
+    """
 
     def __init__(self, path: Path, identity: str) -> None:
         """Open a recording for writing, or go on with it.
@@ -38,10 +44,12 @@ class RecordingWriter:
         self.path = path
         (path / "images").mkdir(parents=True, exist_ok=True)
         _claim(path / "source.txt", identity)
-        self._listing = path / "images.txt"
-        self._lines = self._complete_lines()
-        self._listing.write_text("".join(self._lines), encoding="utf-8")
-        self._file = self._listing.open("a", encoding="utf-8")
+        self.count = 0
+        self.last_stamp_s: float | None = None
+        listing = path / "images.txt"
+        if listing.exists():
+            os.truncate(listing, self._take_up(listing))
+        self._file = listing.open("a", encoding="utf-8")
 
     def __enter__(self) -> "RecordingWriter":
         return self
@@ -50,16 +58,6 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._file.close()
-
-    @property
-    def count(self) -> int:
-        """Images that the recording holds."""
-        return len(self._lines)
-
-    @property
-    def last_stamp_s(self) -> float | None:
-        """Stamp of the last image, or None where there is none yet; a resumed conversion goes on after it."""
-        return float(self._lines[-1].split(" ", 1)[0]) if self._lines else None
 
     def add(self, stamp_s: float, encoded: bytes, suffix: str) -> None:
         """Append one encoded image; stamps must increase.
@@ -78,10 +76,9 @@ class RecordingWriter:
         partial = self.path / (name + ".part")
         partial.write_bytes(encoded)
         os.replace(partial, self.path / name)
-        line = f"{stamp_s:.9f} {name}\n"
-        self._file.write(line)
+        self._file.write(f"{stamp_s:.9f} {name}\n")
         self._file.flush()
-        self._lines.append(line)
+        self.count, self.last_stamp_s = self.count + 1, stamp_s
 
     def write_camera(self, camera: Camera, T_body_camera: Float) -> None:
         """Write `camera.toml`."""
@@ -94,11 +91,74 @@ class RecordingWriter:
         if truth is not None:
             write_tum(self.path / "groundtruth.tum", truth)
 
-    def _complete_lines(self) -> list[str]:
-        if not self._listing.exists():
-            return []
-        lines = self._listing.read_text(encoding="utf-8").splitlines(keepends=True)
-        return [line for line in lines if line.endswith("\n") and (self.path / line.split(" ", 1)[1].strip()).is_file()]
+    def _take_up(self, listing: Path) -> int:
+        """Count the images that are there already; returns the bytes of their lines."""
+        kept = 0
+        with listing.open("rb") as lines:
+            for line in lines:
+                stamp, _, name = line.decode().partition(" ")
+                if not line.endswith(b"\n") or not (self.path / name.strip()).is_file():
+                    break
+                kept, self.count, self.last_stamp_s = kept + len(line), self.count + 1, float(stamp)
+        return kept
+
+
+class PoseWriter:
+    """Appends poses to a TUM file as they come, and takes up one that was cut short.
+
+    Stamps stay integers of nanoseconds until `finish`, which counts them from another zero where it is asked to.
+    """
+
+    def __init__(self, path: Path, wanted: bool) -> None:
+        self._path = path
+        self._partial = path.with_suffix(".part")
+        self._wanted = wanted
+        self._last_ns = -1
+        if wanted and path.exists() and not self._partial.exists():
+            path.unlink()
+        if wanted and self._partial.exists():
+            self._take_up()
+
+    def __enter__(self) -> "PoseWriter":
+        if self._wanted:
+            self._file = self._partial.open("a", encoding="ascii")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._wanted:
+            self._file.close()
+
+    def add(self, stamp_ns: int, numbers: tuple[float, ...]) -> None:
+        """Append `tx ty tz qx qy qz qw`; a stamp that is not after the last one is left out."""
+        if stamp_ns > self._last_ns:
+            self._file.write("%d %.9f %.9f %.9f %.12f %.12f %.12f %.12f\n" % (stamp_ns, *numbers))  # noqa: UP031
+            self._last_ns = stamp_ns
+
+    def finish(self, zero_ns: int = 0) -> None:
+        """Write the trajectory with stamps in seconds from `zero_ns`."""
+        if not self._wanted:
+            return
+        self._file.flush()
+        with self._partial.open(encoding="ascii") as lines, self._path.open("w", encoding="ascii") as out:
+            for line in lines:
+                stamp, _, numbers = line.partition(" ")
+                seconds, nanoseconds = divmod(abs(shifted := int(stamp) - zero_ns), 10**9)
+                out.write(f"{'-' if shifted < 0 else ''}{seconds}.{nanoseconds:09d} {numbers}")
+
+    def forget(self) -> None:
+        """Remove what only a later attempt would need."""
+        self._partial.unlink(missing_ok=True)
+
+    def _take_up(self) -> None:
+        kept = 0
+        with self._partial.open("rb") as lines:
+            for line in lines:
+                if line.endswith(b"\n"):
+                    kept += len(line)
+                    self._last_ns = int(line.split(b" ", 1)[0])
+        os.truncate(self._partial, kept)
 
 
 def _claim(path: Path, identity: str) -> None:

@@ -1,0 +1,128 @@
+"""ROS messages as what a recording holds: encoded images, poses, intrinsics."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
+from flocc_launch.datasets.bag_reader import Topic
+from flocc_launch.datasets.intrinsics import PINHOLE_MODELS
+from flocc_launch.datasets.pixels import JPEG_QUALITY
+from flocc_launch.datasets.source import DatasetError, Lens
+
+RAW_IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGE_TYPES = (RAW_IMAGE, COMPRESSED_IMAGE)
+POSE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Path",
+)
+CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
+
+_MAGIC = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))
+_CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 2, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
+_BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
+
+
+def stamp_ns(header: Any) -> int:
+    """Time of a header, nanoseconds."""
+    stamp = header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
+    """Bytes and suffix of an image message.
+
+    A compressed image is passed on as it is; a raw one becomes PNM (fast, lossless) or JPEG (small).
+
+    Raises:
+        DatasetError: An encoding or compression that flocc does not read.
+    """
+    if topic.type == COMPRESSED_IMAGE:
+        encoded = message.data.tobytes()
+        for magic, suffix in _MAGIC:
+            if encoded.startswith(magic):
+                return encoded, suffix
+        raise DatasetError(f"topic {topic.name}: images are compressed as {message.format!r}; flocc reads JPEG and PNG")
+    pixels = _pixels(message, topic)
+    if not jpeg:
+        height, width = pixels.shape[:2]
+        kind = b"P6" if pixels.ndim == 3 else b"P5"
+        return b"%s\n%d %d\n255\n%s" % (kind, width, height, pixels.tobytes()), ".ppm" if pixels.ndim == 3 else ".pgm"
+    import cv2
+
+    bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    encoded_ok = cv2.imencode(".jpg", np.ascontiguousarray(bgr), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return encoded_ok[1].tobytes(), ".jpg"
+
+
+def _pixels(message: Any, topic: Topic) -> Any:
+    """RGB (H, W, 3) or grey (H, W) uint8 pixels of a raw image."""
+    import cv2
+
+    encoding = str(message.encoding)
+    bytes_per_pixel = 1 if encoding in _BAYER else _CHANNELS.get(encoding)
+    if bytes_per_pixel is None:
+        known = ", ".join([*_CHANNELS, *_BAYER])
+        raise DatasetError(f"topic {topic.name}: images are encoded as {encoding!r}; flocc reads {known}")
+    if len(message.data) < message.height * message.step or message.step < message.width * bytes_per_pixel:
+        raise DatasetError(f"topic {topic.name}: an image has {len(message.data)} bytes, too few for its size")
+    rows = message.data[: message.height * message.step].reshape(message.height, message.step)
+    rows = rows[:, : message.width * bytes_per_pixel]
+    if encoding in _BAYER:
+        return cv2.cvtColor(np.ascontiguousarray(rows), getattr(cv2, f"COLOR_Bayer{_BAYER[encoding]}2RGB"))
+    if encoding == "mono16":
+        return rows[:, 0::2] if message.is_bigendian else rows[:, 1::2]
+    if bytes_per_pixel == 1:
+        return rows
+    pixels = rows.reshape(message.height, message.width, bytes_per_pixel)[..., :3]
+    return pixels if encoding.startswith("rgb") else pixels[..., ::-1]
+
+
+def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Yield stamps in nanoseconds and `tx ty tz qx qy qz qw` of a pose message; a path has many.
+
+    Raises:
+        DatasetError: A number is not finite, or a quaternion is not of unit length.
+    """
+    if topic.type == "nav_msgs/msg/Path":
+        for posed in message.poses:
+            yield stamp_ns(posed.header), _numbers(posed.pose, topic)
+        return
+    pose = message.pose if topic.type == "geometry_msgs/msg/PoseStamped" else message.pose.pose
+    yield stamp_ns(message.header), _numbers(pose, topic)
+
+
+def _numbers(pose: Any, topic: Topic) -> tuple[float, ...]:
+    p, q = pose.position, pose.orientation
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not math.isfinite(p.x + p.y + p.z + norm):
+        raise DatasetError(f"topic {topic.name}: a pose has a number that is not finite")
+    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+        raise DatasetError(f"topic {topic.name}: a pose is not rigid (its quaternion has length {norm:.4g}, not 1)")
+    return p.x, p.y, p.z, q.x / norm, q.y / norm, q.z / norm, q.w / norm
+
+
+def lens_of(message: Any, topic: Topic) -> Lens:
+    """Intrinsics of a CameraInfo message; the camera is taken as the body.
+
+    Raises:
+        DatasetError: The camera is not calibrated, or of another model than pinhole with radtan.
+    """
+    if message.distortion_model not in PINHOLE_MODELS:
+        raise DatasetError(
+            f"topic {topic.name}: the distortion model is {message.distortion_model!r}; flocc takes plumb_bob"
+        )
+    K, D = (message.k, message.d) if "k" in message.__dataclass_fields__ else (message.K, message.D)
+    k1, k2, p1, p2, k3 = ([*map(float, D), 0.0, 0.0, 0.0, 0.0, 0.0])[:5]
+    try:
+        camera = Camera(
+            message.width, message.height, float(K[0]), float(K[4]), float(K[2]), float(K[5]), (k1, k2, p1, p2)
+        )
+    except ValueError as error:
+        raise DatasetError(f"topic {topic.name}: {error}") from error
+    return Lens(camera, k3=k3)

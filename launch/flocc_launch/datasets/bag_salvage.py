@@ -1,0 +1,216 @@
+"""Reads damaged bags from the front until they end, without the index that a recorder writes last.
+
+A message is passed on only when it is whole; of a chunk that is cut, the part before the cut counts. Formats: ROS 1
+bag 2.0, MCAP, and rosbag2's SQLite tables.
+"""
+
+import bz2
+import os
+import shutil
+import sqlite3
+import struct
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+Record = tuple[str, str, str, int, bytes]
+"""Topic, message type (ROS 2's form), message definition or "", bag time in nanoseconds, raw message."""
+
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+MCAP_CHUNK = 0x06
+
+
+class Salvage:
+    """A damaged bag's messages, and a decoder for them."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._ros1 = path.suffix == ".bag"
+        self._types: Any = None
+
+    def topics(self) -> dict[str, str]:
+        """Topics with their types, of everything that is whole."""
+        found: dict[str, str] = {}
+        definitions: dict[str, str] = {}
+        for topic, kind, definition, _, _ in self._records():
+            found.setdefault(topic, kind)
+            definitions.setdefault(kind, definition)
+        self._types = _types(definitions)
+        return dict(sorted(found.items()))
+
+    def messages(self, names: list[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, bag time and raw message."""
+        for topic, _, _, stamp_ns, raw in self._records():
+            if topic in names:
+                yield topic, stamp_ns, raw
+
+    def decode(self, raw: bytes, kind: str) -> Any:
+        """Decode a raw message."""
+        return self._types.deserialize_ros1(raw, kind) if self._ros1 else self._types.deserialize_cdr(raw, kind)
+
+    def _records(self) -> Iterator[Record]:
+        readers = {".bag": _ros1_records, ".mcap": _mcap_records, ".db3": _sqlite_records}
+        return readers[self._path.suffix](self._path)
+
+
+def _types(definitions: dict[str, str]) -> Any:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    described = {kind: text for kind, text in definitions.items() if text}
+    if not described:
+        return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.EMPTY)
+    for kind, text in described.items():
+        store.register(get_types_from_msg(text, kind))
+    return store
+
+
+def _ros1_records(path: Path) -> Iterator[Record]:
+    connections: dict[int, tuple[str, str, str]] = {}
+    with path.open("rb") as file:
+        if file.read(len(ROS1_MAGIC)) != ROS1_MAGIC:
+            return
+        while (record := _ros1_record(file.read)) is not None:
+            header, data = record
+            if header.get("op") == b"\x05":
+                data = _decompressed(header.get("compression", b"none").decode(), data)
+                yield from _ros1_chunk(data, connections)
+            else:
+                yield from _ros1_message(header, data, connections)
+
+
+def _ros1_record(read: Any) -> tuple[dict[str, bytes], bytes] | None:
+    """One record's header and data, or None where the file ends before it does; a chunk may be cut."""
+    header = _sized(read)
+    if header is None:
+        return None
+    fields = _ros1_fields(header[1])
+    data = _sized(read)
+    whole = data is not None and len(data[1]) == data[0]
+    return (fields, data[1]) if data is not None and (whole or fields.get("op") == b"\x05") else None
+
+
+def _sized(read: Any) -> tuple[int, bytes] | None:
+    """A length and as many bytes as there are of it."""
+    size = read(4)
+    if len(size) < 4:
+        return None
+    length = struct.unpack("<I", size)[0]
+    return length, read(length)
+
+
+def _ros1_fields(header: bytes) -> dict[str, bytes]:
+    fields, at = {}, 0
+    while at + 4 <= len(header):
+        length = struct.unpack_from("<I", header, at)[0]
+        name, _, value = header[at + 4 : at + 4 + length].partition(b"=")
+        fields[name.decode(errors="replace")] = value
+        at += 4 + length
+    return fields
+
+
+def _ros1_chunk(data: bytes, connections: dict[int, tuple[str, str, str]]) -> Iterator[Record]:
+    inner = BytesIO(data)
+    while (record := _ros1_record(inner.read)) is not None:
+        yield from _ros1_message(*record, connections)
+
+
+def _ros1_message(
+    header: dict[str, bytes], data: bytes, connections: dict[int, tuple[str, str, str]]
+) -> Iterator[Record]:
+    operation = header.get("op")
+    if operation == b"\x07":
+        fields = _ros1_fields(data)
+        kind = fields["type"].decode()
+        normal = kind if "/msg/" in kind else kind.replace("/", "/msg/")
+        definition = fields["message_definition"].decode(errors="replace")
+        connections[struct.unpack("<I", header["conn"])[0]] = (header["topic"].decode(), normal, definition)
+    elif operation == b"\x02":
+        connection = connections.get(struct.unpack("<I", header["conn"])[0])
+        seconds, nanoseconds = struct.unpack("<II", header["time"])
+        if connection is not None:
+            yield (*connection, seconds * 10**9 + nanoseconds, data)
+
+
+def _mcap_records(path: Path) -> Iterator[Record]:
+    schemas: dict[int, tuple[str, str]] = {}
+    channels: dict[int, tuple[int, str]] = {}
+    with path.open("rb") as file:
+        if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+            return
+        while (record := _mcap_record(file.read)) is not None:
+            yield from _mcap_messages(*record, schemas, channels)
+
+
+def _mcap_record(read: Any) -> tuple[int, bytes] | None:
+    head = read(9)
+    if len(head) < 9:
+        return None
+    operation, length = struct.unpack("<BQ", head)
+    body = read(length)
+    return (operation, body) if len(body) == length or (operation == MCAP_CHUNK and len(body) > 64) else None
+
+
+def _mcap_messages(
+    operation: int, body: bytes, schemas: dict[int, tuple[str, str]], channels: dict[int, tuple[int, str]]
+) -> Iterator[Record]:
+    if operation == 0x03:
+        at, texts = 2, []
+        for _ in range(3):
+            length = struct.unpack_from("<I", body, at)[0]
+            texts.append(body[at + 4 : at + 4 + length].decode(errors="replace"))
+            at += 4 + length
+        schemas[struct.unpack_from("<H", body)[0]] = (texts[0], texts[2] if texts[1] == "ros2msg" else "")
+    elif operation == 0x04:
+        channel, schema, length = struct.unpack_from("<HHI", body)
+        channels[channel] = (schema, body[8 : 8 + length].decode())
+    elif operation == 0x05:
+        channel, _, stamp_ns = struct.unpack_from("<HIQ", body)
+        schema, topic = channels[channel]
+        yield (topic, *schemas[schema], stamp_ns, body[22:])
+    elif operation == MCAP_CHUNK:
+        length = struct.unpack_from("<I", body, 28)[0]
+        compression = body[32 : 32 + length].decode()
+        size = struct.unpack_from("<Q", body, 32 + length)[0]
+        inner = BytesIO(_decompressed(compression or "none", body[40 + length : 40 + length + size]))
+        while (record := _mcap_record(inner.read)) is not None:
+            yield from _mcap_messages(*record, schemas, channels)
+
+
+def _sqlite_records(path: Path) -> Iterator[Record]:
+    """Rows of rosbag2's tables, from a copy that is filled up to its length: SQLite opens no file that is too short."""
+    with TemporaryDirectory(prefix="flocc-bag-") as folder:
+        copy = Path(shutil.copy(path, folder))
+        with copy.open("rb") as file:
+            header = file.read(32)
+        page, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
+        os.truncate(copy, max((65536 if page == 1 else page) * pages, copy.stat().st_size))
+        database = sqlite3.connect(copy)
+        try:
+            topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
+            for topic, stamp_ns, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+                if topic in topics and raw:
+                    yield (*topics[topic], "", stamp_ns, raw)
+        except sqlite3.DatabaseError:
+            return
+        finally:
+            database.close()
+
+
+def _decompressed(compression: str, data: bytes) -> bytes:
+    """As much as can be decompressed of data that may be cut."""
+    if compression == "bz2":
+        return bz2.BZ2Decompressor().decompress(data)
+    if compression == "lz4":
+        import lz4.frame  # type: ignore[import-untyped]
+
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data))
+    if compression == "zstd":
+        module = import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+        return bytes(module.ZstdDecompressor().decompress(data))
+    return data
