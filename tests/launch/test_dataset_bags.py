@@ -249,6 +249,14 @@ def test_images_of_another_size_than_the_intrinsics_are_refused(tmp_path: Path) 
         convert(script.write(tmp_path / "run", "db3"), tmp_path / "out")
 
 
+def test_a_message_that_is_cut_is_said(tmp_path: Path) -> None:
+    bag = walking(False, 3).write(tmp_path / "run", "db3")
+    with sqlite3.connect(next(bag.glob("*.db3"))) as database:
+        database.execute("UPDATE messages SET data = substr(data, 1, 50) WHERE id = 6")
+    with pytest.raises(DatasetError, match=r"topic /odom: a message cannot be read as nav_msgs/msg/Odometry.*1 images"):
+        convert(bag, tmp_path / "out")
+
+
 def test_a_message_of_another_distribution_is_said(tmp_path: Path) -> None:
     bag = walking(False).write(tmp_path / "run", "db3")
     with sqlite3.connect(next(bag.glob("*.db3"))) as database:

@@ -15,9 +15,9 @@ from flocc_launch.datasets.bag_messages import (
     POSE_TYPES,
     image_file,
     lens_of,
-    poses,
     stamp_ns,
 )
+from flocc_launch.datasets.bag_poses import PoseDecoder
 from flocc_launch.datasets.bag_reader import Bag, Topic
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import decoded, undistorted, written_lens
@@ -151,8 +151,10 @@ class _Conversion:
         done_s = self.writer.last_stamp_s
         names = [topic.name for topic in (self.image_topic, self.odometry_topic) if topic is not None]
         total = self.image_topic.count or 0
+        pose_topic = self.odometry_topic
+        decoders = {} if pose_topic is None else {pose_topic.name: PoseDecoder(self.bag, pose_topic)}
         try:
-            for number, (topic, bag_ns, message) in enumerate(self.bag.messages(names, start_ns)):
+            for number, (topic, bag_ns, message) in enumerate(self.bag.messages(names, start_ns, decoders)):
                 if number % CHECKPOINT_MESSAGES == 0:
                     self._save(state_path, bag_ns)
                 if topic is self.image_topic:
@@ -160,7 +162,8 @@ class _Conversion:
                     if progress is not None:
                         progress(self.images_seen, max(total, self.images_seen))
                 else:
-                    self._add_poses(message, topic)
+                    for posed in message:
+                        self.log.add(*posed)
         except DatasetError as error:
             prefix = "" if str(error).startswith(str(self.bag.path)) else f"{self.bag.path}: "
             self.faults.insert(0, f"{prefix}{error}")
@@ -186,10 +189,6 @@ class _Conversion:
         if self.lens.k3 != 0.0:
             encoded, suffix = undistorted(encoded, f"topic {self.image_topic.name}", self.lens)
         self.writer.add(stamp_s, encoded, suffix)
-
-    def _add_poses(self, message: Any, topic: Topic) -> None:
-        for pose_ns, numbers in poses(message, topic):
-            self.log.add(pose_ns, numbers)
 
     def _check_size(self, encoded: bytes) -> None:
         height, width = decoded(encoded, f"{self.bag.path}: topic {self.image_topic.name}").shape[:2]

@@ -99,12 +99,22 @@ def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]
 
 def _numbers(pose: Any, topic: Topic) -> tuple[float, ...]:
     p, q = pose.position, pose.orientation
-    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-    if not math.isfinite(p.x + p.y + p.z + norm):
+    return checked_numbers((p.x, p.y, p.z, q.x, q.y, q.z, q.w), topic)
+
+
+def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ...]:
+    """`tx ty tz qx qy qz qw` with a quaternion of unit length.
+
+    Raises:
+        DatasetError: A number is not finite, or the quaternion is not of about unit length.
+    """
+    x, y, z, qx, qy, qz, qw = numbers
+    norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+    if not math.isfinite(x + y + z + norm):
         raise DatasetError(f"topic {topic.name}: a pose has a number that is not finite")
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
         raise DatasetError(f"topic {topic.name}: a pose is not rigid (its quaternion has length {norm:.4g}, not 1)")
-    return p.x, p.y, p.z, q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm
 
 
 def lens_of(message: Any, topic: Topic) -> Lens:

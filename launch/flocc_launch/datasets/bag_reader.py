@@ -3,7 +3,7 @@
 A bag that was cut off in the middle is read as far as it goes; `Bag.damage` then says what is wrong with it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 from flocc_launch.datasets.source import DatasetError
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
+Decoder = Callable[[bytes], Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +82,26 @@ class Bag:
     ) -> None:
         self._stack.close()
 
-    def messages(self, names: list[str], start_ns: int | None = None) -> Iterator[tuple[Topic, int, Any]]:
+    @property
+    def ros1(self) -> bool:
+        """Whether messages are in ROS 1's serialisation, not in CDR."""
+        return self.path.suffix == ".bag"
+
+    def messages(
+        self, names: list[str], start_ns: int | None = None, decoders: Mapping[str, Decoder] | None = None
+    ) -> Iterator[tuple[Topic, int, Any]]:
         """Yield topic, bag time in nanoseconds and message, in the bag's order.
 
         Args:
             names: Topics.
             start_ns: Leave out what the bag recorded before.
+            decoders: By topic, what is called with raw bytes in place of rosbags' decoder.
 
         Raises:
             DatasetError: A message is not of the type that the bag says.
         """
         if self._reader is None:
-            yield from self._salvaged(names, start_ns)
+            yield from self._salvaged(names, start_ns, decoders or {})
             return
         connections = [c for c in self._reader.connections if c.topic in names]
         stream = self._reader.messages(connections=connections, start=start_ns)
@@ -105,14 +114,21 @@ class Bag:
                 self.damage = f"{self.path}: is damaged or cut off: {error}"
                 return
             topic = self.topics[connection.topic]
-            yield topic, stamp_ns, self._decoded(self._reader.deserialize, raw, connection.msgtype, topic)
+            decoder = decoders.get(topic.name) if decoders else None
+            yield topic, stamp_ns, self.decoded(raw, topic) if decoder is None else decoder(raw)
 
-    def _decoded(self, decode: Any, raw: bytes, msgtype: str, topic: Topic) -> Any:
+    def decoded(self, raw: bytes, topic: Topic) -> Any:
+        """Decode a message.
+
+        Raises:
+            DatasetError: The bytes are not of the topic's type.
+        """
+        decode = self._salvage.decode if self._reader is None else self._reader.deserialize
         try:
-            return decode(raw, msgtype)
+            return decode(raw, topic.type)
         except Exception as error:
             raise DatasetError(
-                f"{self.path}: topic {topic.name}: a message cannot be read as {msgtype}; "
+                f"{self.path}: topic {topic.name}: a message cannot be read as {topic.type}; "
                 f"the type may be of another ROS distribution ({type(error).__name__}: {error})"
             ) from error
 
@@ -138,11 +154,13 @@ class Bag:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         self.damage = f"{self.path}: is damaged or cut off: {reason}"
 
-    def _salvaged(self, names: list[str], start_ns: int | None) -> Iterator[tuple[Topic, int, Any]]:
+    def _salvaged(
+        self, names: list[str], start_ns: int | None, decoders: Mapping[str, Decoder]
+    ) -> Iterator[tuple[Topic, int, Any]]:
         for name, stamp_ns, raw in self._salvage.messages(names):
             if start_ns is None or stamp_ns >= start_ns:
-                topic = self.topics[name]
-                yield topic, stamp_ns, self._decoded(self._salvage.decode, raw, topic.type, topic)
+                topic, decoder = self.topics[name], decoders.get(name)
+                yield topic, stamp_ns, self.decoded(raw, topic) if decoder is None else decoder(raw)
 
 
 def _default_types() -> Any:

@@ -5,7 +5,10 @@ written so far.
 """
 
 import os
+import shutil
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 
@@ -20,6 +23,8 @@ from flocc_launch.datasets.source import DatasetError, Lens, Source
 
 Float = NDArray[np.float64]
 Progress = Callable[[int, int], None]
+
+PENDING_MAX = 8
 
 
 class RecordingWriter:
@@ -50,6 +55,8 @@ class RecordingWriter:
         if listing.exists():
             os.truncate(listing, self._take_up(listing))
         self._file = listing.open("a", encoding="utf-8")
+        self._thread = ThreadPoolExecutor(1)
+        self._pending: deque[Future[None]] = deque()
 
     def __enter__(self) -> "RecordingWriter":
         return self
@@ -57,10 +64,20 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        try:
+            while self._pending:
+                self._pending.popleft().result()
+        finally:
+            self._thread.shutdown()
+            self._file.close()
+
+    def _write(self, name: str, encoded: bytes, line: str) -> None:
+        _write(f"{self.path}/{name}", encoded)
+        self._file.write(line)
+        self._file.flush()
 
     def add(self, stamp_s: float, encoded: bytes, suffix: str) -> None:
-        """Append one encoded image; stamps must increase.
+        """Append one encoded image; stamps must increase. A thread writes it while the next one is read.
 
         Args:
             stamp_s: When it was taken, seconds.
@@ -72,12 +89,10 @@ class RecordingWriter:
         """
         if self.last_stamp_s is not None and stamp_s <= self.last_stamp_s:
             raise ValueError(f"stamp {stamp_s} is not after {self.last_stamp_s}")
+        while len(self._pending) >= PENDING_MAX:
+            self._pending.popleft().result()
         name = f"images/{self.count:06d}{suffix}"
-        partial = self.path / (name + ".part")
-        partial.write_bytes(encoded)
-        os.replace(partial, self.path / name)
-        self._file.write(f"{stamp_s:.9f} {name}\n")
-        self._file.flush()
+        self._pending.append(self._thread.submit(self._write, name, encoded, f"{stamp_s:.9f} {name}\n"))
         self.count, self.last_stamp_s = self.count + 1, stamp_s
 
     def write_camera(self, camera: Camera, T_body_camera: Float) -> None:
@@ -106,7 +121,7 @@ class RecordingWriter:
 class PoseWriter:
     """Appends poses to a TUM file as they come, and takes up one that was cut short.
 
-    Stamps stay integers of nanoseconds until `finish`, which counts them from another zero where it is asked to.
+    `finish` makes the trajectory, and counts stamps from another zero where it is asked to.
     """
 
     def __init__(self, path: Path, wanted: bool) -> None:
@@ -133,18 +148,22 @@ class PoseWriter:
     def add(self, stamp_ns: int, numbers: tuple[float, ...]) -> None:
         """Append `tx ty tz qx qy qz qw`; a stamp that is not after the last one is left out."""
         if stamp_ns > self._last_ns:
-            self._file.write("%d %.9f %.9f %.9f %.12f %.12f %.12f %.12f\n" % (stamp_ns, *numbers))  # noqa: UP031
+            line = "%d.%09d %.9f %.9f %.9f %.12f %.12f %.12f %.12f\n"
+            self._file.write(line % (*divmod(stamp_ns, 10**9), *numbers))
             self._last_ns = stamp_ns
 
     def finish(self, zero_ns: int = 0) -> None:
-        """Write the trajectory with stamps in seconds from `zero_ns`."""
+        """Make the trajectory of what was written, with stamps in seconds from `zero_ns`."""
         if not self._wanted:
             return
         self._file.flush()
+        if zero_ns == 0:
+            shutil.copyfile(self._partial, self._path)
+            return
         with self._partial.open(encoding="ascii") as lines, self._path.open("w", encoding="ascii") as out:
             for line in lines:
                 stamp, _, numbers = line.partition(" ")
-                seconds, nanoseconds = divmod(abs(shifted := int(stamp) - zero_ns), 10**9)
+                seconds, nanoseconds = divmod(abs(shifted := int(stamp.replace(".", "")) - zero_ns), 10**9)
                 out.write(f"{'-' if shifted < 0 else ''}{seconds}.{nanoseconds:09d} {numbers}")
 
     def forget(self) -> None:
@@ -157,8 +176,19 @@ class PoseWriter:
             for line in lines:
                 if line.endswith(b"\n"):
                     kept += len(line)
-                    self._last_ns = int(line.split(b" ", 1)[0])
+                    self._last_ns = int(line.split(b" ", 1)[0].replace(b".", b""))
         os.truncate(self._partial, kept)
+
+
+def _write(path: str, data: bytes) -> None:
+    """Write a file; without Python's buffers, which cost more than the system call."""
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        view = memoryview(data)
+        while view:
+            view = view[os.write(handle, view) :]
+    finally:
+        os.close(handle)
 
 
 def _claim(path: Path, identity: str) -> None:
