@@ -13,7 +13,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -154,7 +154,10 @@ def judge(scene: Scene, skills: Perception) -> dict[str, Any]:
         "seconds": seconds,
         "all_pairs": [ratio_row(outcomes, ratio) for ratio in MATCH_RATIOS],
         "best_matches": [ratio_row(of_best, ratio) for ratio in MATCH_RATIOS],
-        "place_recognition": place_recognition(pairs, of_best),
+        "place_recognition": {
+            "recall_at_1": recall_at_one(pairs, scene),
+            **place_recognition(pairs, of_best),
+        },
     }
 
 
@@ -184,15 +187,25 @@ def is_same_place(scene: Scene, i: int, j: int) -> bool:
     return near and viewing_angle_rad < scene.place_angle_rad
 
 
-def best_matches(pairs: Sequence[Pair], scene: Scene) -> set[tuple[int, int]]:
-    """Each view's most similar view of every other robot, as the core's place recognition chooses candidates."""
+def best_by_view(pairs: Sequence[Pair], scene: Scene) -> dict[tuple[int, str], Pair]:
+    """Each view's most similar view of every other robot, by view and robot."""
     best: dict[tuple[int, str], Pair] = {}
-    for pair in pairs:
-        for own, other in ((pair.query, pair.match), (pair.match, pair.query)):
-            key = (own, scene.views[other].robot)
-            if key not in best or pair.similarity > best[key].similarity:
-                best[key] = pair
-    return {(pair.query, pair.match) for pair in best.values()}
+    for key, pair in _by_view_and_robot(pairs, scene):
+        if key not in best or pair.similarity > best[key].similarity:
+            best[key] = pair
+    return best
+
+
+def best_matches(pairs: Sequence[Pair], scene: Scene) -> set[tuple[int, int]]:
+    """The pairs that the core's place recognition would choose as candidates."""
+    return {(pair.query, pair.match) for pair in best_by_view(pairs, scene).values()}
+
+
+def recall_at_one(pairs: Sequence[Pair], scene: Scene) -> float | None:
+    """Share of best matches at one place, of the views and robots where that robot was at the view's place."""
+    possible = {key for key, pair in _by_view_and_robot(pairs, scene) if pair.same_place}
+    best = best_by_view(pairs, scene)
+    return _ratio(sum(best[key].same_place for key in possible), len(possible))
 
 
 def chosen(pairs: Sequence[Pair], best: set[tuple[int, int]]) -> list[Pair]:
@@ -297,12 +310,9 @@ def place_recognition(pairs: Sequence[Pair], best: Sequence[Outcome]) -> dict[st
         above = right + sum(s >= similarity for s in elsewhere)
         row = {"similarity_min": similarity, "pairs": above, "precision": _ratio(right, above)}
         rows.append({**row, "recall": _ratio(right, len(places))})
-    with_a_place = {i for pair in pairs if pair.same_place for i in (pair.query, pair.match)}
-    able = [o for o in best if o.query in with_a_place or o.match in with_a_place]
     return {
         "best_matches": len(best),
         "same_place": _ratio(sum(o.same_place for o in best), len(best)),
-        "same_place_where_there_is_one": _ratio(sum(o.same_place for o in able), len(able)),
         "register_correctly": _ratio(sum(o.correct for o in best), len(best)),
         "similarity_median_same_place": _median(places),
         "similarity_median_elsewhere": _median(elsewhere),
@@ -372,12 +382,20 @@ def main() -> None:
     sys.stdout.write(text(report) + "\n")
 
 
+def _by_view_and_robot(pairs: Sequence[Pair], scene: Scene) -> Iterator[tuple[tuple[int, str], Pair]]:
+    """Every pair twice: for its one view and the other's robot, and the other way round."""
+    for pair in pairs:
+        yield (pair.query, scene.views[pair.match].robot), pair
+        yield (pair.match, scene.views[pair.query].robot), pair
+
+
 def _scene_lines(name: str, scene: dict[str, Any]) -> list[str]:
     places = scene["place_recognition"]
     here, elsewhere = places["similarity_median_same_place"], places["similarity_median_elsewhere"]
     lines = [
         f"{name}: {scene['views']} views, {scene['pairs']} pairs, seconds {scene['seconds']}",
-        f"  best matches {places['best_matches']}: {_number(places['same_place'])} at the same place, "
+        f"  recall@1 {_number(places['recall_at_1'])}; best matches {places['best_matches']}: "
+        f"{_number(places['same_place'])} at the same place, "
         f"{_number(places['register_correctly'])} register correctly; similarity at one place "
         f"{_number(here)}, elsewhere {_number(elsewhere)}",
     ]

@@ -13,7 +13,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose, so3_exp
 from flocc_launch import evaluate_registration as evaluation
-from flocc_launch.evaluate_registration import Outcome, Pair, best_matches, chosen, outcome, ratio_row
+from flocc_launch.evaluate_registration import Outcome, Pair, best_matches, chosen, outcome, ratio_row, recall_at_one
 from flocc_launch.registration_scenes import Scene, View, fountain, sevenscenes
 
 SHARED = Path(os.environ.get("FLOCC_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "data"
@@ -72,6 +72,13 @@ def test_best_matches_are_those_of_each_view_and_other_robot() -> None:
         (0, 2),
         (0, 3),
     }
+
+
+def test_recall_at_one_counts_views_that_another_robot_saw_the_place_of() -> None:
+    scene = line_of("r1", "r1", "r2")
+    pairs = [Pair(0, 2, 0.3, False), Pair(1, 2, 0.2, True)]
+
+    assert recall_at_one(pairs, scene) == pytest.approx(0.5)  # right for view 1, wrong for view 2, view 0 has no place
 
 
 def test_large_scenes_keep_best_matches_and_a_repeatable_sample(monkeypatch: pytest.MonkeyPatch) -> None:
