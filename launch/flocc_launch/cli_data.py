@@ -13,7 +13,8 @@ weights = typer.Typer(help="Checkpoints of the mast3r front end: needed, checked
 
 Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
 Format = Annotated[str | None, typer.Option("--format", help="Name of the format where it is not recognised.")]
-CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML) for a data set that has none.")]
+CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML or YAML) for a data set that has none.")]
+Every = Annotated[int, typer.Option(min=1, help="Of a bag, keep one image of so many.")]
 
 
 def add_data(app: typer.Typer) -> None:
@@ -42,13 +43,39 @@ def convert(
     format_name: Format = None,
     camera: CameraFile = None,
     odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="TUM file with ground truth, for a bag.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Of a bag with several.")] = None,
+    odometry_topic: Annotated[str | None, typer.Option(help="Of a bag with several.")] = None,
+    every: Every = 1,
+    jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
 ) -> None:
-    """Write a data set as one recording; a conversion that was cut short goes on where it ended."""
+    """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended."""
     from flocc_launch.datasets.commands import convert as run
 
     with progress_bar("converting") as progress:
-        path = run(source, out, format_name=format_name, camera=camera, odometry=odometry, progress=progress)
+        path = run(
+            source, out, format_name=format_name, camera=camera, odometry=odometry, truth=truth,
+            image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg, progress=progress,
+        )  # fmt: skip
     typer.echo(f"recording: {path}")
+
+
+@dataset.command()
+def team(
+    preset: Annotated[str, typer.Argument(help="s3e (one ROS 2 bag) or graco (a folder of ROS 1 bags).")],
+    source: Source,
+    odometry: Annotated[Path, typer.Option(help="Folder with ROBOT.tum or ROBOT.txt per robot.")],
+    out: Annotated[Path, typer.Option(help="Gets a recording per robot.")],
+    truth: Annotated[Path | None, typer.Option(help="Folder with ground truth per robot.")] = None,
+    camera: Annotated[list[str] | None, typer.Option(help="ROBOT=FILE: intrinsics, once per robot.")] = None,
+    every: Every = 1,
+) -> None:
+    """Write the bags of a published multi-robot data set as recordings, one per robot."""
+    from flocc_launch.datasets.presets import convert_team
+
+    with progress_bar("converting") as progress:
+        for path in convert_team(preset, source, out, odometry, truth, camera or [], every, progress):
+            typer.echo(f"recording: {path}")
 
 
 @dataset.command()

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.launch.bag_fixtures import HEIGHT, WIDTH, ZERO_NS, BagScript, walking
+from typer.testing import CliRunner
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_launch.cli_data import dataset
 from flocc_launch.datasets.bag_convert import convert_bag
 from flocc_launch.datasets.commands import convert, info
-from flocc_launch.datasets.presets import GRACO_GROUND, S3E_ALPHA, Team, convert_graco, convert_s3e
+from flocc_launch.datasets.presets import GRACO_GROUND, S3E_ALPHA, Team, convert_graco, convert_s3e, convert_team
 from flocc_launch.datasets.source import DatasetError
 
 KINDS = ["bag", "db3", "mcap"]
@@ -310,6 +312,23 @@ def test_s3e_says_whose_camera_is_missing(tmp_path: Path) -> None:
     team = replace(team, cameras={"alpha": camera_file(tmp_path)})
     with pytest.raises(DatasetError, match="bob: intrinsics are missing: S3E publishes no calibration of Bob"):
         convert_s3e(bag, tmp_path / "out", team)
+
+
+@pytest.mark.parametrize(
+    ("preset", "camera", "sentence"),
+    [("kitti", "a=b", "the preset 'kitti' is not known; there are s3e, graco"), ("s3e", "bob", "must be ROBOT=FILE")],
+)
+def test_a_team_that_cannot_be_is_refused(tmp_path: Path, preset: str, camera: str, sentence: str) -> None:
+    with pytest.raises(DatasetError, match=sentence):
+        convert_team(preset, tmp_path, tmp_path / "out", tmp_path, None, [camera])
+
+
+def test_the_command_line_converts_a_bag(tmp_path: Path) -> None:
+    bag = walking(True).write(tmp_path / "run.bag")
+    options = ["--image-topic", "/cam/image/compressed", "--every", "2", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(dataset, ["convert", str(bag), *options])
+    assert result.exit_code == 0, result.output
+    assert len(Recording.open(tmp_path / "out").frames) == 3
 
 
 def test_graco_in_its_published_layout(tmp_path: Path) -> None:

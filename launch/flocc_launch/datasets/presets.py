@@ -4,7 +4,7 @@ Neither holds odometry: users bring a TUM trajectory per robot. Only what is pub
 not (S3E's Bob and Carol, GrAco's aerial robots) need a camera file each.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -53,6 +53,33 @@ class Team:
     truth: Path | None = None
     cameras: Mapping[str, Path] = field(default_factory=dict)
     every: int = 1
+
+
+def convert_team(
+    preset: str,
+    source: Path,
+    out: Path,
+    odometry: Path,
+    truth: Path | None,
+    cameras: Sequence[str],
+    every: int = 1,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Convert a published data set by the name of its preset; cameras are given as `ROBOT=FILE`.
+
+    Raises:
+        DatasetError: The preset or a camera's form is not known, or the conversion fails.
+    """
+    converters = {"s3e": convert_s3e, "graco": convert_graco}
+    if preset not in converters:
+        raise DatasetError(f"the preset {preset!r} is not known; there are {', '.join(converters)}")
+    files: dict[str, Path] = {}
+    for pair in cameras:
+        robot, separator, file = pair.partition("=")
+        if not separator:
+            raise DatasetError(f"--camera {pair!r} must be ROBOT=FILE")
+        files[robot] = Path(file)
+    return converters[preset](source, out, Team(odometry, truth, files, every), progress)
 
 
 def convert_s3e(bag: Path, out: Path, team: Team, progress: Progress | None = None) -> list[Path]:
