@@ -6,6 +6,7 @@ Every message but a heartbeat may be lost: heartbeats repeat, and what they say 
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,8 @@ CORRECTION_KEYFRAMES_MAX = 1500
 COMPUTE_CLASS_MAX = 9
 HOPS_MAX = 255
 COUNTER_MAX = 2**53 - 1
+CHECKSUM_MAX = 2**32 - 1
+REPEATED_MAX = 8192
 
 
 class UnknownVersion(DecodeError):
@@ -295,11 +298,49 @@ def _check_poses(poses: NDArray[np.float64]) -> None:
 
 _BEAT = integer(0, COUNTER_MAX)
 _TERM_COUNTER = integer(0, TERM_COUNTER_MAX)
-_CHECKSUM = integer(0, 2**32 - 1)
+_CHECKSUM = integer(0, CHECKSUM_MAX)
 _COMPUTE_CLASS = integer(0, COMPUTE_CLASS_MAX)
 _ADVERT = struct(LeaderAdvert, term=TERM, compute_class=_COMPUTE_CLASS, beat=_BEAT, hops=integer(0, HOPS_MAX))
-_DIGEST = struct(LogDigest, log=LOG_ID, count=COUNT, checksum=_CHECKSUM)
-_VERSION = struct(CorrectionVersion, log=LOG_ID, term=TERM, round=COUNT)
+_ANY_DIGEST = struct(LogDigest, log=LOG_ID, count=COUNT, checksum=_CHECKSUM)
+_ANY_VERSION = struct(CorrectionVersion, log=LOG_ID, term=TERM, round=COUNT)
+
+
+@lru_cache(maxsize=REPEATED_MAX, typed=True)
+def _digest(robot: Any, incarnation: Any, count: Any, checksum: Any) -> LogDigest:
+    """Heartbeats repeat most of what they say: the same digest comes back as the same object, checked once."""
+    return _ANY_DIGEST.unpack([[robot, incarnation], count, checksum])
+
+
+@lru_cache(maxsize=REPEATED_MAX, typed=True)
+def _version(robot: Any, incarnation: Any, counter: Any, leader: Any, life: Any, number: Any) -> CorrectionVersion:
+    return _ANY_VERSION.unpack([[robot, incarnation], [counter, [leader, life]], number])
+
+
+def _unpack_digest(value: Any) -> LogDigest:
+    try:
+        (robot, incarnation), count, checksum = value
+        return _digest(robot, incarnation, count, checksum)
+    except (TypeError, ValueError) as error:
+        raise DecodeError("expected a digest") from error
+
+
+def _unpack_version(value: Any) -> CorrectionVersion:
+    try:
+        (robot, incarnation), (counter, (leader, life)), number = value
+        return _version(robot, incarnation, counter, leader, life, number)
+    except (TypeError, ValueError) as error:
+        raise DecodeError("expected the version of a correction") from error
+
+
+def _pack_digest(value: LogDigest) -> list[Any]:
+    log, count, checksum = value.log, value.count, value.checksum
+    if not 0 <= count <= INDEX_MAX or not 0 <= checksum <= CHECKSUM_MAX:
+        raise DecodeError(f"digest of {log} is out of range")
+    return [[log.robot, log.incarnation], count, checksum]
+
+
+_DIGEST = Codec(_pack_digest, _unpack_digest)
+_VERSION = Codec(_ANY_VERSION.pack, _unpack_version)
 _PAIR = struct(CandidatePair, low=KEYFRAME_ID, high=KEYFRAME_ID)
 
 _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {

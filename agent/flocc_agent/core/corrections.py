@@ -31,6 +31,8 @@ class Corrections:
         self._rounds = rounds
         self._newest: dict[LogId, CorrectionMessage] = {}
         self._asked_until_s: dict[LogId, float] = {}
+        self._agreed: dict[LogId, CorrectionVersion] = {}
+        self._versions: tuple[CorrectionVersion, ...] | None = None
 
     @property
     def applied(self) -> CorrectionMessage | None:
@@ -46,15 +48,23 @@ class Corrections:
         return {
             "corrections": (len(self._newest), self._gossip.logs_max),
             "asked_corrections": (len(self._asked_until_s), REMEMBERED_MAX),
+            "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
         }
 
     def restore(self, message: CorrectionMessage) -> None:
         """Put back the correction that was applied before a restart."""
         self._newest[message.log] = message
+        self._versions = None
 
     def versions(self) -> tuple[CorrectionVersion, ...]:
         """What this robot holds, for its heartbeat."""
-        return tuple(CorrectionVersion(log, m.term, m.round) for log, m in sorted(self._newest.items()))
+        if self._versions is None:
+            self._versions = tuple(CorrectionVersion(log, m.term, m.round) for log, m in sorted(self._newest.items()))
+        return self._versions
+
+    def news(self, versions: tuple[CorrectionVersion, ...]) -> tuple[CorrectionVersion, ...]:
+        """Those versions that were not yet found to be no newer than this robot's own."""
+        return tuple(version for version in versions if version is not self._agreed.get(version.log))
 
     def on_versions(self, peer: str, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """Ask a peer for corrections that are newer than this robot's."""
@@ -65,6 +75,8 @@ class Corrections:
             if newer and self._asked_until_s.get(version.log, now) <= now:
                 remember(self._asked_until_s, version.log, now + self._gossip.request_timeout_s)
                 effects.append(Unicast(peer, CorrectionRequest(version.log)))
+            elif not newer:
+                remember(self._agreed, version.log, version)
         return effects
 
     def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
@@ -80,15 +92,21 @@ class Corrections:
         if held is None and len(self._newest) >= self._gossip.logs_max:
             return [Report("peer_refused", {"peer": message.term.leader.robot, "reason": "too many corrections"})]
         self._newest[message.log] = message
+        self._versions = None
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
 
     def publish(self, term: Term, round_number: int, solution: GraphSolution) -> list[Effect]:
-        """Send what a round changed, as the leader."""
+        """Send what a round changed, as the leader; a log whose solution leaves the map keeps its last correction."""
         effects: list[Effect] = []
         for component in solution.components:
             for log in component.logs:
-                message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
+                try:
+                    message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
+                except ValueError as error:
+                    facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
+                    effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
+                    continue
                 if self._changed(message):
                     effects += [Broadcast(message), *self.on_message(message)]
         return effects

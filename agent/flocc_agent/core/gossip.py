@@ -6,6 +6,7 @@ neighbour about what was sent, so a lost, doubled, late or reordered message can
 """
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Protocol, TypeVar
 
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
@@ -24,6 +25,7 @@ from flocc_protocol.records import KeyframeRecord, Record, chain, decode_record,
 Key = TypeVar("Key")
 Entry = TypeVar("Entry")
 
+DECODED_MAX = 1024
 REMEMBERED_MAX = 1024
 """Open requests, pauses and forks that are remembered; beyond this the oldest are forgotten."""
 
@@ -103,6 +105,7 @@ class Gossip:
         self._pauses_s: dict[tuple[LogId, str], float] = {}
         self._not_before_s: dict[tuple[LogId, str], float] = {}
         self._forked: dict[tuple[LogId, str], None] = {}
+        self._agreed: dict[LogId, LogDigest] = {}
         self._told: dict[tuple[str, str], None] = {}
         self._digests: tuple[LogDigest, ...] | None = None
 
@@ -114,6 +117,7 @@ class Gossip:
             "paused": (len(self._not_before_s), REMEMBERED_MAX),
             "forked": (len(self._forked), REMEMBERED_MAX),
             "refused": (len(self._told), REMEMBERED_MAX),
+            "agreed": (len(self._agreed), REMEMBERED_MAX),
         }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
@@ -148,13 +152,17 @@ class Gossip:
     def on_digests(self, sender: LogId, digests: tuple[LogDigest, ...], now: float) -> list[Effect]:
         """Ask the sender for what it has more of."""
         effects: list[Effect] = []
-        for digest in digests:
+        for digest in digests if digests != self._digests else ():
+            if digest is self._agreed.get(digest.log):
+                continue
             copy = self.logs.get(digest.log)
             held = len(copy) if copy else 0
             if digest.count > held:
                 effects += self._behind(sender.robot, digest.log, held, now)
             elif copy is not None and copy.checksums[digest.count] != digest.checksum:
                 effects += self._fork(sender.robot, digest.log, "two writers of one log")
+            else:
+                remember(self._agreed, digest.log, digest)
         return effects
 
     def _behind(self, peer: str, log: LogId, held: int, now: float) -> list[Effect]:
@@ -199,7 +207,7 @@ class Gossip:
         effects: list[Effect] = []
         for data in batch.records[len(copy) - batch.first :]:
             try:
-                record = decode_record(self._opened(batch.log, len(copy), data))
+                record = decoded(self._opened(batch.log, len(copy), data))
             except DecodeError as error:
                 return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
             if not copy.accepts(record) or len(copy) >= self._parameters.records_max:
@@ -276,6 +284,12 @@ def remember(entries: dict[Key, Entry], key: Key, entry: Entry, entries_max: int
     entries[key] = entry
     while len(entries) > entries_max:
         del entries[next(iter(entries))]
+
+
+@lru_cache(maxsize=DECODED_MAX)
+def decoded(data: bytes) -> Record:
+    """A record, decoded once where several copies of a log live in one process."""
+    return decode_record(data)
 
 
 def _fitting(encoded: list[bytes], first: int) -> tuple[bytes, ...]:

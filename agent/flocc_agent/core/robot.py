@@ -247,10 +247,11 @@ class Robot:
 
     def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """What others apply: a leader outbids it, and whoever has something older asks for it."""
-        if not versions:
+        news = self.corrections.news(versions)
+        if not news:
             return []
-        refused = self.election.on_applied(sender, max(version.term for version in versions))
-        return refused or self.corrections.on_versions(sender.robot, versions, now)
+        refused = self.election.on_applied(sender, max(version.term for version in news))
+        return refused or self.corrections.on_versions(sender.robot, news, now)
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""
