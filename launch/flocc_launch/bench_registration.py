@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flocc_launch.bench_memory import measure
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -53,7 +55,8 @@ def run(network: Network = "full", rounds: int = 3, threads: int = 2, height: in
 
     Returns:
         The object of DESIGN.md section 8: `ratios` (name to median, min, max; null where this machine has no fast
-        bfloat16), `limits`, `errors` (of bfloat16 against float32), `pose`, `accelerator`, `machine`, `command`.
+        bfloat16), `limits`, `errors` (of bfloat16 against float32), `memory`, `pose`, `accelerator` (null without one),
+        `machine`, `command`.
     """
     import torch
 
@@ -67,6 +70,7 @@ def run(network: Network = "full", rounds: int = 3, threads: int = 2, height: in
         "ratios": ratios,
         "limits": LIMITS,
         "errors": errors,
+        "memory": measure(network, height, width, threads=threads),
         "pose": pose_rows(),
         "accelerator": accelerator(network, (height, width)) if torch.cuda.is_available() else None,
         "machine": machine(threads),
