@@ -1,7 +1,9 @@
-"""For all tests: coroutine functions run on an event loop of their own."""
+"""For all tests: coroutine functions run on an event loop of their own; where the shared recordings are."""
 
 import asyncio
 import inspect
+import os
+from pathlib import Path
 
 import pytest
 
@@ -14,3 +16,12 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     names = inspect.signature(pyfuncitem.obj).parameters
     asyncio.run(pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names}))
     return True
+
+
+@pytest.fixture
+def shared() -> Path:
+    """The folder of shared recordings; a test that asks for it skips where there is none."""
+    folder = Path(os.environ.get("FLOCC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+    if not (folder / "data").is_dir():
+        pytest.skip(f"no shared recordings at {folder} (set FLOCC_SHARED)")
+    return folder
