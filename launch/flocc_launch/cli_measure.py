@@ -79,6 +79,22 @@ def registration(json_out: JsonOption = False) -> None:
     _print_bench(run(), json_out)
 
 
+@bench.command()
+def perception(
+    shared: Annotated[Path | None, typer.Argument(help="Folder of the research sets, as ../shared/data.")] = None,
+    recordings: Annotated[list[Path] | None, typer.Option(help="Recordings with ground truth.")] = None,
+    config: Annotated[Path | None, typer.Option(help="An agent's configuration; its perception is judged.")] = None,
+    json_out: JsonOption = False,
+) -> None:
+    """Precision, recall and pose errors of a perception back-end on recorded images with ground truth."""
+    from flocc_agent.config import AgentConfig
+    from flocc_launch.evaluate_registration import run, text
+
+    chosen = None if config is None else AgentConfig.read(config).perception
+    report = run(shared, chosen, recordings or ())
+    typer.echo(json.dumps(report, indent=1) if json_out else text(report))
+
+
 def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
     """Simulate drawn scenarios under all checkers; leave with exit code 1 when an invariant was violated."""
     from flocc_launch.simulation.campaign import Outcome, campaign
