@@ -170,9 +170,9 @@ def inside(xy: Int, height: int, width: int, border_px: int) -> NDArray[np.bool_
 
 def match_confidences(matches: Matches, confidence_1: Tensor, confidence_2: Tensor) -> Float32:
     """(N,) smaller of the two pixels' descriptor confidences, given (H, W) maps."""
-    of_1 = confidence_1[matches.xy1[:, 1], matches.xy1[:, 0]]
-    of_2 = confidence_2[matches.xy2[:, 1], matches.xy2[:, 0]]
-    return torch.minimum(of_1, of_2).float().cpu().numpy()
+    of_1 = confidence_1.float().cpu().numpy()[matches.xy1[:, 1], matches.xy1[:, 0]]
+    of_2 = confidence_2.float().cpu().numpy()[matches.xy2[:, 1], matches.xy2[:, 0]]
+    return np.asarray(np.minimum(of_1, of_2), np.float32)
 
 
 def match_views(desc: tuple[Tensor, Tensor], confidence: tuple[Tensor, Tensor], parameters: MatchParameters) -> Matches:
@@ -183,8 +183,9 @@ def match_views(desc: tuple[Tensor, Tensor], confidence: tuple[Tensor, Tensor], 
         confidence: (H, W) descriptor confidences of each view.
         parameters: Seeds, directions and filters.
     """
+    desc_1, desc_2 = (part if part.device.type == "cuda" else part.cpu() for part in desc)
     run = reciprocal_matches_both_ways if parameters.both_directions else reciprocal_matches
-    matches = run(desc[0], desc[1], parameters.subsample)
+    matches = run(desc_1, desc_2, parameters.subsample)
     for_1 = inside(matches.xy1, desc[0].shape[0], desc[0].shape[1], parameters.border_px)
     for_2 = inside(matches.xy2, desc[1].shape[0], desc[1].shape[1], parameters.border_px)
     matches = matches.where(for_1 & for_2)

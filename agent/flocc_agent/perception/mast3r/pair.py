@@ -78,7 +78,7 @@ def register_pair(
         return PairResult(0, matches)
     if calibrations is None and K_estimated is None:
         return PairResult(len(matches), PoseFailed("the pointmap fixes no focal length", degenerate=True))
-    pts3d = views[0].pts3d[0].double().cpu().numpy()
+    pts3d = views[0].pts3d[0].cpu().double().numpy()
     points = pts3d[matches.xy1[:, 1], matches.xy1[:, 0]]
     if calibrations is not None:
         points = reray(points[:, 2], matches.xy1.astype(np.float64), calibrations[0])
