@@ -13,7 +13,17 @@ from tests.protocol.wire_examples import BOB, ENCODED, ENVELOPES, MESSAGES
 from tests.protocol.wire_mutations import flip, noise, rearrange, replace_node
 
 from flocc_agent.core import gossip
-from flocc_agent.core.effects import Broadcast, Effect, Encode, FetchLatent, Optimise, PersistRecord, Register, Unicast
+from flocc_agent.core.effects import (
+    Broadcast,
+    Effect,
+    Encode,
+    FetchLatent,
+    Optimise,
+    PersistRecord,
+    Register,
+    Report,
+    Unicast,
+)
 from flocc_agent.core.events import (
     Event,
     GraphOptimised,
@@ -193,6 +203,22 @@ def test_a_registration_that_makes_no_sense_is_a_rejection(result: Registration)
     swarm.registration = lambda: result  # type: ignore[method-assign]
     swarm.run(20.0)
     assert any(len(copy) > copy.keyframes for copy in swarm.robots["alice"].gossip.logs.values())
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e8, 0.0])
+def test_a_solution_that_leaves_the_map_is_not_published(value: float) -> None:
+    swarm = DamagedSwarm(0, damaged_ratio=0.0)
+    swarm.inject = lambda receiver: None  # type: ignore[method-assign]
+    swarm.run(20.0)
+    (leader,) = (robot for robot in swarm.robots.values() if robot.election.leading)
+    assert leader.election.term is not None
+    applied = leader.corrections.applied
+    poses = np.full((leader.gossip.logs[leader.log].keyframes, 4, 4), value)
+    broken = Component((leader.log,), {leader.log: poses}, {leader.log: poses[0]}, {leader.log: None})
+    effects = leader.corrections.publish(leader.election.term, 1000, GraphSolution((broken,), ()))
+    assert [type(effect) for effect in effects] == [Report]
+    assert leader.corrections.applied is applied
 
 
 def items_held(value: object) -> int:
