@@ -206,7 +206,7 @@ def test_a_registration_that_makes_no_sense_is_a_rejection(result: Registration)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e8, 0.0])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e8])
 def test_a_solution_that_leaves_the_map_is_not_published(value: float) -> None:
     swarm = DamagedSwarm(0, damaged_ratio=0.0)
     swarm.inject = lambda receiver: None  # type: ignore[method-assign]
