@@ -53,6 +53,14 @@ def test_has_the_official_number_of_tensors_and_parameters(
     assert sum(parameter.numel() for parameter in network.parameters()) == parameters
 
 
+def test_vgg16_has_the_official_names() -> None:
+    with torch.device("meta"):
+        names = list(CosPlace("VGG16", 64).state_dict())
+    convolutions = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]
+    expected = [f"backbone.{k}.{part}" for k in convolutions for part in ("weight", "bias")]
+    assert names == [*expected, "aggregation.1.p", "aggregation.3.weight", "aggregation.3.bias"]
+
+
 @pytest.mark.parametrize("backbone", ["ResNet50", "VGG16"])
 def test_other_backbones_give_unit_descriptors_of_any_picture_size(backbone: str) -> None:
     network = keyed_cosplace(backbone, 32)

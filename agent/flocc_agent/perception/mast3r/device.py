@@ -1,6 +1,7 @@
 """Where and in which number format the networks run, by what the machine can do; and whether they fit."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -41,6 +42,7 @@ class Compute:
     head_dtype: torch.dtype
 
 
+@lru_cache(maxsize=1)
 def cpu_has_fast_bf16() -> bool:
     """Whether this CPU multiplies bfloat16 matrices in hardware (AMX or AVX512-BF16)."""
     try:
