@@ -69,6 +69,7 @@ class Reach:
 class _Fetch:
     """The state of one wanted latent: in flight until then, or paused until then."""
 
+    holder: str = ""
     in_flight_until_s: float | None = None
     not_before_s: float = float("-inf")
     pause_s: float = 0.0
@@ -123,6 +124,12 @@ class Latents:
             if keyframe.log.robot == name and fetch.in_flight_until_s is None:
                 fetch.not_before_s, fetch.pause_s = float("-inf"), 0.0
 
+    def on_lost(self, name: str) -> None:
+        """A robot is out of range: what it was to deliver may be fetched elsewhere."""
+        for fetch in self._fetches.values():
+            if fetch.holder == name:
+                fetch.in_flight_until_s = None
+
     def on_wants(self, wants: Iterable[KeyframeId]) -> bool:
         """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new."""
         new = False
@@ -162,7 +169,8 @@ class Latents:
                 break
             holder = self._may_fetch(keyframe, reach, now)
             if holder is not None:
-                self._fetches.setdefault(keyframe, _Fetch()).in_flight_until_s = now + self._parameters.fetch_timeout_s
+                fetch = self._fetches.setdefault(keyframe, _Fetch())
+                fetch.holder, fetch.in_flight_until_s = holder, now + self._parameters.fetch_timeout_s
                 effects.append(FetchLatent(keyframe, holder, self._parameters.fetch_timeout_s))
         self._forget_oldest()
         return effects

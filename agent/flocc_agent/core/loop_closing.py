@@ -183,6 +183,7 @@ class LoopClosing:
     def on_lost(self, name: str, now: float) -> None:
         """A robot is out of range; the pairs that it was to register wait for `takeover_s`."""
         self._reach.remove(name)
+        self.latents.on_lost(name)
         for offer in self._offers.values():
             if offer.to == name:
                 offer.since_s = now

@@ -91,6 +91,12 @@ class Swarm:
             self._fetcher.forget(name)
             self.report(name, "agent_stopped", {})
 
+    def add_twin(self, name: str) -> None:
+        """Somebody switches on a second robot under a name that is taken, with a disk of its own."""
+        twin = f"{name}-twin"
+        self._add(twin, len(self.stations), self.stations[name].playback)
+        self.stations[twin].log = LogId(name, 1)
+
     def lose_disk(self, name: str) -> None:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
         station = self.stations[name]

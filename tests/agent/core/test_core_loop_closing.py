@@ -231,6 +231,13 @@ def test_a_robot_that_comes_back_is_asked_at_once() -> None:
     assert len(latents.fetch([wanted], reach(r2=()), 0.1)) == 1
 
 
+def test_what_a_lost_robot_was_to_deliver_is_fetched_elsewhere() -> None:
+    latents, wanted = Latents(R1, PARAMETERS), keyframe("r3/1")
+    latents.fetch([wanted], reach(r3=()), 0.0)
+    latents.on_lost("r3")
+    assert latents.fetch([wanted], reach(r2=(wanted,)), 3.0) == [FetchLatent(wanted, "r2", PARAMETERS.fetch_timeout_s)]
+
+
 def test_no_more_fetches_than_allowed_are_in_flight() -> None:
     latents, wanted = Latents(R1, PARAMETERS), [keyframe(f"r2/{k}") for k in range(9)]
     assert len(latents.fetch(wanted, reach(r2=()), 0.0)) == PARAMETERS.fetches_max
