@@ -180,7 +180,7 @@ async def _failed_over(swarm: Swarm) -> tuple[float, float]:
 
 
 async def partition(folder: Path, runs: int, outage_s: float) -> dict[str, Any]:
-    """Part four robots two and two while they map, heal, and give the seconds until all is one again."""
+    """Part four robots with one map two and two while they go on, heal, and give the seconds until all is one again."""
     healed_s = [await _healed_after_s(folder / str(run), outage_s) for run in range(runs)]
     return {"runs": runs, "outage_s": outage_s, "robots": 4, "one_again_s": spread(healed_s)}
 
@@ -189,7 +189,7 @@ async def _healed_after_s(folder: Path, outage_s: float) -> float:
     swarm = Swarm(meeting(robots=4, rate=2.0, length_m=160.0), folder)
     await swarm.start()
     try:
-        await swarm.until(lambda: follow(swarm.agents, "r1"), START_S, "r1 leads")
+        await swarm.until(lambda: follow(swarm.agents, "r1") and one_frame(swarm.agents), START_S, "one map")
         parted_s = swarm.now_s()
         groups = {"groups": [["r1", "r3"], ["r2", "r4"]], "from_s": parted_s}
         await swarm.order(RadioConfig.model_validate({"partitions": [groups]}))
