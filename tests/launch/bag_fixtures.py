@@ -50,6 +50,11 @@ class BagScript:
         kind = "sensor_msgs/msg/CompressedImage"
         self.add(topic, kind, stamp_ns, self.type(kind)(self.header(stamp_ns), form, data))
 
+    def jpeg(self, topic: str, stamp_ns: int, encoded: bytes) -> None:
+        kind = "sensor_msgs/msg/CompressedImage"
+        data = np.frombuffer(encoded, dtype=np.uint8)
+        self.add(topic, kind, stamp_ns, self.type(kind)(self.header(stamp_ns), "jpeg", data))
+
     def raw(self, topic: str, stamp_ns: int, pixels: Any, encoding: str, padding: int = 0) -> None:
         rows = pixels.reshape(pixels.shape[0], -1).view(np.uint8)
         rows = np.pad(rows, ((0, 0), (0, padding)))

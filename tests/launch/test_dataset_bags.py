@@ -15,7 +15,7 @@ from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
 from flocc_launch.cli_data import dataset
 from flocc_launch.datasets.bag_convert import convert_bag
-from flocc_launch.datasets.commands import convert, info
+from flocc_launch.datasets.commands import convert, info, split
 from flocc_launch.datasets.presets import GRACO_GROUND, S3E_ALPHA, Team, convert_graco, convert_s3e, convert_team
 from flocc_launch.datasets.source import DatasetError
 
@@ -329,6 +329,14 @@ def test_the_command_line_converts_a_bag(tmp_path: Path) -> None:
     result = CliRunner().invoke(dataset, ["convert", str(bag), *options])
     assert result.exit_code == 0, result.output
     assert len(Recording.open(tmp_path / "out").frames) == 3
+
+
+def test_a_bag_is_converted_before_it_is_split(tmp_path: Path) -> None:
+    bag = walking(False, 8).write(tmp_path / "run", "mcap")
+    with pytest.raises(DatasetError, match="run: is a bag; make a recording of it first"):
+        split(bag, tmp_path / "parts", 2)
+    folders = split(convert(bag, tmp_path / "out"), tmp_path / "parts", 2)
+    assert [len(Recording.open(folder).frames) for folder in folders] == [4, 4]
 
 
 def test_graco_in_its_published_layout(tmp_path: Path) -> None:

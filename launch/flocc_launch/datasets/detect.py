@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.folders import (
     read_euroc,
     read_kitti,
@@ -41,6 +42,8 @@ def detect_format(path: Path) -> str:
         return "tum"
     if (path / "images").is_dir() or (path / "images.txt").exists():
         return "plain"
+    if is_bag(path):
+        raise DatasetError(f"{path}: is a bag; make a recording of it first: flocc dataset convert")
     raise DatasetError(f"{path}: is none of the known data sets ({', '.join(READERS)})")
 
 
