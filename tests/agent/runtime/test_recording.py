@@ -16,7 +16,7 @@ T_BODY_CAMERA = pose(so3_exp(np.array([0.1, -1.2, 0.4])), np.array([0.1, 0.0, 0.
 
 
 def motion(count: int = 5, step_s: float = 1.0) -> Trajectory:
-    stamps_s = np.arange(count) * step_s
+    stamps_s = np.linspace(0.0, (count - 1) * step_s, count)
     poses = [pose(so3_exp(np.array([0.0, 0.0, 0.2 * s])), np.array([s, 0.0, 0.0])) for s in stamps_s]
     return Trajectory(stamps_s, np.array(poses))
 
