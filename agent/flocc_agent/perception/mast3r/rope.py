@@ -52,6 +52,6 @@ def grid_rotation(grid_height: int, grid_width: int, head_dim: int, device: torc
 def rotate(tokens: Tensor, rotation: Rotation) -> Tensor:
     """Rotate queries or keys (B, heads, S, head_dim) by their positions; the result keeps their dtype."""
     cos, sin = rotation
-    quarters = tokens.reshape(*tokens.shape[:-1], 2, 2, -1)
-    swapped = quarters.flip(-2).flatten(-3)
-    return (tokens * cos + swapped * sin).to(tokens.dtype)
+    rotated = tokens.to(torch.float32, copy=True)
+    swapped = rotated.reshape(*tokens.shape[:-1], 2, 2, -1).flip(-2).flatten(-3)
+    return rotated.mul_(cos).addcmul_(swapped, sin).to(tokens.dtype)
