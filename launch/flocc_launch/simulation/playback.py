@@ -60,6 +60,10 @@ class Playback:
         stamp_s = min(max(since_start_s + self.first_stamp_s, float(stamps_s[0])), float(stamps_s[-1]))
         return np.array([np.interp(stamp_s, stamps_s, self.truth.T_fixed_body[:, k, 3]) for k in range(3)])
 
+    def lasts_s(self) -> float:
+        """Time from the first frame to the end of the truth, 0 where it is not known."""
+        return 0.0 if self.truth is None else float(self.truth.stamps_s[-1]) - self.first_stamp_s
+
 
 def nothing() -> Playback:
     """Of a robot without a camera, such as a server."""

@@ -1,5 +1,6 @@
 """A whole swarm on virtual time: stations, links, latents, and what happens to them over time."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -60,9 +61,11 @@ class Swarm:
         self._seed = seed
         self._fetcher = LatentFetcher(self.agenda, self.network, self._running)
         self._reporters: dict[str, Reporter] = {}
+        self._near: dict[tuple[str, float | None], list[str]] = {}
         self._around = Surroundings(self._broadcast, self._unicast, self._fetcher.fetch, self._observe)
         for number, name in enumerate(sorted(playbacks)):
             self._add(name, number, playbacks[name])
+        self._move()
 
     def run_until(self, end_s: float) -> None:
         """Let time pass."""
@@ -96,6 +99,7 @@ class Swarm:
         twin = f"{name}-twin"
         self._add(twin, len(self.stations), self.stations[name].playback)
         self.stations[twin].log = LogId(name, 1)
+        self._near.clear()
 
     def lose_disk(self, name: str) -> None:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
@@ -141,23 +145,34 @@ class Swarm:
         for k, capture in enumerate(playback.captures):
             at_s = start_s + (capture.stamp_s - playback.first_stamp_s) / rate
             self.agenda.at(at_s, lambda k=k: station.capture(k))  # type: ignore[misc]
-        if playback.truth is not None:
-            self._follow(station, start_s)
 
-    def _follow(self, station: Station, start_s: float) -> None:
-        """Tell the radio where a robot is, as long as it moves."""
-        truth = station.playback.truth
-        assert truth is not None
-        since_s = max(self.agenda.now_s - start_s, 0.0) * self.scenario.rate
-        position_m = station.playback.position_m(since_s)
-        if position_m is not None:
-            self.radio.update_position(station.name, position_m)
-        if since_s + station.playback.first_stamp_s < float(truth.stamps_s[-1]):
-            self.agenda.after(POSITION_PERIOD_S, lambda: self._follow(station, start_s))
+    def _move(self) -> None:
+        """Tell the radio where the robots are, as long as one of them moves."""
+        moving = False
+        for name, station in self.stations.items():
+            since_s = max(self.agenda.now_s - self.scenario.robot(name).start_s, 0.0) * self.scenario.rate
+            position_m = station.playback.position_m(since_s)
+            if position_m is not None:
+                self.radio.update_position(name, position_m)
+                moving |= since_s <= station.playback.lasts_s()
+        self._near.clear()
+        if moving:
+            self.agenda.after(POSITION_PERIOD_S, self._move)
+
+    def _in_range(self, sender: str) -> list[str]:
+        """Stations that the radio's range does not rule out; the radio itself decides."""
+        range_m = self.radio.parameters.range_m
+        near = self._near.get((sender, range_m))
+        if near is None:
+            here = self.radio.position_m(sender)
+            near = [
+                name for name in self.stations if name != sender and _within(here, self.radio.position_m(name), range_m)
+            ]
+            self._near[sender, range_m] = near
+        return near
 
     def _broadcast(self, sender: Station, message: Message) -> None:
-        receivers = [name for name in self.stations if name != sender.name]
-        self.network.send(sender.name, Envelope(sender.log, message), receivers)
+        self.network.send(sender.name, Envelope(sender.log, message), self._in_range(sender.name))
 
     def _unicast(self, sender: Station, to: str, message: Message) -> None:
         receivers = [s.name for s in self.stations.values() if s.log.robot == to and s is not sender]
@@ -176,3 +191,7 @@ class Swarm:
                 self.lines.append(self._reporters[station.name].line(effect, self.agenda.now_s))
         for observer in self.observers:
             observer(station, event, effects)
+
+
+def _within(here: tuple[float, ...] | None, there: tuple[float, ...] | None, range_m: float | None) -> bool:
+    return range_m is None or here is None or there is None or math.dist(here, there) <= range_m

@@ -4,6 +4,7 @@ Each robot has one encoder, one registrar and one optimiser. Results are compute
 dies meanwhile costs nothing; they never depend on how long they took.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -23,13 +24,15 @@ from flocc_agent.core.events import (
 )
 from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
-from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.playback import Capture
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
+
+logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
@@ -108,11 +111,19 @@ class Workers:
         query, match, neighbour = latents
         T_neighbour_query = pose_from_tq(np.array(job.T_neighbour_query))
         odometry = OdometryPair(neighbour, T_neighbour_query, f"{job.neighbour} {job.query}")
-        return PairRegistered(job.pair, self._eyes.register(query, match, odometry))
+        try:
+            return PairRegistered(job.pair, self._eyes.register(query, match, odometry))
+        except Exception as error:  # as in the real workers, a failure is an event
+            logger.error("registering %s with %s failed", job.query, job.match, exc_info=True)
+            return PairRegistered(job.pair, RegistrationFailed(RegistrationFailure.CRASHED, str(error)))
 
     def optimise(self, job: Optimise) -> Event:
         """Optimise a pose graph; how long it really took is nobody's business on virtual time."""
-        solution = self._optimiser(job.graph, job.initial)
+        try:
+            solution = self._optimiser(job.graph, job.initial)
+        except Exception as error:  # as in the real workers, a failure is an event
+            logger.error("round %d of %s failed", job.round, job.term, exc_info=True)
+            return GraphOptimisationFailed(job.term, job.round, str(error).strip().split("\n")[0])
         if isinstance(solution, OptimisationFailed):
             return GraphOptimisationFailed(job.term, job.round, solution.reason)
         return GraphOptimised(job.term, job.round, replace(solution, solve_s=0.0, timings_s={}))
