@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.edges import Edges, state_of
 from flocc_agent.backend.initial import initial_poses
-from flocc_agent.backend.linear import SCALE_KEYS_FROM, LinearSolver
+from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.rotations import matrices
@@ -39,12 +39,14 @@ SIZES = ((6, 500, 5000), (6, 1000, 10000))
 NEW_CLOSURES = 50
 COMMAND = "flocc bench solver --json"
 ANCHOR_SIGMA = 1e-6
+SCALE_KEYS_FROM = 1 << 40
 LIMITS = {
     "smoothed_lm_over_gtsam_base_lm": 1.5,
     "independent_lm_over_gtsam_base_lm": 1.2,
     "smoothed_lm_over_smoothed_custom_factor": 0.04,
     "smoothed_lm_over_gtsam_base_gnc": 0.1,
     "resolve_over_full": 0.3,
+    "resolve_over_full_smoothed_lm": 0.3,
 }
 
 
@@ -70,7 +72,7 @@ def prepare(robots: int, keyframes: int, closures: int, seed: int) -> Bench:
     """Draw a problem and align its robots."""
     generated = generate(np.random.default_rng(seed), robots, keyframes, closures)
     by_index = dict(enumerate(generated.graph.closures))
-    return Bench(generated, initial_poses(generated.graph.trajectories, by_index, 4.0, None))
+    return Bench(generated, initial_poses(generated.graph.trajectories, by_index, 4.0, None)[0])
 
 
 def run(seed: int = 1, repeats: int = 3, sizes: tuple[tuple[int, int, int], ...] = SIZES) -> dict[str, Any]:
@@ -108,14 +110,15 @@ def measure(bench: Bench, repeats: int, size: tuple[int, int, int]) -> dict[str,
     }
     problem = problem_of(bench, config_of(Formulation.SMOOTHED))
     graph, values = gtsam_base(bench)
+    default = config_of(BackendConfig().formulation, BackendConfig().solver)
     seconds: dict[str, list[float]] = {}
     solved: dict[str, Any] = {}
     for _ in range(repeats):
         _timed("gtsam_base_lm", lambda: gtsam_lm(graph, values), seconds, solved)
         for formulation, call in ours.items():
             _timed(f"{formulation.value}_lm", call, seconds, solved)
-        _timed("full", lambda: optimise(bench.graph, config_of(Formulation.SMOOTHED)), seconds, solved)
-        _resolve(bench, seconds, solved)
+        _rounds(bench, default, "", seconds, solved)
+        _rounds(bench, config_of(Formulation.SMOOTHED), "_smoothed_lm", seconds, solved)
     _timed("gtsam_base_gnc", lambda: gtsam_gnc(graph, values, bench), seconds, solved)
     _timed("smoothed_custom_factor", lambda: custom_factor(problem, bench), seconds, solved)
     return {
@@ -139,6 +142,7 @@ def ratios_of(seconds: dict[str, list[float]]) -> dict[str, dict[str, float | bo
         "smoothed_lm_over_smoothed_custom_factor": ("smoothed_lm", "smoothed_custom_factor"),
         "smoothed_lm_over_gtsam_base_gnc": ("smoothed_lm", "gtsam_base_gnc"),
         "resolve_over_full": ("resolve", "full"),
+        "resolve_over_full_smoothed_lm": ("resolve_smoothed_lm", "full_smoothed_lm"),
     }
     return {name: ratio(seconds[a], seconds[b], LIMITS[name]) for name, (a, b) in pairs.items()}
 
@@ -188,14 +192,18 @@ def solver_of(bench: Bench, config: BackendConfig) -> Callable[[], Solved]:
     return call
 
 
-def _resolve(bench: Bench, seconds: dict[str, list[float]], solved: dict[str, Any]) -> None:
-    """Time a round that adds closures to a graph that was solved before."""
-    config, graph = config_of(Formulation.SMOOTHED), bench.graph
-    if "before" not in solved:
-        solved["before"] = optimise(PoseGraph(graph.trajectories, graph.closures[:-NEW_CLOSURES]), config)
-    before = solved["before"]
+def _rounds(
+    bench: Bench, config: BackendConfig, suffix: str, seconds: dict[str, list[float]], solved: dict[str, Any]
+) -> None:
+    """Time a whole solve, and a round that adds closures to a graph that was solved before."""
+    graph = bench.graph
+    name, earlier = f"resolve{suffix}", f"before{suffix}"
+    _timed(f"full{suffix}", lambda: optimise(graph, config), seconds, solved)
+    if earlier not in solved:
+        solved[earlier] = optimise(PoseGraph(graph.trajectories, graph.closures[:-NEW_CLOSURES]), config)
+    before = solved[earlier]
     assert isinstance(before, GraphSolution)
-    _timed("resolve", lambda: optimise(graph, config, before), seconds, solved)
+    _timed(name, lambda: optimise(graph, config, before), seconds, solved)
 
 
 def gtsam_base(bench: Bench) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -276,7 +284,7 @@ def _edge_factor(edges: Edges, k: int) -> gtsam.CustomFactor:
         T_ij = values.atPose3(i).between(values.atPose3(j))
         p = T_ij.translation()
         rotation_error = rotation_hat_inverse.compose(T_ij.rotation())
-        q = rotation_error.toQuaternion()
+        q: Any = rotation_error.toQuaternion()
         sign = 1.0 if q.w() >= 0 else -1.0
         v = sign * np.array([q.x(), q.y(), q.z()])
         scale = values.atVector(keys[2])[0] if has_scale else 1.0

@@ -1,16 +1,21 @@
-"""Marginal covariances at the solution, from the Bayes tree of the last linearisation."""
+"""Marginal covariances at the solution, from the normal equations of the last linearisation."""
 
+import logging
 from collections.abc import Mapping, Sequence
 
-import gtsam
 import numpy as np
 
 from flocc_agent.backend.edges import jacobians, residuals
+from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.solvers import WEIGHT_MIN, Objective, Solved
 from flocc_agent.core.pose_graph import Trajectory
 from flocc_agent.geometry import Float, hat
 from flocc_protocol.ids import KeyframeId, LogId
+
+logger = logging.getLogger(__name__)
+
+COVARIANCE_MAX = 1e30
 
 
 def adjoint(T: Float) -> Float:
@@ -32,32 +37,35 @@ def covariances_of(
     """Marginal covariances (6, 6), relative to the anchor's first keyframe.
 
     Returns:
-        Of every log's `T_map_odom` in the tangent space of that pose (None where not configured), and of the wanted
-        keyframes in their own tangent spaces. With `T_map_odom = T_map_keyframe T_odom_keyframe^-1`, a tangent
-        vector of the last keyframe is moved by the adjoint of its `T_odom_keyframe`.
+        Of every log's `T_map_odom` in the tangent space of that pose (None where not configured or computable), and of
+        the wanted keyframes in their own tangent spaces. With `T_map_odom = T_map_keyframe T_odom_keyframe^-1`, a
+        tangent vector of the last keyframe is moved by the adjoint of its `T_odom_keyframe`.
     """
     of_logs: dict[LogId, Float | None] = dict.fromkeys(problem.logs)
     if not objective.config.covariances:
         return of_logs, {}
     last = [KeyframeId(log, len(trajectories[log]) - 1) for log in problem.logs]
     every = [*last, *(keyframe for keyframe in wanted if keyframe.index < len(trajectories[keyframe.log]))]
-    marginals = keyframe_covariances(objective, solved, [problem.index(keyframe) for keyframe in every])
+    try:
+        marginals = keyframe_covariances(objective, solved, [problem.index(keyframe) for keyframe in every])
+    except SingularSystem as error:
+        logger.warning("%s: no covariances, the graph is too badly conditioned: %.80s", problem.logs[0], error)
+        return of_logs, {}
     for keyframe, S in zip(last, marginals, strict=False):
         Ad = adjoint(np.asarray(trajectories[keyframe.log].T_odom_keyframe[-1], dtype=float))
-        of_logs[keyframe.log] = Ad @ S @ Ad.T
-    return of_logs, dict(zip(every[len(last) :], marginals[len(last) :], strict=True))
+        of_logs[keyframe.log] = _usable(Ad @ S @ Ad.T)
+    of_wanted = zip(every[len(last) :], marginals[len(last) :], strict=True)
+    return of_logs, {keyframe: S for keyframe, S in of_wanted if _usable(S) is not None}
 
 
 def keyframe_covariances(objective: Objective, solved: Solved, indices: Sequence[int]) -> list[Float]:
     """Marginal covariance (6, 6) of poses in their own tangent spaces; zero for the pose that does not move."""
     at = residuals(objective.edges, solved.state)
     jac = jacobians(objective.edges, at)
-    sqrt_weights = np.sqrt(np.maximum(solved.weights, WEIGHT_MIN))
-    graph = objective.linear.factors(objective.edges, solved.state, at, jac, sqrt_weights)
-    tree = graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
-    fixed = objective.linear.fixed
-    return [np.zeros((6, 6)) if n == fixed else _symmetric(tree.marginalCovariance(n)) for n in indices]
+    weights = np.maximum(solved.weights, WEIGHT_MIN)
+    return objective.linear.marginals(objective.edges, solved.state, at, jac, weights, list(indices))
 
 
-def _symmetric(S: Float) -> Float:
-    return np.asarray(0.5 * (S + S.T))
+def _usable(S: Float) -> Float | None:
+    """A covariance, or None for what rounding made of it in a badly conditioned graph."""
+    return S if np.all(np.isfinite(S)) and np.all(np.diag(S) >= 0) and np.max(S) < COVARIANCE_MAX else None

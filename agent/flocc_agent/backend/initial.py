@@ -3,10 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
 from flocc_agent.backend.screening import first_not_rigid
-from flocc_agent.core.pose_graph import AbsoluteFix, Component, GraphSolution, LoopClosure, Trajectory
+from flocc_agent.core.pose_graph import AbsoluteFix, ClosureState, Component, GraphSolution, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, angle_rad, inverse, pose, umeyama
 from flocc_protocol.ids import LogId
 
@@ -18,8 +19,8 @@ def initial_poses(
     closures: Mapping[int, LoopClosure],
     steepness: float,
     earlier: GraphSolution | None,
-) -> dict[LogId, Float]:
-    """Poses (N, 4, 4) of every log in one frame.
+) -> tuple[dict[LogId, Float], bool]:
+    """Poses (N, 4, 4) of every log in one frame, and whether they are those of the earlier solution.
 
     They come from the earlier solution where it has all logs in one component and most closures of every pair of robots
     still agree with it. Otherwise the robots are placed anew: a first closure that was wrong must not outlive the right
@@ -31,8 +32,8 @@ def initial_poses(
         warm = {log: extended(component.T_map_keyframe[log], trajectories[log]) for log in trajectories}
         judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
         if all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
-            return warm
-    return {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}
+            return warm, True
+    return {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}, False
 
 
 def upheld(T_map_keyframe: Mapping[LogId, Float], closures: Sequence[LoopClosure]) -> bool:
@@ -82,3 +83,9 @@ def initial_world(T_map_keyframe: Mapping[LogId, Float], fixes: Sequence[Absolut
         return np.eye(4)
     in_map = np.array([T_map_keyframe[fix.keyframe.log][fix.keyframe.index][:3, 3] for fix in fixes])
     return umeyama(np.array([fix.position_m for fix in fixes]), in_map)[1]
+
+
+def trusted_closures(closures: Sequence[LoopClosure], earlier: GraphSolution) -> NDArray[np.bool_]:
+    """Which closures (L,) the earlier solution did not reject: those that it used, and those that it has not seen."""
+    rejected = {(c.query, c.match) for c in earlier.closures if c.state is ClosureState.REJECTED}
+    return np.array([(c.query, c.match) not in rejected for c in closures], dtype=bool)

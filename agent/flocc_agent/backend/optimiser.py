@@ -14,7 +14,7 @@ import numpy as np
 
 from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.edges import state_of
-from flocc_agent.backend.initial import initial_poses, initial_world
+from flocc_agent.backend.initial import initial_poses, initial_world, trusted_closures
 from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.problem import build
@@ -155,7 +155,7 @@ def _solve_connected(
     wanted: Sequence[KeyframeId],
 ) -> Outcome:
     times = [time.perf_counter()]
-    T_initial = initial_poses(trajectories, closures, config.steepness, initial)
+    T_initial, warm = initial_poses(trajectories, closures, config.steepness, initial)
     T_map_world = initial_world(T_initial, fixes)
     times.append(time.perf_counter())
     problem = build(trajectories, closures, fixes, config, T_initial, T_map_world)
@@ -163,7 +163,8 @@ def _solve_connected(
     state = state_of(np.concatenate(poses), problem.clusters)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     objective = Objective(problem.edges, problem.closure_rows, linear, config)
-    solved = solve(objective, state)
+    trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None
+    solved = solve(objective, state, trusted)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())

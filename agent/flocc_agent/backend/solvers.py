@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from flocc_agent.backend.edges import Edges, State, jacobians, residuals
+from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residuals
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.config import BackendConfig, Solver
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 DAMPING_MIN, DAMPING_MAX = 1.0, 1e12
 DAMPING_FACTOR = 10.0
@@ -56,8 +57,12 @@ class Objective:
 
     def cost(self, state: State, weights: Float, hold: bool) -> float:
         """Sum of half squared residuals, weighted, with the priors of cluster scales."""
+        return self.cost_at(residuals(self.edges, state, hold), state, weights)
+
+    def cost_at(self, at: Residuals, state: State, weights: Float) -> float:
+        """The cost of residuals that are already there."""
         prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
-        return float(0.5 * (weights @ residuals(self.edges, state, hold).squared() + prior))
+        return float(0.5 * (weights @ at.squared() + prior))
 
     def closure_residuals(self, state: State) -> Float:
         """Squared residuals (L,) of the closures."""
@@ -78,15 +83,21 @@ class Objective:
         return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - self.config.inlier_probability))
 
 
-def solve(objective: Objective, state: State) -> Solved:
-    """Run the configured solver from a state, then hold scales at their bound where they passed it."""
+def solve(objective: Objective, state: State, trusted: Bool | None = None) -> Solved:
+    """Run the configured solver from a state, then hold scales at their bound where they passed it.
+
+    Args:
+        objective: What is minimised.
+        state: Where to start.
+        trusted: (L,) closures that an earlier solution kept or has not seen, where the start is that solution.
+    """
     solver = objective.config.solver
     if solver is Solver.LM or objective.closures.start == objective.closures.stop:
         solved = descend(objective, state, objective.weights())
     elif solver in (Solver.HUBER, Solver.CAUCHY):
         solved = reweighted(objective, state)
     else:
-        solved = graduated(objective, state)
+        solved = (confirmed(objective, state, trusted) if trusted is not None else None) or graduated(objective, state)
     return held(objective, solved)
 
 
@@ -104,18 +115,19 @@ def descend(
 ) -> Solved:
     """Levenberg-Marquardt for given weights: Gauss-Newton steps, damped only where one does not go down."""
     budget = objective.config.iterations_max if steps_max is None else steps_max
-    cost, damping, solves = objective.cost(state, weights, hold), 0.0, 0
+    at = residuals(objective.edges, state, hold)
+    cost, damping, solves = objective.cost_at(at, state, weights), 0.0, 0
     while solves < budget:
-        at = residuals(objective.edges, state, hold)
         jac = jacobians(objective.edges, at)
         while True:
             solves += 1
             try:
-                delta = objective.linear.step(objective.edges, state, at, jac, np.sqrt(weights), damping)
+                delta = objective.linear.step(objective.edges, state, at, jac, weights, damping)
                 candidate = state.retract(delta)
-                candidate_cost = objective.cost(candidate, weights, hold)
+                there = residuals(objective.edges, candidate, hold)
+                candidate_cost = objective.cost_at(there, candidate, weights)
             except SingularSystem:
-                candidate, candidate_cost = state, np.inf
+                candidate, there, candidate_cost = state, at, np.inf
             if candidate_cost <= cost:
                 break
             if _is_finished(objective.config, cost, candidate_cost - cost):
@@ -123,7 +135,7 @@ def descend(
             if solves >= budget or damping >= DAMPING_MAX:
                 return Solved(state, weights, cost, solves, False)
             damping = max(damping * DAMPING_FACTOR, DAMPING_MIN)
-        decrease, state, cost = cost - candidate_cost, candidate, candidate_cost
+        decrease, state, at, cost = cost - candidate_cost, candidate, there, candidate_cost
         if _is_finished(objective.config, cost, decrease):
             return Solved(state, weights, cost, solves, True)
         damping = 0.0 if damping <= DAMPING_MIN else damping / DAMPING_FACTOR**2
@@ -162,6 +174,20 @@ def kernel_loss(solver: Solver, squared: Float, bound: Float) -> Float:
     if solver is Solver.HUBER:
         return np.where(squared <= bound, squared, 2.0 * np.sqrt(bound * squared) - bound)
     return np.asarray(bound * np.log1p(squared / bound))
+
+
+def confirmed(objective: Objective, state: State, trusted: Bool) -> Solved | None:
+    """Solve with the trusted closures alone; None where one of them then disagrees, or another one agrees.
+
+    From an earlier solution this is the whole work of a round whose new closures fit, a few linear systems instead of
+    all of GNC. Where they do not fit, either they or the earlier choice may be wrong, and GNC decides anew.
+    """
+    weights = objective.weights(trusted.astype(float))
+    solved = descend(objective, state, np.maximum(weights, WEIGHT_MIN))
+    agree = objective.closure_residuals(solved.state) <= objective.bounds()
+    if not np.array_equal(agree, trusted):
+        return None
+    return Solved(solved.state, weights, solved.cost, solved.iterations, solved.converged)
 
 
 def graduated(objective: Objective, state: State) -> Solved:
