@@ -178,8 +178,8 @@ class Gossip:
         copy = self.logs.get(request.log)
         if copy is None or request.first >= len(copy):
             return []
-        records = _fitting(copy.encoded, request.first)
-        batch = RecordBatch(request.log, request.first, copy.checksums[request.first], records)
+        following = copy.encoded[request.first : request.first + RECORDS_BATCH_MAX]
+        batch = RecordBatch.of(request.log, request.first, copy.checksums[request.first], following)
         return [Unicast(sender.robot, batch)]
 
     def on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
@@ -290,15 +290,3 @@ def remember(entries: dict[Key, Entry], key: Key, entry: Entry, entries_max: int
 def decoded(data: bytes) -> Record:
     """A record, decoded once where several copies of a log live in one process."""
     return decode_record(data)
-
-
-def _fitting(encoded: list[bytes], first: int) -> tuple[bytes, ...]:
-    """Records from `first` on that fit one batch; at least one."""
-    records: list[bytes] = []
-    size = 0
-    for data in encoded[first : first + RECORDS_BATCH_MAX]:
-        size += len(data)
-        if records and size > RECORDS_BATCH_BYTES_MAX:
-            break
-        records.append(data)
-    return tuple(records)
