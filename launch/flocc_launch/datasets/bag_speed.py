@@ -24,6 +24,7 @@ from flocc_launch.datasets.source import Lens
 MESSAGES = 10_000
 IMAGE_EVERY = 10
 ROUNDS = 5
+TRANSPORT_QUALITY = 80  # the default of ROS' compressed_image_transport
 
 
 def write_bag(path: Path, messages: int = MESSAGES) -> Path:
@@ -33,7 +34,7 @@ def write_bag(path: Path, messages: int = MESSAGES) -> Path:
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     noise = cv2.resize(np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8), (640, 480))
-    jpeg = cv2.imencode(".jpg", noise)[1].ravel()
+    jpeg = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, TRANSPORT_QUALITY])[1].ravel()
     kinds = ("nav_msgs/msg/Odometry", "sensor_msgs/msg/CompressedImage")
     with Writer(path, version=9) as writer:
         connections = [
