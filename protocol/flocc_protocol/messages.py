@@ -261,6 +261,10 @@ class CandidatePair:
         if not self.low < self.high:
             raise ValueError("a candidate pair is sorted and joins two keyframes")
 
+    def other(self, end: KeyframeId) -> KeyframeId:
+        """The end that is not the given one."""
+        return self.high if end == self.low else self.low
+
     @classmethod
     def of(cls, a: KeyframeId, b: KeyframeId) -> "CandidatePair":
         """Sort two keyframes into a pair."""

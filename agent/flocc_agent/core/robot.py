@@ -122,6 +122,7 @@ class Robot:
         self._sequence = 0
         self._heartbeat_due_s = now
         self._pending: list[_Pending] = []
+        self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer)
         self.assembly = GraphAssembly()
@@ -344,19 +345,29 @@ class Robot:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe()
                     if descriptor is not None:
-                        found = self.recognition.on_keyframe(KeyframeId(new.log, index), descriptor.numpy())
-                        effects += self.closing.on_candidates(found, now)
+                        effects += self._recognise(KeyframeId(new.log, index), descriptor, now)
                 case ClosureRecord(query, match) | RejectionRecord(query, match):
                     self.closing.on_resolved(CandidatePair.of(query, match))
                 case _:
                     pass
         return effects
 
+    def _recognise(self, keyframe: KeyframeId, descriptor: Array, now: float) -> list[Effect]:
+        """Look for a keyframe's candidates; after a restart not in logs where it had a partner before."""
+        found = self.recognition.on_keyframe(keyframe, descriptor.numpy())
+        candidates = [c for c in found if (keyframe, c.pair.other(keyframe).log) not in self._partnered]
+        return self.closing.on_candidates(candidates, now)
+
     def _restore(self, restored: Restored, now: float) -> None:
-        """Resolved pairs first, so that no pair of the past is found again."""
+        """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
         news = [self.gossip.restore(log, data) for log, records in restored.records for data in records]
         self._take([new for new in news if not isinstance(new.record, KeyframeRecord)], now)
+        for new in news:
+            if isinstance(new.record, ClosureRecord | RejectionRecord):
+                query, match = new.record.query, new.record.match
+                self._partnered |= {(query, match.log), (match, query.log)}
         self._take([new for new in news if isinstance(new.record, KeyframeRecord)], now)
+        self._partnered.clear()
         for keyframe in restored.latents:
             self.closing.on_held(keyframe)
         if restored.correction is not None:

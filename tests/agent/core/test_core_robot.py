@@ -1,12 +1,16 @@
 """The whole robot: neighbours, names, restarts, deadlines."""
 
-from tests.agent.core.virtual_time import Robots, descriptor, keyframe
+import math
 
-from flocc_agent.core.effects import Broadcast, Encode, PersistRecord, Register, Report
-from flocc_agent.core.events import KeyframeEncoded, MessageReceived
+import numpy as np
+from tests.agent.core.virtual_time import Robots, answer, descriptor, keyframe
+
+from flocc_agent.core.effects import Broadcast, Effect, Encode, PersistRecord, Register, Report
+from flocc_agent.core.events import Event, KeyframeEncoded, MessageReceived
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters, NeighbourParameters
 from flocc_agent.core.robot import Restored
+from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Heartbeat, RecordBatch
 from flocc_protocol.records import KeyframeRecord
@@ -111,6 +115,32 @@ def test_a_restarted_robot_registers_nothing_twice() -> None:
     robots.run(20.0)
     assert len([e for _, _, e in robots.done if isinstance(e, Register)]) == before
     assert robots.cores["r1"].closing.open_pairs() == []
+
+
+def test_a_restarted_robot_looks_for_no_other_partner_of_a_keyframe_that_had_one() -> None:
+    """Live, r2/0 met only r1/0; after the restart r1/1 would be more like it."""
+
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, Encode):
+            angle_rad = math.radians(effect.image)
+            return KeyframeEncoded(
+                effect.keyframe, Array.of(np.array([math.cos(angle_rad), math.sin(angle_rad)]), "f4")
+            )
+        return answer(effect)
+
+    robots = Robots(work=work)
+    robots.add("r1")
+    robots.add("r2")
+    for name, angle_deg in (("r1", 0), ("r2", 30), ("r2", 50), ("r1", 42)):
+        robots.capture(name, 0.1 * angle_deg, look=angle_deg)
+        robots.run(2.0)
+    robots.run(5.0)
+    before = robots.cores["r2"].assembly.closures
+    disk = disk_of(robots, "r1")
+    robots.kill("r1")
+    robots.add("r1", restored=disk)
+    robots.run(20.0)
+    assert robots.cores["r2"].assembly.closures == before == 3
 
 
 def test_a_robot_that_lost_its_disk_is_a_new_incarnation_and_its_old_log_stays() -> None:
