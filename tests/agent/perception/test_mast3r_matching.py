@@ -18,7 +18,7 @@ from flocc_agent.perception.mast3r.matching import (  # noqa: E402
     reciprocal_matches_both_ways,
     symmetric_matches,
 )
-from flocc_agent.perception.mast3r.search import TileIndex, nearest  # noqa: E402
+from flocc_agent.perception.mast3r.search import BlockIndex, nearest  # noqa: E402
 
 
 def records() -> tuple[dict[str, Any], list[Any]]:
@@ -107,7 +107,7 @@ def test_the_sieves_never_lose_the_winner(noise: float, size: tuple[int, int], f
     queries = field.flatten(0, 1)[::3] + noise * torch.randn(len(field.flatten(0, 1)[::3]), 24, generator=generator)
     queries = queries / queries.norm(dim=-1, keepdim=True)
     exact = (queries.double() @ field.flatten(0, 1).double().T).argmax(dim=1)
-    assert torch.equal(TileIndex(field, fast)(queries), exact)
+    assert torch.equal(BlockIndex(field, fast)(queries), exact)
 
 
 @pytest.mark.parametrize("fast", [False, True])
@@ -116,9 +116,9 @@ def test_the_sieves_are_exact_where_scores_are_negative_or_equal(fast: bool) -> 
     field = field / field.norm(dim=-1, keepdim=True)
     queries = -field.flatten(0, 1)[:200]
     exact = (queries.double() @ field.flatten(0, 1).double().T).argmax(dim=1)
-    assert torch.equal(TileIndex(field, fast)(queries), exact)
+    assert torch.equal(BlockIndex(field, fast)(queries), exact)
     flat = torch.ones(64, 64, 24) / 24**0.5
-    assert TileIndex(flat, fast)(flat[0, :5]).tolist() == [0] * 5
+    assert BlockIndex(flat, fast)(flat[0, :5]).tolist() == [0] * 5
 
 
 def test_nearest_takes_the_first_of_equals() -> None:
