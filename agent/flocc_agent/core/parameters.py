@@ -48,7 +48,7 @@ class ElectionParameters:
     leader_timeout_s: float = 3.0
     """A leader whose own counter stood still for this long is lost."""
     hops_max: int = 8
-    """A leader is followed over at most this many robots; longer chains form several groups."""
+    """A leader is followed over at most this many robots; those further off follow nobody, yet get its corrections."""
 
     def __post_init__(self) -> None:
         positive = min(self.startup_s, self.answer_timeout_s, self.coordinator_timeout_s, self.leader_timeout_s)

@@ -5,7 +5,7 @@ from tests.agent.core.virtual_time import Robots
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
 from flocc_agent.core.election import COUNTER_JUMP_MAX, LeaderElection, Role
 from flocc_agent.core.events import Leaving
-from flocc_agent.core.parameters import ElectionParameters
+from flocc_agent.core.parameters import CoreParameters, ElectionParameters
 from flocc_agent.core.robot import Restored
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import Answer, Coordinator, Election, Heartbeat, LeaderAdvert
@@ -223,3 +223,15 @@ def test_two_groups_that_merge_agree_on_a_term_above_both() -> None:
     robots.separate()
     robots.run(5.0)
     assert set(robots.leaders().values()) == {"7:r1"}
+
+
+def test_robots_beyond_the_greatest_number_of_hops_follow_nobody_and_are_corrected_all_the_same() -> None:
+    robots = Robots(CoreParameters(election=ElectionParameters(hops_max=2)))
+    names = ["r1", "r2", "r3", "r4", "r5"]
+    for k, name in enumerate(names):
+        robots.add(name)
+        robots.capture(name, 0.0, look=k)
+    robots.cut = {frozenset((a, b)) for i, a in enumerate(names) for b in names[i + 2 :]}
+    robots.run(30.0)
+    assert robots.leaders() == {"r1": "1:r1", "r2": "1:r1", "r3": "1:r1", "r4": "None", "r5": "None"}
+    assert set(robots.frames()) == set(names)
