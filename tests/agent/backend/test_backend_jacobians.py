@@ -1,0 +1,81 @@
+"""Claim: every Jacobian is the numerical derivative, at random states, near pi and near zero translation."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flocc_agent.backend import rotations
+from flocc_agent.backend.edges import GAMMA_MIN, Edges, Residuals, State, jacobians, residuals, scales_at, state_of
+from flocc_agent.geometry import pose, so3_exp, so3_log
+
+Float = NDArray[np.float64]
+
+STEP = 1e-6
+CASES = ("random", "near pi", "near zero translation", "identity")
+
+
+def edge(rng: np.random.Generator, case: str, sigma: float, cluster: int, scale: float = 1.0) -> tuple[Edges, State]:
+    """One edge and a state: two poses and one cluster scale."""
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    R_error = {"near pi": so3_exp(axis * (np.pi - 1e-3)), "identity": np.eye(3)}.get(case, so3_exp(rng.normal(size=3)))
+    t_hat = rng.normal(size=3) * (1e-7 if case == "near zero translation" else 2.0)
+    R_hat = so3_exp(rng.normal(size=3))
+    T_i = pose(so3_exp(rng.normal(size=3)), rng.normal(size=3) * 3)
+    offset = rng.normal(size=3) * (1e-7 if case == "near zero translation" else 1.0)
+    T_ij = pose(R_hat @ R_error, t_hat * 1.5 + offset)
+    A = rng.normal(size=(6, 6))
+    covariance = A @ A.T + np.eye(6)
+    d = np.concatenate([np.zeros(3), R_hat.T @ t_hat])
+    L = np.linalg.inv(np.linalg.cholesky(covariance))
+    wide = np.linalg.inv(np.linalg.cholesky(covariance + sigma**2 * np.outer(d, d)))
+    edges = Edges(
+        np.array([0]), np.array([1]), rotations.quaternions(R_hat[None]), d[None], L[None], wide[None],
+        np.array([sigma]), np.array([cluster]),
+    )  # fmt: skip
+    state = state_of(np.array([T_i, T_i @ T_ij]))
+    return edges, State(state.q, state.t, np.array([scale]))
+
+
+def stacked(at: Residuals) -> Float:
+    return np.append(at.e[0], at.bound[0])
+
+
+def numerical(edges: Edges, state: State, n: int) -> Float:
+    delta = np.zeros(13)
+    delta[n] = STEP
+    forward, backward = (stacked(residuals(edges, state.retract(sign * delta))) for sign in (1.0, -1.0))
+    return np.asarray((forward - backward) / (2 * STEP))
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("sigma", "cluster"), [(0.0, -1), (0.7, -1), (0.3, 0), (0.0, 0)])
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_are_the_numerical_derivatives(case: str, sigma: float, cluster: int, seed: int) -> None:
+    edges, state = edge(np.random.default_rng(seed), case, sigma, cluster)
+    at = residuals(edges, state)
+    jac = jacobians(edges, at)
+    analytic = np.hstack([jac.A_i[0], jac.A_j[0], jac.a_scale[0][:, None]])
+    measured = np.stack([numerical(edges, state, n)[:6] for n in range(13)], axis=1)
+    np.testing.assert_allclose(analytic, measured, atol=2e-7 * max(1.0, float(np.abs(measured).max())))
+
+
+def test_a_held_scale_pulls_at_its_cluster_and_not_at_its_poses_scale() -> None:
+    rng = np.random.default_rng(3)
+    edges, state = edge(rng, "random", 0.3, 0, scale=0.5)
+    flipped = State(state.q, state.t - 2 * np.array([[0.0] * 3, state.t[1] - state.t[0]]), state.scale)
+    at = residuals(edges, flipped)
+    assert at.held[0]
+    assert scales_at(edges, flipped)[0] == GAMMA_MIN
+    slope = np.array([numerical(edges, flipped, 12)])[0]
+    np.testing.assert_allclose(slope, np.append(np.zeros(6), -1.0 / edges.sigma[0]), atol=1e-6)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-7, np.pi])
+def test_batched_quaternions_agree_with_the_logarithm(angle_rad: float) -> None:
+    axis = np.array([0.6, -0.64, 0.48])
+    R = so3_exp(angle_rad * axis)
+    q = rotations.quaternions(R[None])
+    np.testing.assert_allclose(rotations.matrices(q)[0], R, atol=1e-12)
+    assert rotations.angles_rad(q)[0] == pytest.approx(float(np.linalg.norm(so3_log(R))), abs=1e-7)
+    np.testing.assert_allclose(rotations.matrices(rotations.exponential(angle_rad * axis[None]))[0], R, atol=1e-12)

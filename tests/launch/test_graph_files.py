@@ -1,0 +1,141 @@
+"""Claims about pose-graph files and `flocc optimise`: what was written is read, damage is named, references are met."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flocc_agent.config import Formulation, Solver
+from flocc_agent.core.pose_graph import LoopClosure
+from flocc_agent.geometry import pose, so3_exp
+from flocc_launch.graph_files import GraphFileError, read_g2o, read_graph_file, write_g2o
+from flocc_launch.optimise import OptimiseError, optimise_file
+from flocc_protocol.ids import KeyframeId, LogId
+
+A, B = LogId("a"), LogId("b")
+EDGE = "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+COSMO = "cosmo_bench/{0}/kth_r3_00_d06_d09_d10_{0}.jrl"
+OPTIMA = {
+    "sphere2500": 1687.006,
+    "parking-garage": 1.26252,
+    "smallGrid3D": 1025.398,
+    "tinyGrid3D": 18.5194,
+    "CSAIL": 31.4703,
+    "kitti_00": 125.681,
+}
+
+
+def data(shared: Path, *parts: str) -> Path:
+    return shared.joinpath("data", *parts)
+
+
+def test_poses_and_closures_come_back_from_a_written_file(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    T = {log: np.array([pose(so3_exp(rng.normal(size=3)), rng.normal(size=3)) for _ in range(4)]) for log in (A, B)}
+    loop = LoopClosure(
+        KeyframeId(A, 1), KeyframeId(B, 2), T[A][3], covariance=np.diag(np.arange(1.0, 7.0)), metric=True
+    )
+    write_g2o(tmp_path / "graph.g2o", T, [loop])
+    read = read_g2o(tmp_path / "graph.g2o").graph
+    (back,) = read.closures
+    assert (back.query, back.match) == (loop.query, loop.match)
+    assert back.covariance is not None
+    np.testing.assert_allclose(back.covariance, np.diag(np.arange(1.0, 7.0)), rtol=1e-9)
+    np.testing.assert_allclose(back.T_query_match_unscaled, T[A][3], atol=1e-12)
+    for log in (A, B):
+        np.testing.assert_allclose(
+            read.trajectories[log].T_odom_keyframe, np.linalg.solve(T[log][0], T[log]), atol=1e-9
+        )
+
+
+def test_a_line_that_occurs_twice_counts_twice(tmp_path: Path) -> None:
+    (tmp_path / "x.g2o").write_text(f"{EDGE}\n{EDGE}\n")
+    (trajectory,) = read_g2o(tmp_path / "x.g2o").graph.trajectories.values()
+    assert trajectory.edge_covariances is not None
+    np.testing.assert_allclose(trajectory.edge_covariances[0], 0.5 * np.eye(6))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "complaint"),
+    [
+        ("empty.g2o", "", "has no edges"),
+        ("short.g2o", "EDGE_SE3:QUAT 0 1 1 2 3\n", "line 1"),
+        ("words.g2o", EDGE.replace(" 1 0 0 0 0 0 1 1", " x 0 0 0 0 0 1 1", 1) + "\n", "line 1"),
+        ("nan.g2o", EDGE.replace("0 1 1 0", "0 1 nan 0", 1) + "\n", "line 1"),
+        ("gap.g2o", f"{EDGE}\n{EDGE.replace('QUAT 0 1', 'QUAT 1 5')}\n", "no odometry from keyframe 1"),
+        ("bad.jrl", "{", "not JSON"),
+        ("other.jrl", "{}", "not a JRL file"),
+        ("none.jrl", '{"measurements": {"a": []}}', "has no measurements"),
+        ("what.txt", "", "neither"),
+    ],
+)
+def test_a_damaged_file_is_named_in_one_sentence(tmp_path: Path, name: str, text: str, complaint: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(GraphFileError, match=complaint) as raised:
+        read_graph_file(path)
+    assert str(path) in str(raised.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(GraphFileError, match="cannot be read"):
+        read_graph_file(tmp_path / "nothing.g2o")
+
+
+def test_an_unwritable_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "x.g2o").write_text(EDGE + "\n")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OptimiseError, match="cannot be written"):
+        optimise_file(tmp_path / "x.g2o", tmp_path / "file")
+
+
+def test_result_json_holds_the_documented_keys(tmp_path: Path) -> None:
+    (tmp_path / "x.g2o").write_text(EDGE + "\n")
+    optimise_file(tmp_path / "x.g2o", tmp_path / "out", formulation=Formulation.BASE, solver=Solver.LM)
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    expected = {"formulation", "solver", "cost_initial", "cost", "ate_m", "iterations", "solve_s", "components"}
+    assert expected | {"closures_rejected"} <= set(result)
+    assert result["ate_m"] is None
+    assert read_g2o(tmp_path / "out" / "optimised.g2o").graph.trajectories.keys() == {A}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", OPTIMA)
+def test_the_listed_g2o_optima_are_met_to_six_digits(shared: Path, tmp_path: Path, name: str) -> None:
+    path = data(shared, "g2o", f"{name}.g2o")
+    result = optimise_file(path, tmp_path, formulation=Formulation.BASE, solver=Solver.LM)
+    assert result["cost"] == pytest.approx(OPTIMA[name], rel=1e-5 / 2)
+
+
+@pytest.mark.data
+def test_kitti_00_in_five_robots(shared: Path, tmp_path: Path) -> None:
+    folder = data(shared, "g2o", "lajoie_splits", "kitti00")
+    result = optimise_file(folder, tmp_path, formulation=Formulation.BASE, solver=Solver.LM)
+    assert len(result["components"]) == 1
+    assert result["ate_m"] <= 3.0
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "metric_m"), [("wifi", 1.880), ("proradio", 1.086)])
+def test_free_scales_reach_the_metric_reference_from_odometry_frames(
+    shared: Path, tmp_path: Path, name: str, metric_m: float
+) -> None:
+    path = data(shared, COSMO.format(name))
+    ate = {
+        formulation: optimise_file(
+            path, tmp_path, formulation=formulation, solver=Solver.LM, unit_scale=True, drop_labelled_outliers=True
+        )["ate_m"]
+        for formulation in (Formulation.INDEPENDENT, Formulation.SMOOTHED)
+    }
+    assert ate[Formulation.INDEPENDENT] <= metric_m + 0.15
+    assert ate[Formulation.SMOOTHED] <= ate[Formulation.INDEPENDENT] + 0.05
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["wifi", "proradio"])
+def test_the_default_finds_the_outliers_among_real_robots_closures(shared: Path, tmp_path: Path, name: str) -> None:
+    result = optimise_file(data(shared, COSMO.format(name)), tmp_path, unit_scale=True)
+    assert result["ate_odometry_m"] == pytest.approx(18.61, abs=0.01)
+    assert result["ate_m"] <= 2.5
+    assert result["outliers_used"] <= 0.05 * result["labelled_outliers"]
