@@ -111,7 +111,8 @@ class Fault(Section):
     groups: tuple[tuple[RobotName, ...], ...] = ()
     """Groups of a partition; robots that no group names are one more group."""
     value: float | None = None
-    """Loss ratio, latency in seconds, range in metres, or the factor by which robots are slow."""
+    """Loss ratio, latency in seconds, range in metres, or the factor by which robots are slow; of a kill in simulate:
+    effects of the robot's next step that still happen."""
     message: str | None = None
     """Kind of message that a mute swallows, with probability `value` (simulate only)."""
     disk_lost: bool = False

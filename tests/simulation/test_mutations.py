@@ -16,7 +16,7 @@ from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.pose_graph import GraphSolution
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.robot import Restored, Robot
 from flocc_launch.scenario import Fault, FaultKind, Scenario
 from flocc_launch.simulation.campaign import run_checked
 from flocc_launch.simulation.disk import Disk
@@ -140,6 +140,25 @@ def test_a_disk_that_forgets_what_was_published_is_noticed(monkeypatch: pytest.M
 
     monkeypatch.setattr(Disk, "restored", forgetful)
     assert "nothing lost" in broken(scenario(*killed_and_back("r1")))
+
+
+def test_a_robot_that_sends_before_it_writes_loses_what_it_published(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Robot._append
+
+    def hasty(self: Robot, record: Any, now: float) -> list[Effect]:
+        effects = original(self, record, now)
+        return [
+            *(e for e in effects if isinstance(e, Broadcast)),
+            *(e for e in effects if not isinstance(e, Broadcast)),
+        ]
+
+    monkeypatch.setattr(Robot, "_append", hasty)
+    cuts = tuple(
+        Fault(at_s=t + dt, kind=kind, robots=("r1",), value=value)
+        for t in range(4, 24, 2)
+        for dt, kind, value in ((0.0, FaultKind.KILL, 1.0), (1.5, FaultKind.START, None))
+    )
+    assert "nothing lost" in broken(scenario(*cuts))
 
 
 def test_a_table_without_a_maximum_breaks_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

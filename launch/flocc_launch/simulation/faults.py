@@ -19,7 +19,7 @@ def inject(swarm: Swarm, fault: Fault) -> None:
     match fault.kind:
         case FaultKind.KILL:
             for name in fault.robots:
-                swarm.kill(name)
+                kill(swarm, name, fault.value)
         case FaultKind.RESTART:
             for name in fault.robots:
                 restart(swarm, name, fault.disk_lost)
@@ -39,6 +39,14 @@ def inject(swarm: Swarm, fault: Fault) -> None:
                 swarm.stations[name].workers.slowness = fault.value or 1.0
         case _:
             swarm.radio.parameters = changed(swarm.radio.parameters, fault, swarm.agenda.now_s)
+
+
+def kill(swarm: Swarm, name: str, effects: float | None) -> None:
+    """Cut a robot's power now, or in the middle of its next step that wants more than so many effects."""
+    if effects is None:
+        swarm.kill(name)
+    else:
+        swarm.stations[name].dies_after = int(effects)
 
 
 def restart(swarm: Swarm, name: str, disk_lost: bool) -> None:

@@ -98,7 +98,8 @@ def _fault(rng: np.random.Generator, names: list[str], at_s: float) -> list[Faul
     kind = rng.choice(["kill", "kill", "restart", "disk", "partition", "blackout", "slow", "loss", "mute", "leave"])
     match kind:
         case "kill":
-            return [Fault(at_s=at_s, kind=FaultKind.KILL, robots=victim)]
+            effects = None if rng.uniform() < 0.5 else float(rng.integers(1, 4))
+            return [Fault(at_s=at_s, kind=FaultKind.KILL, robots=victim, value=effects)]
         case "restart" | "disk":
             return [Fault(at_s=at_s, kind=FaultKind.RESTART, robots=victim, disk_lost=kind == "disk")]
         case "partition":

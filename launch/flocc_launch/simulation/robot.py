@@ -59,12 +59,14 @@ class Surroundings:
         unicast: Send to the stations of one robot name.
         fetch: Start to fetch a latent.
         observe: Told of every step: station, event (None for a tick) and effects.
+        died: Told that a station's power was cut in the middle of a step.
     """
 
     broadcast: Callable[["Station", Message], None]
     unicast: Callable[["Station", str, Message], None]
     fetch: Callable[["Station", FetchLatent], None]
     observe: Callable[["Station", Event | None, list[Effect]], None]
+    died: Callable[["Station"], None]
 
 
 class Station:
@@ -75,6 +77,7 @@ class Station:
         core: The robot's behaviour, None while it is switched off.
         life: Counts starts.
         solution: The last solution it made as a leader.
+        dies_after: The power is cut when so many effects of a step with more are carried out; None: it is not.
     """
 
     def __init__(
@@ -98,6 +101,7 @@ class Station:
         self.core: Robot | None = None
         self.life = 0
         self.solution: GraphSolution | None = None
+        self.dies_after: int | None = None
         self._compute_class = compute_class
         self._agenda = agenda
         self._around = around
@@ -125,6 +129,7 @@ class Station:
     def kill(self) -> None:
         """Lose everything but the disk."""
         self.core = None
+        self.dies_after = None
         self.life += 1
         self._images.clear()
 
@@ -193,11 +198,16 @@ class Station:
         self._agenda.at(wake_s, wake)
 
     def _carry_out(self, event: Event | None, effects: list[Effect]) -> None:
-        """Do what the core wants, in its order."""
-        self._around.observe(self, event, effects)
-        for effect in effects:
+        """Do what the core wants, in its order, as far as the power lasts."""
+        dies = self.dies_after is not None and len(effects) > self.dies_after
+        done = effects[: self.dies_after] if dies else effects
+        self._around.observe(self, event, done)
+        for effect in done:
             self._do(effect)
-        self._arm()
+        if dies:
+            self._around.died(self)
+        else:
+            self._arm()
 
     def _do(self, effect: Effect) -> None:
         now_s = self._agenda.now_s

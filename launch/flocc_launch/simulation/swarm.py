@@ -62,7 +62,9 @@ class Swarm:
         self._fetcher = LatentFetcher(self.agenda, self.network, self._running)
         self._reporters: dict[str, Reporter] = {}
         self._near: dict[tuple[str, float | None], list[str]] = {}
-        self._around = Surroundings(self._broadcast, self._unicast, self._fetcher.fetch, self._observe)
+        self._around = Surroundings(
+            self._broadcast, self._unicast, self._fetcher.fetch, self._observe, lambda station: self.kill(station.name)
+        )
         for number, name in enumerate(sorted(playbacks)):
             self._add(name, number, playbacks[name])
         self._move()
