@@ -28,6 +28,7 @@ COARSE_MARGIN = 2 * (2 * 2**-8 + 2**-8)
 """Twice the largest error of a bfloat16 score of unit vectors: both factors rounded (2^-8), then the result (2^-8)."""
 FINE_MARGIN = 4e-6
 """Twice the largest error of a float32 score of unit vectors of 24 numbers, and of lengths that are not exactly one."""
+COSINE_MARGIN = 1e-6
 ANGLE_MARGIN_RAD = 2e-3
 """Rounding of arc cosines of float32 scores near one."""
 
@@ -104,16 +105,18 @@ class BlockIndex:
 
     def _within_cones(self, queries: Tensor) -> Tensor:
         """(B, Q) blocks with a tile whose cone can reach a query's score in the block of the nearest cone."""
-        cosines = (self._centres @ queries.T).clamp(-1, 1)
-        first = cosines.argmax(dim=0) // TILES_PER_BLOCK
+        cosines = queries @ self._centres.T
+        first = cosines.argmax(dim=1) // TILES_PER_BLOCK
         lower = torch.empty(len(queries))
         for k, chosen in grouped(first, len(self._blocks)):
             lower[chosen] = (self._blocks[k] @ queries[chosen].T).amax(dim=0)
         reach = lower.clamp(-1, 1).arccos() + ANGLE_MARGIN_RAD
         # The arc cosine decreases: angle <= radius + reach is cosine >= cos(radius + reach), everything from pi on.
-        limit = (self._radii[:, None] + reach).clamp(max=torch.pi).cos_()
-        tiles = (cosines >= limit) | (limit <= -1 + 1e-6)
-        return tiles.view(-1, TILES_PER_BLOCK, len(queries)).any(dim=1)
+        of_reach, of_radius = (torch.stack([x.cos(), x.sin()], dim=1) for x in (reach, self._radii))
+        tiles = cosines >= (of_reach * torch.tensor([1.0, -1.0])) @ of_radius.T - COSINE_MARGIN
+        if float(reach.max() + self._radii.max()) >= torch.pi:
+            tiles |= reach[:, None] + self._radii >= torch.pi
+        return tiles.view(len(queries), -1, TILES_PER_BLOCK).any(dim=2).T.contiguous()
 
     def _roughly_best(self, queries: Tensor, rough: Tensor) -> Tensor:
         """(B, Q) blocks whose bfloat16 score is within its rounding of the best."""
