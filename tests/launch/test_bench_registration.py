@@ -4,8 +4,8 @@ import pytest
 
 pytest.importorskip("torch", reason="torch, an optional extra, is not installed")
 
-from flocc_launch.bench_memory import measure  # noqa: E402
-from flocc_launch.bench_registration import matching_ratios, network_ratios, spread  # noqa: E402
+from flocc_launch.bench_memory import measure
+from flocc_launch.bench_registration import matching_ratios, network_ratios, spread
 
 
 def test_ratios_of_both_parts_come_with_the_errors_of_bfloat16() -> None:
