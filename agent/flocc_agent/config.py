@@ -65,8 +65,8 @@ class BackendConfig(Section):
     """Scales of closures: fixed, one each, one each but linked within a cluster, or one for all."""
     solver: Solver = Solver.GNC_TLS
     """lm is fastest and trusts every closure; gnc-* find and reject outliers."""
-    pairwise_consistency: bool = True
-    """Filter closures by pairwise consistency maximisation before solving."""
+    pairwise_consistency: bool = False
+    """Filter closures by pairwise consistency maximisation before solving; needs odometry covariances that are true."""
     closures_to_join_min: int = Field(2, ge=1)
     """Maps with fewer agreeing closures between them stay apart: a single wrong one would contradict nothing."""
     scale_initial: ScaleInitial = ScaleInitial.ODOMETRY

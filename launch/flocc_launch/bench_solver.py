@@ -12,7 +12,7 @@ graph, on both sides. The contenders of GTSAM:
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -208,10 +208,15 @@ def _rounds(
 
 def gtsam_base(bench: Bench) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """The base formulation in GTSAM's own factors."""
-    config = config_of(Formulation.BASE)
-    problem = problem_of(bench, config)
+    return between_factors(problem_of(bench, config_of(Formulation.BASE)), bench.T_start)
+
+
+def between_factors(
+    problem: Problem, T_start: Mapping[LogId, Float]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """GTSAM's own between factors for every edge, own scales put into the covariance; the anchor's prior is last."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    poses = np.concatenate([bench.T_start[log] for log in problem.logs])
+    poses = np.concatenate([T_start[log] for log in problem.logs])
     for n, T in enumerate(poses):
         values.insert(n, gtsam.Pose3(T))
     edges = problem.edges
@@ -219,7 +224,7 @@ def gtsam_base(bench: Bench) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     T_hat[:, :3, :3] = matrices(edges.q_hat)
     T_hat[:, :3, 3] = np.einsum("eij,ej->ei", T_hat[:, :3, :3], edges.d[:, 3:])
     for k in range(len(edges)):
-        noise = gtsam.noiseModel.Gaussian.SqrtInformation(edges.sqrt_information[k])
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(edges.sqrt_information_wide[k])
         graph.add(gtsam.BetweenFactorPose3(int(edges.i[k]), int(edges.j[k]), gtsam.Pose3(T_hat[k]), noise))
     anchor = gtsam.noiseModel.Isotropic.Sigma(6, ANCHOR_SIGMA)
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(poses[0]), anchor))
