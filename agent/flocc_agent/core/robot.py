@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flocc_agent.core.assembly import GraphAssembly
-from flocc_agent.core.corrections import Corrections, pose7, upper_triangle
+from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
@@ -30,14 +30,14 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
+from flocc_agent.core.judgement import judged, judgement_report
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.place_recognition import PlaceRecognition
-from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
+from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.rounds import Rounds, solution_report
-from flocc_agent.geometry import is_rigid
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
@@ -57,14 +57,11 @@ from flocc_protocol.messages import (
     RecordRequest,
 )
 from flocc_protocol.records import (
-    SCALE_INITIAL_MAX,
-    SCALE_INITIAL_MIN,
     ClosureRecord,
     FixRecord,
     KeyframeRecord,
     Record,
     RejectionRecord,
-    encode_record,
 )
 
 
@@ -304,25 +301,8 @@ class Robot:
         roles = self.closing.roles(pair)
         if roles is None:
             return []
-        record = self._judge(*roles, result)
+        record = judged(*roles, result, self._parameters.loop_closing)
         return [*self._append(record, now), judgement_report(record, self.log)]
-
-    def _judge(
-        self, query: KeyframeId, match: KeyframeId, result: Registration | RegistrationFailed
-    ) -> ClosureRecord | RejectionRecord:
-        counts = (result.correspondences, result.odometry_correspondences)
-        if isinstance(result, RegistrationFailed):
-            return RejectionRecord(query, match, result.failure.value, *counts)
-        ratio = match_ratio(*counts)
-        limits = self._parameters.loop_closing
-        if result.correspondences < limits.correspondences_min:
-            return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
-        if ratio < limits.match_ratio_threshold:
-            return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
-        try:
-            return _closure(query, match, result, ratio)
-        except ValueError as error:
-            return RejectionRecord(query, match, f"no closure: {error}", *counts)
 
     def _on_optimised(self, event: GraphOptimised) -> list[Effect]:
         if not self.rounds.on_solution(event.term, event.round, event.solution):
@@ -419,36 +399,3 @@ def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:
         "keyframe",
         {"keyframe": keyframe, "stamp_s": record.stamp_s, "T_odom_camera": pose_facts},  # type: ignore[dict-item]
     )
-
-
-def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: float) -> ClosureRecord:
-    """The record of an accepted registration; a scale that no record can hold counts as none.
-
-    Raises:
-        ValueError: The registration makes no sense; a log must never hold it.
-    """
-    if not is_rigid(result.T_query_match_unscaled):
-        raise ValueError("the relative pose is not rigid")
-    scale = result.scale_initial
-    if scale is not None and not SCALE_INITIAL_MIN <= scale <= SCALE_INITIAL_MAX:
-        scale = None
-    covariance = None if result.covariance is None else upper_triangle(result.covariance)
-    counts = (result.correspondences, result.odometry_correspondences)
-    record = ClosureRecord(query, match, pose7(result.T_query_match_unscaled), *counts, ratio, scale, covariance)
-    encode_record(record)
-    return record
-
-
-def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
-    """An accepted or refused registration, for people."""
-    facts = {
-        "query": str(record.query),
-        "match": str(record.match),
-        "correspondences": record.correspondences,
-        "odometry_correspondences": record.odometry_correspondences,
-        "ratio": round(match_ratio(record.correspondences, record.odometry_correspondences), 4),
-        "by": by.robot,
-    }
-    if isinstance(record, RejectionRecord):
-        return Report("closure_rejected", {**facts, "reason": record.reason})  # type: ignore[dict-item]
-    return Report("closure_accepted", {**facts, "scale_initial": record.scale_initial})  # type: ignore[dict-item]

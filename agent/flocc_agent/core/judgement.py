@@ -1,0 +1,66 @@
+"""Judgement: whether a registration becomes a loop closure, by the ratio of Eq. (1) (Sec. III-B)."""
+
+from flocc_agent.core.corrections import pose7, upper_triangle
+from flocc_agent.core.effects import Report
+from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
+from flocc_agent.geometry import is_rigid
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.records import (
+    SCALE_INITIAL_MAX,
+    SCALE_INITIAL_MIN,
+    ClosureRecord,
+    RejectionRecord,
+    encode_record,
+)
+
+
+def judged(
+    query: KeyframeId, match: KeyframeId, result: Registration | RegistrationFailed, limits: LoopClosingParameters
+) -> ClosureRecord | RejectionRecord:
+    """Accept a registration whose match ratio reaches R_thr, or refuse it with a reason."""
+    counts = (result.correspondences, result.odometry_correspondences)
+    if isinstance(result, RegistrationFailed):
+        return RejectionRecord(query, match, result.failure.value, *counts)
+    ratio = match_ratio(*counts)
+    if result.correspondences < limits.correspondences_min:
+        return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
+    if ratio < limits.match_ratio_threshold:
+        return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
+    try:
+        return _closure(query, match, result, ratio)
+    except ValueError as error:
+        return RejectionRecord(query, match, f"no closure: {error}", *counts)
+
+
+def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: float) -> ClosureRecord:
+    """The record of an accepted registration; a scale that no record can hold counts as none.
+
+    Raises:
+        ValueError: The registration makes no sense; a log must never hold it.
+    """
+    if not is_rigid(result.T_query_match_unscaled):
+        raise ValueError("the relative pose is not rigid")
+    scale = result.scale_initial
+    if scale is not None and not SCALE_INITIAL_MIN <= scale <= SCALE_INITIAL_MAX:
+        scale = None
+    covariance = None if result.covariance is None else upper_triangle(result.covariance)
+    counts = (result.correspondences, result.odometry_correspondences)
+    record = ClosureRecord(query, match, pose7(result.T_query_match_unscaled), *counts, ratio, scale, covariance)
+    encode_record(record)
+    return record
+
+
+def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
+    """An accepted or refused registration, for people."""
+    facts = {
+        "query": str(record.query),
+        "match": str(record.match),
+        "correspondences": record.correspondences,
+        "odometry_correspondences": record.odometry_correspondences,
+        "ratio": round(match_ratio(record.correspondences, record.odometry_correspondences), 4),
+        "by": by.robot,
+    }
+    if isinstance(record, RejectionRecord):
+        return Report("closure_rejected", {**facts, "reason": record.reason})  # type: ignore[dict-item]
+    return Report("closure_accepted", {**facts, "scale_initial": record.scale_initial})  # type: ignore[dict-item]
