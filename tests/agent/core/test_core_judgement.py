@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from tests.agent.core.virtual_time import keyframe
 
 from flocc_agent.core.judgement import judged, judgement_report
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_protocol.ids import LogId
 from flocc_protocol.records import ClosureRecord, RejectionRecord
-from tests.agent.core.virtual_time import keyframe
 
 QUERY, MATCH = keyframe("r1/3"), keyframe("r2/5")
 LIMITS = LoopClosingParameters(match_ratio_threshold=0.3, correspondences_min=20)
@@ -42,7 +43,7 @@ def test_a_failed_registration_is_refused_with_its_reason() -> None:
 
 
 @pytest.mark.parametrize("T", [np.full((4, 4), np.nan), np.diag([2.0, 2.0, 2.0, 1.0])])
-def test_a_pose_that_makes_no_sense_is_refused(T: np.ndarray) -> None:  # type: ignore[type-arg]
+def test_a_pose_that_makes_no_sense_is_refused(T: NDArray[np.float64]) -> None:
     assert reason(replace(GOOD, T_query_match_unscaled=T)) is not None
 
 
