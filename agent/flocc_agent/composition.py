@@ -38,6 +38,7 @@ from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.arrays import Array
+from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
@@ -211,8 +212,21 @@ class Agent:
         return True
 
     def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
-        """Give the agent an absolute position (3,) of the last keyframe's camera, with its covariance (3, 3)."""
-        self._started.add_fix(position_m, covariance_m2)
+        """Give the agent an absolute position of the last keyframe's camera.
+
+        Args:
+            position_m: (3,) in a local frame such as ENU, within 1e7 m of its origin.
+            covariance_m2: (3, 3), positive definite.
+
+        Raises:
+            BadFix: The position is not finite or too far, or the covariance is none.
+        """
+        position, covariance = np.asarray(position_m, dtype=float), np.asarray(covariance_m2, dtype=float)
+        if position.shape != (3,) or not np.all(np.abs(position) < COORDINATE_MAX):
+            raise BadFix(f"robot {self.config.name}: the fix {position.tolist()} is no position in a local frame")
+        if covariance.shape != (3, 3) or not np.all(np.isfinite(covariance)) or np.linalg.eigvalsh(covariance)[0] <= 0:
+            raise BadFix(f"robot {self.config.name}: the covariance of the fix is not positive definite")
+        self._started.add_fix(position, covariance)
 
     async def corrections(self) -> AsyncIterator[Correction]:
         """Corrections as they come, the last one first; ends when the agent stops."""
@@ -335,6 +349,10 @@ class Agent:
     def _close_store(self) -> None:
         if self._store is not None:
             self._store.close()
+
+
+class BadFix(FloccError):
+    """An absolute position that cannot be used; the agent goes on without it."""
 
 
 class BadKeyframe(FloccError):
