@@ -214,7 +214,8 @@ class Scenario(Section):
         if not sources and (not self.robots or lacking):
             who = f"robot '{lacking[0]}' has no recording" if lacking else "there is no robot"
             raise ValueError(f"{who}; give [world], [dataset], [tracks] or recordings")
-        unknown = {robot for fault in self.faults for robot in fault.robots} - set(self.names())
+        named = {robot for fault in self.faults for robots in (fault.robots, *fault.groups) for robot in robots}
+        unknown = named - set(self.names())
         if unknown:
             raise ValueError(f"a fault names robot '{min(unknown)}', which is not in the scenario")
         return self

@@ -1,12 +1,14 @@
 """`simulate`: the same bytes for the same seed, and a whole run folder."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from flocc_launch.run_folder import RunFolder, RunFolderError
+from flocc_launch.run_records import ClosureAccepted
 from flocc_launch.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
@@ -65,3 +67,29 @@ def test_a_folder_that_holds_a_run_is_left_alone(tmp_path: Path) -> None:
     simulate(scenario(), tmp_path / "run")
     with pytest.raises(RunFolderError, match="holds a run already"):
         simulate(scenario(), tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"at_s": 1.0, "kind": "kill", "robots": ["r9"]},
+        {"at_s": 1.0, "kind": "partition", "groups": [["r1"], ["r9"]]},
+    ],
+)
+def test_a_fault_that_names_a_robot_that_is_not_there_is_refused(fault: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="'r9'"):
+        scenario(faults=[fault])
+
+
+def test_a_mute_names_what_it_swallows() -> None:
+    with pytest.raises(ValueError, match="kind of message"):
+        scenario(faults=[{"at_s": 1.0, "kind": "mute", "value": 1.0}])
+
+
+def test_a_robot_without_images_of_its_own_serves_the_others(tmp_path: Path) -> None:
+    robots = {"server": {"compute_class": 9}}
+    report = simulate(scenario(robots=robots), tmp_path / "run")
+    assert {span.leader for span in report.leaders} == {"server"}
+    events = RunFolder.open(tmp_path / "run").iterate_events()
+    by = Counter(event.by for event in events if isinstance(event, ClosureAccepted))
+    assert by["server"] > 0.8 * by.total()
