@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from flocc_agent.core.effects import FetchLatent
-from flocc_agent.core.events import Event, LatentFetched, LatentFetchFailed
+from flocc_agent.core.events import LATENT_UNKNOWN, Event, LatentFetched, LatentFetchFailed
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.network import Network
 from flocc_launch.simulation.robot import Station
@@ -27,7 +27,7 @@ class LatentFetcher:
     def fetch(self, asker: Station, job: FetchLatent) -> None:
         """Start a fetch; it ends in one LatentFetched or LatentFetchFailed, at the latest when its time is over."""
         fetch = _Fetch(self, asker, job)
-        self._agenda.after(job.deadline_s, lambda: fetch.fail("no answer in time"))
+        self._agenda.after(job.deadline_s, lambda: fetch.fail("deadline"))
         fetch.ask()
 
     def _progress(self, asker: Station, keyframe: KeyframeId) -> int:
@@ -88,7 +88,7 @@ class _Fetch:
         if self._dead() or fetcher._progress(self._asker, keyframe) != offset:
             return
         if latent is None:
-            self.fail("the holder does not have it")
+            self.fail(LATENT_UNKNOWN)
             return
         fetcher._note(self._asker, keyframe, offset + size)
         if offset + size < len(latent):
