@@ -5,7 +5,7 @@ owner fetch and hold it. Failed fetches are tried again after growing pauses.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flocc_agent.core.effects import Effect, FetchLatent
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -23,11 +23,13 @@ class Peer:
         compute_class: 0 (small) to 9.
         load: Registrations that wait there.
         holds: Latents that it holds for others.
+        log: The log that it writes.
     """
 
     compute_class: int
     load: int = 0
     holds: tuple[KeyframeId, ...] = ()
+    log: LogId | None = None
 
 
 class Reach:
@@ -43,7 +45,12 @@ class Reach:
         """Note a robot in range; whether that changes what can be had."""
         known = self._peers.get(name)
         self._peers[name] = peer
-        return known is None or (known.compute_class, known.holds) != (peer.compute_class, peer.holds)
+        return known is None or replace(known, load=peer.load) != peer
+
+    def writes(self, log: LogId) -> bool:
+        """Whether the writer of a log is in range; a robot that lost its disk writes another one."""
+        peer = self._peers.get(log.robot)
+        return peer is not None and peer.log in (None, log)
 
     def remove(self, name: str) -> None:
         """A robot is out of range."""

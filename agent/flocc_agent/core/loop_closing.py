@@ -212,7 +212,10 @@ class LoopClosing:
         return min((time for time in (*times, self.latents.due_s(now)) if time > now), default=float("inf"))
 
     def _offer_due_s(self, offer: _Offer) -> float:
-        return offer.next_s if offer.to in self._reach else self._takeover_at_s(offer)
+        return offer.next_s if self._in_reach(offer) else self._takeover_at_s(offer)
+
+    def _in_reach(self, offer: _Offer) -> bool:
+        return offer.to in self._reach if offer.transferred else self._reach.writes(registrar_of(offer.candidate.pair))
 
     def _takeover_at_s(self, offer: _Offer) -> float:
         """When the finder may register a pair itself; later where it takes others to bring the latents."""
@@ -265,7 +268,7 @@ class LoopClosing:
         """Tell robots in range what is theirs to register; take over from those that are gone."""
         due: dict[tuple[str, bool], list[CandidatePair]] = {}
         for pair, offer in sorted(self._offers.items()) if self._offers else ():
-            if offer.to in self._reach:
+            if self._in_reach(offer):
                 if offer.next_s <= now:
                     due.setdefault((offer.to, offer.transferred), []).append(pair)
             elif self._takeover_at_s(offer) <= now:

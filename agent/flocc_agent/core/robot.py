@@ -234,7 +234,7 @@ class Robot:
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self.gossip.on_digests(sender, heartbeat.digests, now)
         effects += self._on_versions(sender, heartbeat.corrections, now)
-        self.closing.on_peer(sender.robot, Peer(heartbeat.compute_class, heartbeat.load, heartbeat.holds))
+        self.closing.on_peer(sender.robot, Peer(heartbeat.compute_class, heartbeat.load, heartbeat.holds, sender))
         self.closing.on_wants(heartbeat.wants)
         return effects
 
