@@ -11,7 +11,16 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from flocc_agent.core.parameters import CoreParameters
 from flocc_protocol.errors import FloccError
@@ -29,6 +38,13 @@ class Section(BaseModel):
     """Base of all sections: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, ser_json_inf_nan="constants")
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _is_relative_to_its_file(cls, value: object, info: ValidationInfo) -> object:
+        """Paths that a file names are relative to that file."""
+        folder = (info.context or {}).get("folder")
+        return folder / value if folder is not None and isinstance(value, Path) else value
 
 
 class Formulation(StrEnum):
@@ -521,7 +537,7 @@ class AgentConfig(Section):
         Raises:
             ConfigError: The file cannot be used; the message names it and the key.
         """
-        return validated(cls, read_toml(path), str(path))
+        return validated(cls, read_toml(path), str(path), path.resolve().parent)
 
 
 def read_toml(path: Path) -> dict[str, object]:
@@ -567,14 +583,20 @@ def first_error(error: ValidationError, source: str) -> str:
 M = TypeVar("M", bound=BaseModel)
 
 
-def validated(model: type[M], fields: Mapping[str, object], source: str) -> M:
+def validated(model: type[M], fields: Mapping[str, object], source: str, folder: Path | None = None) -> M:
     """Check fields against a model.
+
+    Args:
+        model: What they should be.
+        fields: As they were read.
+        source: Where they come from, for the error's sentence.
+        folder: What relative paths in them start from; None leaves them as they are.
 
     Raises:
         ConfigError: One sentence that names the source and the key.
     """
     try:
-        return model.model_validate(fields)
+        return model.model_validate(fields, context={"folder": folder})
     except (ValidationError, FloccError) as error:
         raise ConfigError(
             first_error(error, source) if isinstance(error, ValidationError) else f"{source}: {error}"

@@ -256,7 +256,7 @@ class Scenario(Section):
         fields = read_toml(path)
         for key, value in (changes or {}).items():
             _put(fields, key.split("."), value)
-        return validated(cls, _resolved(fields, path.resolve().parent), str(path))
+        return validated(cls, fields, str(path), path.resolve().parent)
 
 
 def agent_config(scenario: Scenario, name: str, **changes: object) -> AgentConfig:
@@ -283,14 +283,3 @@ def _put(fields: dict[str, object], keys: list[str], value: object) -> None:
         assert isinstance(inner, dict), f"{key} is a table"
         fields = inner
     fields[keys[-1]] = value
-
-
-def _resolved(fields: dict[str, object], folder: Path) -> dict[str, object]:
-    """Make the paths of data relative to the scenario's folder."""
-    dataset, robots = fields.get("dataset"), fields.get("robots")
-    if isinstance(dataset, dict) and isinstance(dataset.get("source"), str):
-        dataset["source"] = str(folder / dataset["source"])
-    for robot in robots.values() if isinstance(robots, dict) else ():
-        if isinstance(robot, dict) and isinstance(robot.get("recording"), str):
-            robot["recording"] = str(folder / robot["recording"])
-    return fields

@@ -1,0 +1,43 @@
+"""Configuration files: paths are relative to their file, wherever they stand in it."""
+
+from pathlib import Path
+
+from flocc_agent.config import AgentConfig
+from flocc_launch.scenario import Scenario
+
+AGENT = """
+name = "r1"
+folder = "state"
+[source]
+recording = "walks/one"
+[perception.mast3r]
+weights = "/models/mast3r.pth"
+place_weights = "cosplace.pth"
+[transport]
+control_listen = ["tls/127.0.0.1:0"]
+bulk_listen = ["tls/127.0.0.1:0"]
+[transport.tls]
+folder = "keys/r1"
+"""
+
+
+def test_paths_of_an_agent_start_at_its_file(tmp_path: Path) -> None:
+    (tmp_path / "agent.toml").write_text(AGENT, encoding="utf-8")
+    config = AgentConfig.read(tmp_path / "agent.toml")
+    assert config.folder == tmp_path / "state"
+    assert config.source.recording == tmp_path / "walks/one"
+    assert config.perception.mast3r.weights == Path("/models/mast3r.pth")
+    assert config.perception.mast3r.place_weights == tmp_path / "cosplace.pth"
+    assert config.transport.tls is not None
+    assert config.transport.tls.folder == tmp_path / "keys/r1"
+
+
+def test_paths_of_a_scenario_start_at_its_file(tmp_path: Path) -> None:
+    text = 'name = "s"\n[robots.r1]\nrecording = "one"\n[robots.r2]\nrecording = "/two"\n'
+    (tmp_path / "scenario.toml").write_text(text, encoding="utf-8")
+    robots = Scenario.read(tmp_path / "scenario.toml").robots
+    assert [robots[name].recording for name in ("r1", "r2")] == [tmp_path / "one", Path("/two")]
+
+
+def test_a_configuration_made_in_a_program_keeps_its_paths() -> None:
+    assert AgentConfig(name="r1", folder=Path("state")).folder == Path("state")
