@@ -153,7 +153,8 @@ class LoopClosing:
 
     def on_latent_lost(self, keyframe: KeyframeId) -> list[CandidatePair]:
         """A latent exists no more: the pairs that need it, which are to be rejected."""
-        return [work.pair for work in self._sorted_work() if keyframe in self._needs(work)]
+        offered = [pair for pair in sorted(self._offers) if keyframe in (pair.low, pair.high)]
+        return [*(work.pair for work in self._sorted_work() if keyframe in self._needs(work)), *offered]
 
     def on_fetch_failed(self, keyframe: KeyframeId, now: float) -> None:
         """A fetch ended without the latent."""
@@ -218,7 +219,12 @@ class LoopClosing:
         return offer.to in self._reach if offer.transferred else self._reach.writes(registrar_of(offer.candidate.pair))
 
     def _takeover_at_s(self, offer: _Offer) -> float:
-        """When the finder may register a pair itself; later where it takes others to bring the latents."""
+        """When the finder may register a pair itself; later where it takes others to bring the latents.
+
+        At once where the robot is here and writes another log: nobody writes the pair's log any more.
+        """
+        if offer.to in self._reach:
+            return offer.since_s
         pair = offer.candidate.pair
         at_hand = offer.transferred or (pair.low in self.latents and pair.high in self.latents)
         return offer.since_s + self._parameters.takeover_s * (1 if at_hand else FAR_TAKEOVERS)

@@ -101,7 +101,7 @@ def groups(swarm: Swarm) -> list[list[Station]]:
     while left:
         group = [left.pop(min(left))]
         for member in group:
-            near = [name for name in sorted(left) if _hear_each_other(swarm, member.name, name)]
+            near = [name for name in sorted(left) if hear_each_other(swarm, member, left[name])]
             group += [left.pop(name) for name in near]
         found.append(sorted(group, key=lambda station: station.name))
     return found
@@ -112,6 +112,8 @@ def names(group: Iterable[Station]) -> str:
     return " ".join(station.name for station in group)
 
 
-def _hear_each_other(swarm: Swarm, one: str, other: str) -> bool:
+def hear_each_other(swarm: Swarm, one: Station, other: Station) -> bool:
+    """Whether two stations are in direct range of each other."""
     now_s = swarm.agenda.now_s
-    return swarm.radio.connects(one, other, now_s) and swarm.radio.connects(other, one, now_s)
+    connects = swarm.radio.connects
+    return connects(one.name, other.name, now_s) and connects(other.name, one.name, now_s)
