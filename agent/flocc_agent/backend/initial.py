@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.core.pose_graph import AbsoluteFix, ClosureState, Component, GraphSolution, LoopClosure, Trajectory
-from flocc_agent.geometry import Float, angle_rad, inverse, pose, umeyama
+from flocc_agent.geometry import Float, inverse, pose, umeyama
 from flocc_protocol.ids import LogId
 
 JUDGES_MIN = 2
@@ -26,30 +26,44 @@ def initial_poses(
     still agree with it. Otherwise the robots are placed anew: a first closure that was wrong must not outlive the right
     ones that follow it.
     """
-    T_map_odom, aligned = align(trajectories, closures, steepness)
     component = component_with(trajectories, earlier)
+    warm: dict[LogId, Float] = {}
     if component is not None:
         warm = {log: extended(component.T_map_keyframe[log], trajectories[log]) for log in trajectories}
-        judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
-        if all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
+        if all(upheld(warm, of_pair) for of_pair in by_pair(closures)):
             return warm, True
+    T_map_odom, aligned = align(trajectories, closures, steepness)
+    judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
+    if warm and all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
+        return warm, True
     return {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}, False
+
+
+def by_pair(closures: Mapping[int, LoopClosure]) -> list[list[LoopClosure]]:
+    """Closures between robots, by pair of robots: where most of all agree with poses, no others can be more."""
+    pairs: dict[frozenset[LogId], list[LoopClosure]] = {}
+    for closure in closures.values():
+        pairs.setdefault(frozenset((closure.query.log, closure.match.log)), []).append(closure)
+    return [of_pair for logs, of_pair in pairs.items() if len(logs) > 1]
 
 
 def upheld(T_map_keyframe: Mapping[LogId, Float], closures: Sequence[LoopClosure]) -> bool:
     """Whether most of these closures agree with the poses, in rotation and in the direction of their translation."""
-    return 2 * sum(_agrees(T_map_keyframe, closure) for closure in closures) > len(closures)
+    T_query = np.array([T_map_keyframe[c.query.log][c.query.index] for c in closures])
+    T_match = np.array([T_map_keyframe[c.match.log][c.match.index] for c in closures])
+    measured = np.array([c.T_query_match_unscaled for c in closures], dtype=float)
+    return 2 * int(np.count_nonzero(_agree(inverse(T_query) @ T_match, measured))) > len(closures)
 
 
-def _agrees(T_map_keyframe: Mapping[LogId, Float], closure: LoopClosure) -> bool:
-    T_map_query = T_map_keyframe[closure.query.log][closure.query.index]
-    T_map_match = T_map_keyframe[closure.match.log][closure.match.index]
-    T = inverse(T_map_query) @ T_map_match
-    measured = np.asarray(closure.T_query_match_unscaled, dtype=float)
-    u = measured[:3, 3] / max(float(np.linalg.norm(measured[:3, 3])), 1e-12)
-    aside_m = float(np.linalg.norm(T[:3, 3] - max(float(T[:3, 3] @ u), 0.0) * u))
-    turned_rad = angle_rad(measured[:3, :3].T @ T[:3, :3])
-    return turned_rad < ROTATION_TOLERANCE_RAD and aside_m < TRANSLATION_TOLERANCE_M
+def _agree(T: Float, measured: Float) -> NDArray[np.bool_]:
+    """Whether relative poses (K, 4, 4) turn as measured and lie on the measured rays."""
+    t, u = T[:, :3, 3], measured[:, :3, 3]
+    u = u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)
+    along = np.maximum(np.einsum("ki,ki->k", t, u), 0.0)
+    aside_m = np.linalg.norm(t - along[:, None] * u, axis=1)
+    cosine = 0.5 * (np.einsum("kij,kij->k", measured[:, :3, :3], T[:, :3, :3]) - 1.0)
+    turned_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.asarray((turned_rad < ROTATION_TOLERANCE_RAD) & (aside_m < TRANSLATION_TOLERANCE_M))
 
 
 def component_with(logs: Mapping[LogId, Trajectory], earlier: GraphSolution | None) -> Component | None:
