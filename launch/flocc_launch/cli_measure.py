@@ -97,7 +97,7 @@ def perception(
 
 def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
     """Simulate drawn scenarios under all checkers; leave with exit code 1 when an invariant was violated."""
-    from flocc_launch.simulation.campaign import Outcome, campaign
+    from flocc_launch.simulation.campaign import Outcome, campaign, write_campaign
     from flocc_launch.simulation.campaign import shrink as smaller
     from flocc_launch.simulation.generator import drawn_scenario
 
@@ -108,7 +108,7 @@ def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
     found = campaign(range(first, first + seeds), PROCESSES, tell)
     out.mkdir(parents=True, exist_ok=True)
     path = out / "campaign.json"
-    path.write_text(json.dumps(found.as_json(), indent=1) + "\n", encoding="utf-8")
+    write_campaign(found, path)
     failed = [outcome.seed for outcome in found.outcomes if outcome.violations]
     typer.echo(f"{seeds} runs, {len(failed)} with violations: {path.resolve()}")
     for seed in failed if shrink else ():

@@ -13,7 +13,6 @@ from flocc_agent.radio import Blackout, RadioParameters
 from flocc_protocol.errors import FloccError
 
 ROBOTS_MAX = 1000
-SLOWDOWN_MAX = 1000.0
 NEEDS_VALUE = frozenset({"loss", "latency", "range", "slow"})
 
 

@@ -2,7 +2,6 @@
 
 from enum import Enum
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -128,8 +127,3 @@ def set_attention(module: nn.Module, kind: AttentionKind) -> None:
     for part in module.modules():
         if isinstance(part, (SelfAttention, CrossAttention)):
             part.kind = kind
-
-
-def no_gradient_like(module: nn.Module, device: torch.device, dtype: torch.dtype) -> nn.Module:
-    """Move a module for inference only: evaluation mode, no gradients, one dtype."""
-    return module.eval().requires_grad_(False).to(device=device, dtype=dtype)
