@@ -308,6 +308,8 @@ class Agent:
                 perception.encode,
                 perception.register,
                 build_optimiser(config.backend),
+                perception.encoder.part,
+                lambda: perception.encoder.encode_s,
             ),
             Reporter(config.name, self._T_body_camera, config.backend.steepness),
             self._on_line,

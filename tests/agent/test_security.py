@@ -124,7 +124,7 @@ class Listener:
         self.received: list[tuple[str, str, bytes]] = []
         self.transport = ZenohTransport(SWARM, robot, config)
         self.transport.set_receiver(lambda *message: self.received.append(message))
-        self.transport.serve_latents(lambda key: b"secret latent")
+        self.transport.serve_latents(lambda key, encode_bytes: b"secret latent")
 
 
 def secure_configs(folders: dict[str, Path]) -> dict[str, TransportConfig]:

@@ -88,8 +88,22 @@ class Encoder(Protocol):
         """Identity of the method and its weights; latents of one identity can be registered with each other."""
         ...
 
+    @property
+    def encode_s(self) -> float | None:
+        """Smoothed time to encode one picture, seconds; None where a latent is always fetched rather than encoded."""
+        ...
+
     def encode(self, image: Image) -> bytes:
         """Compute the latent of an image."""
+        ...
+
+    def part(self, latent: bytes, encode_bytes: int | None, /) -> bytes:
+        """Cut what this robot stored of a keyframe down to what it sends.
+
+        Args:
+            latent: What `encode` gave.
+            encode_bytes: What the link carries while the asker encodes a picture; None where it wants no picture.
+        """
         ...
 
 

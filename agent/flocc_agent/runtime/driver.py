@@ -93,11 +93,15 @@ class Skills:
         encode: Image to descriptor and latent.
         register: (query latent, match latent, odometry pair) to a relative pose up to scale.
         optimise: Pose graph and last solution to a solution; must be importable by a worker process.
+        part: (latent, what the link carries while the asker encodes a picture) to what is sent; see `Encoder.part`.
+        encode_s: See `Encoder.encode_s`.
     """
 
     encode: Callable[[Image], Encoded]
     register: Callable[[bytes, bytes, OdometryPair | None], Registration | RegistrationFailed]
     optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+    part: Callable[[bytes, int | None], bytes]
+    encode_s: Callable[[], float | None]
 
 
 class Driver:
@@ -280,10 +284,11 @@ class Driver:
         for queue in self._subscribers:
             _put_newest(queue, None)
 
-    def _latent_named(self, key: str) -> bytes | None:
-        """A latent for the transport, by a name that a peer gave."""
+    def _latent_named(self, key: str, encode_bytes: int | None) -> bytes | None:
+        """A latent for the transport, by a name that a peer gave, or the part of it that reaches him sooner."""
         try:
-            return self._store.latent(KeyframeId.parse(key))
+            latent = self._store.latent(KeyframeId.parse(key))
+            return None if latent is None else self._skills.part(latent, encode_bytes)
         except (ValueError, FloccError):
             return None
 
@@ -390,7 +395,8 @@ class Driver:
 
     async def _fetch(self, effect: FetchLatent) -> None:
         keyframe, holder = effect.keyframe, effect.holder
-        answer = await self._transport.fetch_latent(holder, str(keyframe), effect.deadline_s)
+        encode_s = self._skills.encode_s()
+        answer = await self._transport.fetch_latent(holder, str(keyframe), effect.deadline_s, encode_s=encode_s)
         if not isinstance(answer, Fetched):
             self.put(LatentFetchFailed(keyframe, holder, answer.problem.value))
             return

@@ -20,6 +20,9 @@ FORMAT = 1
 PARTIALS_MAX = 8
 SERVED_MAX = 4
 PIECE_BYTES_MIN = 16 * 1024
+LINKS_MAX = 256
+RATE_SMOOTHING_RATIO = 0.3
+CARRIED_BYTES_MAX = 2**31
 DIGITS_MAX = 12
 
 UNKNOWN = b"flocc: unknown latent"
@@ -57,9 +60,19 @@ class Piece:
 
 @dataclass(slots=True)
 class Partial:
-    """What came so far of one latent, and how long a piece to ask for next; shorter on links that prove slow."""
+    """What came so far of one latent, and how long a piece to ask for next; shorter on links that prove slow.
+
+    Attributes:
+        piece_bytes: Length to ask for.
+        encode_bytes: What the link carries while this robot encodes a picture; None where it wants no picture. It
+            stays the same for all pieces, because the holder chooses by it what the whole is.
+        sha256: Of the whole; empty before the first piece.
+        total_bytes: Of the whole; None before the first piece.
+        received: The bytes so far.
+    """
 
     piece_bytes: int
+    encode_bytes: int | None = None
     sha256: bytes = b""
     total_bytes: int | None = None
     received: bytearray = field(default_factory=bytearray)
@@ -99,9 +112,9 @@ class Partials:
         self._piece_bytes = piece_bytes
         self._partials: OrderedDict[str, Partial] = OrderedDict()
 
-    def of(self, latent: str) -> Partial:
+    def of(self, latent: str, encode_bytes: int | None = None) -> Partial:
         """What came so far of a latent; the least recently asked is forgotten when there are too many."""
-        partial = self._partials.setdefault(latent, Partial(self._piece_bytes))
+        partial = self._partials.setdefault(latent, Partial(self._piece_bytes, encode_bytes))
         self._partials.move_to_end(latent)
         while len(self._partials) > PARTIALS_MAX:
             self._partials.popitem(last=False)
@@ -117,22 +130,47 @@ class Partials:
         return len(partial.received) if partial else 0
 
 
+class LinkRates:
+    """How fast pieces came from each robot lately, request and answer included."""
+
+    def __init__(self) -> None:
+        self._bytes_per_s: OrderedDict[str, float] = OrderedDict()
+
+    def note(self, robot: str, piece_bytes: int, elapsed_s: float) -> None:
+        """A piece came; short ones tell of the latency rather than of the rate and are left out."""
+        if piece_bytes < PIECE_BYTES_MIN or elapsed_s <= 0:
+            return
+        rate = piece_bytes / elapsed_s
+        before = self._bytes_per_s.setdefault(robot, rate)
+        self._bytes_per_s[robot] = before + RATE_SMOOTHING_RATIO * (rate - before)
+        self._bytes_per_s.move_to_end(robot)
+        while len(self._bytes_per_s) > LINKS_MAX:
+            self._bytes_per_s.popitem(last=False)
+
+    def carried_bytes(self, robot: str, duration_s: float | None) -> int | None:
+        """What the link from a robot carries in a time; None where nothing was measured or no time is given."""
+        rate = self._bytes_per_s.get(robot)
+        return None if rate is None or duration_s is None else min(int(rate * duration_s), CARRIED_BYTES_MAX)
+
+
 class Server:
     """Cuts latents into pieces; remembers the last few, because one latent is asked for piece by piece."""
 
-    def __init__(self, lookup: Callable[[str], bytes | None], latent_bytes_max: int, chunk_bytes_max: int) -> None:
+    def __init__(
+        self, lookup: Callable[[str, int | None], bytes | None], latent_bytes_max: int, chunk_bytes_max: int
+    ) -> None:
         self._lookup = lookup
         self._latent_bytes_max = latent_bytes_max
         self._chunk_bytes_max = chunk_bytes_max
         self._lock = Lock()
-        self._recent: OrderedDict[str, tuple[bytes, bytes]] = OrderedDict()
+        self._recent: OrderedDict[tuple[str, int | None], tuple[bytes, bytes]] = OrderedDict()
 
-    def piece(self, latent: str, offset: int, length: int) -> Piece | None:
+    def piece(self, latent: str, offset: int, length: int, encode_bytes: int | None = None) -> Piece | None:
         """Give a piece of a latent, shorter at the end; None when it is not held or larger than allowed."""
         with self._lock:
-            held = self._recent.get(latent)
+            held = self._recent.get((latent, encode_bytes))
         if held is None:
-            held = self._read(latent)
+            held = self._read(latent, encode_bytes)
         if held is None:
             return None
         payload, sha256 = held
@@ -140,13 +178,13 @@ class Server:
         end = offset + min(length, self._chunk_bytes_max)
         return Piece(offset, len(payload), sha256, payload[offset:end])
 
-    def _read(self, latent: str) -> tuple[bytes, bytes] | None:
-        payload = self._lookup(latent)
+    def _read(self, latent: str, encode_bytes: int | None) -> tuple[bytes, bytes] | None:
+        payload = self._lookup(latent, encode_bytes)
         if payload is None or len(payload) > self._latent_bytes_max:
             return None
         held = payload, hashlib.sha256(payload).digest()
         with self._lock:
-            self._recent[latent] = held
+            self._recent[latent, encode_bytes] = held
             while len(self._recent) > SERVED_MAX:
                 self._recent.popitem(last=False)
         return held

@@ -17,7 +17,7 @@ from flocc_protocol.errors import FloccError
 Receiver = Callable[[str, str, bytes], None]
 """Takes (sender, kind, payload), on the event loop's thread."""
 
-LatentLookup = Callable[[str], bytes | None]
+LatentLookup = Callable[[str, int | None], bytes | None]
 """Gives the latent of a name such as `r1/7`, None when it is not held. Called on a thread of the transport."""
 
 
@@ -117,7 +117,12 @@ class Transport(Protocol):
         ...
 
     async def fetch_latent(
-        self, owner: str, key: str, deadline_s: float, sha256: bytes | None = None
+        self,
+        owner: str,
+        key: str,
+        deadline_s: float,
+        sha256: bytes | None = None,
+        encode_s: float | None = None,
     ) -> Fetched | FetchFailed:
         """Fetch one latent, in pieces, at the lowest priority.
 
@@ -126,6 +131,8 @@ class Transport(Protocol):
             key: The latent's name, such as `r1/7`.
             deadline_s: Seconds from now.
             sha256: The hash that the latent must have, where a record says so.
+            encode_s: How long this robot takes to encode a picture, seconds, where it takes a picture instead of a
+                latent when that is sooner over the link as measured so far.
         """
         ...
 

@@ -6,6 +6,7 @@ their own; what arrived is kept, and the next try goes on from there.
 
 import asyncio
 import logging
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from threading import BoundedSemaphore
@@ -15,7 +16,7 @@ import zenoh
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import Radio
-from flocc_agent.runtime.latent_transfer import UNKNOWN, Partial, Partials, Piece, Server, checked_number
+from flocc_agent.runtime.latent_transfer import UNKNOWN, LinkRates, Partial, Partials, Piece, Server, checked_number
 from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, LatentLookup, TrafficCounter
 from flocc_agent.runtime.zenoh_session import open_session
 from flocc_protocol import keys
@@ -52,6 +53,7 @@ class BulkService:
         self._fetchers = ThreadPoolExecutor(config.fetches_max, thread_name_prefix=f"{robot}-fetch")
         self._slots = asyncio.Semaphore(config.fetches_max)
         self._partials = Partials(config.chunk_bytes)
+        self._rates = LinkRates()
         self._in_flight: set[zenoh.CancellationToken] = set()
 
     def serve(self, lookup: LatentLookup) -> None:
@@ -107,7 +109,9 @@ class BulkService:
         assert self._server is not None
         _, latent = keys.parse_latent_key(str(query.key_expr))
         offset, length = (checked_number(query.parameters.get(name)) for name in ("offset", "length"))
-        piece = self._server.piece(latent, offset, length)
+        wanted = query.parameters.get("encode_bytes")
+        encode_bytes = None if wanted is None else checked_number(wanted)
+        piece = self._server.piece(latent, offset, length, encode_bytes)
         if piece is None:
             query.reply_err(UNKNOWN)
             return
@@ -116,11 +120,14 @@ class BulkService:
 
     # --- fetching: on the loop, except `_ask_blocking`
 
-    async def fetch(self, owner: str, latent: str, deadline_s: float, sha256: bytes | None) -> Fetched | FetchFailed:
+    async def fetch(
+        self, owner: str, latent: str, deadline_s: float, sha256: bytes | None, encode_s: float | None
+    ) -> Fetched | FetchFailed:
         """Fetch one latent; see `Transport.fetch_latent`."""
+        encode_bytes = self._rates.carried_bytes(owner, encode_s)
         try:
             async with asyncio.timeout(deadline_s), self._slots:
-                problem = await self._complete(owner, latent, sha256)
+                problem = await self._complete(owner, latent, sha256, encode_bytes)
         except TimeoutError:
             problem = FetchProblem.DEADLINE
         if problem in (FetchProblem.NO_ANSWER, FetchProblem.DEADLINE, FetchProblem.CLOSED):
@@ -129,12 +136,16 @@ class BulkService:
         self._partials.forget(latent)
         return FetchFailed(problem) if problem is not None else Fetched(bytes(partial.received))
 
-    async def _complete(self, owner: str, latent: str, sha256: bytes | None) -> FetchProblem | None:
+    async def _complete(
+        self, owner: str, latent: str, sha256: bytes | None, encode_bytes: int | None
+    ) -> FetchProblem | None:
         """Ask for piece after piece until nothing is missing; pieces in a row that do not come end it."""
-        partial, tries = self._partials.of(latent), 0
+        partial, tries = self._partials.of(latent, encode_bytes), 0
         while not partial.is_complete:
+            asked_s = time.monotonic()
             answer = await self._ask(owner, latent, partial)
             if isinstance(answer, Piece) and await self._is_received(owner, answer):
+                self._rates.note(owner, len(answer.payload), time.monotonic() - asked_s)
                 problem, tries = partial.add(answer, self._config.latent_bytes_max, sha256), 0
                 if problem is not None:
                     return problem
@@ -153,6 +164,8 @@ class BulkService:
         """Ask for the next piece, on a thread."""
         key = keys.latent_key(self._swarm, owner, latent)
         selector = f"{key}?offset={len(partial.received)};length={partial.piece_bytes}"
+        if partial.encode_bytes is not None:
+            selector += f";encode_bytes={partial.encode_bytes}"
         token = zenoh.CancellationToken()
         self._in_flight.add(token)
         try:

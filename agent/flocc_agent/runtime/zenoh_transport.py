@@ -355,7 +355,12 @@ class ZenohTransport:
     # --- latents
 
     async def fetch_latent(
-        self, owner: str, key: str, deadline_s: float, sha256: bytes | None = None
+        self,
+        owner: str,
+        key: str,
+        deadline_s: float,
+        sha256: bytes | None = None,
+        encode_s: float | None = None,
     ) -> Fetched | FetchFailed:
         """Fetch one latent in pieces, a few latents at a time, at the lowest priority."""
-        return await self._bulk.fetch(owner, key, deadline_s, sha256)
+        return await self._bulk.fetch(owner, key, deadline_s, sha256, encode_s)

@@ -12,13 +12,12 @@ pytest.importorskip("torch", reason="torch, an optional extra, is not installed"
 from flocc_agent.perception.latent import BadLatent, pack, unpack
 from flocc_agent.perception.mast3r.payload import (
     KIND,
-    Exchange,
     Geometry,
-    choose_exchange,
+    LatentDtype,
     jpeg_of,
     jpeg_size,
     read_payload,
-    served,
+    sooner_part,
     write_payload,
 )
 from flocc_agent.perception.mast3r.preprocess import plan_crop
@@ -75,24 +74,23 @@ def test_a_picture_travels_instead_of_a_latent() -> None:
     assert len(data) < 60_000
 
 
-def test_of_both_parts_the_faster_one_is_served() -> None:
+def test_of_both_parts_the_one_that_reaches_the_decoder_sooner_is_sent() -> None:
     both = write_payload(MODEL, geometry(), latent(), jpeg=jpeg_of(smooth_pixels(), 90))
-    fast, slow = served(both, 100e6, 0.7), served(both, 1e5, 0.01)
-    assert set(unpack(fast, KIND).arrays) == {"latent"}
+    fast, slow = sooner_part(both, 10_000_000), sooner_part(both, 1_000)
+    assert set(unpack(fast, KIND).arrays) == set(unpack(sooner_part(both, None), KIND).arrays) == {"latent"}
     assert set(unpack(slow, KIND).arrays) == {"jpeg"}
     assert read_payload(slow, MODEL, CHANNELS).pixels is not None
     alone = write_payload(MODEL, geometry(), latent())
-    assert served(alone, 1e3, 0.01) == alone
+    assert sooner_part(alone, 1_000) == alone
 
 
-@pytest.mark.parametrize(
-    ("latent_bytes", "crossover_bits_per_s"),
-    [(786_432 + 4096, 8.4e6), (1_572_864, 17.4e6)],
-)
-def test_auto_changes_its_choice_where_the_specification_says(latent_bytes: int, crossover_bits_per_s: float) -> None:
-    for rate, expected in ((0.95, Exchange.IMAGE), (1.05, Exchange.LATENT)):
-        assert choose_exchange(latent_bytes, 54_000, rate * crossover_bits_per_s, 0.7) is expected
-    assert choose_exchange(latent_bytes, 54_000, None, 0.7) is Exchange.LATENT
+@pytest.mark.parametrize(("dtype", "crossover_bits_per_s"), [("int8", 8.4e6), ("fp16", 17.4e6)])
+def test_auto_changes_its_choice_where_the_specification_says(dtype: LatentDtype, crossover_bits_per_s: float) -> None:
+    full_size = np.zeros((768, 1024), np.float32)
+    both = write_payload(MODEL, geometry(), full_size, dtype, jpeg=np.zeros(54_000, np.uint8))
+    for rate, expected in ((0.95, "jpeg"), (1.05, "latent")):
+        carried_bytes = int(rate * crossover_bits_per_s * 0.7 / 8)
+        assert expected in unpack(sooner_part(both, carried_bytes), KIND).arrays
 
 
 def altered(change: dict[str, Any]) -> bytes:

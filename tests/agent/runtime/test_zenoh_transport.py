@@ -39,6 +39,7 @@ class Member:
         self.received: list[tuple[str, str, bytes]] = []
         self.held: dict[str, bytes] = {}
         self.lookups: list[str] = []
+        self.encode_bytes: list[int | None] = []
         self.transport = ZenohTransport(swarm, robot, config, radio)
         self.met: set[str] = set()
         self.transport.set_receiver(self._receive)
@@ -50,8 +51,9 @@ class Member:
         else:
             self.received.append((sender, kind, payload))
 
-    def _lookup(self, key: str) -> bytes | None:
+    def _lookup(self, key: str, encode_bytes: int | None) -> bytes | None:
         self.lookups.append(key)
+        self.encode_bytes.append(encode_bytes)
         return self.held.get(key)
 
     def heard(self, *message: object) -> bool:
@@ -180,15 +182,29 @@ async def test_lost_pieces_are_asked_for_again() -> None:
 async def test_asks_for_less_at_a_time_where_long_pieces_do_not_come(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = Server.piece
 
-    def piece(server: Server, latent: str, offset: int, length: int) -> Piece | None:
+    def piece(server: Server, latent: str, offset: int, length: int, encode_bytes: int | None) -> Piece | None:
         if length > 40_000:
             raise DecodeError("no answer, as on a link that is too slow")
-        return whole(server, latent, offset, length)
+        return whole(server, latent, offset, length, encode_bytes)
 
     monkeypatch.setattr(Server, "piece", piece)
     async with swarm(ROBOTS[:2], chunk_bytes=160_000) as (one, two):
         two.held["r2/7"] = LATENT
         assert await one.transport.fetch_latent("r2", "r2/7", 20.0) == Fetched(LATENT)
+
+
+async def test_a_fetch_says_what_the_link_carries_while_a_picture_is_encoded() -> None:
+    radio = Radio(RadioParameters(LinkParameters(bandwidth_bytes_s=1e6)), np.random.default_rng(2))
+    async with swarm(ROBOTS[:2], radios={"r1": radio}) as (one, two):
+        two.held = {f"r2/{n}": LATENT[:300_000] for n in range(3)}
+        for n, encode_s in enumerate((0.5, 0.5, None)):
+            fetched = await one.transport.fetch_latent("r2", f"r2/{n}", 20.0, encode_s=encode_s)
+            assert fetched == Fetched(LATENT[:300_000])
+    first, measured, without = two.encode_bytes
+    assert first is None, "nothing was measured yet"
+    assert measured is not None
+    assert 200_000 < measured < 520_000, "half a second of a megabyte per second, less what requests cost"
+    assert without is None
 
 
 async def test_heartbeats_are_on_time_while_latents_flow() -> None:

@@ -40,6 +40,7 @@ from flocc_agent.perception.mast3r.payload import (
     Payload,
     jpeg_of,
     read_payload,
+    sooner_part,
     write_payload,
 )
 from flocc_agent.perception.mast3r.preprocess import (
@@ -110,8 +111,8 @@ class Mast3rEncoder:
 
     @property
     def encode_s(self) -> float | None:
-        """Smoothed time to encode one picture, seconds; None before the first."""
-        return self._engine.encode_s
+        """Smoothed time to encode one picture, seconds; None before the first and unless `exchange` is auto."""
+        return self._engine.encode_s if self._config.exchange == "auto" else None
 
     def encode(self, image: Image) -> bytes:
         """Compute the payload of an image: its latent, its picture, or both, as configured.
@@ -136,6 +137,14 @@ class Mast3rEncoder:
             write_payload(self._model, geometry, latent, self._config.latent_dtype, jpeg)
             for (geometry, _), latent, jpeg in zip(framed, latents, jpegs, strict=True)
         ]
+
+    def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
+        """Cut a stored payload down to the part that reaches the asker's decoder sooner; a single part stays.
+
+        Raises:
+            BadLatent: The stored payload is damaged.
+        """
+        return sooner_part(latent, encode_bytes)
 
     def _framed(self, image: Image) -> tuple[Geometry, NDArray[np.uint8]]:
         """Undistort, resize and cut an image, and carry its calibration along."""

@@ -5,7 +5,6 @@ sizes do not fit its header, is refused with `BadLatent`.
 """
 
 from dataclasses import astuple, dataclass
-from enum import Enum
 from typing import Any, Literal
 
 import cv2
@@ -27,13 +26,6 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 LatentDtype = Literal["fp16", "int8"]
-
-
-class Exchange(Enum):
-    """What is sent of a keyframe."""
-
-    LATENT = "latent"
-    IMAGE = "image"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,34 +206,22 @@ def _calibration(value: object) -> Float:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def choose_exchange(
-    latent_bytes: int, image_bytes: int, link_bits_per_s: float | None, receiver_encode_s: float
-) -> Exchange:
-    """Decide what reaches a decoder sooner: the latent, or the picture that the receiver then encodes.
+def sooner_part(data: bytes, encode_bytes: int | None) -> bytes:
+    """Cut a stored payload down to what reaches a decoder sooner: the latent, or the picture that is then encoded.
 
     Args:
-        latent_bytes: Size of the latent payload.
-        image_bytes: Size of the picture payload.
-        link_bits_per_s: Measured rate of the link; None where nothing was measured yet (the latent is sent).
-        receiver_encode_s: How long the receiver takes to encode one picture.
-    """
-    if link_bits_per_s is None or link_bits_per_s <= 0:
-        return Exchange.LATENT
-    saved_s = 8.0 * (latent_bytes - image_bytes) / link_bits_per_s
-    return Exchange.IMAGE if saved_s > receiver_encode_s else Exchange.LATENT
-
-
-def served(data: bytes, link_bits_per_s: float | None, receiver_encode_s: float) -> bytes:
-    """Cut a stored payload down to the part that is faster over a link; one with a single part stays as it is.
+        data: A stored payload; one with a single part stays as it is.
+        encode_bytes: What the link carries while the receiver encodes a picture: a picture that saves more bytes than
+            that is sooner. None where nothing was measured yet, or where no picture is wanted: the latent is sent.
 
     Raises:
         BadLatent: The stored payload is damaged.
     """
     content = unpack(data, KIND)
-    image = {name: array for name, array in content.arrays.items() if name == "jpeg"}
+    picture = {name: array for name, array in content.arrays.items() if name == "jpeg"}
     latent = {name: array for name, array in content.arrays.items() if name != "jpeg"}
-    if not image or not latent:
+    if not picture or not latent:
         return data
-    sizes = [sum(array.nbytes for array in part.values()) for part in (latent, image)]
-    chosen = choose_exchange(sizes[0], sizes[1], link_bits_per_s, receiver_encode_s)
-    return pack(KIND, content.header, latent if chosen is Exchange.LATENT else image)
+    latent_bytes, picture_bytes = (sum(array.nbytes for array in part.values()) for part in (latent, picture))
+    picture_is_sooner = encode_bytes is not None and latent_bytes - picture_bytes > encode_bytes
+    return pack(KIND, content.header, picture if picture_is_sooner else latent)
