@@ -9,6 +9,7 @@ import typer
 
 from flocc_launch.cli_common import EXIT_BAD_INPUT, progress_bar, show_report
 from flocc_launch.cli_data import add_data
+from flocc_launch.cli_experiment import add_experiments
 from flocc_launch.cli_measure import add_measures, run_campaign
 from flocc_launch.cli_tools import add_tools
 from flocc_protocol.errors import FloccError
@@ -30,7 +31,10 @@ app = typer.Typer(
 add_tools(app)
 add_data(app)
 add_measures(app)
+add_experiments(app)
 
+WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
+HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
 Latency = Annotated[float | None, typer.Option(help="Delay on every link, seconds.")]
@@ -73,9 +77,9 @@ def demo(
 
 @app.command()
 def launch(
-    scenario: Annotated[str, typer.Argument(help="Scenario file (TOML), or the name of a shipped one.")],
+    scenario: Annotated[str, typer.Argument(help=WHAT_RUNS)],
     out: Out = Path("runs/launch"),
-    agents: Annotated[int | None, typer.Option(min=1, help="Number of robots of the world or data set.")] = None,
+    agents: Annotated[int | None, typer.Option(min=1, help=HOW_MANY)] = None,
     loss: Loss = None,
     latency: Latency = None,
     bandwidth: Bandwidth = None,
@@ -95,9 +99,9 @@ def launch(
 
 @app.command()
 def simulate(
-    scenario: Annotated[str | None, typer.Argument(help="Scenario file (TOML), or the name of a shipped one.")] = None,
+    scenario: Annotated[str | None, typer.Argument(help=WHAT_RUNS)] = None,
     out: Out = Path("runs/simulate"),
-    agents: Annotated[int | None, typer.Option(min=1, help="Number of robots.")] = None,
+    agents: Annotated[int | None, typer.Option(min=1, help=HOW_MANY)] = None,
     seed: Seed = None,
     loss: Loss = None,
     latency: Latency = None,

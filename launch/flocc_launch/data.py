@@ -11,6 +11,7 @@ from flocc_launch.scenario import DatasetScenario, Scenario, TracksScenario, Wor
 if TYPE_CHECKING:
     from flocc_launch.simulation.tracks import Walk
 
+RECORDING_FILES = ("images.txt", "odometry.tum", "camera.toml")
 Progress = Callable[[int, int], None]
 
 
@@ -34,7 +35,11 @@ def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str
     elif scenario.tracks is not None:
         made = _tracks(scenario.tracks)
     found = {f"r{i + 1}": path for i, path in enumerate(made)}
-    given = {name: robot.recording for name, robot in scenario.robots.items() if robot.recording is not None}
+    given = {
+        name: _recording(robot.recording, progress)
+        for name, robot in scenario.robots.items()
+        if robot.recording is not None
+    }
     return {**found, **given}
 
 
@@ -48,12 +53,29 @@ def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:
 
 
 def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
+    from flocc_launch.datasets.bag_reader import is_bag
     from flocc_launch.datasets.commands import split
 
-    source = dataset.source.resolve()
-    key = hashlib.sha256(f"{source} {dataset.robots} {dataset.seed}".encode()).hexdigest()[:12]
-    out = cache_folder() / "datasets" / f"{source.name}-{key}"
+    source = _recording(dataset.source, progress) if is_bag(dataset.source) else dataset.source.resolve()
+    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed}")
     return split(source, out, dataset.robots, seed=dataset.seed, progress=progress)
+
+
+def _recording(path: Path, progress: Progress | None) -> Path:
+    """The folder itself where it is a recording, else one made of the data set or bag."""
+    from flocc_launch.datasets.commands import convert
+
+    if all((path / name).exists() for name in RECORDING_FILES):
+        return path
+    return convert(path, _dataset_folder(path.resolve(), "whole"), progress=progress)
+
+
+def _dataset_folder(source: Path, how: str) -> Path:
+    """Where a data set's recordings are kept; a data set that was changed since gets another folder."""
+    files = [source] if source.is_file() else sorted(source.rglob("*"))
+    stats = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
+    key = hashlib.sha256(f"{source} {how} {stats}".encode()).hexdigest()[:12]
+    return cache_folder() / "datasets" / f"{source.name}-{key}"
 
 
 def _tracks(tracks: TracksScenario) -> list[Path]:

@@ -253,8 +253,12 @@ class Scenario(Section):
         Raises:
             ConfigError: The file cannot be used; the message names it and the key.
         """
-        fields = read_toml(path)
-        for key, value in (changes or {}).items():
+        return cls.of(read_toml(path), changes or {}, path)
+
+    @classmethod
+    def of(cls, fields: dict[str, object], changes: Mapping[str, object], path: Path) -> "Scenario":
+        """Check fields that a file, or a folder of data in its place, gave; arguments and errors as of `read`."""
+        for key, value in changes.items():
             _put(fields, key.split("."), value)
         return validated(cls, fields, str(path), path.resolve().parent)
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flocc_agent.config import ConfigError
+from flocc_launch.own_data import is_own_data, scenario_fields
 from flocc_launch.scenario import Scenario
 
 FOLDER = Path(__file__).parent / "scenarios"
@@ -30,13 +31,15 @@ def read_scenario(text: str, changes: Mapping[str, object], agents: int | None =
     """Read a scenario file, or a shipped scenario by its name.
 
     Args:
-        text: Path or name.
+        text: Path or name; a folder or a bag is the user's own data.
         changes: Keys that the command line overrides.
         agents: Number of robots of its world, data set or tracks.
 
     Raises:
         ConfigError: It cannot be read, or it has no robots that could be counted anew.
     """
+    if text not in names() and is_own_data(Path(text)):
+        return Scenario.of(scenario_fields(Path(text), agents), changes, Path(text))
     read = Scenario.read if Path(text).suffix == ".toml" or Path(text).exists() else None
     scenario = read(Path(text), changes) if read else read_shipped(text, changes)
     if agents is None:

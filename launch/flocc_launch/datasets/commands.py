@@ -11,9 +11,10 @@ from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.cut import cut
-from flocc_launch.datasets.detect import read_source
+from flocc_launch.datasets.detect import check_times, read_source
 from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
 from flocc_launch.datasets.names import robot_names
+from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.writer import Progress, write_source
 
@@ -192,14 +193,19 @@ def split(
 
 def _odometry(source: Source, odometry: Path | None, drift: DriftSpec | None, rng: np.random.Generator) -> Trajectory:
     if odometry is not None:
-        return read_tum(odometry).relative_to_first()
+        given = read_tum(odometry)
+        check_times(source, given, odometry)
+        return given.relative_to_first()
     if drift is not None:
         if source.truth is None:
             raise DatasetError(f"{source.path}: has no ground truth to make drifting odometry from")
         return drifted(source.truth, drift, rng, source.up_world)
     found = source.odometry or source.truth
     if found is None:
-        raise DatasetError(f"{source.path}: has neither odometry nor ground truth; name a TUM file with --odometry")
+        raise DatasetError(
+            f"{source.path}: has neither odometry nor ground truth ({expected_files(source.path)}); "
+            "name a TUM file with --odometry"
+        )
     return found.relative_to_first()
 
 

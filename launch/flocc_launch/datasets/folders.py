@@ -1,12 +1,10 @@
-"""Readers of data sets in folders: TUM RGB-D, EuRoC ASL, KITTI odometry, 7-Scenes, and a plain folder.
+"""Readers of published data sets in folders: TUM RGB-D, EuRoC ASL, KITTI odometry, 7-Scenes.
 
 Each reader takes what is good and lists what is wrong as faults; it raises only where nothing can be used.
 """
 
-import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +12,13 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose, number_lines, read_tum, text_lines
+from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import image_size
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
 Float = NDArray[np.float64]
-T = TypeVar("T")
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
 SEVENSCENES_RATE_HZ = 30.0
 KITTI_RATE_HZ = 10.0
 UP_CAMERA = np.array([0.0, -1.0, 0.0])
@@ -36,8 +33,8 @@ TUM_CAMERAS = {
 
 def read_tum_rgbd(path: Path) -> Source:
     """Read a TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt`; the body is the colour camera."""
-    images, faults = _listed_images(path / "rgb.txt")
-    lens = _camera_file(path)
+    images, faults = listed_images(path / "rgb.txt")
+    lens = camera_file(path)
     for name, ((fx, fy, cx, cy), distortion, k3) in TUM_CAMERAS.items():
         if lens is None and name in path.resolve().name:
             lens = Lens(Camera(640, 480, fx, fy, cx, cy, distortion), k3=k3)
@@ -49,10 +46,10 @@ def read_euroc(path: Path) -> Source:
     """Read an EuRoC ASL sequence's left camera: `mav0/cam0`, ground truth of the IMU body."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     folder = mav / "cam0" / "data"
-    images = tuple((int(file.stem) * 1e-9, file) for file in _image_files(folder) if file.stem.isdigit())
+    images = tuple((int(file.stem) * 1e-9, file) for file in image_files(folder) if file.stem.isdigit())
     lens = read_lens(mav / "cam0" / "sensor.yaml") if (mav / "cam0" / "sensor.yaml").exists() else None
     truth = _optional(mav / "state_groundtruth_estimate0" / "data.csv", _read_euroc_truth)
-    return Source(path, "euroc", _some(images, folder), lens, truth=truth)
+    return Source(path, "euroc", some(images, folder), lens, truth=truth)
 
 
 def _read_euroc_truth(path: Path) -> Trajectory:
@@ -69,17 +66,17 @@ def read_kitti(path: Path) -> Source:
     folder = next((path / name for name in ("image_0", "image_l", "image_2") if (path / name).is_dir()), None)
     if folder is None:
         raise DatasetError(f"{path}: has no folder image_0")
-    files = _image_files(folder)
+    files = image_files(folder)
     times = path / "times.txt"
     stamps_s = (
         [v[0] for _, v in number_lines(times, 1)] if times.exists() else [i / KITTI_RATE_HZ for i in range(len(files))]
     )
     truth, faults = _kitti_truth(path, stamps_s)
     count = len(files) if truth is None else len(truth)
-    faults = (*faults, *_unequal(folder, len(files), times if times.exists() else path, len(stamps_s), count))
+    faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, len(stamps_s), count))
     images = tuple(zip(stamps_s, files, strict=False))
-    lens = _camera_file(path) or _kitti_lens(path / "calib.txt", "P2" if folder.name == "image_2" else "P0", files)
-    return Source(path, "kitti", _some(images, folder), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
+    lens = camera_file(path) or _kitti_lens(path / "calib.txt", "P2" if folder.name == "image_2" else "P0", files)
+    return Source(path, "kitti", some(images, folder), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
 
 
 def _kitti_truth(path: Path, stamps_s: list[float]) -> tuple[Trajectory | None, tuple[str, ...]]:
@@ -126,12 +123,12 @@ def read_sevenscenes(path: Path) -> Source:
         poses.append(checked_pose(np.array(rows), str(pose_file)))
         stamps_s.append(number / SEVENSCENES_RATE_HZ)
         images.append((stamps_s[-1], file))
-    _some(tuple(images), path)
+    some(tuple(images), path)
     orphans = len(list(path.glob("frame-*.pose.txt"))) - len(images)
     if orphans > 0:
         faults.append(f"{path}: has {orphans} poses more than images")
     truth = Trajectory(np.array(stamps_s), np.array(poses))
-    lens = _camera_file(path) or _sevenscenes_lens(path, images[0][1])
+    lens = camera_file(path) or _sevenscenes_lens(path, images[0][1])
     return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=tuple(faults))
 
 
@@ -142,95 +139,6 @@ def _sevenscenes_lens(path: Path, image: Path) -> Lens:
         return Lens(Camera(width, height, 585.0, 585.0, width / 2, height / 2))
     K = [values for _, values in number_lines(file, 3)]
     return Lens(Camera(width, height, K[0][0], K[1][1], K[0][2], K[1][2]))
-
-
-def read_plain(path: Path) -> Source:
-    """Read a folder of images with a TUM trajectory and intrinsics.
-
-    Stamps come from `images.txt` (or `rgb.txt`), else from file names (seconds, or nanoseconds), else from the
-    trajectory where it has as many poses as there are images.
-    """
-    odometry = _first_trajectory(path, ("odometry", "trajectory", "poses", "vio"))
-    truth = _first_trajectory(path, ("groundtruth", "gt", "ground_truth"))
-    listing = next((path / name for name in ("images.txt", "rgb.txt") if (path / name).exists()), None)
-    if listing is not None:
-        images, faults = _listed_images(listing)
-    else:
-        images, faults = _stamped_by_name(path, odometry or truth)
-    return Source(path, "plain", images, _camera_file(path), odometry=odometry, truth=truth, faults=faults)
-
-
-def _first_trajectory(path: Path, stems: tuple[str, ...]) -> Trajectory | None:
-    names = [f"{stem}{suffix}" for stem in stems for suffix in (".tum", ".txt")]
-    file = next((path / name for name in names if (path / name).exists()), None)
-    return read_tum(file) if file is not None else None
-
-
-def _stamped_by_name(
-    path: Path, trajectory: Trajectory | None
-) -> tuple[tuple[tuple[float, Path], ...], tuple[str, ...]]:
-    folder = path / "images" if (path / "images").is_dir() else path
-    files = _image_files(folder)
-    _some(tuple(files), folder)
-    stamps_s = [_stamp_of_name(file.stem) for file in files]
-    if all(stamp_s is not None for stamp_s in stamps_s):
-        pairs = sorted((stamp_s, file) for stamp_s, file in zip(stamps_s, files, strict=True) if stamp_s is not None)
-        return tuple(pairs), ()
-    if trajectory is None:
-        raise DatasetError(f"{folder}: the images have no stamps: name them by seconds, or list them in images.txt")
-    images = tuple(zip((float(stamp_s) for stamp_s in trajectory.stamps_s), files, strict=False))
-    return images, _unequal(folder, len(files), path, len(files), len(trajectory))
-
-
-def _stamp_of_name(stem: str) -> float | None:
-    if re.fullmatch(r"\d{16,20}", stem):
-        return int(stem) * 1e-9
-    return float(stem) if re.fullmatch(r"\d+\.\d+|\d{9,11}", stem) else None
-
-
-def _unequal(folder: Path, images: int, stamps_file: Path, stamps: int, poses: int) -> tuple[str, ...]:
-    if images == poses == stamps:
-        return ()
-    if images == stamps:
-        return (f"{folder}: has {images} images, but the trajectory has {poses} poses",)
-    return (f"{folder}: has {images} images, but {stamps_file} has {stamps} stamps",)
-
-
-def _listed_images(path: Path) -> tuple[tuple[tuple[float, Path], ...], tuple[str, ...]]:
-    images: list[tuple[float, Path]] = []
-    missing = []
-    for line, text in text_lines(path):
-        stamp, _, name = text.partition(" ")
-        try:
-            stamp_s, file = float(stamp), path.parent / name.strip()
-        except ValueError:
-            raise DatasetError(f"{path}:{line}: must be 'stamp_s relative/path', not {text[:80]!r}") from None
-        if images and stamp_s <= images[-1][0]:
-            raise DatasetError(f"{path}:{line}: time goes backwards, from {images[-1][0]:.6f} s to {stamp_s:.6f} s")
-        if file.is_file():
-            images.append((stamp_s, file))
-        else:
-            missing.append(f"{path}:{line}: the image {file} does not exist")
-    faults = tuple(missing[:1]) if len(missing) < 2 else (f"{missing[0]} (and {len(missing) - 1} others)",)
-    return _some(tuple(images), path), faults
-
-
-def _image_files(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise DatasetError(f"{folder}: is not a folder")
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-
-
-def _some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
-    if not images:
-        raise DatasetError(f"{where}: no image was found")
-    return images
-
-
-def _camera_file(path: Path) -> Lens | None:
-    names = ("camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "intrinsics.yaml", "sensor.yaml")
-    file = next((path / name for name in names if (path / name).exists()), None)
-    return read_lens(file) if file is not None else None
 
 
 def _optional(path: Path, read: Callable[[Path], Trajectory]) -> Trajectory | None:

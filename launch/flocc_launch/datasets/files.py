@@ -1,0 +1,75 @@
+"""What the readers of folders share: lists of images, the files in a folder, a camera beside them."""
+
+import re
+from pathlib import Path
+from typing import TypeVar
+
+from flocc_agent.runtime.trajectory import text_lines
+from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.source import DatasetError, Lens
+
+T = TypeVar("T")
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
+CAMERA_FILES = ("camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "intrinsics.yaml", "sensor.yaml")
+
+
+def unequal(folder: Path, images: int, stamps_file: Path, stamps: int, poses: int) -> tuple[str, ...]:
+    """Faults of a folder whose images, stamps and poses are not equally many; none where they are."""
+    if images == poses == stamps:
+        return ()
+    if images == stamps:
+        return (f"{folder}: has {images} images, but the trajectory has {poses} poses",)
+    return (f"{folder}: has {images} images, but {stamps_file} has {stamps} stamps",)
+
+
+def listed_images(path: Path) -> tuple[tuple[tuple[float, Path], ...], tuple[str, ...]]:
+    """Images of a list with lines `stamp_s relative/path`, and a fault where some are missing.
+
+    Raises:
+        DatasetError: A line is of another form, time goes backwards, or no image is there.
+    """
+    images: list[tuple[float, Path]] = []
+    missing = []
+    for line, text in text_lines(path):
+        try:
+            stamp, name = re.split(r"[\s,]+", text, maxsplit=1)
+            stamp_s, file = float(stamp), path.parent / name
+        except ValueError:
+            raise DatasetError(f"{path}:{line}: must be 'stamp_s relative/path', not {text[:80]!r}") from None
+        if images and stamp_s <= images[-1][0]:
+            raise DatasetError(f"{path}:{line}: time goes backwards, from {images[-1][0]:.6f} s to {stamp_s:.6f} s")
+        if file.is_file():
+            images.append((stamp_s, file))
+        else:
+            missing.append(f"{path}:{line}: the image {file} does not exist")
+    faults = tuple(missing[:1]) if len(missing) < 2 else (f"{missing[0]} (and {len(missing) - 1} others)",)
+    return some(tuple(images), path), faults
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Image files of a folder, by name.
+
+    Raises:
+        DatasetError: It is no folder.
+    """
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: is not a folder")
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
+    """The images, of which there is at least one.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    if not images:
+        raise DatasetError(f"{where}: no image was found")
+    return images
+
+
+def camera_file(path: Path) -> Lens | None:
+    """The camera that a file in a folder describes, or None."""
+    file = next((path / name for name in CAMERA_FILES if (path / name).exists()), None)
+    return read_lens(file) if file is not None else None
