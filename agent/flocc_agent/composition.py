@@ -37,6 +37,7 @@ from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_agent.stages import stage
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
@@ -69,7 +70,10 @@ class Perception:
 
     def encode(self, image: Image) -> EncodedImage:
         """Describe and encode one image, once per keyframe."""
-        return EncodedImage(Array.int8(self.describer.describe(image)), self.encoder.encode(image))
+        with stage("describe"):
+            descriptor = Array.int8(self.describer.describe(image))
+        with stage("encode"):
+            return EncodedImage(descriptor, self.encoder.encode(image))
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's."""

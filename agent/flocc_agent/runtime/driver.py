@@ -54,8 +54,9 @@ from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.persistence import Persist, write
 from flocc_agent.runtime.reporting import Reporter, result_of
 from flocc_agent.runtime.store import Store
-from flocc_agent.runtime.transport import Fetched, Transport
+from flocc_agent.runtime.transport import Fetched, Transport, TransportCounters
 from flocc_agent.runtime.workers import Workers, WorkFailed
+from flocc_agent.stages import brief_of, fields_of
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import KeyframeId
@@ -69,6 +70,7 @@ INBOX_MAX = 8192
 IMAGES_MAX = 8
 CORRECTIONS_MAX = 16
 BYTES_PERIOD_S = 1.0
+ACCOUNT_PERIOD_S = 10.0
 
 
 class Encoded(Protocol):
@@ -138,7 +140,7 @@ class Driver:
         self._reporter = reporter
         self._on_line = on_line
         self._clock_s = clock_s
-        self._inbox: deque[Event] = deque()
+        self._inbox: deque[tuple[float, Event]] = deque()
         self._wake = asyncio.Event()
         self._opened = asyncio.Event()
         self._images: dict[int, Image] = {}
@@ -149,7 +151,9 @@ class Driver:
         self._subscribers: list[asyncio.Queue[Correction | None]] = []
         self._refused: Counter[tuple[str, str]] = Counter()
         self._last_graph: PoseGraph | None = None
-        self._bytes_due_s = clock_s() + BYTES_PERIOD_S
+        self._began_s = clock_s()
+        self._bytes_due_s = self._began_s + BYTES_PERIOD_S
+        self._account_due_s = self._began_s + ACCOUNT_PERIOD_S
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
 
@@ -185,7 +189,7 @@ class Driver:
 
     def put(self, event: Event) -> None:
         """Put an event into the inbox, on the loop's thread."""
-        self._inbox.append(event)
+        self._inbox.append((self._clock_s(), event))
         self._wake.set()
 
     def stop(self) -> None:
@@ -218,6 +222,8 @@ class Driver:
             "logs": {str(digest.log): [digest.count, digest.checksum] for digest in digests},
             "sent_bytes": sum(traffic.payload_bytes for traffic in counters.sent.values()),
             "received_bytes": sum(traffic.payload_bytes for traffic in counters.received.values()),
+            "links": {table: totals(peers) for table, peers in counters.links().items()},
+            "stages": brief_of(self._workers.stages.snapshot()),
             "refused": self.counters(),
             "busy": self.busy(),
         }
@@ -258,7 +264,10 @@ class Driver:
             if self.robot.deadline() <= now:
                 await self._carry_out(self.robot.tick(now))
             while self._inbox and self.robot.deadline() > self._clock_s():
-                await self._carry_out(self.robot.handle(self._inbox.popleft(), self._clock_s()))
+                put_s, event = self._inbox.popleft()
+                now = self._clock_s()
+                self._workers.stages.observe("inbox_wait", now - put_s)
+                await self._carry_out(self.robot.handle(event, now))
             self._count_bytes()
             await self._sleep()
 
@@ -395,11 +404,12 @@ class Driver:
 
     async def _fetch(self, effect: FetchLatent) -> None:
         keyframe, holder = effect.keyframe, effect.holder
-        encode_s = self._skills.encode_s()
+        encode_s, began_s = self._skills.encode_s(), self._clock_s()
         answer = await self._transport.fetch_latent(holder, str(keyframe), effect.deadline_s, encode_s=encode_s)
         if not isinstance(answer, Fetched):
             self.put(LatentFetchFailed(keyframe, holder, answer.problem.value))
             return
+        self._workers.stages.observe("fetch", self._clock_s() - began_s)
         await asyncio.to_thread(self._store.put_latent, keyframe, answer.latent)
         self.put(LatentFetched(keyframe, holder))
 
@@ -425,7 +435,7 @@ class Driver:
 
     async def _warm_up(self) -> None:
         """Start the optimiser's process now, so that the first round does not wait for it."""
-        await self._workers.run("optimise", self._skills.optimise, PoseGraph({}), None)
+        await self._workers.run("optimise", self._skills.optimise, PoseGraph({}), None, counted=False)
 
     async def _optimise(self, effect: Optimise) -> None:
         result = await self._workers.run("optimise", self._skills.optimise, effect.graph, effect.initial)
@@ -452,12 +462,31 @@ class Driver:
         sent = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.sent.items())}
         received = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.received.items())}
         self._on_line(self._reporter.line(Report("bytes", {"sent": dict(sent), "received": dict(received)}), now))
+        if now >= self._account_due_s or last:
+            self._account_due_s = now + ACCOUNT_PERIOD_S
+            self._on_line(self._account(counters, now))
+
+    def _account(self, counters: TransportCounters, now: float) -> dict[str, Any]:
+        """Bytes by link and kind, and time by stage, since this start of the agent."""
+        return {
+            "t": round(now, 6),
+            "robot": self.robot.log.robot,
+            "event": "account",
+            "since_s": round(self._began_s, 6),
+            **counters.links(),
+            "stages": fields_of(self._workers.stages.snapshot()),
+        }
 
 
 _WARNINGS = frozenset({"peer_refused", "duplicate_name", "log_forked", "latent_lost", "optimisation_failed"})
 _INFOS = frozenset(
     {"leader", "leader_lost", "neighbour_up", "neighbour_down", "closure_accepted", "correction", "optimised"}
 )
+
+
+def totals(peers: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
+    """Bytes by peer, all kinds together."""
+    return {peer: sum(kinds.values()) for peer, kinds in peers.items()}
 
 
 def _level(report: Report) -> int:

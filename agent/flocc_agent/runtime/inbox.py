@@ -66,8 +66,10 @@ class Inbox:
         waiting_bytes = self._waiting_bytes.get(message.kind, 0) + len(message.payload)
         queue.append(message)
         while len(queue) > self._messages_max or (waiting_bytes > self._bytes_max and len(queue) > 1):
-            waiting_bytes -= len(queue.popleft().payload)
+            oldest = queue.popleft()
+            waiting_bytes -= len(oldest.payload)
             self._counter.count_dropped(f"inbox-full-{message.kind}")
+            self._counter.count_lost(oldest.kind, len(oldest.payload), oldest.sender)
         self._waiting_bytes[message.kind] = waiting_bytes
 
     def _wake(self) -> None:

@@ -7,10 +7,10 @@ Repair of lost messages is the replicated log's business, not the transport's.
 
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from flocc_protocol.errors import FloccError
 
@@ -65,24 +65,47 @@ class Traffic:
     payload_bytes: int = 0
 
 
+ByPeer = dict[str, dict[str, Traffic]]
+"""Peer -> kind -> traffic."""
+
+
 @dataclass(frozen=True, slots=True)
 class TransportCounters:
     """What went through a transport so far.
 
+    A byte is one of payload as handed to zenoh: of an encoded message or of a piece of a latent. Keys, attachments,
+    requests for latents, and what zenoh, TLS and TCP put around it are not counted. `sent` counts a broadcast once,
+    `sent_to` once for each robot that is linked at that moment. What was sent to a robot is what it received, less
+    what it received again, plus what it lost; the rest was lost by the network or is on its way.
+
     Attributes:
         sent: By kind; latents that were served are of kind "latent".
         received: By kind; only what reached the robot.
-        sent_to: By receiver, unicasts and latents.
-        received_from: By sender.
+        sent_to: By receiver and kind.
+        received_from: By sender and kind.
+        lost_from: By sender and kind: arrived, but the emulated radio or a limit of this robot kept it away.
+        repeated_from: By sender and kind: of what was received, what the emulated radio repeated.
         dropped: Messages by reason: inbox-full, too-large, rate, malformed-key, too-many-peers, not-sent, closed,
             radio-loss, radio-range and so on, foreign-version, foreign-swarm, name-twice, serve-busy.
     """
 
     sent: dict[str, Traffic]
     received: dict[str, Traffic]
-    sent_to: dict[str, Traffic]
-    received_from: dict[str, Traffic]
+    sent_to: ByPeer
+    received_from: ByPeer
+    lost_from: ByPeer
+    repeated_from: ByPeer
     dropped: dict[str, int]
+
+    def links(self) -> dict[str, dict[str, dict[str, int]]]:
+        """Payload bytes by table, peer and kind, for files."""
+        return {
+            table: {
+                peer: {kind: traffic.payload_bytes for kind, traffic in kinds.items()}
+                for peer, kinds in getattr(self, table).items()
+            }
+            for table in LINK_TABLES
+        }
 
 
 class Transport(Protocol):
@@ -141,22 +164,43 @@ class Transport(Protocol):
         ...
 
 
+KIND_TABLES = ("sent", "received")
+LINK_TABLES = ("sent_to", "received_from", "lost_from", "repeated_from")
+NAMES_MAX = 4096
+"""Kinds, or pairs of peer and kind, that are counted apart; those of further ones are not counted."""
+
+
 class TrafficCounter:
     """Counts for a transport; any thread may count."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._messages: dict[str, Counter[str]] = {table: Counter() for table in TABLES}
-        self._bytes: dict[str, Counter[str]] = {table: Counter() for table in TABLES}
+        self._kinds: dict[str, dict[str, list[int]]] = {table: {} for table in KIND_TABLES}
+        self._links: dict[str, dict[tuple[str, str], list[int]]] = {table: {} for table in LINK_TABLES}
         self._dropped: Counter[str] = Counter()
 
-    def count_sent(self, kind: str, payload_bytes: int, to: str | None = None) -> None:
-        """A message left; `to` is None for a broadcast."""
-        self._count("sent", kind, "sent_to", to, payload_bytes)
+    def count_sent(self, kind: str, payload_bytes: int, to: Iterable[str]) -> None:
+        """A message left for these robots."""
+        with self._lock:
+            _count(self._kinds["sent"], kind, payload_bytes)
+            for peer in to:
+                _count(self._links["sent_to"], (peer, kind), payload_bytes)
 
     def count_received(self, kind: str, payload_bytes: int, sender: str) -> None:
         """A message reached the robot."""
-        self._count("received", kind, "received_from", sender, payload_bytes)
+        with self._lock:
+            _count(self._kinds["received"], kind, payload_bytes)
+            _count(self._links["received_from"], (sender, kind), payload_bytes)
+
+    def count_lost(self, kind: str, payload_bytes: int, sender: str) -> None:
+        """A message arrived and was kept from the robot."""
+        with self._lock:
+            _count(self._links["lost_from"], (sender, kind), payload_bytes)
+
+    def count_repeated(self, kind: str, payload_bytes: int, sender: str) -> None:
+        """A message will reach the robot once more than it was sent."""
+        with self._lock:
+            _count(self._links["repeated_from"], (sender, kind), payload_bytes)
 
     def count_dropped(self, reason: str, count: int = 1) -> None:
         """A message was given up."""
@@ -166,19 +210,38 @@ class TrafficCounter:
     def snapshot(self) -> TransportCounters:
         """All counts at one moment."""
         with self._lock:
-            traffic = {
-                table: {name: Traffic(n, self._bytes[table][name]) for name, n in sorted(messages.items())}
-                for table, messages in self._messages.items()
-            }
-            return TransportCounters(**traffic, dropped=dict(sorted(self._dropped.items())))
+            sent, received = (_by_kind(self._kinds[table]) for table in KIND_TABLES)
+            links = {table: _by_peer(counted) for table, counted in self._links.items()}
+            return TransportCounters(
+                sent=sent,
+                received=received,
+                sent_to=links["sent_to"],
+                received_from=links["received_from"],
+                lost_from=links["lost_from"],
+                repeated_from=links["repeated_from"],
+                dropped=dict(sorted(self._dropped.items())),
+            )
 
-    def _count(self, kinds: str, kind: str, peers: str, peer: str | None, payload_bytes: int) -> None:
-        with self._lock:
-            for table, name in ((kinds, kind), (peers, peer)):
-                if name is not None and (name in self._messages[table] or len(self._messages[table]) < NAMES_MAX):
-                    self._messages[table][name] += 1
-                    self._bytes[table][name] += payload_bytes
+
+Name = TypeVar("Name", str, tuple[str, str])
 
 
-TABLES = ("sent", "received", "sent_to", "received_from")
-NAMES_MAX = 1024
+def _count(counted: dict[Name, list[int]], name: Name, payload_bytes: int) -> None:
+    counts = counted.get(name)
+    if counts is None:
+        if len(counted) >= NAMES_MAX:
+            return
+        counts = counted[name] = [0, 0]
+    counts[0] += 1
+    counts[1] += payload_bytes
+
+
+def _by_kind(counted: dict[str, list[int]]) -> dict[str, Traffic]:
+    return {kind: Traffic(*counts) for kind, counts in sorted(counted.items())}
+
+
+def _by_peer(counted: dict[tuple[str, str], list[int]]) -> ByPeer:
+    tables: ByPeer = {}
+    for (peer, kind), counts in sorted(counted.items()):
+        tables.setdefault(peer, {})[kind] = Traffic(*counts)
+    return tables

@@ -21,6 +21,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Generic, TypeVar
 
+from flocc_agent.stages import StageTimes, Timed, timed
+
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
@@ -51,6 +53,7 @@ class Workers:
 
     Attributes:
         slowdown: Factor by which every task is made to last longer, to emulate a slow robot; 1 is full speed.
+        stages: How long the stages of tasks took, and how long tasks waited for their turn (KIND_wait).
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class Workers:
             idle_s: A process without tasks for so long is ended; its memory is free until the next task.
         """
         self.slowdown = 1.0
+        self.stages = StageTimes()
         self._pools = {
             kind: ThreadPoolExecutor(count, thread_name_prefix=kind) for kind, count in sorted(threads.items())
         }
@@ -80,8 +84,16 @@ class Workers:
         self._pending_max = pending_max
         self._is_closed = False
 
-    async def run(self, kind: str, function: Callable[..., T], *arguments: object) -> Ok[T] | WorkFailed:
+    async def run(
+        self, kind: str, function: Callable[..., T], *arguments: object, counted: bool = True
+    ) -> Ok[T] | WorkFailed:
         """Run a function off the loop; whatever it raises is logged and returned as a failure.
+
+        Args:
+            kind: Which workers.
+            function: What to run.
+            arguments: With what.
+            counted: Whether its times count among `stages`.
 
         Raises:
             KeyError: There are no workers of this kind.
@@ -93,21 +105,36 @@ class Workers:
         self._pending[kind] += 1
         began_s = time.monotonic()
         try:
-            return await self._run(kind, function, arguments)
+            result = await self._run(kind, function, arguments)
         finally:
             if self.slowdown > 1.0:
                 await asyncio.sleep((self.slowdown - 1.0) * (time.monotonic() - began_s))
             self._pending[kind] -= 1
+        if isinstance(result, WorkFailed):
+            return result
+        if counted:
+            self._count(kind, result.value, time.monotonic() - began_s)
+        return Ok(result.value.value)
 
-    async def _run(self, kind: str, function: Callable[..., T], arguments: tuple[object, ...]) -> Ok[T] | WorkFailed:
+    async def _run(
+        self, kind: str, function: Callable[..., T], arguments: tuple[object, ...]
+    ) -> Ok[Timed[T]] | WorkFailed:
         if kind in self._processes:
-            return await self._processes[kind].run(function, arguments)
+            return await self._processes[kind].run(timed, (function, *arguments))
         try:
-            return Ok(await asyncio.get_running_loop().run_in_executor(self._pools[kind], function, *arguments))
+            pool = self._pools[kind]
+            return Ok(await asyncio.get_running_loop().run_in_executor(pool, timed, function, *arguments))
         except Exception as error:
             if self._is_closed:
                 return WorkFailed("the workers are closed")
             return _failed(kind, error)
+
+    def _count(self, kind: str, done: Timed[T], whole_s: float) -> None:
+        """Note a task's stages, its own time where no stage bears its name, and what was not work as its wait."""
+        lasted_s = self.slowdown * done.lasted_s
+        for stage, lap_s in {kind: done.lasted_s, **done.laps_s}.items():
+            self.stages.observe(stage, self.slowdown * lap_s)
+        self.stages.observe(f"{kind}_wait", max(whole_s - lasted_s, 0.0))
 
     async def close(self) -> None:
         """End all workers: waiting tasks fail, running threads finish, processes are ended. Safe to call twice."""

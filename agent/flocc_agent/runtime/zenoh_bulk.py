@@ -21,6 +21,7 @@ from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, La
 from flocc_agent.runtime.zenoh_session import open_session
 from flocc_protocol import keys
 from flocc_protocol.errors import DecodeError, FloccError
+from flocc_protocol.ids import checked_name
 
 logger = logging.getLogger(__name__)
 
@@ -111,12 +112,14 @@ class BulkService:
         offset, length = (checked_number(query.parameters.get(name)) for name in ("offset", "length"))
         wanted = query.parameters.get("encode_bytes")
         encode_bytes = None if wanted is None else checked_number(wanted)
+        asker = query.parameters.get("asker")
+        asker = None if asker is None else checked_name(asker)
         piece = self._server.piece(latent, offset, length, encode_bytes)
         if piece is None:
             query.reply_err(UNKNOWN)
             return
         query.reply(query.key_expr, piece.payload, attachment=piece.header())
-        self._counter.count_sent(KIND, len(piece.payload))
+        self._counter.count_sent(KIND, len(piece.payload), () if asker is None else (asker,))
 
     # --- fetching: on the loop, except `_ask_blocking`
 
@@ -163,7 +166,7 @@ class BulkService:
     async def _ask(self, owner: str, latent: str, partial: Partial) -> Piece | FetchProblem:
         """Ask for the next piece, on a thread."""
         key = keys.latent_key(self._swarm, owner, latent)
-        selector = f"{key}?offset={len(partial.received)};length={partial.piece_bytes}"
+        selector = f"{key}?offset={len(partial.received)};length={partial.piece_bytes};asker={self._robot}"
         if partial.encode_bytes is not None:
             selector += f";encode_bytes={partial.encode_bytes}"
         token = zenoh.CancellationToken()
@@ -222,6 +225,7 @@ class BulkService:
             asked = self._radio.transmit(self._robot, owner, KIND, REQUEST_BYTES, now_s)
             arrivals = self._radio.transmit(owner, self._robot, KIND, len(piece.payload), asked[0]) if asked else []
             if not arrivals:
+                self._counter.count_lost(KIND, len(piece.payload), owner)
                 return False
             await asyncio.sleep(arrivals[0] - now_s)
         self._counter.count_received(KIND, len(piece.payload), owner)

@@ -2,7 +2,8 @@
 
 Control (heartbeats, elections, records, corrections, requests) is published with DROP; bulk (latents) is fetched with
 BLOCK at the lowest priority, in pieces, on threads. Callbacks of zenoh only enqueue. Liveliness tokens are used to
-name strangers and doubles, never to say who is there: that is what heartbeats are for.
+name strangers and doubles, and to account for whom a broadcast went to, never to say who is there: that is what
+heartbeats are for.
 
 With a `Radio`, links are emulated at the receiver: every message that arrives is put to the model, which loses,
 delays or repeats it. The sender's true position then travels as the attachment of its messages.
@@ -105,6 +106,7 @@ class ZenohTransport:
         self._delayed: dict[int, asyncio.TimerHandle] = {}
         self._delayed_count = 0
         self._named: set[tuple[str, ...]] = set()
+        self._linked: dict[str, str] = {}
 
     async def __aenter__(self) -> "ZenohTransport":
         try:
@@ -215,7 +217,7 @@ class ZenohTransport:
             self._publishers[kind] = self._declare(kind)
         publisher, attachment = self._publishers[kind], self._position()
         self._put(lambda: publisher.put(payload, attachment=attachment), payload)
-        return self._counter.count_sent(kind, len(payload))
+        return self._counter.count_sent(kind, len(payload), set(self._linked.values()))
 
     def unicast(self, to: str, kind: str, payload: bytes) -> None:
         """Send to one robot in range, or drop."""
@@ -236,7 +238,7 @@ class ZenohTransport:
             ),
             payload,
         )
-        return self._counter.count_sent(keys.checked_kind(kind), len(payload), to)
+        return self._counter.count_sent(keys.checked_kind(kind), len(payload), (to,))
 
     def _may_send(self, payload: bytes) -> bool:
         return len(payload) <= self._config.message_bytes_max
@@ -276,14 +278,19 @@ class ZenohTransport:
         except DecodeError:
             return self._counter.count_dropped("malformed-key")
         payload_bytes = len(sample.payload)
-        if payload_bytes > self._config.message_bytes_max:
-            return self._counter.count_dropped("too-large")
-        refusal = self._limiter.refusal(address.sender, payload_bytes, time.monotonic())
+        refusal = self._refusal(address.sender, payload_bytes)
         if refusal is not None:
+            self._counter.count_lost(address.kind, payload_bytes, address.sender)
             return self._counter.count_dropped(refusal)
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
         assert self._inbox is not None
         return self._inbox.put(Incoming(address.sender, address.kind, sample.payload.to_bytes(), attachment))
+
+    def _refusal(self, sender: str, payload_bytes: int) -> str | None:
+        """Why a message is kept from the robot, if it is."""
+        if payload_bytes > self._config.message_bytes_max:
+            return "too-large"
+        return self._limiter.refusal(sender, payload_bytes, time.monotonic())
 
     def _address(self, key: str) -> keys.Address:
         address = self._addresses.get(key)
@@ -301,7 +308,12 @@ class ZenohTransport:
             self._radio.update_position(message.sender, POSITION.unpack(message.attachment))
         now_s = self._clock_s()
         size = len(message.payload)
-        for arrival_s in self._radio.transmit(message.sender, self.robot, message.kind, size, now_s):
+        arrivals_s = self._radio.transmit(message.sender, self.robot, message.kind, size, now_s)
+        if not arrivals_s:
+            self._counter.count_lost(message.kind, size, message.sender)
+        for _ in arrivals_s[1:]:
+            self._counter.count_repeated(message.kind, size, message.sender)
+        for arrival_s in arrivals_s:
             self._deliver_after(arrival_s - now_s, message)
         return None
 
@@ -309,6 +321,7 @@ class ZenohTransport:
         if delay_s <= 0.0:
             return self._deliver(message)
         if len(self._delayed) >= DELAYED_MAX:
+            self._counter.count_lost(message.kind, len(message.payload), message.sender)
             return self._counter.count_dropped("radio-delayed")
         assert self._loop is not None
         number = self._delayed_count = self._delayed_count + 1
@@ -333,7 +346,10 @@ class ZenohTransport:
             seen = keys.parse_alive_key(str(sample.key_expr))
         except DecodeError:
             return self._counter.count_dropped("malformed-key")
-        if sample.kind != zenoh.SampleKind.PUT or seen.boot == self.boot:
+        if seen.boot == self.boot:
+            return None
+        if sample.kind != zenoh.SampleKind.PUT:
+            self._linked = {boot: robot for boot, robot in self._linked.items() if boot != seen.boot}
             return None
         if seen.version != keys.VERSION:
             return self._name_once(
@@ -343,6 +359,8 @@ class ZenohTransport:
             return self._name_once("foreign-swarm", f"robot {seen.robot} of swarm {seen.swarm} is ignored", seen)
         if seen.robot == self.robot:
             return self._name_once("name-twice", f"another process runs under the name {seen.robot}", seen)
+        if len(self._linked) < self._config.peers_max:
+            self._linked = {**self._linked, seen.boot: seen.robot}
         return None
 
     def _name_once(self, reason: str, sentence: str, seen: keys.Presence) -> None:

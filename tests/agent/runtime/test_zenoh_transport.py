@@ -112,7 +112,7 @@ async def test_fetches_a_latent_in_pieces_and_looks_it_up_once() -> None:
         two.held["r2/7"] = LATENT
         assert await one.transport.fetch_latent("r2", "r2/7", 10.0) == Fetched(LATENT)
         assert two.lookups == ["r2/7"]
-        received = one.transport.counters().received_from["r2"]
+        received = one.transport.counters().received_from["r2"]["latent"]
         assert received.payload_bytes == len(LATENT)
 
 
@@ -162,7 +162,7 @@ async def test_a_cut_fetch_goes_on_where_it_ended_also_with_another_holder() -> 
         assert cut.problem is FetchProblem.DEADLINE
         assert 0 < cut.kept_bytes < len(LATENT)
         assert await one.transport.fetch_latent("r3", "r2/7", 10.0) == Fetched(LATENT)
-        assert one.transport.counters().received_from["r3"].payload_bytes >= len(LATENT) - cut.kept_bytes
+        assert one.transport.counters().received_from["r3"]["latent"].payload_bytes >= len(LATENT) - cut.kept_bytes
         assert one.transport.counters().received["latent"].payload_bytes == len(LATENT)
 
 

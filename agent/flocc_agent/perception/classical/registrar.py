@@ -31,6 +31,7 @@ from flocc_agent.perception.classical.features import Features
 from flocc_agent.perception.classical.three_view import three_view
 from flocc_agent.perception.classical.two_view import TwoView, two_view
 from flocc_agent.perception.latent import BadLatent
+from flocc_agent.stages import stage
 
 BASELINE_MIN_M = 1e-3
 """An odometry pair that moved less gives no scale."""
@@ -53,12 +54,16 @@ class ClassicalRegistrar:
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's; raises nothing for bad latents."""
         try:
-            query_features, match_features = decode_features(query), decode_features(match)
-            odometry_pair = self._odometry_pair(query_features, odometry)
+            with stage("decode"):
+                query_features, match_features = decode_features(query), decode_features(match)
+            with stage("match"):
+                odometry_pair = self._odometry_pair(query_features, odometry)
         except BadLatent as error:
             return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
-        loop_pair = two_view(query_features, match_features, self._config)
-        return self._judged(query_features, loop_pair, odometry_pair, odometry)
+        with stage("match"):
+            loop_pair = two_view(query_features, match_features, self._config)
+        with stage("pose"):
+            return self._judged(query_features, loop_pair, odometry_pair, odometry)
 
     def _judged(
         self, query: Features, loop_pair: TwoView | int, odometry_pair: TwoView | int, odometry: OdometryPair | None

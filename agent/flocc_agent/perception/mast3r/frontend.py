@@ -55,6 +55,7 @@ from flocc_agent.perception.mast3r.preprocess import (
 from flocc_agent.perception.mast3r.relative_pose import PnpParameters, PoseFailed
 from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
 from flocc_agent.perception.mast3r.weights import load_cosplace, load_mast3r
+from flocc_agent.stages import stage
 
 PLACE_SIDE_MIN_PX = 16
 ACTIVATION_BYTES = 1_200_000_000
@@ -236,7 +237,8 @@ class Mast3rRegistrar:
         """Decode and register pairs; uncalibrated ones are decoded in both orders for both focal lengths."""
         forward = [(first[1], second[1]) for first, second in pairs]
         backward = [] if self._config.calibrated else [(second, first) for first, second in forward]
-        decoded = self._engine.decode([*forward, *backward])
+        with stage("decode"):
+            decoded = self._engine.decode([*forward, *backward])
         results = []
         for k, (first, second) in enumerate(pairs):
             calibrations = (first[0].K, second[0].K) if self._config.calibrated else None

@@ -18,6 +18,7 @@ from flocc_agent.perception.mast3r.relative_pose import (
     reray,
     weiszfeld_focal,
 )
+from flocc_agent.stages import stage
 
 Float = NDArray[np.float64]
 
@@ -73,7 +74,8 @@ def register_pair(
         matching: The matcher's parameters.
         pnp: The solver's parameters.
     """
-    matches = match_pair(views, matching)
+    with stage("match"):
+        matches = match_pair(views, matching)
     if isinstance(matches, PoseFailed):
         return PairResult(0, matches)
     if calibrations is None and K_estimated is None:
@@ -84,7 +86,8 @@ def register_pair(
         points = reray(points[:, 2], matches.xy1.astype(np.float64), calibrations[0])
     K_2 = calibrations[1] if calibrations is not None else K_estimated
     assert K_2 is not None
-    return PairResult(len(matches), relative_pose(points, matches.xy2.astype(np.float64), K_2, pnp))
+    with stage("pose"):
+        return PairResult(len(matches), relative_pose(points, matches.xy2.astype(np.float64), K_2, pnp))
 
 
 def disagreement_rad(T_query_match: Float, T_match_query: Float) -> float:
