@@ -1,0 +1,25 @@
+"""All experiments by name."""
+
+from typing import Any
+
+from flocc_launch.experiments.experiment import Experiment, ExperimentError
+from flocc_launch.experiments.faults import FAULTS
+
+ALL: tuple[Experiment[Any], ...] = (FAULTS,)
+
+
+def names() -> list[str]:
+    """Names of all experiments, in the order of the paper."""
+    return [experiment.name for experiment in ALL]
+
+
+def find(name: str) -> Experiment[Any]:
+    """An experiment by its name.
+
+    Raises:
+        ExperimentError: There is none of that name.
+    """
+    found = next((experiment for experiment in ALL if experiment.name == name), None)
+    if found is None:
+        raise ExperimentError(f"there is no experiment {name!r}; there are {', '.join(names())}")
+    return found
