@@ -26,11 +26,11 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def show_report(report: "Report", out: Path) -> None:
-    """Print what came of a run; leave with exit code 1 when an expectation was missed."""
+    """Print what came of a run; leave with exit code 1 when an expectation was missed or has no value."""
     from flocc_launch.report.text import sentences
 
     for sentence in sentences(report):
         typer.echo(sentence)
     typer.echo(f"report: {(out / 'report.html').resolve()}")
-    if any(expectation.met is False for expectation in report.expectations):
+    if any(expectation.met is not True for expectation in report.expectations):
         sys.exit(EXIT_MISSED)

@@ -18,6 +18,7 @@ from typing import Any
 from flocc_agent.config import RadioConfig, SourceConfig
 from flocc_launch.agent_process import Lines, recover_result
 from flocc_launch.data import recordings
+from flocc_launch.expectations import check_measurable
 from flocc_launch.keys import make_keys
 from flocc_launch.processes import AgentProcess, loopback_transports
 from flocc_launch.report.finish import finish
@@ -74,9 +75,11 @@ def launch(
         secure: Make keys for this run, and let agents trust those who have them only.
 
     Raises:
-        FloccError: The data cannot be used, or no agent could be started.
+        FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
     """
+    check_faults(scenario)
     paths = recordings(scenario, progress)
+    check_measurable(scenario, paths)
     folder = fresh_folder(out)
     return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure).run())
 
@@ -94,6 +97,17 @@ def fresh_folder(out: Path) -> RunFolder:
     return RunFolder.create(out)
 
 
+def check_faults(scenario: Scenario) -> None:
+    """Say which fault processes over real zenoh cannot have.
+
+    Raises:
+        LaunchError: There is one.
+    """
+    simulated = {FaultKind.MUTE, FaultKind.CALM} & {fault.kind for fault in scenario.faults}
+    if simulated:
+        raise LaunchError(f"{scenario.name}: a fault '{min(simulated).value}' exists on virtual time only")
+
+
 class _Launch:
     """One run."""
 
@@ -107,7 +121,7 @@ class _Launch:
         self._secure = secure
         self._epoch_s = time.monotonic()
         self._lines = Lines(folder.path / LAUNCHER_EVENTS)
-        self._radio = scenario.radio
+        self._radio = scenario.links()
         self._faults = sorted(scenario.faults, key=lambda fault: fault.at_s)
         self._interrupted = False
         self._changed_s = 0.0
@@ -203,6 +217,12 @@ class _Launch:
             case FaultKind.RESTART:
                 for agent in concerned:
                     await self._restart(agent, fault.disk_lost)
+            case FaultKind.START:
+                for agent in concerned:
+                    if not agent.running:
+                        await agent.start(self._epoch_s)
+            case FaultKind.LEAVE:
+                await asyncio.gather(*(agent.stop() for agent in concerned))
             case FaultKind.SLOW:
                 for agent in concerned:
                     await agent.order({"slow": fault.value})
@@ -251,17 +271,17 @@ class _Launch:
 
     def _run_record(self, wall_s: float | None = None) -> Run:
         scenario = self._scenario
-        limits = scenario.expectations.model_dump(exclude_none=True)
         return Run(
             scenario=scenario.name,
             seed=scenario.seed,
             robots=scenario.names(),
+            servers=scenario.servers(),
             start=datetime.now(UTC).isoformat(timespec="seconds"),
             driver="launch",
             recordings={name: str(path.resolve()) for name, path in self._paths.items()},
-            radio=json.loads(scenario.radio.model_dump_json(), parse_constant=lambda _: None),
+            radio=json.loads(scenario.links().model_dump_json(), parse_constant=lambda _: None),
             settings=scenario.settings(),
-            expectations=limits,
+            expectations=scenario.expectations.limits(),
             duration_s=wall_s,
             wall_s=wall_s,
         )

@@ -56,6 +56,8 @@ class Run(Record):
     """Seed of everything that is drawn; null where nothing was seeded."""
     robots: list[str]
     """Robot names."""
+    servers: list[str] = []
+    """Those of them without a camera: they take no keyframes, so they are in no map."""
     start: str | float | None = None
     """Wall clock at t = 0: ISO 8601 or Unix seconds; null on virtual time."""
     driver: Literal["launch", "simulate", "agent"] | None = None
@@ -66,8 +68,8 @@ class Run(Record):
     """Settings of the link model: loss, latency, bandwidth, range, as the scenario gave them."""
     settings: dict[str, Any] = {}
     """Other settings worth reading beside the result, nested as in the configuration."""
-    expectations: dict[str, float] = {}
-    """Expectation -> limit, of the scenario."""
+    expectations: dict[str, float | str] = {}
+    """Expectation -> limit, of the scenario; of `leader` the robot's name."""
     duration_s: float | None = None
     """End of the run on the clock of `events.jsonl`; null where the last event is the end."""
     wall_s: float | None = None

@@ -3,8 +3,10 @@
 The same file runs under `flocc launch` (processes over zenoh) and `flocc simulate` (virtual time).
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -14,6 +16,7 @@ from flocc_agent.config import (
     AgentConfig,
     BackendConfig,
     KeyframeConfig,
+    PartitionConfig,
     PerceptionConfig,
     RadioConfig,
     Section,
@@ -25,6 +28,21 @@ from flocc_agent.core.parameters import CoreParameters
 from flocc_protocol.ids import checked_name
 
 RobotName = Annotated[str, AfterValidator(checked_name)]
+
+
+def checked_route(corners_m: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """Return the corners of a walk, or say why nobody can walk it.
+
+    Raises:
+        ValueError: Fewer than two corners, two equal ones in a row, or one that is not finite.
+    """
+    steps_m = [math.dist(a, b) for a, b in pairwise(corners_m)]
+    if not steps_m or not all(0 < step_m < math.inf for step_m in steps_m):
+        raise ValueError("a route has at least two corners, each away from the one before")
+    return corners_m
+
+
+Route = Annotated[tuple[tuple[float, float], ...], AfterValidator(checked_route)]
 
 
 class RobotScenario(Section):
@@ -74,14 +92,40 @@ class TracksScenario(Section):
     speed_m_s: float = Field(0.7, gt=0)
     """Walking speed."""
     length_m: float = Field(80.0, gt=0)
-    """Length of each walk."""
+    """Length of each walk that is drawn."""
+    routes_m: dict[RobotName, Route] = Field(default_factory=dict)
+    """Robot to the corners of its walk, `[[x, y], ...]` in metres; a robot without one gets a drawn walk."""
+
+    @model_validator(mode="after")
+    def _routes_are_of_its_robots(self) -> Self:
+        unknown = set(self.routes_m) - {f"r{i + 1}" for i in range(self.robots)}
+        if unknown:
+            raise ValueError(f"routes_m names robot '{min(unknown)}', which is not one of r1 to r{self.robots}")
+        return self
+
+
+class Rendezvous(Section):
+    """Robots that are in range of each other for a while; without any, everybody always is."""
+
+    robots: tuple[RobotName, ...] = Field(min_length=2)
+    """Who meets."""
+    from_s: float = Field(ge=0)
+    """Begin, seconds after the start of the run."""
+    to_s: float = Field(gt=0)
+    """End, seconds after the start of the run."""
+
+    @model_validator(mode="after")
+    def _ends_after_it_begins(self) -> Self:
+        if self.to_s <= self.from_s:
+            raise ValueError(f"a rendezvous from {self.from_s:g} s ends at {self.to_s:g} s")
+        return self
 
 
 class FaultKind(StrEnum):
     """What goes wrong, or right again.
 
     `start` switches dead robots on, `leave` stops them in order; `calm` makes every link perfect but for its range
-    and every worker as fast as it was (the last two and `mute` in simulate only).
+    and every worker as fast as it was (`calm` and `mute` in simulate only).
     """
 
     KILL = "kill"
@@ -163,6 +207,14 @@ class Expectations(Section):
     """Changes of the leader, as most robots saw them, after the first."""
     frames_max: int | None = Field(None, ge=1)
     """Map frames at the end."""
+    leader: RobotName | None = None
+    """Who leads at the end."""
+    leader_registered_ratio_min: float | None = Field(None, ge=0, le=1)
+    """Share of the accepted closures that the leader of the end registered."""
+
+    def limits(self) -> dict[str, float | str]:
+        """What was asked for, by name."""
+        return self.model_dump(exclude_none=True)
 
 
 class Scenario(Section):
@@ -200,6 +252,8 @@ class Scenario(Section):
     """Bounds of all robots' disks."""
     simulation: SimulationScenario = SimulationScenario()
     """Workers on virtual time."""
+    rendezvous: tuple[Rendezvous, ...] = ()
+    """Who meets when; with it, robots outside of any rendezvous hear nobody."""
     faults: tuple[Fault, ...] = ()
     """What goes wrong, and when."""
     expectations: Expectations = Expectations()
@@ -214,10 +268,23 @@ class Scenario(Section):
         if not sources and (not self.robots or lacking):
             who = f"robot '{lacking[0]}' has no recording" if lacking else "there is no robot"
             raise ValueError(f"{who}; give [world], [dataset], [tracks] or recordings")
-        named = {robot for fault in self.faults for robots in (fault.robots, *fault.groups) for robot in robots}
-        unknown = named - set(self.names())
-        if unknown:
-            raise ValueError(f"a fault names robot '{min(unknown)}', which is not in the scenario")
+        self._names_robots_that_are_there()
+        return self
+
+    def _names_robots_that_are_there(self) -> None:
+        faults = {robot for fault in self.faults for robots in (fault.robots, *fault.groups) for robot in robots}
+        meetings = {robot for meeting in self.rendezvous for robot in meeting.robots}
+        leader = {self.expectations.leader} - {None}
+        for what, named in (("a fault", faults), ("a rendezvous", meetings), ("expectations.leader", leader)):
+            unknown = named - set(self.names())
+            if unknown:
+                raise ValueError(f"{what} names robot '{min(map(str, unknown))}', which is not in the scenario")
+
+    @model_validator(mode="after")
+    def _has_one_schedule(self) -> Self:
+        divides = {FaultKind.PARTITION, FaultKind.HEAL} & {fault.kind for fault in self.faults}
+        if self.rendezvous and (divides or self.radio.partitions):
+            raise ValueError("a schedule of rendezvous and partitions exclude each other")
         return self
 
     def settings(self) -> dict[str, object]:
@@ -234,13 +301,25 @@ class Scenario(Section):
 
     def names(self) -> list[str]:
         """Names of all robots, sorted."""
+        return sorted({*self._made(), *self.robots})
+
+    def servers(self) -> list[str]:
+        """Robots without a camera, sorted: they take no keyframes and are in no map."""
+        return [name for name in self.names() if name not in self._made() and self.robot(name).recording is None]
+
+    def _made(self) -> list[str]:
+        """Names of the robots of the world, data set or tracks."""
         source = self.world or self.dataset or self.tracks
-        made = [f"r{i + 1}" for i in range(source.robots)] if source else []
-        return sorted({*made, *self.robots})
+        return [f"r{i + 1}" for i in range(source.robots)] if source else []
 
     def robot(self, name: str) -> RobotScenario:
         """What the scenario says of one robot."""
         return self.robots.get(name, RobotScenario())
+
+    def links(self) -> RadioConfig:
+        """The emulated links, with the schedule of rendezvous as partitions."""
+        partitions = separations(self.rendezvous, self.names())
+        return self.radio.model_copy(update={"partitions": partitions}) if partitions else self.radio
 
     @classmethod
     def read(cls, path: Path, changes: Mapping[str, object] | None = None) -> "Scenario":
@@ -275,10 +354,36 @@ def agent_config(scenario: Scenario, name: str, **changes: object) -> AgentConfi
         keyframes=scenario.keyframes,
         perception=scenario.perception,
         backend=scenario.backend,
-        radio=scenario.radio,
+        radio=scenario.links(),
         store=scenario.store,
         **changes,
     )
+
+
+def separations(meetings: Sequence[Rendezvous], names: Sequence[str]) -> tuple[PartitionConfig, ...]:
+    """The partitions that leave only the rendezvous, one for each time in which nobody comes or goes.
+
+    Args:
+        meetings: Who meets when; those that share a robot at one time are one meeting.
+        names: All robots.
+    """
+    if not meetings:
+        return ()
+    times_s = sorted({0.0, *(time_s for meeting in meetings for time_s in (meeting.from_s, meeting.to_s)), math.inf})
+    return tuple(
+        PartitionConfig(groups=_groups(meetings, names, from_s), from_s=from_s, to_s=to_s)
+        for from_s, to_s in pairwise(times_s)
+    )
+
+
+def _groups(meetings: Sequence[Rendezvous], names: Sequence[str], at_s: float) -> tuple[tuple[str, ...], ...]:
+    """Who is together at a time; a robot that meets nobody is a group of its own."""
+    groups = [{name} for name in names]
+    for meeting in meetings:
+        if meeting.from_s <= at_s < meeting.to_s:
+            joined = [group for group in groups if group & set(meeting.robots)]
+            groups = [group for group in groups if group not in joined] + [set().union(*joined)]
+    return tuple(sorted(tuple(sorted(group)) for group in groups))
 
 
 def _put(fields: dict[str, object], keys: list[str], value: object) -> None:

@@ -45,11 +45,11 @@ def merging(loaded: LoadedRun) -> list[Finding]:
 
 
 def groups_of(loaded: LoadedRun) -> list[tuple[str, ...]]:
-    """Living robots by their map frame at the end; a robot without one is a group of its own."""
+    """Living robots with a camera by their map frame at the end; a robot without a frame is a group of its own."""
     died = {robot for robot, end in ends(loaded.events).items() if isinstance(end, AgentDied)}
     groups: dict[str, list[str]] = {}
     for robot in loaded.robots:
-        if robot not in died:
+        if robot not in died and robot not in loaded.run.servers:
             frame = loaded.tracks[robot].map_frame
             groups.setdefault(frame if frame is not None else f"none of {robot}", []).append(robot)
     return [tuple(group) for _, group in sorted(groups.items())]

@@ -21,7 +21,7 @@ from flocc_launch.report.model import (
 )
 from flocc_launch.report.timeline import corrections_of, ends, leader_changes, merged_after_s, terms_led
 from flocc_launch.report.tracks import Track
-from flocc_launch.run_records import AgentDied, BytesCounted, GraphOptimised, PeerRefused, of_kind
+from flocc_launch.run_records import AgentDied, BytesCounted, ClosureAccepted, GraphOptimised, PeerRefused, of_kind
 
 Float = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def build(loaded: LoadedRun) -> Report:
         wall_s=run.wall_s,
         robots=list(loaded.robots),
         map_frames=frames,
-        merged_after_s=merged_after_s(loaded.events, loaded.robots),
+        merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
         ate_joint_m=ate_joint_m(tracks),
         ate_joint_odometry_m=ate_joint_odometry_m(tracks, aligned=False),
@@ -62,7 +62,7 @@ def build(loaded: LoadedRun) -> Report:
         robot_details=robots,
         warnings=warnings_of(loaded),
     )
-    return report.model_copy(update={"expectations": judged(run.expectations, report)})
+    return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
 
 
 def flocc_version() -> str:
@@ -127,6 +127,7 @@ def robot_part(loaded: LoadedRun, robot: str) -> Robot:
         keyframes_with_ground_truth=int(track.true.sum()),
         path_length_m=track.path_length_m(),
         map_frame=track.map_frame,
+        server=robot in loaded.run.servers,
         corrections=len(corrections),
         frame_changes=sum(correction.frame_changed for correction in corrections),
         logs={} if result is None else dict(sorted(result.logs.items())),
@@ -207,29 +208,41 @@ def how_it_died(event: AgentDied) -> str:
     return "no reason known" if event.exit_code is None else f"exit code {event.exit_code}"
 
 
-def judged(limits: Mapping[str, float], report: Report) -> list[Expectation]:
+def registered_by(loaded: LoadedRun) -> Counter[str]:
+    """Accepted closures by the robot that registered them."""
+    return Counter(event.by or event.robot for event in of_kind(loaded.events, ClosureAccepted))
+
+
+def judged(
+    limits: Mapping[str, float | str], report: Report, registered: Mapping[str, int] | None = None
+) -> list[Expectation]:
     """Hold a scenario's expectations against a report.
 
-    `NAME_max` and `NAME_within_s` hold where the value is at most the limit, `NAME_min` where it is at least. What
-    never happened within the run misses its `_within_s`; any other value that is not known is not judged.
+    `NAME_max` and `NAME_within_s` hold where the value is at most the limit, `NAME_min` where it is at least, a name
+    where it is that name. What never happened within the run misses its `_within_s`; any other value that is not known
+    is not judged.
     """
-    values = measured(report)
+    values = measured(report, registered or {})
     return [
         Expectation(name=name, limit=limit, value=values.get(name), met=met(name, limit, values.get(name)))
         for name, limit in sorted(limits.items())
     ]
 
 
-def met(name: str, limit: float, value: float | None) -> bool | None:
+def met(name: str, limit: float | str, value: float | str | None) -> bool | None:
     """Whether a value keeps its limit; None where it cannot be said."""
     if value is None:
         return False if name.endswith("_within_s") else None
+    if isinstance(limit, str) or isinstance(value, str):
+        return value == limit
     return value >= limit if name.endswith("_min") else value <= limit
 
 
-def measured(report: Report) -> dict[str, float | None]:
+def measured(report: Report, registered: Mapping[str, int]) -> dict[str, float | str | None]:
     """The values that expectations can name."""
     before, after = report.ate_joint_odometry_m, report.ate_joint_m
+    leader = max(report.leaders, key=lambda span: span.to_s).leader if report.leaders else None
+    closures = sum(registered.values())
     return {
         "merged_within_s": report.merged_after_s,
         "ate_max_m": after,
@@ -240,4 +253,6 @@ def measured(report: Report) -> dict[str, float | None]:
         "frames_max": len(report.map_frames),
         "bytes_max": sum(report.bytes.values()),
         "wall_max_s": report.wall_s,
+        "leader": leader,
+        "leader_registered_ratio_min": None if leader is None or not closures else registered.get(leader, 0) / closures,
     }

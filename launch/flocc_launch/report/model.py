@@ -40,8 +40,8 @@ class Expectation(Record):
     """One expectation of the scenario."""
 
     name: str
-    limit: float
-    value: float | None
+    limit: float | str
+    value: float | str | None
     met: bool | None
     """Null where it could not be measured."""
 
@@ -72,6 +72,8 @@ class Robot(Record):
     map_frame: str | None
     corrections: int
     """Corrections that it applied."""
+    server: bool = False
+    """It has no camera, so that it takes no keyframes and is in no map."""
     frame_changes: int
     """Times that its map frame changed under it."""
     logs: dict[str, int]

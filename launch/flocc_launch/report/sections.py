@@ -72,7 +72,7 @@ def expectations(report: Report) -> str:
     for asked in report.expectations:
         class_, said = words[asked.met]
         verdict = element("span", said, class_=class_)
-        rows.append([text_of(asked.name), plain(asked.limit), plain(asked.value), verdict])
+        rows.append([text_of(asked.name), text_of(plain(asked.limit)), text_of(plain(asked.value)), verdict])
     return element("h2", "Expectations") + table(["name", "limit#", "value#", ""], rows, class_="narrow")
 
 

@@ -95,8 +95,10 @@ def number(value: float | None, unit: str = "") -> str:
     return f"{text} {unit}" if unit else text
 
 
-def plain(value: float | None) -> str:
-    """A whole number as such, any other with three significant digits."""
+def plain(value: float | str | None) -> str:
+    """A whole number or a name as such, any other number with three significant digits."""
+    if isinstance(value, str):
+        return value
     return count_of(int(value)) if value is not None and value == int(value) else number(value)
 
 

@@ -14,7 +14,7 @@ def verdict(report: Report) -> str:
 def map_sentence(report: Report) -> str:
     """Whether the robots that lived to the end share one map."""
     died = [robot.robot for robot in report.robot_details if robot.end == "died"]
-    living = [robot for robot in report.robot_details if robot.end != "died"]
+    living = [robot for robot in report.robot_details if robot.end != "died" and not robot.server]
     frames = {robot.map_frame for robot in living}
     who = f"{listed(died)} died; " if died else ""
     if len(report.robots) == 1:

@@ -7,6 +7,7 @@ from flocc_agent.composition import build_optimiser, build_perception
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
+from flocc_launch.expectations import check_measurable
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
 from flocc_launch.run_folder import RobotResult, Run, RunFolder
@@ -44,8 +45,9 @@ def simulate(
         The report, which the folder holds as well.
 
     Raises:
-        FloccError: A recording cannot be read, or the folder holds a run already.
+        FloccError: A recording cannot be read, an expectation cannot be measured, or the folder holds a run already.
     """
+    check_measurable(scenario, recordings or {})
     chosen = scenario.seed if seed is None else seed
     folder = RunFolder.create(out)
     playbacks = playbacks_of(scenario, recordings or {})
@@ -105,16 +107,16 @@ def write(folder: RunFolder, swarm: Swarm, seed: int, end_s: float) -> None:
             truth.parent.mkdir(exist_ok=True)
             write_tum(truth, station.playback.truth)
     folder.write_events(swarm.lines)
-    limits = scenario.expectations.model_dump(exclude_none=True)
     folder.write_run(
         Run(
             scenario=scenario.name,
             seed=seed,
             robots=list(swarm.stations),
+            servers=scenario.servers(),
             driver="simulate",
-            radio=scenario.radio.model_dump(mode="json", exclude_defaults=True),
+            radio=scenario.links().model_dump(mode="json", exclude_defaults=True),
             settings=scenario.settings(),
-            expectations={name: float(limit) for name, limit in limits.items()},
+            expectations=scenario.expectations.limits(),
             duration_s=end_s,
         )
     )

@@ -52,7 +52,7 @@ class Swarm:
     def __init__(self, scenario: Scenario, playbacks: Mapping[str, Playback], equipment: Equipment, seed: int) -> None:
         self.scenario = scenario
         self.agenda = Agenda()
-        self.radio = Radio(scenario.radio.parameters(), np.random.default_rng([seed, LINKS]))
+        self.radio = Radio(scenario.links().parameters(), np.random.default_rng([seed, LINKS]))
         self.network = Network(self.agenda, self.radio, self._receive, np.random.default_rng([seed, AIR]))
         self.stations: dict[str, Station] = {}
         self.lines: list[dict[str, Any]] = []
@@ -180,8 +180,8 @@ class Swarm:
         receivers = [s.name for s in self.stations.values() if s.log.robot == to and s is not sender]
         self.network.send(sender.name, Envelope(sender.log, message), receivers)
 
-    def _receive(self, receiver: str, envelope: Envelope) -> None:
-        self.stations[receiver].receive(envelope)
+    def _receive(self, receiver: str, envelope: Envelope) -> bool:
+        return self.stations[receiver].receive(envelope)
 
     def _running(self, robot: str) -> Station | None:
         """The station that answers to a robot's name."""

@@ -1,6 +1,7 @@
 """Walks without images: robots go round blocks of a town whose streets they share, with drifting odometry."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,21 +33,37 @@ class Walk:
 def walks(scenario: TracksScenario, drift: DriftSpec | None = None) -> list[Walk]:
     """Draw the walks of all robots; a robot's own does not depend on how many there are."""
     return [
-        _walk(scenario, drift or DriftSpec(), np.random.default_rng([scenario.seed, robot]))
+        _walk(scenario, robot, drift or DriftSpec(), np.random.default_rng([scenario.seed, robot]))
         for robot in range(scenario.robots)
     ]
 
 
-def _walk(scenario: TracksScenario, drift: DriftSpec, rng: np.random.Generator) -> Walk:
+def _walk(scenario: TracksScenario, robot: int, drift: DriftSpec, rng: np.random.Generator) -> Walk:
+    route_m = scenario.routes_m.get(f"r{robot + 1}")
+    points_m = _round_a_block(scenario, rng) if route_m is None else _along(np.array(route_m, dtype=np.float64))
+    ahead = np.diff(points_m, axis=0)
+    heading_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
+    stamps_s = np.arange(len(ahead), dtype=np.float64) * (STEP_M / scenario.speed_m_s)
+    truth = Trajectory(stamps_s, np.array([_standing(p, h) for p, h in zip(points_m, heading_rad, strict=False)]))
+    return Walk(truth, drifted(truth, drift, rng))
+
+
+def _along(corners_m: Float) -> Float:
+    """Points (N, 2) along given corners (K, 2), the corners rounded, both ends kept."""
+    sides = [_side(a, b) for a, b in pairwise(corners_m)]
+    way_m = np.concatenate([*sides, corners_m[-1:]])
+    margin = min(round(CORNER_M / STEP_M) // 2, len(way_m) // 4)
+    padded_m = np.pad(way_m, ((margin, margin), (0, 0)), mode="reflect", reflect_type="odd")
+    windows = np.lib.stride_tricks.sliding_window_view(padded_m, 2 * margin + 1, axis=0)
+    return np.asarray(windows.mean(axis=2))
+
+
+def _round_a_block(scenario: TracksScenario, rng: np.random.Generator) -> Float:
+    """Points (N, 2) of a drawn walk, from anywhere on its block."""
     ring_m = _rounded(_block(scenario, rng))
     steps = max(2, round(scenario.length_m / STEP_M))
     start = int(rng.integers(len(ring_m)))
-    points_m: Float = ring_m[(start + np.arange(steps + 1)) % len(ring_m)]
-    ahead = np.diff(points_m, axis=0)
-    heading_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
-    stamps_s = np.arange(steps, dtype=np.float64) * (STEP_M / scenario.speed_m_s)
-    truth = Trajectory(stamps_s, np.array([_standing(p, h) for p, h in zip(points_m, heading_rad, strict=False)]))
-    return Walk(truth, drifted(truth, drift, rng))
+    return np.asarray(ring_m[(start + np.arange(steps + 1)) % len(ring_m)])
 
 
 def _block(scenario: TracksScenario, rng: np.random.Generator) -> Float:
