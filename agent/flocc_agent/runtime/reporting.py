@@ -80,6 +80,17 @@ def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None
     }
 
 
+def corrected_bodies(robot: Robot, T_body_camera: Float) -> tuple[list[float], Float]:
+    """Stamps (s) and (N, 4, 4) corrected body poses of all own keyframes; none before the first correction."""
+    applied = robot.corrections.applied
+    records = [r for r in robot.gossip.logs[robot.log].records if isinstance(r, KeyframeRecord)]
+    if applied is None or not records:
+        return [], np.zeros((0, 4, 4))
+    T_odom_camera = np.array([pose_from_tq(np.array(record.T_odom_camera)) for record in records])
+    T_map_body = corrected(applied, T_odom_camera) @ inverse(T_body_camera)
+    return [record.stamp_s for record in records], T_map_body
+
+
 def closures_known(robot: Robot, solution: GraphSolution | None) -> list[dict[str, Any]]:
     """Every closure in a robot's logs, each pair once, with the scale of the last solution it made."""
     scales = {} if solution is None else {CandidatePair.of(c.query, c.match): c.scale for c in solution.closures}
