@@ -12,13 +12,13 @@ import zlib
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend import optimise_graph
-from flocc_agent.config import AgentConfig, BackendConfig, PerceptionConfig, RadioConfig
+from flocc_agent.config import AgentConfig, BackendConfig, PerceptionConfig, RadioConfig, Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, OdometryPair, Registrar
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
@@ -43,6 +43,9 @@ from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
+
+if TYPE_CHECKING:
+    from flocc_agent.runtime.ros2 import Ros2Adapter
 
 Float = NDArray[np.float64]
 
@@ -152,6 +155,8 @@ class Agent:
         self._store: Store | None = None
         self._run: asyncio.Task[None] | None = None
         self._playing: asyncio.Task[None] | None = None
+        self._ros2: Ros2Adapter | None = None
+        self._bridging: asyncio.Task[None] | None = None
         self._radio: Radio | None = None
         self._workers: Workers | None = None
 
@@ -171,6 +176,8 @@ class Agent:
             raise
         if self._recording is not None:
             self._playing = asyncio.create_task(self._play(self._recording))
+        if self._ros2 is not None:
+            self._bridging = asyncio.create_task(self._ros2.run(self._driver.subscribe()))
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -181,8 +188,8 @@ class Agent:
             self._playing.cancel()
         try:
             await self._run
-            if self._playing is not None:
-                await asyncio.gather(self._playing, return_exceptions=True)
+            fed = [task for task in (self._playing, self._bridging) if task is not None]
+            await asyncio.gather(*fed, return_exceptions=True)
         finally:
             self._close_store()
 
@@ -250,9 +257,7 @@ class Agent:
             FloccError: The recording cannot be played on.
         """
         assert self._run is not None
-        waiting: set[asyncio.Task[None]] = {self._run}
-        if self._playing is not None:
-            waiting.add(self._playing)
+        waiting = {self._run, *(task for task in (self._playing, self._bridging) if task is not None)}
         while self._run not in (done := (await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED))[0]):
             waiting -= done
             for task in done:
@@ -278,7 +283,9 @@ class Agent:
         playing = self._playing is not None and not self._playing.done()
         failure = None if self._store is None else self._store.failure
         disk = None if failure is None else str(failure)
-        return {**status, "playing": playing, "busy": status["busy"] or playing, "disk_failure": disk}
+        refused = {**status["refused"], **(self._ros2.counters() if self._ros2 is not None else {})}
+        busy = status["busy"] or playing
+        return {**status, "refused": refused, "playing": playing, "busy": busy, "disk_failure": disk}
 
     @property
     def _started(self) -> Driver:
@@ -294,6 +301,8 @@ class Agent:
         self._radio = Radio(
             config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())])
         )
+        if config.ros2 is not None:
+            self._ros2 = self._adapter(config.ros2)
         perception = build_perception(config.perception, config.seed)
         restored = restore(self._store)
         log = self._store.identity.log
@@ -347,6 +356,20 @@ class Agent:
         if source.hold_s > 0:
             await asyncio.sleep(source.hold_s)
             self.stop()
+
+    def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
+        from flocc_agent.runtime.ros2 import Host, Ros2Adapter
+
+        def report(event: str, fields: dict[str, Any]) -> None:
+            self._on_line({"t": round(self._clock_s(), 6), "robot": self.config.name, "event": event, **fields})
+
+        host = Host(
+            lambda *keyframe: self._started.add_keyframe(*keyframe),
+            lambda T_body_camera: self._started.mount_camera(T_body_camera),
+            lambda: self._started.corrected_bodies(),
+            report,
+        )
+        return Ros2Adapter(config, self.config.name, self._selector, host)
 
     def _on_position(self, position_m: Float) -> None:
         if self._radio is not None:

@@ -9,7 +9,7 @@ import logging
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -52,7 +52,7 @@ from flocc_agent.core.registration import Registration, RegistrationFailed, Regi
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.persistence import Persist, write
-from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, Transport, TransportCounters
 from flocc_agent.runtime.workers import Workers, WorkFailed
@@ -196,6 +196,14 @@ class Driver:
         """Ask `run` to hand over and end."""
         self._stopping = True
         self._wake.set()
+
+    def mount_camera(self, T_body_camera: Float) -> None:
+        """Say where the camera sits on the body, where that was not known at the start."""
+        self._reporter = replace(self._reporter, T_body_camera=T_body_camera)
+
+    def corrected_bodies(self) -> tuple[list[float], Float]:
+        """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes; may be called off the loop's thread."""
+        return corrected_bodies(self.robot, self._reporter.T_body_camera)
 
     def busy(self) -> bool:
         """Whether images, fetches, registrations or rounds are under way."""

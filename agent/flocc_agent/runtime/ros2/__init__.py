@@ -1,0 +1,11 @@
+"""A ROS 2 robot with `rmw_zenoh_cpp` as source and sink, without ROS and without a bridge node (docs/ros2.md).
+
+`names` says how rmw_zenoh names things in zenoh, `types` reads and writes CDR, `incoming` and `outgoing` are the
+messages, `static_frames` and `synchroniser` put images, odometry and mounting together, `session` is zenoh, `adapter`
+is all of it on one event loop.
+"""
+
+from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
+from flocc_agent.runtime.ros2.types import Ros2Error
+
+__all__ = ["Host", "Ros2Adapter", "Ros2Error"]

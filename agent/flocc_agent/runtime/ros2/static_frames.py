@@ -1,0 +1,73 @@
+"""Where the camera sits on the body, from /tf_static: a bounded tree of frames that do not move."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.geometry import inverse, is_rigid, pose_from_tq
+from flocc_agent.runtime.ros2.types import BadMessage
+
+Float = NDArray[np.float64]
+
+FRAMES_MAX = 4096
+DEPTH_MAX = 64
+
+
+class StaticFrames:
+    """Frames by name, each with its parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Float]] = {}
+
+    def add(self, message: Any) -> None:
+        """Take in a TFMessage of /tf_static.
+
+        Raises:
+            BadMessage: A transform is not rigid, or there are too many frames.
+        """
+        for stamped in message.transforms:
+            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+            if child not in self._parents and len(self._parents) >= FRAMES_MAX:
+                raise BadMessage(f"/tf_static has more than {FRAMES_MAX} frames")
+            self._parents[child] = (parent, _pose(stamped.transform, f"/tf_static: {parent} to {child}"))
+
+    def between(self, a: str, b: str) -> Float | None:
+        """`T_a_b`, or None where no chain of static transforms connects the two."""
+        of_a, of_b = self._ancestors(a), self._ancestors(b)
+        common = next((frame for frame in of_b if frame in of_a), None)
+        return None if common is None else inverse(of_a[common]) @ of_b[common]
+
+    def _ancestors(self, frame: str) -> dict[str, Float]:
+        """Pose of a frame in each of its ancestors, itself first."""
+        found = {frame: np.eye(4)}
+        T = np.eye(4)
+        for _ in range(DEPTH_MAX):
+            if frame not in self._parents:
+                break
+            frame, T_parent_child = self._parents[frame]
+            if frame in found:
+                break
+            T = T_parent_child @ T
+            found[frame] = T
+        return found
+
+
+def _pose(transform: Any, where: str) -> Float:
+    t, q = transform.translation, transform.rotation
+    return pose_of_numbers((t.x, t.y, t.z, q.x, q.y, q.z, q.w), where)
+
+
+def pose_of_numbers(numbers: tuple[float, ...], where: str) -> Float:
+    """Pose of `x y z qx qy qz qw`, as ROS writes it.
+
+    Raises:
+        BadMessage: A number is not finite, or the quaternion is not of unit length.
+    """
+    x, y, z, qx, qy, qz, qw = (float(number) for number in numbers)
+    norm = float(np.linalg.norm([qx, qy, qz, qw]))
+    if not np.isfinite(norm) or abs(norm - 1.0) > 1e-2 or not np.all(np.isfinite([x, y, z])):
+        raise BadMessage(f"{where}: position ({x:g}, {y:g}, {z:g}) with a quaternion of length {norm:.3g} is no pose")
+    T = pose_from_tq(np.array([x, y, z, qw, qx, qy, qz]))
+    assert is_rigid(T)
+    return T
