@@ -1,14 +1,14 @@
 """The grammar of flocc's zenoh keys, all of it: one writer per key, the version in the second chunk.
 
-    flocc/v1/SWARM/ROBOT/KIND                  broadcast to every robot in range, such as KIND `heartbeat`
-    flocc/v1/SWARM/ROBOT/to/RECEIVER/KIND      to one robot in range
-    flocc/v1/SWARM/ROBOT/latent/LOG/INDEX      queryable: the latent of one keyframe, held by ROBOT
-    flocc/v1/SWARM/ROBOT/status                queryable: what this agent knows and counts
-    flocc/v1/SWARM/ROBOT/chaos                 queryable: faults on demand
-    flocc/v1/SWARM/ROBOT/alive/BOOT            liveliness token of one start of one robot
+    flocc/v2/SWARM/ROBOT/KIND                  broadcast to every robot in range, such as KIND `heartbeat`
+    flocc/v2/SWARM/ROBOT/to/RECEIVER/KIND      to one robot in range
+    flocc/v2/SWARM/ROBOT/latent/LOG/INDEX      queryable: the latent of one keyframe, held by ROBOT
+    flocc/v2/SWARM/ROBOT/status                queryable: what this agent knows and counts
+    flocc/v2/SWARM/ROBOT/chaos                 queryable: faults on demand
+    flocc/v2/SWARM/ROBOT/alive/BOOT            liveliness token of one start of one robot
 
 ROBOT always is the writer (or the one who answers), so the sender is read from the key and an access rule per
-robot, `flocc/v1/SWARM/ROBOT/**`, says who may write what. Payloads carry their own version byte as well.
+robot, `flocc/v2/SWARM/ROBOT/**`, says who may write what. Payloads carry their own version byte as well.
 """
 
 import re
@@ -19,7 +19,7 @@ from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import NAME_PATTERN, checked_name
 
 ROOT = "flocc"
-VERSION = "v1"
+VERSION = "v2"
 KEY_CHARACTERS_MAX = 256
 
 KIND_PATTERN = re.compile(r"[a-z][a-z0-9_-]{0,15}")

@@ -7,7 +7,7 @@ Every message but a heartbeat may be lost: heartbeats repeat, and what they say 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,17 +35,19 @@ from flocc_protocol.codec import (
 )
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
-from flocc_protocol.records import SEALED_RECORD_BYTES_MAX, UPPER_TRIANGLE
+from flocc_protocol.records import SEALED_RECORD_BYTES_MAX, SIGNATURE_BYTES, UPPER_TRIANGLE
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 VERSION_MAX = 127
 MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
 WANTS_MAX = 16
 OFFERS_MAX = 64
 RECORDS_BATCH_MAX = 64
+BATCHES_MAX = 64
 RECORDS_BATCH_BYTES_MAX = 32 * 1024
 CORRECTION_KEYFRAMES_MAX = 1500
+CORRECTIONS_MAX = 16
 COMPUTE_CLASS_MAX = 9
 HOPS_MAX = 255
 COUNTER_MAX = 2**53 - 1
@@ -103,10 +105,11 @@ class Heartbeat:
         leader: The followed leader, None while there is none.
         term_counter_max: Highest term counter the sender knows of.
         load: Registrations waiting at the sender.
-        digests: What the sender holds of each log.
-        corrections: Which corrections the sender holds.
+        digests: What the sender holds of some logs: those that grew lately, and the others in turn.
+        corrections: Which corrections the sender holds, of some logs in the same way.
         wants: Latents the sender needs and cannot reach, for relays.
         holds: Latents the sender holds for a neighbour that wanted them.
+        lost: Latents that a neighbour wanted, and that exist no more as the sender knows from their owner.
     """
 
     sequence: int
@@ -119,6 +122,7 @@ class Heartbeat:
     corrections: tuple[CorrectionVersion, ...] = ()
     wants: tuple[KeyframeId, ...] = ()
     holds: tuple[KeyframeId, ...] = ()
+    lost: tuple[KeyframeId, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,17 +170,27 @@ class RecordBatch:
     records: tuple[bytes, ...]
 
     def __post_init__(self) -> None:
-        bytes_total = sum(map(len, self.records))
-        if len(self.records) > RECORDS_BATCH_MAX or bytes_total > RECORDS_BATCH_BYTES_MAX:
-            raise ValueError(f"{len(self.records)} records of {bytes_total} bytes are more than a batch may hold")
+        if len(self.records) > RECORDS_BATCH_MAX or self.size_bytes > RECORDS_BATCH_BYTES_MAX:
+            raise ValueError(f"{len(self.records)} records of {self.size_bytes} bytes are more than a batch may hold")
         if self.first + len(self.records) > INDEX_MAX:
             raise ValueError(f"a log does not hold {self.first + len(self.records)} records")
 
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all its records."""
+        return sum(map(len, self.records))
+
     @classmethod
-    def of(cls, log: LogId, first: int, checksum_before: int, records: Iterable[bytes]) -> "RecordBatch":
-        """Build a batch from as many of the records, in order, as one message holds; at least one."""
+    def of(
+        cls,
+        log: LogId,
+        first: int,
+        checksum_before: int,
+        records: Iterable[bytes],
+        room: int = RECORDS_BATCH_BYTES_MAX,
+    ) -> "RecordBatch":
+        """Build a batch from as many of the records, in order, as fit into that many bytes of one message."""
         taken: list[bytes] = []
-        room = RECORDS_BATCH_BYTES_MAX
         for record in records:
             room -= len(record)
             if room < 0 or len(taken) == RECORDS_BATCH_MAX:
@@ -186,15 +200,33 @@ class RecordBatch:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordRequest:
-    """Please send records of one log from number `first` on."""
+class Records:
+    """Records of several logs; all together are no larger than one batch may be."""
+
+    batches: tuple[RecordBatch, ...]
+
+    def __post_init__(self) -> None:
+        bytes_total = sum(batch.size_bytes for batch in self.batches)
+        if len(self.batches) > BATCHES_MAX or bytes_total > RECORDS_BATCH_BYTES_MAX:
+            raise ValueError(f"{len(self.batches)} batches of {bytes_total} bytes are more than a message may hold")
+
+
+class LogPosition(NamedTuple):
+    """A place in a log: the record of this number is the next one."""
 
     log: LogId
     first: int
 
 
 @dataclass(frozen=True, slots=True)
-class CorrectionMessage:
+class RecordRequest:
+    """Please send records of these logs, of each from its position on, as many as fit one message."""
+
+    positions: tuple[LogPosition, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogCorrection:
     """A leader's correction of one log, which anyone may pass on.
 
     Attributes:
@@ -207,6 +239,7 @@ class CorrectionMessage:
         first: Number of the first corrected keyframe.
         step: Every `step`-th keyframe is listed; those between are interpolated.
         T_map_camera: (N, 7) float32 poses, translation and quaternion w x y z.
+        signature: The leader's, over `signed_part`; empty where the swarm has no keys.
     """
 
     log: LogId
@@ -218,6 +251,7 @@ class CorrectionMessage:
     first: int
     step: int
     T_map_camera: Array
+    signature: bytes = b""
 
     def __post_init__(self) -> None:
         shape = self.T_map_camera.shape
@@ -227,14 +261,42 @@ class CorrectionMessage:
             raise ValueError("a correction ends within its log")
         if self.covariance is not None and self.covariance.shape != (UPPER_TRIANGLE,):
             raise ValueError(f"a covariance is an upper triangle of {UPPER_TRIANGLE}")
+        if len(self.signature) not in (0, SIGNATURE_BYTES):
+            raise ValueError(f"a signature has {SIGNATURE_BYTES} bytes")
         _check_poses(self.T_map_camera.numpy())
 
 
 @dataclass(frozen=True, slots=True)
-class CorrectionRequest:
-    """Please send your correction of this log."""
+class CorrectionBatch:
+    """Corrections of several logs; all together list no more keyframes than one may."""
 
-    log: LogId
+    corrections: tuple[LogCorrection, ...]
+
+    def __post_init__(self) -> None:
+        keyframes = sum(correction.T_map_camera.shape[0] for correction in self.corrections)
+        if len(self.corrections) > CORRECTIONS_MAX or keyframes > CORRECTION_KEYFRAMES_MAX:
+            raise ValueError(f"{len(self.corrections)} corrections of {keyframes} keyframes do not fit one message")
+
+    @classmethod
+    def packed(cls, corrections: Iterable[LogCorrection]) -> "list[CorrectionBatch]":
+        """Put any number of corrections, in their order, into messages."""
+        batches: list[list[LogCorrection]] = [[]]
+        room = CORRECTION_KEYFRAMES_MAX
+        for correction in corrections:
+            keyframes = correction.T_map_camera.shape[0]
+            if keyframes > room or len(batches[-1]) == CORRECTIONS_MAX:
+                batches.append([])
+                room = CORRECTION_KEYFRAMES_MAX
+            batches[-1].append(correction)
+            room -= keyframes
+        return [cls(tuple(each)) for each in batches if each]
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionRequest:
+    """Please send your corrections of these logs."""
+
+    logs: tuple[LogId, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,16 +312,25 @@ class CandidateOffer:
     transferred: bool = False
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class CandidatePair:
-    """Two keyframes of different robots that may show one place; `low < high`."""
-
+class _PairFields(NamedTuple):
     low: KeyframeId
     high: KeyframeId
 
-    def __post_init__(self) -> None:
-        if not self.low < self.high:
+
+class CandidatePair(_PairFields):
+    """Two keyframes of different robots that may show one place; `low < high`."""
+
+    __slots__ = ()
+
+    def __new__(cls, low: KeyframeId, high: KeyframeId) -> "CandidatePair":
+        """Check the order.
+
+        Raises:
+            ValueError: They are not sorted, or the same.
+        """
+        if not low < high:
             raise ValueError("a candidate pair is sorted and joins two keyframes")
+        return super().__new__(cls, low, high)
 
     def other(self, end: KeyframeId) -> KeyframeId:
         """The end that is not the given one."""
@@ -277,9 +348,9 @@ Message = (
     | Answer
     | Coordinator
     | Handover
-    | RecordBatch
+    | Records
     | RecordRequest
-    | CorrectionMessage
+    | CorrectionBatch
     | CorrectionRequest
     | CandidateOffer
 )
@@ -346,6 +417,27 @@ def _pack_digest(value: LogDigest) -> list[Any]:
 _DIGEST = Codec(_pack_digest, _unpack_digest)
 _VERSION = Codec(_ANY_VERSION.pack, _unpack_version)
 _PAIR = struct(CandidatePair, low=KEYFRAME_ID, high=KEYFRAME_ID)
+_CORRECTION = struct(
+    LogCorrection,
+    log=LOG_ID,
+    term=TERM,
+    round=COUNT,
+    anchor=LOG_ID,
+    T_map_odom=POSE,
+    covariance=optional(ARRAY),
+    first=COUNT,
+    step=integer(1, 2**31 - 1),
+    T_map_camera=ARRAY,
+    signature=blob(SIGNATURE_BYTES),
+)
+_POSITION = struct(LogPosition, log=LOG_ID, first=COUNT)
+_BATCH = struct(
+    RecordBatch,
+    log=LOG_ID,
+    first=COUNT,
+    checksum_before=_CHECKSUM,
+    records=sequence(blob(SEALED_RECORD_BYTES_MAX), RECORDS_BATCH_MAX),
+)
 
 _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     "heartbeat": (
@@ -362,39 +454,17 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             corrections=sequence(_VERSION, LOGS_MAX),
             wants=sequence(KEYFRAME_ID, WANTS_MAX),
             holds=sequence(KEYFRAME_ID, WANTS_MAX),
+            lost=sequence(KEYFRAME_ID, WANTS_MAX),
         ),
     ),
     "election": (Election, struct(Election, counter=_TERM_COUNTER)),
     "answer": (Answer, struct(Answer, counter=_TERM_COUNTER)),
     "coordinator": (Coordinator, struct(Coordinator, advert=_ADVERT)),
     "handover": (Handover, struct(Handover, term=TERM)),
-    "records": (
-        RecordBatch,
-        struct(
-            RecordBatch,
-            log=LOG_ID,
-            first=COUNT,
-            checksum_before=_CHECKSUM,
-            records=sequence(blob(SEALED_RECORD_BYTES_MAX), RECORDS_BATCH_MAX),
-        ),
-    ),
-    "want-records": (RecordRequest, struct(RecordRequest, log=LOG_ID, first=COUNT)),
-    "correction": (
-        CorrectionMessage,
-        struct(
-            CorrectionMessage,
-            log=LOG_ID,
-            term=TERM,
-            round=COUNT,
-            anchor=LOG_ID,
-            T_map_odom=POSE,
-            covariance=optional(ARRAY),
-            first=COUNT,
-            step=integer(1, 2**31 - 1),
-            T_map_camera=ARRAY,
-        ),
-    ),
-    "want-correction": (CorrectionRequest, struct(CorrectionRequest, log=LOG_ID)),
+    "records": (Records, struct(Records, batches=sequence(_BATCH, BATCHES_MAX))),
+    "want-records": (RecordRequest, struct(RecordRequest, positions=sequence(_POSITION, BATCHES_MAX))),
+    "correction": (CorrectionBatch, struct(CorrectionBatch, corrections=sequence(_CORRECTION, CORRECTIONS_MAX))),
+    "want-correction": (CorrectionRequest, struct(CorrectionRequest, logs=sequence(LOG_ID, LOGS_MAX))),
     "candidates": (
         CandidateOffer,
         struct(CandidateOffer, pairs=sequence(_PAIR, OFFERS_MAX), transferred=boolean()),
@@ -407,6 +477,11 @@ MESSAGE_KINDS: tuple[str, ...] = tuple(_CODECS)
 def kind_of(message: Message) -> str:
     """Name of a message's kind, as accounting and key expressions use it."""
     return _KINDS[type(message)]
+
+
+def signed_part(correction: LogCorrection) -> bytes:
+    """What a correction's signature covers: all its other fields, as they are on the wire."""
+    return to_bytes(_CORRECTION.pack(correction)[:-1])
 
 
 def encode(envelope: Envelope) -> bytes:

@@ -184,13 +184,13 @@ async def test_a_stranger_reads_nothing_and_writes_nothing(folders: dict[str, Pa
             stranger.declare_subscriber("**", lambda sample: heard.append(str(sample.key_expr)))
             await until(
                 lambda: len(two.received) > 100,
-                act=lambda: (one.transport.broadcast("log", b"x"), stranger.put("flocc/v1/field/r3/log", b"forged")),  # type: ignore[func-returns-value,arg-type]
+                act=lambda: (one.transport.broadcast("log", b"x"), stranger.put("flocc/v2/field/r3/log", b"forged")),  # type: ignore[func-returns-value,arg-type]
             )
-            replies = list(stranger.get("flocc/v1/field/*/latent/r1/0", timeout=1.0))
+            replies = list(stranger.get("flocc/v2/field/*/latent/r1/0", timeout=1.0))
             assert stranger.info.peers_zid() == []
         finally:
             stranger.close()
-    assert [key for key in heard if not key.startswith("flocc/v1/field/r3")] == []
+    assert [key for key in heard if not key.startswith("flocc/v2/field/r3")] == []
     assert [reply for reply in replies if reply.ok is not None] == []
     assert {sender for sender, *_ in (*one.received, *two.received)} <= {"r1", "r2"}
 
@@ -207,9 +207,9 @@ async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path])
         try:
 
             def write() -> None:
-                rogue.put("flocc/v1/field/r2/log", b"forged")
-                rogue.put("flocc/v1/field/r2/to/r1/pull", b"forged")
-                rogue.put("flocc/v1/field/r3/log", b"own")
+                rogue.put("flocc/v2/field/r2/log", b"forged")
+                rogue.put("flocc/v2/field/r2/to/r1/pull", b"forged")
+                rogue.put("flocc/v2/field/r3/log", b"own")
 
             await until(lambda: len(one.received) > 20, act=write)
         finally:
@@ -237,7 +237,7 @@ async def test_only_operators_are_answered(folders: dict[str, Path]) -> None:
         member = open_session(settings, "r3")
         try:
             await until(lambda: len(member.info.peers_zid()) == 1)
-            replies = await asyncio.to_thread(lambda: list(member.get("flocc/v1/field/*/status", timeout=1.0)))
+            replies = await asyncio.to_thread(lambda: list(member.get("flocc/v2/field/*/status", timeout=1.0)))
         finally:
             member.close()
     assert [reply for reply in replies if reply.ok is not None] == []

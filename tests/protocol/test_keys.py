@@ -32,7 +32,7 @@ def test_reads_back_the_latent_of_any_keyframe(
     assert keys.parse_latent_key(keys.latent_key(swarm, holder, latent)) == (holder, latent)
 
 
-@given(st.text(max_size=300) | st.from_regex(r"\Aflocc/v1/[a-z*$/]{0,60}\Z"))
+@given(st.text(max_size=300) | st.from_regex(r"\Aflocc/v2/[a-z*$/]{0,60}\Z"))
 def test_any_other_text_is_a_decode_error_or_an_address(text: str) -> None:
     for parse in (keys.parse_message_key, keys.parse_latent_key, keys.parse_alive_key, keys.parse_admin_key):
         try:
@@ -42,11 +42,11 @@ def test_any_other_text_is_a_decode_error_or_an_address(text: str) -> None:
 
 
 def test_writes_the_documented_keys() -> None:
-    assert keys.broadcast_key("field", "r1", keys.Kind.HEARTBEAT) == "flocc/v1/field/r1/heartbeat"
-    assert keys.unicast_key("field", "r1", "r2", "pull") == "flocc/v1/field/r1/to/r2/pull"
-    assert keys.latent_key("field", "r1", "r1~5/7") == "flocc/v1/field/r1/latent/r1~5/7"
-    assert keys.admin_key("field", "*", keys.Admin.STATUS) == "flocc/v1/field/*/status"
-    assert keys.alive_key("field", "r1", "0f") == "flocc/v1/field/r1/alive/0f"
+    assert keys.broadcast_key("field", "r1", keys.Kind.HEARTBEAT) == "flocc/v2/field/r1/heartbeat"
+    assert keys.unicast_key("field", "r1", "r2", "pull") == "flocc/v2/field/r1/to/r2/pull"
+    assert keys.latent_key("field", "r1", "r1~5/7") == "flocc/v2/field/r1/latent/r1~5/7"
+    assert keys.admin_key("field", "*", keys.Admin.STATUS) == "flocc/v2/field/*/status"
+    assert keys.alive_key("field", "r1", "0f") == "flocc/v2/field/r1/alive/0f"
 
 
 @given(NAMES, NAMES, st.sampled_from(keys.Admin))
@@ -55,12 +55,12 @@ def test_reads_back_who_answers_an_operator(swarm: str, robot: str, admin: keys.
 
 
 def test_names_the_version_of_a_foreign_key() -> None:
-    with pytest.raises(DecodeError, match="protocol version 'v2'"):
-        keys.parse_message_key("flocc/v2/field/r1/hb")
+    with pytest.raises(DecodeError, match="protocol version 'v1'"):
+        keys.parse_message_key("flocc/v1/field/r1/hb")
 
 
 def test_recognises_a_stranger_of_another_version_by_its_token() -> None:
-    assert keys.parse_alive_key("flocc/v2/farm/r9/alive/ab") == keys.Presence("v2", "farm", "r9", "ab")
+    assert keys.parse_alive_key("flocc/v1/farm/r9/alive/ab") == keys.Presence("v1", "farm", "r9", "ab")
 
 
 @pytest.mark.parametrize("name", ["", "R1", "r 1", "r*", "r/1", "a" * 33])

@@ -7,8 +7,10 @@ from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX, Pose7
 from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
 from flocc_protocol.messages import (
+    BATCHES_MAX,
     COMPUTE_CLASS_MAX,
     CORRECTION_KEYFRAMES_MAX,
+    CORRECTIONS_MAX,
     COUNTER_MAX,
     HOPS_MAX,
     LOGS_MAX,
@@ -20,7 +22,7 @@ from flocc_protocol.messages import (
     CandidateOffer,
     CandidatePair,
     Coordinator,
-    CorrectionMessage,
+    CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
     Election,
@@ -28,14 +30,18 @@ from flocc_protocol.messages import (
     Handover,
     Heartbeat,
     LeaderAdvert,
+    LogCorrection,
     LogDigest,
+    LogPosition,
     Message,
     RecordBatch,
     RecordRequest,
+    Records,
 )
 from flocc_protocol.records import (
     REASON_LENGTH_MAX,
     SEALED_RECORD_BYTES_MAX,
+    SIGNATURE_BYTES,
     ClosureRecord,
     FixRecord,
     KeyframeRecord,
@@ -78,6 +84,11 @@ RECORDS: tuple[Record, ...] = (
 )
 ENCODED = tuple(encode_record(record) for record in RECORDS)
 
+CORRECTIONS = (
+    LogCorrection(ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), Array.of(np.ones(21)), 3, 2, EXACT_POSES),
+    LogCorrection(BOB, TERM, 0, ALICE, IDENTITY, None, 0, 1, poses_array(0), bytes(range(SIGNATURE_BYTES))),
+)
+
 MESSAGES: tuple[Message, ...] = (
     Heartbeat(
         812,
@@ -90,19 +101,17 @@ MESSAGES: tuple[Message, ...] = (
         (CorrectionVersion(ALICE, TERM, 4), CorrectionVersion(BOB, TERM, 4)),
         (KeyframeId(BOB, 8),),
         (KeyframeId(ALICE, 3),),
+        (KeyframeId(BOB, 7),),
     ),
     Heartbeat(0, 0, 0, None, 0, 0, ()),
     Election(8),
     Answer(8),
     Coordinator(ADVERT),
     Handover(TERM),
-    RecordBatch(ALICE, 12, 0x1234, ENCODED),
-    RecordRequest(BOB, 41),
-    CorrectionMessage(
-        ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), Array.of(np.ones(21)), 3, 2, EXACT_POSES
-    ),
-    CorrectionMessage(BOB, TERM, 0, ALICE, IDENTITY, None, 0, 1, poses_array(0)),
-    CorrectionRequest(BOB),
+    Records((RecordBatch(ALICE, 12, 0x1234, ENCODED), RecordBatch(BOB, 0, 0, ENCODED[:1]))),
+    RecordRequest((LogPosition(ALICE, 12), LogPosition(BOB, 41))),
+    CorrectionBatch(CORRECTIONS),
+    CorrectionRequest((ALICE, BOB)),
     CandidateOffer((CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),), True),
 )
 ENVELOPES = tuple(Envelope(BOB, message) for message in MESSAGES)
@@ -118,7 +127,21 @@ def largest_messages() -> list[Message]:
     advert = LeaderAdvert(leader, COMPUTE_CLASS_MAX, COUNTER_MAX, HOPS_MAX)
     keyframe = KeyframeId(_long(0), INDEX_MAX)
     other = KeyframeId(_long(1), INDEX_MAX)
-    covariance = Array.of(np.ones(21), "f8")
+
+    def correction(number: int, keyframes: int) -> LogCorrection:
+        return LogCorrection(
+            _long(number),
+            leader,
+            INDEX_MAX,
+            _long(1),
+            IDENTITY,
+            Array.of(np.ones(21), "f8"),
+            INDEX_MAX - CORRECTION_KEYFRAMES_MAX + 1,
+            1,
+            poses_array(keyframes),
+            bytes(SIGNATURE_BYTES),
+        )
+
     return [
         Heartbeat(
             COUNTER_MAX,
@@ -131,31 +154,29 @@ def largest_messages() -> list[Message]:
             tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(LOGS_MAX)),
             (keyframe,) * WANTS_MAX,
             (keyframe,) * WANTS_MAX,
+            (keyframe,) * WANTS_MAX,
         ),
         Election(TERM_COUNTER_MAX),
         Answer(TERM_COUNTER_MAX),
         Coordinator(advert),
         Handover(leader),
-        RecordBatch(_long(0), INDEX_MAX - 4, 2**32 - 1, (bytes(SEALED_RECORD_BYTES_MAX),) * 3 + (bytes(8000),)),
-        RecordBatch(
-            _long(0),
-            INDEX_MAX - RECORDS_BATCH_MAX,
-            2**32 - 1,
-            (bytes(RECORDS_BATCH_BYTES_MAX // RECORDS_BATCH_MAX),) * RECORDS_BATCH_MAX,
+        Records(
+            tuple(
+                RecordBatch(
+                    _long(k), INDEX_MAX - 8, 2**32 - 1, (bytes(RECORDS_BATCH_BYTES_MAX // BATCHES_MAX // 8),) * 8
+                )
+                for k in range(BATCHES_MAX)
+            )
         ),
-        RecordRequest(_long(0), INDEX_MAX),
-        CorrectionMessage(
-            _long(0),
-            leader,
-            INDEX_MAX,
-            _long(1),
-            IDENTITY,
-            covariance,
-            INDEX_MAX - CORRECTION_KEYFRAMES_MAX + 1,
-            1,
-            poses_array(CORRECTION_KEYFRAMES_MAX),
+        Records(
+            (RecordBatch(_long(0), INDEX_MAX - 4, 2**32 - 1, (bytes(SEALED_RECORD_BYTES_MAX),) * 3 + (bytes(8000),)),)
         ),
-        CorrectionRequest(_long(0)),
+        RecordRequest(tuple(LogPosition(_long(k), INDEX_MAX) for k in range(BATCHES_MAX))),
+        CorrectionBatch(
+            tuple(correction(k, CORRECTION_KEYFRAMES_MAX // CORRECTIONS_MAX) for k in range(CORRECTIONS_MAX))
+        ),
+        CorrectionBatch((correction(0, CORRECTION_KEYFRAMES_MAX),)),
+        CorrectionRequest(tuple(_long(k) for k in range(LOGS_MAX))),
         CandidateOffer((CandidatePair(keyframe, other),) * OFFERS_MAX, True),
     ]
 
@@ -238,6 +259,22 @@ def _tuples(items: st.SearchStrategy[object], longest: int) -> st.SearchStrategy
 
 
 _starts = st.integers(0, 2**30)
+batches = st.builds(
+    RecordBatch, log_ids, _starts, st.integers(0, 2**32 - 1), _tuples(st.binary(max_size=64), RECORDS_BATCH_MAX)
+)
+corrections = st.builds(
+    LogCorrection,
+    log_ids,
+    terms,
+    _counts,
+    log_ids,
+    poses(),
+    optional_arrays((21,)),
+    _starts,
+    st.integers(1, 1000),
+    st.builds(poses_array, st.integers(0, 20), st.integers(0, 2**32 - 1)),
+    st.sampled_from((b"", bytes(SIGNATURE_BYTES))),
+)
 messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(
         Heartbeat,
@@ -251,27 +288,15 @@ messages: st.SearchStrategy[Message] = st.one_of(
         _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), LOGS_MAX),
         _tuples(keyframe_ids, WANTS_MAX),
         _tuples(keyframe_ids, WANTS_MAX),
+        _tuples(keyframe_ids, WANTS_MAX),
     ),
     st.builds(Election, _term_counters),
     st.builds(Answer, _term_counters),
     st.builds(Coordinator, adverts),
     st.builds(Handover, terms),
-    st.builds(
-        RecordBatch, log_ids, _starts, st.integers(0, 2**32 - 1), _tuples(st.binary(max_size=64), RECORDS_BATCH_MAX)
-    ),
-    st.builds(RecordRequest, log_ids, _counts),
-    st.builds(
-        CorrectionMessage,
-        log_ids,
-        terms,
-        _counts,
-        log_ids,
-        poses(),
-        optional_arrays((21,)),
-        _starts,
-        st.integers(1, 1000),
-        st.builds(poses_array, st.integers(0, 20), st.integers(0, 2**32 - 1)),
-    ),
-    st.builds(CorrectionRequest, log_ids),
+    st.builds(Records, _tuples(batches, BATCHES_MAX)),
+    st.builds(RecordRequest, _tuples(st.builds(LogPosition, log_ids, _counts), BATCHES_MAX)),
+    st.builds(CorrectionBatch, _tuples(corrections, CORRECTIONS_MAX)),
+    st.builds(CorrectionRequest, _tuples(log_ids, LOGS_MAX)),
     st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
 )

@@ -14,7 +14,7 @@ from flocc_protocol.messages import (
     CandidateOffer,
     CandidatePair,
     Coordinator,
-    CorrectionMessage,
+    CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
     Election,
@@ -22,10 +22,13 @@ from flocc_protocol.messages import (
     Handover,
     Heartbeat,
     LeaderAdvert,
+    LogCorrection,
     LogDigest,
+    LogPosition,
     Message,
     RecordBatch,
     RecordRequest,
+    Records,
     encode,
     kind_of,
 )
@@ -67,9 +70,11 @@ def records() -> Iterator[tuple[str, Record]]:
     yield "fix", FixRecord(1000, Array.of(np.ones(3), "f8"), Array.of(np.ones(9), "f8"))
 
 
-def correction(keyframes: int) -> CorrectionMessage:
+def correction(keyframes: int) -> CorrectionBatch:
     """A correction of a log."""
-    return CorrectionMessage(LOGS[1], TERM, 200, LOGS[0], IDENTITY, COVARIANCE, 0, 1, poses_array(keyframes))
+    return CorrectionBatch(
+        (LogCorrection(LOGS[1], TERM, 200, LOGS[0], IDENTITY, COVARIANCE, 0, 1, poses_array(keyframes)),)
+    )
 
 
 def messages() -> Iterator[tuple[str, Message]]:
@@ -82,13 +87,14 @@ def messages() -> Iterator[tuple[str, Message]]:
     yield "answer", Answer(7)
     yield "coordinator", Coordinator(ADVERT)
     yield "handover", Handover(TERM)
-    yield "records, one keyframe (int8, 512)", RecordBatch.of(LOGS[1], 1000, CHECKSUM, [data])
-    yield "records, as many such keyframes as fit", RecordBatch.of(LOGS[1], 1000, CHECKSUM, [data] * 100)
-    yield "want-records", RecordRequest(LOGS[1], 1000)
+    yield "records, one keyframe (int8, 512)", Records((RecordBatch.of(LOGS[1], 1000, CHECKSUM, [data]),))
+    yield "records, as many such keyframes as fit", Records((RecordBatch.of(LOGS[1], 1000, CHECKSUM, [data] * 100),))
+    yield "want-records, 1 log", RecordRequest((LogPosition(LOGS[1], 1000),))
+    yield "want-records, 50 logs", RecordRequest(tuple(LogPosition(log, 1000) for log in LOGS))
     yield "correction, 100 keyframes", correction(100)
     yield "correction, 400 keyframes", correction(400)
     yield "correction, 1500 keyframes", correction(1500)
-    yield "want-correction", CorrectionRequest(LOGS[1])
+    yield "want-correction", CorrectionRequest(LOGS[1:2])
     yield "candidates, 1 pair", CandidateOffer((CandidatePair(QUERY, MATCH),))
 
 

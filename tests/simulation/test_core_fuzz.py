@@ -12,7 +12,7 @@ import pytest
 from tests.protocol.wire_examples import BOB, ENCODED, ENVELOPES, MESSAGES
 from tests.protocol.wire_mutations import flip, noise, rearrange, replace_node
 
-from flocc_agent.core import gossip
+from flocc_agent.core import pulls
 from flocc_agent.core.effects import (
     Broadcast,
     Effect,
@@ -40,7 +40,7 @@ from flocc_agent.core.robot import Robot
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import Envelope, Message, RecordBatch, decode, encode
+from flocc_protocol.messages import Envelope, Message, RecordBatch, Records, decode, encode
 
 NAMES = ("alice", "bob-2", "carol")
 PLACES = 4
@@ -235,9 +235,9 @@ def items_held(value: object) -> int:
 
 def test_strangers_cannot_grow_a_robot_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every message comes from a robot that was never heard of, or speaks of logs that nobody knows."""
-    monkeypatch.setattr(gossip.remember, "__defaults__", (16,))
+    monkeypatch.setattr(pulls.remember, "__defaults__", (16,))
     robot = Robot(LogId("alice"), 0, 0, SMALL, 0.0)
-    carol = [Envelope(LogId("carol"), message) for message in (*MESSAGES, RecordBatch(BOB, 3, 0, ENCODED))]
+    carol = [Envelope(LogId("carol"), message) for message in (*MESSAGES, Records((RecordBatch(BOB, 3, 0, ENCODED),)))]
     examples = [encode(envelope) for envelope in (*ENVELOPES, *carol)]
     for number in range(300):
         now = 0.05 * number

@@ -86,7 +86,7 @@ def attack(rng: random.Random, material: list[tuple[str, bytes]]) -> tuple[str, 
     if rng.random() < 0.2:
         kind = rng.choice(MESSAGE_KINDS)
     sender = "r2" if rng.random() < 0.9 else rng.choice(("r1", "r7", "r1~5", "$", "R"))
-    key = f"flocc/v1/test/{sender}/{'to/r1/' if rng.random() < 0.5 else ''}{kind}"
+    key = f"flocc/v2/test/{sender}/{'to/r1/' if rng.random() < 0.5 else ''}{kind}"
     return (key, mutated(payload, rng)) if rng.random() < 0.95 else (key, payload)
 
 

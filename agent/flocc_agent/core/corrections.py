@@ -7,15 +7,16 @@ nothing, and a robot that was away gets the newest from whoever it meets.
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.gossip import REMEMBERED_MAX, remember
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
+from flocc_agent.core.pulls import REMEMBERED_MAX, remember
 from flocc_agent.geometry import pose_from_tq, tq_from_pose
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import CorrectionMessage, CorrectionRequest, CorrectionVersion
+from flocc_protocol.messages import CorrectionBatch, CorrectionRequest, CorrectionVersion, LogCorrection
 
 Float = NDArray[np.float64]
 
@@ -29,17 +30,17 @@ class Corrections:
         self._own = own
         self._gossip = gossip
         self._rounds = rounds
-        self._newest: dict[LogId, CorrectionMessage] = {}
+        self._newest: dict[LogId, LogCorrection] = {}
         self._asked_until_s: dict[LogId, float] = {}
         self._agreed: dict[LogId, CorrectionVersion] = {}
-        self._versions: tuple[CorrectionVersion, ...] | None = None
+        self._announcer: Announcer[CorrectionVersion] = Announcer()
 
     @property
-    def applied(self) -> CorrectionMessage | None:
+    def applied(self) -> LogCorrection | None:
         """The correction that this robot applied last."""
         return self._newest.get(self._own)
 
-    def of(self, log: LogId) -> CorrectionMessage | None:
+    def of(self, log: LogId) -> LogCorrection | None:
         """The newest known correction of a log."""
         return self._newest.get(log)
 
@@ -51,16 +52,17 @@ class Corrections:
             "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
         }
 
-    def restore(self, message: CorrectionMessage) -> None:
+    def restore(self, message: LogCorrection) -> None:
         """Put back the correction that was applied before a restart."""
-        self._newest[message.log] = message
-        self._versions = None
+        self._keep(message)
 
-    def versions(self) -> tuple[CorrectionVersion, ...]:
-        """What this robot holds, for its heartbeat."""
-        if self._versions is None:
-            self._versions = tuple(CorrectionVersion(log, m.term, m.round) for log, m in sorted(self._newest.items()))
-        return self._versions
+    def announced(self) -> tuple[CorrectionVersion, ...]:
+        """What one heartbeat says of the corrections that this robot holds."""
+        return self._announcer.next()
+
+    def on_neighbour(self) -> None:
+        """Somebody came into range: the next heartbeat says everything."""
+        self._announcer.say_all()
 
     def news(self, versions: tuple[CorrectionVersion, ...]) -> tuple[CorrectionVersion, ...]:
         """Those versions that were not yet found to be no newer than this robot's own."""
@@ -68,37 +70,41 @@ class Corrections:
 
     def on_versions(self, peer: str, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """Ask a peer for corrections that are newer than this robot's."""
-        effects: list[Effect] = []
+        wanted: list[LogId] = []
         for version in versions:
             held = self._newest.get(version.log)
             newer = held is None or (version.term, version.round) > (held.term, held.round)
             if newer and self._asked_until_s.get(version.log, now) <= now:
                 remember(self._asked_until_s, version.log, now + self._gossip.request_timeout_s)
-                effects.append(Unicast(peer, CorrectionRequest(version.log)))
+                wanted.append(version.log)
             elif not newer:
                 remember(self._agreed, version.log, version)
-        return effects
+        return [Unicast(peer, CorrectionRequest(tuple(wanted)))] if wanted else []
 
     def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
-        """Pass a correction on."""
-        held = self._newest.get(request.log)
-        return [Unicast(peer, held)] if held else []
+        """Pass corrections on."""
+        held = [self._newest[log] for log in request.logs if log in self._newest]
+        return [Unicast(peer, batch) for batch in CorrectionBatch.packed(held)]
 
-    def on_message(self, message: CorrectionMessage) -> list[Effect]:
+    def on_message(self, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction; apply it when it is this robot's."""
         held = self._newest.get(message.log)
         if held is not None and (message.term, message.round) <= (held.term, held.round):
             return []
         if held is None and len(self._newest) >= self._gossip.logs_max:
             return [Report("peer_refused", {"peer": message.term.leader.robot, "reason": "too many corrections"})]
-        self._newest[message.log] = message
-        self._versions = None
+        self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
+
+    def _keep(self, message: LogCorrection) -> None:
+        self._newest[message.log] = message
+        self._announcer.put(message.log, CorrectionVersion(message.log, message.term, message.round))
 
     def publish(self, term: Term, round_number: int, solution: GraphSolution) -> list[Effect]:
         """Send what a round changed, as the leader; a log whose solution leaves the map keeps its last correction."""
         effects: list[Effect] = []
+        published: list[LogCorrection] = []
         for component in solution.components:
             for log in component.logs:
                 try:
@@ -108,10 +114,11 @@ class Corrections:
                     effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
                     continue
                 if self._changed(message):
-                    effects += [Broadcast(message), *self.on_message(message)]
-        return effects
+                    published.append(message)
+                    effects += self.on_message(message)
+        return [*(Broadcast(batch) for batch in CorrectionBatch.packed(published)), *effects]
 
-    def _changed(self, message: CorrectionMessage) -> bool:
+    def _changed(self, message: LogCorrection) -> bool:
         """Whether a follower would notice: another term, frame or thinning, or poses that moved."""
         held = self._newest.get(message.log)
         if held is None or (held.term, held.anchor, held.step) != (message.term, message.anchor, message.step):
@@ -124,11 +131,11 @@ class Corrections:
         turned = shift[:, 3:].max(initial=0.0) > self._rounds.rotation_tolerance_rad
         return bool(moved or turned) or self._odom_moved(held, message)
 
-    def _odom_moved(self, held: CorrectionMessage, message: CorrectionMessage) -> bool:
+    def _odom_moved(self, held: LogCorrection, message: LogCorrection) -> bool:
         shift = np.abs(np.array(held.T_map_odom) - np.array(message.T_map_odom))
         return bool(shift.max() > self._rounds.translation_tolerance_m)
 
-    def _apply(self, message: CorrectionMessage, held: CorrectionMessage | None) -> list[Effect]:
+    def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         correction = delivered(message, frame_changed=held is not None and held.anchor != message.anchor)
         facts = {
             "term": message.term.counter,
@@ -141,15 +148,13 @@ class Corrections:
         return [PersistCorrection(message), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
 
 
-def correction_of(
-    component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int
-) -> CorrectionMessage:
+def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:
     """A log's part of a solution, thinned to at most `keyframes_max` keyframes; the last one is always listed."""
     poses = component.T_map_keyframe[log]
     step = max(1, -(-len(poses) // keyframes_max))
     first = (len(poses) - 1) % step
     covariance = component.covariance_map_odom.get(log)
-    return CorrectionMessage(
+    return LogCorrection(
         log=log,
         term=term,
         round=round_number,
@@ -162,7 +167,7 @@ def correction_of(
     )
 
 
-def delivered(message: CorrectionMessage, frame_changed: bool) -> Correction:
+def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
     """A correction as consumers get it."""
     return Correction(
         term=message.term,

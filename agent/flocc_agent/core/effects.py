@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId, Term
-from flocc_protocol.messages import CandidatePair, CorrectionMessage, Message
+from flocc_protocol.messages import CandidatePair, LogCorrection, Message
 
 Float = NDArray[np.float64]
 Fact = str | int | float | bool | None | list["Fact"] | dict[str, "Fact"]
@@ -130,7 +130,7 @@ class PersistTerm:
 class PersistCorrection:
     """Remember the correction that this robot applied."""
 
-    correction: CorrectionMessage
+    correction: LogCorrection
 
 
 @dataclass(frozen=True, slots=True)

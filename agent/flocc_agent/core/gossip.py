@@ -7,10 +7,12 @@ neighbour about what was sent, so a lost, doubled, late or reordered message can
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Protocol, TypeVar
+from typing import Protocol
 
+from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.parameters import GossipParameters
+from flocc_agent.core.pulls import REMEMBERED_MAX, Pulls, remember
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import (
@@ -19,15 +21,11 @@ from flocc_protocol.messages import (
     LogDigest,
     RecordBatch,
     RecordRequest,
+    Records,
 )
 from flocc_protocol.records import KeyframeRecord, Record, chain, decode_record, encode_record
 
-Key = TypeVar("Key")
-Entry = TypeVar("Entry")
-
 DECODED_MAX = 1024
-REMEMBERED_MAX = 1024
-"""Open requests, pauses and forks that are remembered; beyond this the oldest are forgotten."""
 
 
 class Sealer(Protocol):
@@ -85,14 +83,6 @@ class NewRecord:
     record: Record
 
 
-@dataclass(slots=True)
-class _Asked:
-    """An open request for a missing range."""
-
-    peer: str
-    until_s: float
-
-
 class Gossip:
     """All logs that one robot holds."""
 
@@ -101,20 +91,17 @@ class Gossip:
         self._parameters = parameters
         self._sealer = sealer
         self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
-        self._asked: dict[LogId, _Asked] = {}
-        self._pauses_s: dict[tuple[LogId, str], float] = {}
-        self._not_before_s: dict[tuple[LogId, str], float] = {}
+        self._pulls = Pulls(self._held, parameters)
         self._forked: dict[tuple[LogId, str], None] = {}
         self._agreed: dict[LogId, LogDigest] = {}
         self._told: dict[tuple[str, str], None] = {}
-        self._digests: tuple[LogDigest, ...] | None = None
+        self._announcer: Announcer[LogDigest] = Announcer()
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
         return {
             "logs": (len(self.logs), self._parameters.logs_max),
-            "asked": (len(self._asked), REMEMBERED_MAX),
-            "paused": (len(self._not_before_s), REMEMBERED_MAX),
+            **self._pulls.sizes(),
             "forked": (len(self._forked), REMEMBERED_MAX),
             "refused": (len(self._told), REMEMBERED_MAX),
             "agreed": (len(self._agreed), REMEMBERED_MAX),
@@ -125,7 +112,7 @@ class Gossip:
         copy = self.logs.setdefault(log, LogCopy())
         record = decode_record(self._opened(log, len(copy), data))
         copy.append(record, data)
-        self._digests = None
+        self._announce(log, copy)
         return NewRecord(log, len(copy) - 1, record)
 
     def append(self, record: Record) -> tuple[NewRecord, list[Effect], RecordBatch]:
@@ -137,69 +124,100 @@ class Gossip:
             data = self._sealer.seal(self._own, number, data)
         assert copy.accepts(record), "own keyframes are numbered without gaps"
         copy.append(record, data)
-        self._digests = None
+        self._announce(self._own, copy)
         batch = RecordBatch(self._own, number, before, (data,))
         return NewRecord(self._own, number, record), [PersistRecord(self._own, number, data)], batch
 
     def digests(self) -> tuple[LogDigest, ...]:
-        """What this robot holds, for its heartbeat."""
-        if self._digests is None:
-            self._digests = tuple(
-                LogDigest(log, len(copy), copy.checksums[-1]) for log, copy in sorted(self.logs.items()) if len(copy)
-            )
-        return self._digests
+        """What this robot holds."""
+        return self._announcer.all()
+
+    def announced(self) -> tuple[LogDigest, ...]:
+        """What one heartbeat says of it."""
+        return self._announcer.next()
+
+    def on_neighbour(self) -> None:
+        """Somebody came into range: the next heartbeat says everything."""
+        self._announcer.say_all()
+
+    def on_lost(self, peer: str) -> None:
+        """A robot is out of range."""
+        self._pulls.on_lost(peer)
 
     def on_digests(self, sender: LogId, digests: tuple[LogDigest, ...], now: float) -> list[Effect]:
-        """Ask the sender for what it has more of."""
+        """Ask for what others have more of."""
         effects: list[Effect] = []
-        for digest in digests if digests != self._digests else ():
-            if digest is self._agreed.get(digest.log):
-                continue
-            copy = self.logs.get(digest.log)
-            held = len(copy) if copy else 0
-            if digest.count > held:
-                effects += self._behind(sender.robot, digest.log, held, now)
-            elif copy is not None and copy.checksums[digest.count] != digest.checksum:
-                effects += self._fork(sender.robot, digest.log, "two writers of one log")
-            else:
-                remember(self._agreed, digest.log, digest)
-        return effects
+        for digest in digests if digests != self._announcer.all() else ():
+            if digest is not self._agreed.get(digest.log):
+                effects += self._on_digest(sender.robot, digest)
+        return effects + self._pulls.ask(now)
 
-    def _behind(self, peer: str, log: LogId, held: int, now: float) -> list[Effect]:
-        """Another robot has more of a log: ask for it, unless only this robot can have written it."""
+    def _on_digest(self, peer: str, digest: LogDigest) -> list[Effect]:
+        copy = self.logs.get(digest.log)
+        if digest.count > (len(copy) if copy else 0):
+            return self._behind(peer, digest.log, digest.count)
+        self._pulls.on_level(peer, digest.log)
+        if copy is not None and copy.checksums[digest.count] != digest.checksum:
+            return self._fork(peer, digest.log, "two writers of one log")
+        remember(self._agreed, digest.log, digest)
+        return []
+
+    def _behind(self, peer: str, log: LogId, count: int) -> list[Effect]:
+        """Another robot has more of a log: note it, unless only this robot can have written it."""
         if log == self._own:
             return self._fork(peer, log, "others hold more of this robot's own log")
         if log not in self.logs and len(self.logs) >= self._parameters.logs_max:
             return self._refused(peer, "too many logs")
-        return self._ask(peer, log, held, now)
+        if (log, peer) not in self._forked:
+            self._pulls.on_ahead(peer, log, count)
+        return []
 
     def on_request(self, sender: LogId, request: RecordRequest) -> list[Effect]:
-        """Send what follows, as much as fits a message."""
-        copy = self.logs.get(request.log)
-        if copy is None or request.first >= len(copy):
-            return []
-        following = copy.encoded[request.first : request.first + RECORDS_BATCH_MAX]
-        batch = RecordBatch.of(request.log, request.first, copy.checksums[request.first], following)
-        return [Unicast(sender.robot, batch)]
+        """Send what follows, as much of all logs as fits a message."""
+        batches: list[RecordBatch] = []
+        room = RECORDS_BATCH_BYTES_MAX
+        for log, first in request.positions:
+            copy = self.logs.get(log)
+            if copy is None or first >= len(copy):
+                continue
+            following = copy.encoded[first : first + RECORDS_BATCH_MAX]
+            batch = RecordBatch.of(log, first, copy.checksums[first], following, room)
+            if not batch.records:
+                break
+            room -= batch.size_bytes
+            batches.append(batch)
+        return [Unicast(sender.robot, Records(tuple(batches)))] if batches else []
 
-    def on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
+    def on_records(self, sender: LogId, message: Records, now: float) -> tuple[list[NewRecord], list[Effect]]:
         """Take over what is new; ask on for what still lacks."""
+        new: list[NewRecord] = []
+        effects: list[Effect] = []
+        for batch in message.batches:
+            news, more = self._on_batch(sender, batch)
+            new += news
+            effects += more
+        gap = any(batch.first > self._held(batch.log) for batch in message.batches)
+        if gap or (new and _is_full(message)):
+            effects += self._pulls.ask_on(sender.robot, now)
+        return new, effects
+
+    def _on_batch(self, sender: LogId, batch: RecordBatch) -> tuple[list[NewRecord], list[Effect]]:
+        peer = sender.robot
         if batch.log == self._own:
             return [], self._own_log_elsewhere(sender, batch)
         copy = self.logs.get(batch.log) or LogCopy()
         if batch.first > len(copy):
-            return [], self._behind(sender.robot, batch.log, len(copy), now)
+            return [], self._behind(peer, batch.log, batch.first + len(batch.records))
         if not copy.continues(batch):
-            return [], self._fork(sender.robot, batch.log, "two writers of one log")
+            self._pulls.on_level(peer, batch.log)
+            return [], self._fork(peer, batch.log, "two writers of one log")
         if batch.log not in self.logs and len(self.logs) >= self._parameters.logs_max:
-            return [], self._refused(sender.robot, "too many logs")
-        new, effects = self._take(sender.robot, copy, batch)
+            return [], self._refused(peer, "too many logs")
+        new, effects = self._take(peer, copy, batch)
         if new:
             self.logs[batch.log] = copy
-            self._digests = None
-        self._answered(sender.robot, batch, bool(new))
-        if new and len(batch.records) > 1:
-            effects += self._ask_on(sender, batch, now)
+            self._announce(batch.log, copy)
+        self._pulls.on_answer(peer, batch.log, bool(new))
         return new, effects
 
     def _take(self, peer: str, copy: LogCopy, batch: RecordBatch) -> tuple[list[NewRecord], list[Effect]]:
@@ -218,43 +236,15 @@ class Gossip:
             effects.append(PersistRecord(batch.log, number, data))
         return new, effects
 
+    def _held(self, log: LogId) -> int:
+        copy = self.logs.get(log)
+        return len(copy) if copy else 0
+
+    def _announce(self, log: LogId, copy: LogCopy) -> None:
+        self._announcer.put(log, LogDigest(log, len(copy), copy.checksums[-1]))
+
     def _opened(self, log: LogId, number: int, data: bytes) -> bytes:
         return data if self._sealer is None else self._sealer.opened(log, number, data)
-
-    def _ask(self, peer: str, log: LogId, first: int, now: float) -> list[Effect]:
-        """Ask one peer at a time for one log; a peer that did not deliver waits longer each time."""
-        if (log, peer) in self._forked:
-            return []
-        asked = self._asked.get(log)
-        if asked is not None and now < asked.until_s:
-            return []
-        if asked is not None:
-            self._did_not_deliver(log, asked.peer, now)
-        if now < self._not_before_s.get((log, peer), now):
-            return []
-        remember(self._asked, log, _Asked(peer, now + self._parameters.request_timeout_s))
-        return [Unicast(peer, RecordRequest(log, first))]
-
-    def _ask_on(self, sender: LogId, batch: RecordBatch, now: float) -> list[Effect]:
-        """A full batch has a successor; ask for it without waiting for the next heartbeat."""
-        size = sum(map(len, batch.records))
-        if len(batch.records) < RECORDS_BATCH_MAX and size < RECORDS_BATCH_BYTES_MAX // 2:
-            return []
-        return self._ask(sender.robot, batch.log, len(self.logs[batch.log]), now)
-
-    def _answered(self, peer: str, batch: RecordBatch, helped: bool) -> None:
-        asked = self._asked.get(batch.log)
-        if asked is not None and asked.peer == peer:
-            del self._asked[batch.log]
-        if helped:
-            self._pauses_s.pop((batch.log, peer), None)
-            self._not_before_s.pop((batch.log, peer), None)
-
-    def _did_not_deliver(self, log: LogId, peer: str, now: float) -> None:
-        del self._asked[log]
-        pause = min(2 * self._pauses_s.get((log, peer), 0.125), self._parameters.backoff_max_s)
-        remember(self._pauses_s, (log, peer), pause)
-        remember(self._not_before_s, (log, peer), now + pause)
 
     def _own_log_elsewhere(self, sender: LogId, batch: RecordBatch) -> list[Effect]:
         """Only this robot writes its log; a copy that differs means a second writer."""
@@ -279,11 +269,11 @@ class Gossip:
         return [Report("peer_refused", {"peer": peer, "reason": reason})]
 
 
-def remember(entries: dict[Key, Entry], key: Key, entry: Entry, entries_max: int = REMEMBERED_MAX) -> None:
-    """Note an entry and forget the oldest ones beyond the maximum: strangers must not fill the memory."""
-    entries[key] = entry
-    while len(entries) > entries_max:
-        del entries[next(iter(entries))]
+def _is_full(message: Records) -> bool:
+    """Whether something may have been left out because a message holds no more."""
+    sizes = [batch.size_bytes for batch in message.batches]
+    many = any(len(batch.records) == RECORDS_BATCH_MAX for batch in message.batches)
+    return many or sum(sizes) >= RECORDS_BATCH_BYTES_MAX // 2
 
 
 @lru_cache(maxsize=DECODED_MAX)

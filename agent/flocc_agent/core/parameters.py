@@ -62,6 +62,8 @@ class GossipParameters:
 
     __pydantic_config__ = _FORBID
 
+    request_period_s: float = 0.4
+    """Least pause between requests for news that heartbeats tell of; longer fetches more at once, and later."""
     request_timeout_s: float = 1.0
     """A missing range is asked for again, of anybody, after this time."""
     backoff_max_s: float = 8.0
@@ -72,6 +74,7 @@ class GossipParameters:
     """Records that are kept of one log; further ones are refused and counted."""
 
     def __post_init__(self) -> None:
+        _require(self.request_period_s >= 0, "request_period_s must not be negative")
         _require(0 < self.request_timeout_s <= self.backoff_max_s, "request_timeout_s must be in (0, backoff_max_s]")
         _require(1 <= self.logs_max <= 256, "logs_max must be in [1, 256]")
 

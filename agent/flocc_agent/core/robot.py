@@ -46,15 +46,16 @@ from flocc_protocol.messages import (
     CandidateOffer,
     CandidatePair,
     Coordinator,
-    CorrectionMessage,
+    CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
     Election,
     Envelope,
     Handover,
     Heartbeat,
-    RecordBatch,
+    LogCorrection,
     RecordRequest,
+    Records,
 )
 from flocc_protocol.records import (
     ClosureRecord,
@@ -79,7 +80,7 @@ class Restored:
     records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
     latents: tuple[KeyframeId, ...] = ()
     term_counter: int = 0
-    correction: CorrectionMessage | None = None
+    correction: LogCorrection | None = None
 
     def counter_max(self) -> int:
         """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
@@ -214,13 +215,13 @@ class Robot:
                 return self.election.on_coordinator(sender, message, now)
             case Handover():
                 return self.election.on_handover(sender, message, now)
-            case RecordBatch():
-                new, effects = self.gossip.on_batch(sender, message, now)
+            case Records():
+                new, effects = self.gossip.on_records(sender, message, now)
                 return effects + self._take(new, now)
             case RecordRequest():
                 return self.gossip.on_request(sender, message)
-            case CorrectionMessage():
-                return self._on_correction(sender, message)
+            case CorrectionBatch(corrections):
+                return [effect for correction in corrections for effect in self._on_correction(sender, correction)]
             case CorrectionRequest():
                 return self.corrections.on_request(sender.robot, message)
             case CandidateOffer():
@@ -228,9 +229,13 @@ class Robot:
                 return []
 
     def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
+        known = sender.robot in self.neighbours
         effects = self.neighbours.on_heartbeat(sender, heartbeat, now)
         if sender.robot not in self.neighbours:
             return effects
+        if not known:
+            self.gossip.on_neighbour()
+            self.corrections.on_neighbour()
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self.gossip.on_digests(sender, heartbeat.digests, now)
         effects += self._on_versions(sender, heartbeat.corrections, now)
@@ -238,7 +243,7 @@ class Robot:
         self.closing.on_wants(heartbeat.wants)
         return effects
 
-    def _on_correction(self, sender: LogId, message: CorrectionMessage) -> list[Effect]:
+    def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
         """A correction of an absurd term would fence out every leader to come."""
         refused = self.election.on_applied(sender, message.term)
         return refused or self.corrections.on_message(message)
@@ -314,7 +319,7 @@ class Robot:
 
     def _append(self, record: Record, now: float) -> list[Effect]:
         new, effects, batch = self.gossip.append(record)
-        return [*effects, Broadcast(batch), *self._take([new], now)]
+        return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
 
     def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records."""
@@ -371,8 +376,8 @@ class Robot:
                     leader=self.election.advert(),
                     term_counter_max=self.election.counter_max,
                     load=self.closing.load,
-                    digests=self.gossip.digests(),
-                    corrections=self.corrections.versions(),
+                    digests=self.gossip.announced(),
+                    corrections=self.corrections.announced(),
                     wants=self.closing.wants(now),
                     holds=self.closing.holds(),
                 )
@@ -383,6 +388,7 @@ class Robot:
         gone = self.neighbours.tick(now)
         for name in gone:
             self.election.on_lost(name)
+            self.gossip.on_lost(name)
             self.closing.on_lost(name, now)
         return [Report("neighbour_down", {"peer": name}) for name in gone]
 

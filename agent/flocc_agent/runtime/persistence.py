@@ -6,7 +6,7 @@ from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTe
 from flocc_agent.core.robot import Restored
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import CorrectionMessage, Envelope, decode, encode
+from flocc_protocol.messages import CorrectionBatch, Envelope, LogCorrection, UnknownVersion, decode, encode
 
 Persist = PersistRecord | PersistTerm | PersistCorrection
 
@@ -22,7 +22,7 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
             case PersistTerm(counter):
                 store.put_term_counter(counter)
             case PersistCorrection(correction):
-                envelope = Envelope(store.identity.log, correction)
+                envelope = Envelope(store.identity.log, CorrectionBatch((correction,)))
                 store.put_correction(correction.log.robot, encode(envelope))
             case PersistRecord():
                 pass
@@ -31,15 +31,23 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
 def restore(store: Store) -> Restored:
     """Read everything back; of another robot's log as far as it has no gap."""
     own = store.identity.log
-    kept = store.correction(own.robot)
-    correction = None if kept is None else decode(kept).message
-    assert correction is None or isinstance(correction, CorrectionMessage)
     return Restored(
         records=tuple((log, _prefix(store, log)) for log in store.logs()),
         latents=tuple(store.latent_keyframes()),
         term_counter=store.term_counter(),
-        correction=correction if correction is not None and correction.log == own else None,
+        correction=_correction(store, own),
     )
+
+
+def _correction(store: Store, own: LogId) -> LogCorrection | None:
+    """The correction that was applied last, unless another version of flocc, or an earlier incarnation, wrote it."""
+    kept = store.correction(own.robot)
+    try:
+        message = None if kept is None else decode(kept).message
+    except UnknownVersion:
+        return None
+    assert message is None or isinstance(message, CorrectionBatch)
+    return next((c for c in message.corrections if c.log == own), None) if message else None
 
 
 def _prefix(store: Store, log: LogId) -> tuple[bytes, ...]:

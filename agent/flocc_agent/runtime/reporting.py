@@ -16,7 +16,7 @@ from flocc_agent.core.pose_graph import GraphSolution, map_frame
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse, pose_from_tq, se3_exp, se3_log
-from flocc_protocol.messages import CandidatePair, CorrectionMessage
+from flocc_protocol.messages import CandidatePair, LogCorrection
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
 Float = NDArray[np.float64]
@@ -112,7 +112,7 @@ def closures_known(robot: Robot, solution: GraphSolution | None) -> list[dict[st
     ]
 
 
-def corrected(message: CorrectionMessage, T_odom_camera: Float) -> Float:
+def corrected(message: LogCorrection, T_odom_camera: Float) -> Float:
     """Apply a correction to every keyframe, also to those it does not list.
 
     Between listed keyframes the correction is interpolated, after the last one it stays.

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from flocc_agent.core.robot import Restored
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import CorrectionMessage
+from flocc_protocol.messages import LogCorrection
 
 
 @dataclass(slots=True)
@@ -19,7 +19,7 @@ class Disk:
     records: dict[LogId, list[bytes]] = field(default_factory=dict)
     latents: dict[KeyframeId, bytes] = field(default_factory=dict)
     term_counter: int = 0
-    correction: CorrectionMessage | None = None
+    correction: LogCorrection | None = None
     latent_bytes: int = 0
 
     def put_record(self, log: LogId, number: int, data: bytes) -> None:

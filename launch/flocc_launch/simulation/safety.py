@@ -9,7 +9,7 @@ from flocc_launch.simulation import liveness
 from flocc_launch.simulation.invariants import Invariant, Step, core
 from flocc_launch.simulation.robot import Station
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionMessage, RecordBatch
+from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, Records
 
 SIZES_EVERY = 25
 TICKS_PER_S_MAX = 200
@@ -73,8 +73,9 @@ class OneClaim:
                         yield f"{station.name} claims {advert.term}, which is another's"
                 case Optimise(term=term) if term.leader != station.log:
                     yield f"{station.name} optimises in {term}"
-                case Broadcast(CorrectionMessage(term=term)) if term not in self._claims:
-                    yield f"{station.name} corrects in {term}, which nobody claimed"
+                case Broadcast(CorrectionBatch(corrections)):
+                    for term in {correction.term for correction in corrections} - self._claims.keys():
+                        yield f"{station.name} corrects in {term}, which nobody claimed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +121,9 @@ class Published:
         log = step.station.log
         for effect in step.effects:
             match effect:
-                case Broadcast(RecordBatch() as batch) | Unicast(_, RecordBatch() as batch) if batch.log == log:
-                    self._published[log] = max(batch.first + len(batch.records), self._published.get(log, 0))
+                case Broadcast(Records(batches)) | Unicast(_, Records(batches)):
+                    ends = [batch.first + len(batch.records) for batch in batches if batch.log == log]
+                    self._published[log] = max([*ends, self._published.get(log, 0)])
         held = len(core(step.station).gossip.logs[log])
         if held < self._published.get(log, 0):
             yield f"{log} holds {held} of its {self._published[log]} published records"

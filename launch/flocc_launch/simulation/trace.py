@@ -43,7 +43,7 @@ from flocc_launch.simulation.robot import Station
 from flocc_launch.simulation.swarm import Equipment, Swarm
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
-from flocc_protocol.messages import CorrectionMessage, Envelope, Handover
+from flocc_protocol.messages import CorrectionBatch, Envelope, Handover, LogCorrection
 
 PLACES = "abcdefghijklmnopqrstuvwxyz"
 APART_M = 2.0
@@ -97,7 +97,7 @@ class _Trace:
         self._swarm = Swarm(_scenario(classes), {name: _places() for name in classes}, _equipment(), SEED)
         self._swarm.observers.append(self._observe)
         self._lines: list[str] = []
-        self._corrections: dict[str, tuple[Station, CorrectionMessage]] = {}
+        self._corrections: dict[str, tuple[Station, LogCorrection]] = {}
         self._swarm.run_until(0.0)
         self._commands: dict[str, Callable[[list[str]], None]] = {
             "robots": lambda words: None,  # noqa: ARG005
@@ -148,14 +148,15 @@ class _Trace:
         self._swarm.start(words[0])
 
     def _replay(self, words: list[str]) -> None:
-        leader, message = self._corrections[words[0]]
+        leader, correction = self._corrections[words[0]]
+        message = CorrectionBatch((correction,))
         self._swarm.stations[words[0]].handle(MessageReceived(Envelope(leader.log, message)))
 
     def _observe(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
-        if isinstance(event, MessageReceived) and isinstance(event.envelope.message, CorrectionMessage):
-            message = event.envelope.message
-            sender = self._swarm.stations[message.term.leader.robot]
-            self._corrections.setdefault(message.log.robot, (sender, message))
+        if isinstance(event, MessageReceived) and isinstance(event.envelope.message, CorrectionBatch):
+            for correction in event.envelope.message.corrections:
+                sender = self._swarm.stations[correction.term.leader.robot]
+                self._corrections.setdefault(correction.log.robot, (sender, correction))
         for effect in effects:
             text = _told(effect)
             if text is not None:

@@ -6,14 +6,14 @@ from tests.agent.core.virtual_time import Robots
 from flocc_agent.core.corrections import Corrections, pose7
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Unicast
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.gossip import REMEMBERED_MAX
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
+from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.robot import Restored
 from flocc_agent.geometry import pose
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
-from flocc_protocol.messages import CorrectionMessage, CorrectionRequest, CorrectionVersion, Envelope
+from flocc_protocol.messages import CorrectionBatch, CorrectionRequest, CorrectionVersion, Envelope, LogCorrection
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
@@ -22,9 +22,9 @@ def corrections(own: LogId = R1) -> Corrections:
     return Corrections(own, GossipParameters(), RoundParameters())
 
 
-def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> CorrectionMessage:
+def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> LogCorrection:
     poses = Array.of(np.array([[0.0, 0, 0, 1, 0, 0, 0]]), "f4")
-    return CorrectionMessage(log, term, number, anchor, pose7(np.eye(4)), None, 0, 1, poses)
+    return LogCorrection(log, term, number, anchor, pose7(np.eye(4)), None, 0, 1, poses)
 
 
 def delivered(effects: list[Effect]) -> list[tuple[int, int, bool]]:
@@ -78,14 +78,14 @@ def test_a_restarted_robot_bids_above_what_it_applied() -> None:
 def test_another_robots_correction_is_kept_and_passed_on() -> None:
     machine, message = corrections(R1), correction(Term(1, R2), 1, log=R3)
     assert machine.on_message(message) == []
-    assert machine.on_request("r3", CorrectionRequest(R3)) == [Unicast("r3", message)]
+    assert machine.on_request("r3", CorrectionRequest((R3,))) == [Unicast("r3", CorrectionBatch((message,)))]
 
 
 def test_a_newer_version_elsewhere_is_asked_for_once_per_timeout() -> None:
     machine, versions = corrections(), (CorrectionVersion(R1, Term(1, R2), 1),)
-    assert machine.on_versions("r2", versions, 0.0) == [Unicast("r2", CorrectionRequest(R1))]
+    assert machine.on_versions("r2", versions, 0.0) == [Unicast("r2", CorrectionRequest((R1,)))]
     assert machine.on_versions("r3", versions, 0.5) == []
-    assert machine.on_versions("r3", versions, 1.0) == [Unicast("r3", CorrectionRequest(R1))]
+    assert machine.on_versions("r3", versions, 1.0) == [Unicast("r3", CorrectionRequest((R1,)))]
 
 
 def test_versions_of_strangers_do_not_fill_the_memory() -> None:
@@ -118,7 +118,7 @@ def test_a_correction_of_an_absurd_term_is_refused() -> None:
     robots = Robots()
     robots.add("r1")
     hostile = correction(Term(TERM_COUNTER_MAX, R2), 1)
-    robots.put("r1", MessageReceived(Envelope(R2, hostile)))
+    robots.put("r1", MessageReceived(Envelope(R2, CorrectionBatch((hostile,)))))
     assert robots.effects("r1", Deliver) == []
     assert len(robots.reports("r1", "peer_refused")) == 1
 
@@ -127,8 +127,8 @@ def test_a_lost_correction_is_repaired_by_heartbeats() -> None:
     lost = {"count": 0}
 
     def drops(sender: str, receiver: str, message: object) -> bool:
-        lost["count"] += isinstance(message, CorrectionMessage)
-        return isinstance(message, CorrectionMessage) and lost["count"] <= 4
+        lost["count"] += isinstance(message, CorrectionBatch)
+        return isinstance(message, CorrectionBatch) and lost["count"] <= 4
 
     robots = Robots(drops=drops)
     robots.add("r1")

@@ -6,10 +6,10 @@ from itertools import pairwise
 from tests.agent.core.virtual_time import Robots, keyframe
 
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
-from flocc_agent.core.gossip import REMEMBERED_MAX, Gossip
+from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.parameters import GossipParameters
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import LogDigest, RecordBatch, RecordRequest
+from flocc_protocol.messages import LogDigest, LogPosition, RecordBatch, RecordRequest, Records
 from flocc_protocol.records import KeyframeRecord, RejectionRecord, encode_record
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
@@ -27,15 +27,16 @@ def writer(own: LogId, count: int, x_m: float = 0.0) -> Gossip:
     return gossip
 
 
-def batch(source: Gossip, log: LogId, first: int) -> RecordBatch:
-    answers = source.on_request(LogId("asker"), RecordRequest(log, first))
+def batch(source: Gossip, log: LogId, first: int) -> Records:
+    answers = source.on_request(LogId("asker"), RecordRequest((LogPosition(log, first),)))
     assert isinstance(answers[0], Unicast)
-    assert isinstance(answers[0].message, RecordBatch)
+    assert isinstance(answers[0].message, Records)
     return answers[0].message
 
 
 def requests(effects: list[Effect]) -> list[tuple[str, int]]:
-    return [(e.to, e.message.first) for e in effects if isinstance(e, Unicast) and isinstance(e.message, RecordRequest)]
+    asked = [(e.to, e.message) for e in effects if isinstance(e, Unicast) and isinstance(e.message, RecordRequest)]
+    return [(to, position.first) for to, message in asked for position in message.positions]
 
 
 def reports(effects: list[Effect]) -> list[str]:
@@ -44,7 +45,7 @@ def reports(effects: list[Effect]) -> list[str]:
 
 def test_a_longer_copy_elsewhere_is_asked_for_from_where_this_one_ends() -> None:
     reader = Gossip(R2, PARAMETERS)
-    reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)
+    reader.on_records(R1, batch(writer(R1, 3), R1, 0), 0.0)
     assert requests(reader.on_digests(R1, writer(R1, 5).digests(), 1.0)) == [("r1", 3)]
 
 
@@ -71,16 +72,16 @@ def test_a_peer_that_does_not_deliver_is_asked_ever_more_rarely() -> None:
 
 def test_a_repeated_or_late_batch_changes_nothing() -> None:
     reader, source = Gossip(R2, PARAMETERS), writer(R1, 5)
-    reader.on_batch(R1, batch(source, R1, 0), 0.0)
+    reader.on_records(R1, batch(source, R1, 0), 0.0)
     before = reader.digests()
-    assert reader.on_batch(R1, batch(source, R1, 0), 1.0) == ([], [])
-    assert reader.on_batch(R1, batch(source, R1, 2), 1.0) == ([], [])
+    assert reader.on_records(R1, batch(source, R1, 0), 1.0) == ([], [])
+    assert reader.on_records(R1, batch(source, R1, 2), 1.0) == ([], [])
     assert reader.digests() == before
 
 
 def test_a_gap_is_asked_for_at_once() -> None:
     reader = Gossip(R2, PARAMETERS)
-    assert requests(reader.on_batch(R1, batch(writer(R1, 5), R1, 3), 0.0)[1]) == [("r1", 0)]
+    assert requests(reader.on_records(R1, batch(writer(R1, 5), R1, 3), 0.0)[1]) == [("r1", 0)]
 
 
 def test_a_long_log_is_pulled_batch_after_batch() -> None:
@@ -89,32 +90,32 @@ def test_a_long_log_is_pulled_batch_after_batch() -> None:
     while requests(effects):
         now += 0.01
         first = requests(effects)[0][1]
-        effects = reader.on_batch(R1, batch(source, R1, first), now)[1]
+        effects = reader.on_records(R1, batch(source, R1, first), now)[1]
     assert reader.digests() == source.digests()
     assert now < 0.1
 
 
 def test_new_records_are_persisted_in_order() -> None:
     reader = Gossip(R2, PARAMETERS)
-    effects = reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)[1]
+    effects = reader.on_records(R1, batch(writer(R1, 3), R1, 0), 0.0)[1]
     assert [(e.log, e.number) for e in effects if isinstance(e, PersistRecord)] == [(R1, 0), (R1, 1), (R1, 2)]
 
 
 def test_a_fork_is_reported_once_and_neither_side_is_damaged() -> None:
     reader = Gossip(R3, PARAMETERS)
-    reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)
+    reader.on_records(R1, batch(writer(R1, 3), R1, 0), 0.0)
     before = reader.digests()
     other = writer(R1, 5, x_m=1.0)
-    assert reports(reader.on_batch(R2, batch(other, R1, 3), 1.0)[1]) == ["log_forked"]
-    assert reader.on_batch(R2, batch(other, R1, 3), 2.0) == ([], [])
+    assert reports(reader.on_records(R2, batch(other, R1, 3), 1.0)[1]) == ["log_forked"]
+    assert reader.on_records(R2, batch(other, R1, 3), 2.0) == ([], [])
     assert reader.on_digests(R2, other.digests(), 3.0) == []
     assert reader.digests() == before
 
 
 def test_a_batch_that_contradicts_the_copy_within_it_is_refused_whole() -> None:
     reader = Gossip(R3, PARAMETERS)
-    reader.on_batch(R1, batch(writer(R1, 3), R1, 0), 0.0)
-    new, effects = reader.on_batch(R2, batch(writer(R1, 5, x_m=1.0), R1, 0), 1.0)
+    reader.on_records(R1, batch(writer(R1, 3), R1, 0), 0.0)
+    new, effects = reader.on_records(R2, batch(writer(R1, 5, x_m=1.0), R1, 0), 1.0)
     assert (new, reports(effects)) == ([], ["log_forked"])
     assert len(reader.logs[R1]) == 3
 
@@ -127,15 +128,15 @@ def test_more_of_the_own_log_elsewhere_is_reported() -> None:
 
 def test_the_own_log_is_never_written_by_others() -> None:
     robot = writer(R1, 2)
-    new, effects = robot.on_batch(R2, batch(writer(R1, 4), R1, 2), 0.0)
+    new, effects = robot.on_records(R2, batch(writer(R1, 4), R1, 2), 0.0)
     assert (new, reports(effects)) == ([], ["log_forked"])
     assert len(robot.logs[R1]) == 2
 
 
 def test_a_damaged_record_is_refused_and_what_came_before_it_kept() -> None:
-    reader, good = Gossip(R2, PARAMETERS), batch(writer(R1, 3), R1, 0)
+    reader, good = Gossip(R2, PARAMETERS), batch(writer(R1, 3), R1, 0).batches[0]
     damaged = replace(good, records=(good.records[0], b"\x00", good.records[2]))
-    new, effects = reader.on_batch(R1, damaged, 0.0)
+    new, effects = reader.on_records(R1, Records((damaged,)), 0.0)
     assert [entry.number for entry in new] == [0]
     assert reports(effects) == ["peer_refused"]
 
@@ -143,12 +144,12 @@ def test_a_damaged_record_is_refused_and_what_came_before_it_kept() -> None:
 def test_keyframes_are_numbered_without_gaps() -> None:
     reader = Gossip(R2, PARAMETERS)
     skipped = RecordBatch(R1, 0, 0, (encode_record(record(1)),))
-    assert reader.on_batch(R1, skipped, 0.0)[0] == []
+    assert reader.on_records(R1, Records((skipped,)), 0.0)[0] == []
 
 
 def test_logs_beyond_the_maximum_are_refused_without_asking() -> None:
     reader = Gossip(R1, GossipParameters(logs_max=2))
-    reader.on_batch(R2, batch(writer(R2, 1), R2, 0), 0.0)
+    reader.on_records(R2, batch(writer(R2, 1), R2, 0), 0.0)
     digests = writer(R3, 4).digests()
     assert reports(reader.on_digests(R3, digests, 0.0)) == ["peer_refused"]
     assert reader.on_digests(R3, digests, 1.0) == []
@@ -159,7 +160,7 @@ def test_claims_of_what_nobody_has_do_not_fill_the_memory() -> None:
     for t in range(3000):
         reader.on_digests(R2, (LogDigest(LogId("r9", t), 5, 1),), float(t))
     assert all(size <= size_max for size, size_max in reader.sizes().values())
-    assert reader.sizes()["asked"] == (REMEMBERED_MAX, REMEMBERED_MAX)
+    assert reader.sizes()["ahead"] == (PARAMETERS.logs_max, PARAMETERS.logs_max)
 
 
 def test_records_cross_robots_that_never_meet() -> None:
@@ -190,8 +191,8 @@ def test_everything_arrives_though_every_broadcast_of_records_is_lost() -> None:
     lost: list[object] = []
 
     def drops(sender: str, receiver: str, message: object) -> bool:
-        lost.extend([message] if isinstance(message, RecordBatch) else [])
-        return isinstance(message, RecordBatch) and len(lost) <= 6
+        lost.extend([message] if isinstance(message, Records) else [])
+        return isinstance(message, Records) and len(lost) <= 6
 
     robots = Robots(drops=drops)
     robots.add("r1")
@@ -205,5 +206,5 @@ def test_everything_arrives_though_every_broadcast_of_records_is_lost() -> None:
 def test_rejections_travel_like_keyframes() -> None:
     source, reader = Gossip(R1, PARAMETERS), Gossip(R2, PARAMETERS)
     source.append(RejectionRecord(keyframe("r1/0"), keyframe("r2/0"), "few correspondences", 3, 9))
-    new = reader.on_batch(R1, batch(source, R1, 0), 0.0)[0]
+    new = reader.on_records(R1, batch(source, R1, 0), 0.0)[0]
     assert [entry.record for entry in new] == source.logs[R1].records

@@ -12,7 +12,7 @@ from flocc_agent.core.parameters import CoreParameters, NeighbourParameters
 from flocc_agent.core.robot import Restored
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import Envelope, Heartbeat, RecordBatch
+from flocc_protocol.messages import Envelope, Heartbeat, Records
 from flocc_protocol.records import KeyframeRecord
 
 R1, R2 = LogId("r1"), LogId("r2")
@@ -33,7 +33,7 @@ def disk_of(robots: Robots, name: str) -> Restored:
 
 
 def _is_batch(effect: Broadcast) -> bool:
-    return isinstance(effect.message, RecordBatch)
+    return isinstance(effect.message, Records)
 
 
 def test_a_tick_always_moves_the_deadline_on() -> None:

@@ -1,7 +1,7 @@
-"""Claim: the bytes of protocol version 1 never change. They lie in `wire_v1.txt`, one example of everything.
+"""Claim: the bytes of a protocol version never change. Each has a file here with one example of everything.
 
-A change that breaks this needs a new protocol version; then write a new file beside the old one:
-`python -m tests.protocol.test_wire_v1 > tests/protocol/wire_v2.txt`.
+A change that breaks this needs a new protocol version; then write a new file beside the old ones:
+`python -m tests.protocol.test_wire_bytes > tests/protocol/wire_v3.txt`.
 """
 
 import sys
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.protocol.wire_examples import ENCODED, ENVELOPES, RECORDS
 
-from flocc_protocol.messages import PROTOCOL_VERSION, decode, encode, kind_of
+from flocc_protocol.messages import MESSAGE_KINDS, PROTOCOL_VERSION, UnknownVersion, decode, encode, kind_of
 from flocc_protocol.records import decode_record
 
 NAMES = [kind_of(e.message) for e in ENVELOPES] + [type(record).__name__ for record in RECORDS]
@@ -36,6 +36,14 @@ def test_an_example_is_read_as_ever(number: int) -> None:
         assert decode(data) == ENVELOPES[number]
     else:
         assert decode_record(data) == RECORDS[number - FIRST_RECORD]
+
+
+def test_messages_of_version_1_are_named_as_such() -> None:
+    older = [line.split() for line in (Path(__file__).parent / "wire_v1.txt").read_text().splitlines()]
+    for name, data in older:
+        if name in MESSAGE_KINDS:
+            with pytest.raises(UnknownVersion, match="protocol version 1"):
+                decode(bytes.fromhex(data))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,125 @@
+"""Whom to ask for records that this robot's copies lack.
+
+Rules: one peer at a time is asked for one log; one request names all logs that a peer is to send; requests that a
+heartbeat calls for have a least pause between them, so that news of many logs are fetched together. A peer that did
+not deliver what it claims is asked ever more rarely. Answers go on until everything is here, without a pause.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from flocc_agent.core.effects import Effect, Unicast
+from flocc_agent.core.parameters import GossipParameters
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import BATCHES_MAX, LogPosition, RecordRequest
+
+Key = TypeVar("Key")
+Entry = TypeVar("Entry")
+
+REMEMBERED_MAX = 1024
+"""Open requests and pauses that are remembered; beyond this the oldest are forgotten."""
+FIRST_PAUSE_S = 0.25
+
+
+@dataclass(slots=True)
+class _Asked:
+    """An open request for a log's missing records."""
+
+    peer: str
+    until_s: float
+
+
+class Pulls:
+    """What others hold beyond this robot's copies, and what was asked of them."""
+
+    def __init__(self, held: Callable[[LogId], int], parameters: GossipParameters) -> None:
+        self._held = held
+        self._parameters = parameters
+        self._ahead: dict[str, dict[LogId, int]] = {}
+        self._asked: dict[LogId, _Asked] = {}
+        self._pauses_s: dict[tuple[LogId, str], float] = {}
+        self._not_before_s: dict[tuple[LogId, str], float] = {}
+        self._next_s = float("-inf")
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        longest = max(map(len, self._ahead.values()), default=0)
+        return {
+            "ahead": (longest, self._parameters.logs_max),
+            "asked": (len(self._asked), REMEMBERED_MAX),
+            "paused": (len(self._not_before_s), REMEMBERED_MAX),
+        }
+
+    def on_ahead(self, peer: str, log: LogId, count: int) -> None:
+        """A peer holds so many records of a log, more than this robot."""
+        remember(self._ahead.setdefault(peer, {}), log, count, self._parameters.logs_max)
+
+    def on_level(self, peer: str, log: LogId) -> None:
+        """A peer has nothing more of a log, or nothing that can be used."""
+        ahead = self._ahead.get(peer)
+        if ahead is not None and ahead.pop(log, None) is not None and not ahead:
+            del self._ahead[peer]
+
+    def on_lost(self, peer: str) -> None:
+        """A peer is out of range; what it was to send may be asked of others at once."""
+        self._ahead.pop(peer, None)
+        for log in [log for log, asked in self._asked.items() if asked.peer == peer]:
+            del self._asked[log]
+
+    def on_answer(self, peer: str, log: LogId, helped: bool) -> None:
+        """A peer sent records of a log, new ones or others."""
+        asked = self._asked.get(log)
+        if asked is not None and asked.peer == peer:
+            del self._asked[log]
+        if helped:
+            self._pauses_s.pop((log, peer), None)
+            self._not_before_s.pop((log, peer), None)
+
+    def ask(self, now: float) -> list[Effect]:
+        """Ask whoever is ahead, those with the most first, unless that was done just now."""
+        if not self._ahead or now < self._next_s:
+            return []
+        effects: list[Effect] = []
+        for peer in sorted(self._ahead, key=lambda peer: (-len(self._ahead[peer]), peer)):
+            effects += self._request(peer, now, again=False)
+        if effects:
+            self._next_s = now + self._parameters.request_period_s
+        return effects
+
+    def ask_on(self, peer: str, now: float) -> list[Effect]:
+        """A peer's answer was as long as a message may be, or shows a gap: ask at once for what it left out."""
+        return self._request(peer, now, again=True)
+
+    def _request(self, peer: str, now: float, again: bool) -> list[Effect]:
+        positions: list[LogPosition] = []
+        for log, count in sorted(self._ahead.get(peer, {}).items()):
+            held = self._held(log)
+            if count <= held:
+                self.on_level(peer, log)
+            elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again):
+                remember(self._asked, log, _Asked(peer, now + self._parameters.request_timeout_s))
+                positions.append(LogPosition(log, held))
+        return [Unicast(peer, RecordRequest(tuple(positions)))] if positions else []
+
+    def _may_ask(self, peer: str, log: LogId, now: float, again: bool) -> bool:
+        """Whether nobody else is to send the log, and the peer did not disappoint just now."""
+        asked = self._asked.get(log)
+        if asked is not None:
+            if asked.until_s > now:
+                return again and asked.peer == peer
+            self._did_not_deliver(log, asked.peer, now)
+        return self._not_before_s.get((log, peer), now) <= now
+
+    def _did_not_deliver(self, log: LogId, peer: str, now: float) -> None:
+        del self._asked[log]
+        pause_s = min(2 * self._pauses_s.get((log, peer), FIRST_PAUSE_S / 2), self._parameters.backoff_max_s)
+        remember(self._pauses_s, (log, peer), pause_s)
+        remember(self._not_before_s, (log, peer), now + pause_s)
+
+
+def remember(entries: dict[Key, Entry], key: Key, entry: Entry, entries_max: int = REMEMBERED_MAX) -> None:
+    """Note an entry and forget the oldest ones beyond the maximum: strangers must not fill the memory."""
+    entries[key] = entry
+    while len(entries) > entries_max:
+        del entries[next(iter(entries))]
