@@ -1,5 +1,6 @@
 # make demo    three robots in a generated world, one report: creates .venv and installs what that needs
 # make test    installs what tests need and runs all of them: ruff, mypy, import contracts, pytest
+# make swarm-test   every shipped scenario over real zenoh, and a worse variant of each that must fail; five minutes
 # make check   the same without installing anything
 # make clean   removes .venv and everything that was generated
 
@@ -14,7 +15,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 DESCRIPTION := pyproject.toml constraints.txt
 
-.PHONY: demo test check lint types contracts tests constraints clean
+.PHONY: demo test swarm-test check lint types contracts tests constraints clean
 .DEFAULT_GOAL := check
 
 demo: $(VENV)/.demo
@@ -39,10 +40,13 @@ contracts:
 tests:
 	@mkdir -p build; set -o pipefail; status=0; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -m "not swarm" | tee build/pytest.txt || status=1; \
-	$(BIN)/python -m pytest -q -m swarm | tee build/pytest-swarm.txt || status=1; \
+	$(BIN)/python -m pytest -q -m "swarm and not scenarios" | tee build/pytest-swarm.txt || status=1; \
 	echo "pytest:              $$(tail -n 1 build/pytest.txt)"; \
 	echo "pytest, live swarms: $$(tail -n 1 build/pytest-swarm.txt)"; \
 	exit $$status
+
+swarm-test: $(VENV)/.test
+	$(BIN)/python -m pytest -q -m scenarios
 
 constraints: $(VENV)/.test
 	$(BIN)/python .ci/constraints.py > constraints.new

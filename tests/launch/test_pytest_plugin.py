@@ -1,0 +1,134 @@
+"""The pytest plugin, in test suites of their own: what a user sees of scenarios that pass, fail or cannot be used."""
+
+import pytest
+
+pytest_plugins = ["pytester"]
+
+SCENARIO = """
+name = "hangar"
+rate = 4.0
+[tracks]
+robots = 2
+[tracks.routes_m]
+r1 = [[0, 0], [12, 0]]
+r2 = [[0, 0], [12, 0]]
+[perception]
+method = "synthetic"
+[simulation]
+optimiser = "quick"
+[expectations]
+merged_within_s = 20.0
+closures_min = 1
+"""
+
+
+def run(pytester: pytest.Pytester, tests: str, *arguments: str) -> pytest.RunResult:
+    pytester.makefile(".toml", hangar=SCENARIO)
+    pytester.makepyfile(tests)
+    return pytester.runpytest_subprocess("-p", "no:cacheprovider", "--strict-markers", *arguments)
+
+
+def test_a_marked_scenario_is_run_and_its_report_is_at_hand(pytester: pytest.Pytester) -> None:
+    result = run(
+        pytester,
+        """
+        import pytest
+
+        @pytest.mark.flocc("hangar.toml", seed=3, radio={"loss_ratio": 0.1})
+        def test_it_merges(flocc_run):
+            assert flocc_run.report.seed == 3
+            assert flocc_run.report.closures.accepted_inter_robot >= 1
+            assert (flocc_run.folder / "report.html").exists()
+        """,
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_a_missed_expectation_fails_the_test_and_says_why(pytester: pytest.Pytester) -> None:
+    result = run(
+        pytester,
+        """
+        import pytest
+
+        APART = [{"at_s": 0.0, "kind": "partition", "groups": [["r1"], ["r2"]]}]
+
+        @pytest.mark.flocc("hangar.toml", faults=APART)
+        def test_it_merges(flocc_run):
+            raise AssertionError("the fixture fails before")
+        """,
+    )
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(
+        ["*merged_within_s: expected 20.0, was None*", "*heard nobody at all*", "*report.html*"]
+    )
+    result.stdout.no_fnmatch_line("*the fixture fails before*")
+
+
+def test_one_test_runs_several_scenarios(pytester: pytest.Pytester) -> None:
+    result = run(
+        pytester,
+        """
+        def test_a_seed_is_a_run(flocc):
+            one, again, other = (flocc.simulate("hangar.toml", seed=seed).check() for seed in (1, 1, 2))
+            events = [(run.folder / "events.jsonl").read_bytes() for run in (one, again, other)]
+            assert events[0] == events[1] != events[2]
+
+        def test_a_miss_is_no_failure_until_it_is_checked(flocc):
+            run = flocc.simulate("hangar.toml", expectations={"closures_min": 100_000})
+            assert [expectation.name for expectation in run.missed] == ["closures_min"]
+        """,
+    )
+    result.assert_outcomes(passed=2)
+
+
+def test_a_scenario_that_cannot_be_used_is_named(pytester: pytest.Pytester) -> None:
+    result = run(
+        pytester,
+        """
+        import pytest
+
+        @pytest.mark.flocc("hangar.toml", radio={"lossy": 1.0})
+        def test_unknown_key(flocc_run): ...
+
+        @pytest.mark.flocc("nowhere.toml")
+        def test_no_file(flocc_run): ...
+
+        @pytest.mark.flocc("hangar.toml", driver="gazebo")
+        def test_no_driver(flocc_run): ...
+
+        def test_no_marker(flocc_run): ...
+        """,
+    )
+    result.assert_outcomes(errors=4)
+    result.stdout.fnmatch_lines(
+        ["*the key 'radio.lossy' does not exist*", "*nowhere.toml*", "*not 'gazebo'*", "*flocc_run needs*"]
+    )
+
+
+@pytest.mark.swarm
+def test_a_marked_scenario_is_launched_over_real_zenoh(pytester: pytest.Pytester) -> None:
+    result = run(
+        pytester,
+        """
+        import pytest
+
+        @pytest.mark.flocc("hangar.toml", driver="launch", settle_s=1.0)
+        def test_it_merges(flocc_run):
+            assert flocc_run.report.driver == "launch"
+        """,
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_the_plugin_loads_nothing_of_flocc_before_it_is_asked(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import sys
+
+        def test_it_is_light():
+            heavy = {"numpy", "pydantic", "zenoh", "gtsam", "flocc_launch.scenario", "flocc_agent"}
+            assert "flocc_launch.pytest_plugin" in sys.modules
+            assert heavy & set(sys.modules) == set()
+        """
+    )
+    pytester.runpytest_subprocess("-p", "no:cacheprovider").assert_outcomes(passed=1)
