@@ -156,6 +156,39 @@ def pose_from_tq(tq: Float) -> Float:
     return pose(R_from_q_wxyz(tq[3:7]), tq[:3])
 
 
+def poses_from_tq(tq: Float) -> Float:
+    """Poses (N, 4, 4) of rows (N, 7): translation x y z, quaternion w x y z, which is normalised first.
+
+    Raises:
+        ValueError: A quaternion is zero or not finite.
+    """
+    norms = np.linalg.norm(tq[:, 3:7], axis=1)
+    if not np.all(np.isfinite(norms) & (norms >= 1e-12)):
+        raise ValueError("a quaternion has no direction")
+    w, x, y, z = (tq[:, 3:7] / norms[:, None]).T
+    T = np.zeros((len(tq), 4, 4))
+    T[:, 0, 0], T[:, 0, 1], T[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    T[:, 1, 0], T[:, 1, 1], T[:, 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    T[:, 2, 0], T[:, 2, 1], T[:, 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    T[:, :3, 3], T[:, 3, 3] = tq[:, :3], 1.0
+    return T
+
+
+def tq_from_poses(T: Float) -> Float:
+    """Rows (N, 7) of poses (N, 4, 4): translation x y z, unit quaternion w x y z, w not negative."""
+    m = T[:, :3, :3]
+    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], axis=1)
+    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    s0, s1, s2, s3 = squares.T
+    rows = np.array([[s0, wx, wy, wz], [wx, s1, xy, xz], [wy, xy, s2, yz], [wz, xz, yz, s3]])
+    largest = np.argmax(squares, axis=1)
+    q_wxyz = rows[largest, :, np.arange(len(T))]
+    q_wxyz *= np.where(q_wxyz[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
+    return np.concatenate([T[:, :3, 3], q_wxyz], axis=1)
+
+
 def tq_from_pose(T: Float) -> Float:
     """Seven numbers of a pose: translation x y z, quaternion w x y z."""
     return np.concatenate([T[:3, 3], q_wxyz_from_R(T[:3, :3])])

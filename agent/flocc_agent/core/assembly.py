@@ -1,4 +1,8 @@
-"""Pose-graph assembly: from the records of all logs to the graph that the leader optimises."""
+"""Pose-graph assembly: from the records of all logs to the graph that the leader optimises.
+
+Every robot takes in every record, and only a leader asks for the graph: records are kept as they are, and become
+matrices when somebody wants them.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,13 +10,39 @@ from numpy.typing import NDArray
 from flocc_agent.core.corrections import pose7, symmetric
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import between, pose_from_tq
+from flocc_agent.geometry import between, pose_from_tq, poses_from_tq
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import ClosureRecord, FixRecord, KeyframeRecord
 
 Float = NDArray[np.float64]
+
+
+class _Odometry:
+    """One log's keyframes: poses as its records give them, and whether each was described."""
+
+    def __init__(self) -> None:
+        self.poses: list[Pose7] = []
+        self.encoded: list[bool] = []
+        self._matrices: Float = np.empty((0, 4, 4))
+
+    def matrices(self) -> Float:
+        """All poses (N, 4, 4), T_odom_keyframe."""
+        known = len(self._matrices)
+        if known < len(self.poses):
+            self._matrices = np.concatenate([self._matrices, poses_from_tq(np.array(self.poses[known:]))])
+        return self._matrices
+
+    def neighbour(self, index: int) -> int | None:
+        """The nearest described keyframe before this one, for the first ones the nearest after it."""
+        around = (*range(index - 1, -1, -1), *range(index + 1, len(self.encoded)))
+        return next((other for other in around if self.encoded[other]), None)
+
+    def between(self, index: int, other: int) -> Pose7:
+        """Pose of one keyframe in the frame of another, `T_other_index`."""
+        T_odom_other, T_odom_index = (pose_from_tq(np.array(self.poses[k])) for k in (other, index))
+        return pose7(between(T_odom_other, T_odom_index))
 
 
 class GraphAssembly:
@@ -26,9 +56,9 @@ class GraphAssembly:
     def __init__(self) -> None:
         self.keyframes = 0
         self.revision = 0
-        self._poses: dict[LogId, list[Float]] = {}
-        self._encoded: dict[LogId, list[bool]] = {}
-        self._closures: dict[CandidatePair, tuple[LogId, int, LoopClosure]] = {}
+        self._odometry: dict[LogId, _Odometry] = {}
+        self._closures: dict[CandidatePair, tuple[LogId, int, ClosureRecord]] = {}
+        self._built: dict[CandidatePair, LoopClosure] = {}
         self._early: dict[KeyframeId, int] = {}
         self._fixes: list[AbsoluteFix] = []
         self._odometry_pairs: dict[KeyframeId, tuple[KeyframeId, Pose7]] = {}
@@ -59,56 +89,59 @@ class GraphAssembly:
         """
         found = self._odometry_pairs.get(keyframe)
         if found is None:
-            index = self._neighbour(keyframe)
+            odometry = self._odometry.get(keyframe.log)
+            if odometry is None or keyframe.index >= len(odometry.poses):
+                return None
+            index = odometry.neighbour(keyframe.index)
             if index is None:
                 return None
-            poses = self._poses[keyframe.log]
-            T_neighbour_query = pose7(between(poses[index], poses[keyframe.index]))
+            T_neighbour_query = odometry.between(keyframe.index, index)
             found = self._odometry_pairs[keyframe] = (KeyframeId(keyframe.log, index), T_neighbour_query)
         return found
 
-    def _neighbour(self, keyframe: KeyframeId) -> int | None:
-        encoded = self._encoded.get(keyframe.log, [])
-        if keyframe.index >= len(encoded):
-            return None
-        around = (*range(keyframe.index - 1, -1, -1), *range(keyframe.index + 1, len(encoded)))
-        return next((index for index in around if encoded[index]), None)
-
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
-        trajectories = {log: Trajectory(np.array(poses)) for log, poses in sorted(self._poses.items())}
+        trajectories = {log: Trajectory(odometry.matrices()) for log, odometry in sorted(self._odometry.items())}
         closures = tuple(
-            closure
-            for _, (_, _, closure) in sorted(self._closures.items(), key=lambda item: item[0])
-            if self._known(closure.query) and self._known(closure.match)
+            self._closure(pair) for pair in sorted(self._closures) if self._known(pair.low) and self._known(pair.high)
         )
         return PoseGraph(trajectories, closures, tuple(fix for fix in self._fixes if self._known(fix.keyframe)))
 
+    def _closure(self, pair: CandidatePair) -> LoopClosure:
+        built = self._built.get(pair)
+        if built is None:
+            built = self._built[pair] = _loop_closure(self._closures[pair][2])
+        return built
+
     def _known(self, keyframe: KeyframeId) -> bool:
-        return keyframe.index < len(self._poses.get(keyframe.log, []))
+        odometry = self._odometry.get(keyframe.log)
+        return odometry is not None and keyframe.index < len(odometry.poses)
 
     def _add_keyframe(self, log: LogId, record: KeyframeRecord) -> None:
         """A new log, or a keyframe that a closure was waiting for, makes the last solution out of date."""
-        poses = self._poses.setdefault(log, [])
-        keyframe = KeyframeId(log, len(poses))
-        poses.append(pose_from_tq(np.array(record.T_odom_camera)))
-        self._encoded.setdefault(log, []).append(record.descriptor is not None)
+        odometry = self._odometry.get(log)
+        if odometry is None:
+            odometry = self._odometry[log] = _Odometry()
+        odometry.poses.append(record.T_odom_camera)
+        odometry.encoded.append(record.descriptor is not None)
         self.keyframes += 1
-        self.revision += len(poses) == 1 or self._early.pop(keyframe, 0) > 0
+        awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry.poses) - 1), 0) > 0
+        self.revision += awaited or len(odometry.poses) == 1
 
     def _add_closure(self, new: NewRecord, record: ClosureRecord) -> None:
         """Of several registrations of one pair the one in the lowest log counts, on every robot."""
         pair = CandidatePair.of(record.query, record.match)
         held = self._closures.get(pair)
         if held is None or (new.log, new.number) < held[:2]:
-            self._closures[pair] = (new.log, new.number, _closure(record))
+            self._closures[pair] = (new.log, new.number, record)
+            self._built.pop(pair, None)
             self.revision += 1
             for keyframe in (record.query, record.match):
                 if not self._known(keyframe):
                     self._early[keyframe] = self._early.get(keyframe, 0) + 1
 
 
-def _closure(record: ClosureRecord) -> LoopClosure:
+def _loop_closure(record: ClosureRecord) -> LoopClosure:
     return LoopClosure(
         query=record.query,
         match=record.match,

@@ -12,7 +12,7 @@ from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, Per
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, remember
-from flocc_agent.geometry import pose_from_tq, tq_from_pose
+from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import LogId, Term
@@ -150,7 +150,7 @@ class Corrections:
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:
     """A log's part of a solution, thinned to at most `keyframes_max` keyframes; the last one is always listed."""
-    poses = component.T_map_keyframe[log]
+    poses = np.asarray(component.T_map_keyframe[log])
     step = max(1, -(-len(poses) // keyframes_max))
     first = (len(poses) - 1) % step
     covariance = component.covariance_map_odom.get(log)
@@ -163,7 +163,7 @@ def correction_of(component: Component, log: LogId, term: Term, round_number: in
         covariance=None if covariance is None else Array.of(covariance[_UPPER], "f4"),
         first=first,
         step=step,
-        T_map_camera=Array.of(np.array([tq_from_pose(T) for T in poses[first::step]]).reshape(-1, 7), "f4"),
+        T_map_camera=Array.of(tq_from_poses(poses[first::step]), "f4"),
     )
 
 
@@ -178,7 +178,7 @@ def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
         covariance=None if message.covariance is None else symmetric(message.covariance.numpy()),
         first=message.first,
         step=message.step,
-        T_map_camera=np.array([pose_from_tq(row) for row in message.T_map_camera.numpy()]).reshape(-1, 4, 4),
+        T_map_camera=poses_from_tq(message.T_map_camera.numpy()),
     )
 
 

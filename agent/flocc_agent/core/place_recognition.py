@@ -1,15 +1,18 @@
 """Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A)."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.parameters import PlaceRecognitionParameters
+from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 CAPACITY_FIRST = 64
+DIRECTIONS_MAX = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,11 @@ class PlaceRecognition:
     """Compares each new keyframe with those of the other robots.
 
     A robot with keyframes of its own looks at pairs that it is part of, since both partners do the same.
+
+    Attributes:
+        refused: Descriptors of another length than their log's, or without direction.
+        best_similarities: Robot -> best similarity of any of its keyframes with one of this robot's, also below the
+            threshold; at most as many as logs are kept.
     """
 
     def __init__(self, own: LogId, parameters: PlaceRecognitionParameters) -> None:
@@ -50,10 +58,11 @@ class PlaceRecognition:
         self._parameters = parameters
         self._by_log: dict[LogId, _Descriptors] = {}
         self.refused = 0
+        self.best_similarities: dict[str, float] = {}
 
-    def on_keyframe(self, keyframe: KeyframeId, values: NDArray[np.float64]) -> list[Candidate]:
+    def on_keyframe(self, keyframe: KeyframeId, place: Array) -> list[Candidate]:
         """Add a keyframe's descriptor and find its candidates, best first."""
-        descriptor = normalised(values)
+        descriptor = direction(place)
         if descriptor is None or not self._fits(keyframe.log, descriptor):
             self.refused += 1
             return []
@@ -77,17 +86,29 @@ class PlaceRecognition:
         if others.matrix.shape[1] != len(descriptor):
             return []
         similarities = others.matrix @ descriptor
-        best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches]
+        if self._parameters.best_matches == 1:
+            best = [int(similarities.argmax())]
+        else:
+            best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
+        self._note(log.robot if keyframe.log == self._own else keyframe.log.robot, float(similarities[best[0]]))
         return [
             Candidate(CandidatePair.of(keyframe, KeyframeId(log, others.indices[k])), float(similarities[k]))
             for k in best
             if similarities[k] >= self._parameters.similarity_threshold
         ]
 
+    def _note(self, robot: str, similarity: float) -> None:
+        """Remember the best similarity with each other robot, for those who ask why nothing was found."""
+        self.best_similarities[robot] = max(similarity, self.best_similarities.get(robot, -1.0))
 
-def normalised(values: NDArray[np.float64]) -> NDArray[np.float32] | None:
-    """Descriptor (D,) of unit length, or None where it has no direction."""
+
+@lru_cache(maxsize=DIRECTIONS_MAX)
+def direction(place: Array) -> NDArray[np.float32] | None:
+    """Descriptor (D,) of unit length, or None where it has no direction; found once for all robots of a process."""
+    values = place.numpy()
     norm = float(np.linalg.norm(values))
     if not np.isfinite(norm) or norm < 1e-12:
         return None
-    return np.asarray(values / norm, dtype=np.float32)
+    unit = np.asarray(values / norm, dtype=np.float32)
+    unit.flags.writeable = False
+    return unit

@@ -19,6 +19,7 @@ Entry = TypeVar("Entry")
 
 REMEMBERED_MAX = 1024
 """Open requests and pauses that are remembered; beyond this the oldest are forgotten."""
+PEERS_MAX = 64
 FIRST_PAUSE_S = 0.25
 
 
@@ -47,13 +48,16 @@ class Pulls:
         longest = max(map(len, self._ahead.values()), default=0)
         return {
             "ahead": (longest, self._parameters.logs_max),
+            "peers_ahead": (len(self._ahead), PEERS_MAX),
             "asked": (len(self._asked), REMEMBERED_MAX),
             "paused": (len(self._not_before_s), REMEMBERED_MAX),
         }
 
     def on_ahead(self, peer: str, log: LogId, count: int) -> None:
         """A peer holds so many records of a log, more than this robot."""
-        remember(self._ahead.setdefault(peer, {}), log, count, self._parameters.logs_max)
+        if peer not in self._ahead:
+            remember(self._ahead, peer, {}, PEERS_MAX)
+        remember(self._ahead[peer], log, count, self._parameters.logs_max)
 
     def on_level(self, peer: str, log: LogId) -> None:
         """A peer has nothing more of a log, or nothing that can be used."""

@@ -339,7 +339,7 @@ class Robot:
 
     def _recognise(self, keyframe: KeyframeId, descriptor: Array, now: float) -> list[Effect]:
         """Look for a keyframe's candidates; after a restart not in logs where it had a partner before."""
-        found = self.recognition.on_keyframe(keyframe, descriptor.numpy())
+        found = self.recognition.on_keyframe(keyframe, descriptor)
         candidates = [c for c in found if (keyframe, c.pair.other(keyframe).log) not in self._partnered]
         return self.closing.on_candidates(candidates, now)
 

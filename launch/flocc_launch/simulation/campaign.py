@@ -123,13 +123,18 @@ def prepared(scenario: Scenario) -> Swarm:
 
 def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     assert scenario.tracks is not None
-    drawn = _walked(scenario.tracks.model_copy(update={"robots": ROBOTS_MAX}), scenario.keyframes)
+    tracks = scenario.tracks.model_copy(update={"robots": ROBOTS_MAX})
+    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json())
     return {name: drawn[name] for name in scenario.names()}
 
 
 @lru_cache(maxsize=64)
-def _walked(tracks: TracksScenario, keyframes: KeyframeConfig) -> dict[str, Playback]:
-    return playbacks_of(Scenario(tracks=tracks, keyframes=keyframes), {})
+def _walked(tracks: str, keyframes: str) -> dict[str, Playback]:
+    """Playbacks of walks, drawn once for all seeds that share them; both parameters are JSON."""
+    scenario = Scenario(
+        tracks=TracksScenario.model_validate_json(tracks), keyframes=KeyframeConfig.model_validate_json(keyframes)
+    )
+    return playbacks_of(scenario, {})
 
 
 def shrink(scenario: Scenario, fails: Callable[[Scenario], bool] | None = None) -> Scenario:
