@@ -8,14 +8,26 @@ from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Heartbeat
 
 
+LOSS_WEIGHT = 0.05
+"""How much one heartbeat weighs in the running share of lost ones: about the last twenty count."""
+
+
 @dataclass(slots=True)
 class Neighbour:
-    """A robot in range: its log, its last heartbeat and when it came."""
+    """A robot in range: its log, its last heartbeat and when it came, and the running share of heartbeats lost."""
 
     log: LogId
     heartbeat: Heartbeat
     heard_s: float
     previous_boot: int | None = None
+    loss_ratio: float = 0.0
+
+    def count_lost(self, heartbeat: Heartbeat) -> None:
+        """Weigh in what the numbers of two heartbeats of one start show; one that came late or twice shows nothing."""
+        missing = heartbeat.sequence - self.heartbeat.sequence - 1
+        if heartbeat.boot == self.heartbeat.boot and missing >= 0:
+            kept = (1.0 - LOSS_WEIGHT) ** missing
+            self.loss_ratio = (1.0 - LOSS_WEIGHT) * (1.0 - kept * (1.0 - self.loss_ratio))
 
 
 class Neighbours:
@@ -40,6 +52,10 @@ class Neighbours:
         """Names of all robots in range, sorted."""
         return sorted(self._by_name)
 
+    def loss_ratios(self) -> dict[str, float]:
+        """Share of the last heartbeats of each robot in range that did not arrive, by name."""
+        return {name: self._by_name[name].loss_ratio for name in self.names()}
+
     def on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Note a heartbeat; report a new neighbour, a restarted one, or two robots that share a name."""
         if sender.robot == self._own.robot:
@@ -52,6 +68,7 @@ class Neighbours:
             self._due_s = min(self._due_s, self._expires_s(sender.robot))
             return [Report("neighbour_up", {"peer": sender.robot, "log": str(sender)})]
         effects = self._restarted(known, sender, heartbeat)
+        known.count_lost(heartbeat)
         known.log, known.heartbeat, known.heard_s = sender, heartbeat, now
         return effects
 

@@ -230,6 +230,8 @@ class Driver:
             "logs": {str(digest.log): [digest.count, digest.checksum] for digest in digests},
             "sent_bytes": sum(traffic.payload_bytes for traffic in counters.sent.values()),
             "received_bytes": sum(traffic.payload_bytes for traffic in counters.received.values()),
+            "loss": self._losses(),
+            "queues": self._queues(),
             "links": {table: totals(peers) for table, peers in counters.links().items()},
             "stages": brief_of(self._workers.stages.snapshot()),
             "refused": self.counters(),
@@ -469,10 +471,19 @@ class Driver:
         counters = self._transport.counters()
         sent = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.sent.items())}
         received = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.received.items())}
-        self._on_line(self._reporter.line(Report("bytes", {"sent": dict(sent), "received": dict(received)}), now))
+        facts = {"sent": sent, "received": received, "loss": self._losses(), "queues": self._queues()}
+        self._on_line(self._reporter.line(Report("bytes", facts), now))  # type: ignore[arg-type]
         if now >= self._account_due_s or last:
             self._account_due_s = now + ACCOUNT_PERIOD_S
             self._on_line(self._account(counters, now))
+
+    def _losses(self) -> dict[str, float]:
+        """Share of each neighbour's last heartbeats that did not arrive."""
+        return {name: round(ratio, 3) for name, ratio in self.robot.neighbours.loss_ratios().items()}
+
+    def _queues(self) -> dict[str, int]:
+        """What waits: events for the core, images for the encoder, candidates for their registration."""
+        return {"inbox": len(self._inbox), "images": len(self._images), "candidates": self.robot.closing.load}
 
     def _account(self, counters: TransportCounters, now: float) -> dict[str, Any]:
         """Bytes by link and kind, and time by stage, since this start of the agent."""

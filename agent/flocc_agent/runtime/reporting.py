@@ -77,6 +77,7 @@ def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None
         "keyframes": keyframes,
         "closures": closures_known(robot, solution),
         "logs": {str(digest.log): digest.count for digest in robot.gossip.digests()},
+        "best_similarities": best_similarities(robot),
     }
 
 
@@ -89,6 +90,11 @@ def corrected_bodies(robot: Robot, T_body_camera: Float) -> tuple[list[float], F
     T_odom_camera = np.array([pose_from_tq(np.array(record.T_odom_camera)) for record in records])
     T_map_body = corrected(applied, T_odom_camera) @ inverse(T_body_camera)
     return [record.stamp_s for record in records], T_map_body
+
+
+def best_similarities(robot: Robot) -> dict[str, float]:
+    """Best cosine similarity of any keyframe of each other robot with one of this robot, below the threshold too."""
+    return {name: round(best, 4) for name, best in sorted(robot.recognition.best_similarities.items())}
 
 
 def closures_known(robot: Robot, solution: GraphSolution | None) -> list[dict[str, Any]]:
