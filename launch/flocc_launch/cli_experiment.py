@@ -65,6 +65,20 @@ def list_experiments() -> None:
         typer.echo(f"{each.name:18} {each.title}")
 
 
+@experiment.command("steepness")
+def write_learned_steepness(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished registration experiment.")],
+    config: Annotated[Path, typer.Argument(help="Configuration of an agent, or a scenario (TOML).")],
+) -> None:
+    """Write the k of Eq. (2) that a registration experiment learned into a configuration file."""
+    from flocc_launch.experiments.steepness import learned, write_steepness
+
+    found = learned(run)
+    write_steepness(config, found.steepness)
+    fit = found.fit
+    typer.echo(f"{config}: backend.steepness = {found.steepness:g}, from {fit.pairs} registrations ({fit.right} right)")
+
+
 def command_of(chosen: "Experiment[Any]") -> Any:
     """The command of an experiment."""
 
@@ -91,9 +105,23 @@ def settings_of(chosen: "Experiment[Any]", given: dict[str, str], quick: bool, c
     if quick:
         fields |= chosen.quick
     for name, text in given.items():
-        is_list = get_origin(chosen.settings.model_fields[name].annotation) is tuple
-        fields[name] = [part for part in text.split(",") if part] if is_list else text
+        fields[name] = _given(text, chosen.settings.model_fields[name].annotation)
     return validated(chosen.settings, fields, f"experiment {chosen.name}")
+
+
+def _given(text: str, kind: Any) -> object:
+    """An option's value: a list is separated by commas, and a perception stands in a configuration file.
+
+    Raises:
+        ConfigError: The file cannot be used.
+    """
+    from flocc_agent.config import PerceptionConfig, read_toml, validated
+
+    if kind is PerceptionConfig:
+        path = Path(text)
+        found = read_toml(path).get("perception", {})
+        return validated(PerceptionConfig, found if isinstance(found, dict) else {}, str(path), path.resolve().parent)
+    return [part for part in text.split(",") if part] if get_origin(kind) is tuple else text
 
 
 def _settings_in(path: Path, name: str) -> dict[str, object]:
@@ -121,11 +149,14 @@ def _with_options(run: Callable[..., None], chosen: "Experiment[Any]") -> Callab
 
 
 def _option(field: "FieldInfo") -> Any:
-    """Text, checked by the settings; lists are separated by commas."""
-    default = field.default
-    shown = ",".join(map(str, default)) if isinstance(default, tuple) else str(default)
-    kind = get_args(field.annotation)[0] if get_origin(field.annotation) is tuple else field.annotation
-    metavar = "LIST" if get_origin(field.annotation) is tuple else getattr(kind, "__name__", "value").upper()
+    """Text, checked by the settings; lists are separated by commas, a section is read from a file."""
+    from pydantic import BaseModel
+
+    kind, default = field.annotation, field.default
+    is_list, is_section = get_origin(kind) is tuple, isinstance(default, BaseModel)
+    shown = ",".join(map(str, default)) if is_list else "its defaults" if is_section else str(default)
+    single = next((inner for inner in get_args(kind) if isinstance(inner, type)), str)
+    metavar = "LIST" if is_list else "FILE" if is_section else getattr(kind, "__name__", single.__name__).upper()
     return Annotated[str | None, typer.Option(help=f"{field.description} [{shown or 'none'}]", metavar=metavar)]
 
 

@@ -84,6 +84,8 @@ class Outcome:
         position_error_m: With the translation's length made the true one.
         scale_ratio: Metric length by Eq. (6) over the true one; None without scale.
         correct: Rotation and position are within the limits.
+        confidence: Mean confidence of the network; None of methods without one.
+        confidence_ratio: The same over the odometry pair's.
     """
 
     query: int
@@ -98,6 +100,8 @@ class Outcome:
     position_error_m: float | None = None
     scale_ratio: float | None = None
     correct: bool = False
+    confidence: float | None = None
+    confidence_ratio: float | None = None
 
 
 def run(
@@ -273,7 +277,16 @@ def outcome(scene: Scene, pair: Pair, result: Registration | RegistrationFailed)
         position_error_m,
         scale,
         rotation_deg < ROTATION_ERROR_MAX_DEG and position_error_m < scene.position_error_max_m,
+        result.confidence,
+        confidence_ratio(result),
     )
+
+
+def confidence_ratio(result: Registration) -> float | None:
+    """The network's mean confidence in the loop pair over that in the odometry pair, None without both."""
+    if result.confidence is None or result.odometry_confidence is None:
+        return None
+    return result.confidence / result.odometry_confidence
 
 
 def ratio_row(outcomes: Sequence[Outcome], ratio_min: float) -> dict[str, Any]:

@@ -135,6 +135,13 @@ def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:
     return sides[0], sides[1]
 
 
+def stereo_revisits(folder: Path) -> Scene:
+    """The views of loop_pairs as four robots, each with its right image before its left one."""
+    left, right = loop_pairs(folder)
+    views = tuple(view for pair in zip(right, left, strict=True) for view in pair)
+    return Scene(folder.name, views, 1.0, float(np.radians(60.0)), 0.3)
+
+
 def corridor(folder: Path) -> tuple[list[Image], list[Image], list[set[int]]]:
     """Two passes of a corridor: query images, reference images, and the right references of each query."""
     query, reference = ([_uncalibrated(file) for file in _jpegs(folder / part)] for part in ("query", "ref"))

@@ -98,6 +98,8 @@ class Registration:
         scale_initial: Metres per network unit by Eq. (6); None where the odometry pair gave none.
         covariance: (6, 6) covariance (rotation rad, translation in network units) in the tangent space of the
             match, or None where the method gives none.
+        confidence: Mean confidence that the network gives the loop pair's points; None of other methods.
+        odometry_confidence: The same of the odometry pair.
     """
 
     T_query_match_unscaled: Float
@@ -105,6 +107,8 @@ class Registration:
     odometry_correspondences: int
     scale_initial: float | None
     covariance: Float | None = None
+    confidence: float | None = None
+    odometry_confidence: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

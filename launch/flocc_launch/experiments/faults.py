@@ -11,9 +11,9 @@ from pydantic import Field
 
 from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig
 from flocc_launch.experiments.experiment import Cell, Experiment, Finding, Row, Settings, Summary, judged
-from flocc_launch.experiments.plots import spread_line
+from flocc_launch.experiments.plots import from_zero, spread_line
 from flocc_launch.experiments.simulated import simulated
-from flocc_launch.experiments.statistics import grouped, middle, with_spread
+from flocc_launch.experiments.statistics import grouped, middle, values, with_spread
 from flocc_launch.scenario import Scenario, TracksScenario
 
 if TYPE_CHECKING:
@@ -145,9 +145,10 @@ def _metres(value: float | None) -> str:
 
 def draw(figure: "Figure", _settings: FaultsSettings, rows: Sequence[Row]) -> None:
     """A column per axis, a line of panels per measure."""
-    figure.set_size_inches(10, 9)
-    panels = figure.subplots(len(MEASURES), len(AXES), sharex="col", sharey="row", squeeze=False)
-    for column, axis in enumerate(AXES):
+    axes = [axis for axis in AXES if levels_of(rows, axis)]
+    figure.set_size_inches(1.5 + 3.0 * len(axes), 9)
+    panels = figure.subplots(len(MEASURES), len(axes), sharex="col", sharey="row", squeeze=False)
+    for column, axis in enumerate(axes):
         levels = levels_of(rows, axis)
         for line, (measure_name, label) in enumerate(MEASURES.items()):
             panel = panels[line][column]
@@ -155,8 +156,8 @@ def draw(figure: "Figure", _settings: FaultsSettings, rows: Sequence[Row]) -> No
             if column == 0:
                 panel.set_ylabel(label)
         panels[-1][column].set_xlabel(LABELS[axis])
-    for line in panels:
-        line[0].set_ylim(bottom=0)
+    for line, measure_name in zip(panels, MEASURES, strict=True):
+        from_zero(line[0], values(rows, measure_name))
 
 
 FAULTS = Experiment(

@@ -25,3 +25,8 @@ def spread_line(
     medians = [(level, middle(rows, column)) for level, rows in levels]
     line = [(level, value) for level, value in medians if value is not None]
     panel.plot(*zip(*line, strict=True), color=colour, marker=marker, markersize=5, label=label) if line else None
+
+
+def from_zero(panel: "Axes", known: Sequence[float]) -> None:
+    """Let the upright axis begin at zero and end above every value."""
+    panel.set_ylim(0.0, 1.08 * max(known, default=1.0) or 1.0)

@@ -4,8 +4,9 @@ from typing import Any
 
 from flocc_launch.experiments.experiment import Experiment, ExperimentError
 from flocc_launch.experiments.faults import FAULTS
+from flocc_launch.experiments.registration import REGISTRATION
 
-ALL: tuple[Experiment[Any], ...] = (FAULTS,)
+ALL: tuple[Experiment[Any], ...] = (REGISTRATION, FAULTS)
 
 
 def names() -> list[str]:

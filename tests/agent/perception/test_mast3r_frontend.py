@@ -27,6 +27,7 @@ from flocc_agent.perception.mast3r.device import (  # noqa: E402
 from flocc_agent.perception.mast3r.engine import Engine, LatentOnDevice, batches  # noqa: E402
 from flocc_agent.perception.mast3r.frontend import Mast3rEncoder, Mast3rRegistrar  # noqa: E402
 from flocc_agent.perception.mast3r.network import Mast3r, View  # noqa: E402
+from flocc_agent.perception.mast3r.pair import mean_confidence  # noqa: E402
 from flocc_agent.perception.mast3r.preprocess import BadImage  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import TINY  # noqa: E402
 from flocc_launch.weights import synthesize  # noqa: E402
@@ -158,6 +159,13 @@ def test_a_true_pose_is_found_with_its_counts_scale_and_covariance(config: Mast3
     assert result.covariance is not None
     assert np.all(np.linalg.eigvalsh(result.covariance) > 0)
     assert engine.decoded == 2
+    assert (result.confidence, result.odometry_confidence) == (1.0, 1.0)
+
+
+def test_the_mean_confidence_is_that_of_both_views_points() -> None:
+    nothing = torch.zeros(1, 2, 2)
+    views = (View(nothing, 2.0 + nothing, nothing, nothing), View(nothing, 4.0 + nothing, nothing, nothing))
+    assert mean_confidence(views) == 3.0
 
 
 def test_the_odometry_pair_is_decoded_once_per_keyframe_and_the_cache_is_bounded(config: Mast3rConfig) -> None:

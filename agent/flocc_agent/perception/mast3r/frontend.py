@@ -202,6 +202,8 @@ class Mast3rRegistrar:
             odometry_count,
             scale(odometry, odometry_pair),
             loop_pair.pose.covariance,
+            loop_pair.confidence,
+            None if odometry_pair is None else odometry_pair.confidence,
         )
 
     def _count(self, pair: PairResult) -> int:

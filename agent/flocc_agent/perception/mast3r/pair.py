@@ -30,10 +30,12 @@ class PairResult:
     Attributes:
         matches: Number of filtered reciprocal matches.
         pose: Pose of camera 2 in camera 1, or why there is none.
+        confidence: Mean confidence of both views' points; None where the network gave values that are not finite.
     """
 
     matches: int
     pose: RelativePose | PoseFailed
+    confidence: float | None = None
 
     def inliers(self) -> int:
         """Matches that agree with the pose; 0 without one."""
@@ -78,8 +80,9 @@ def register_pair(
         matches = match_pair(views, matching)
     if isinstance(matches, PoseFailed):
         return PairResult(0, matches)
+    confidence = mean_confidence(views)
     if calibrations is None and K_estimated is None:
-        return PairResult(len(matches), PoseFailed("the pointmap fixes no focal length", degenerate=True))
+        return PairResult(len(matches), PoseFailed("the pointmap fixes no focal length", degenerate=True), confidence)
     pts3d = views[0].pts3d[0].cpu().double().numpy()
     points = pts3d[matches.xy1[:, 1], matches.xy1[:, 0]]
     if calibrations is not None:
@@ -87,7 +90,12 @@ def register_pair(
     K_2 = calibrations[1] if calibrations is not None else K_estimated
     assert K_2 is not None
     with stage("pose"):
-        return PairResult(len(matches), relative_pose(points, matches.xy2.astype(np.float64), K_2, pnp))
+        return PairResult(len(matches), relative_pose(points, matches.xy2.astype(np.float64), K_2, pnp), confidence)
+
+
+def mean_confidence(views: tuple[View, View]) -> float:
+    """Mean confidence of both views' points, >= 1: what the paper compares the match ratio with (Sec. IV-B)."""
+    return float(torch.stack([view.conf.float().mean() for view in views]).mean())
 
 
 def disagreement_rad(T_query_match: Float, T_match_query: Float) -> float:

@@ -1,0 +1,311 @@
+"""`flocc experiment registration`: which number tells right registrations from wrong ones (Sec. IV-B).
+
+Pairs of views of different robots that are nearer than a distance are drawn, as in the paper, whatever they look at,
+and registered. A registration is an outlier when its translation error, with the true length, exceeds a limit. Pairs
+for which the method gives no pose are counted and belong to neither side: nothing could accept them.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flocc_launch.evaluate_registration import Outcome, registered
+from flocc_launch.experiments.experiment import (
+    Cell,
+    Experiment,
+    Finding,
+    Progress,
+    Row,
+    Summary,
+    judged,
+)
+from flocc_launch.experiments.logistic import LogisticFit, fit_logistic
+from flocc_launch.experiments.plots import COLOURS
+from flocc_launch.experiments.precision_recall import Curve, curve
+from flocc_launch.experiments.registration_data import (
+    RegistrationSettings,
+    data_of,
+    distance_m,
+    drawn_pairs,
+    error_max_m,
+    near_pairs,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+METRICS = {
+    "similarity": "similarity",
+    "confidence": "mean confidence",
+    "confidence_ratio": "confidence ratio",
+    "correspondences": "correspondences",
+    "ratio": "correspondence ratio, Eq. (1)",
+}
+POOLED = "all"
+PRECISION_WANTED = 0.95
+RESAMPLES = 500
+SOURCE = "Sec. IV-B, precision and recall of five metrics"
+
+
+def prepare(settings: RegistrationSettings, progress: Progress) -> None:
+    """Make the scenes and load the back-end once, so that bad data and checkpoints are told at once."""
+    del progress  # generating a town tells its own
+    data_of(settings)
+
+
+def cells(settings: RegistrationSettings) -> list[Cell]:
+    """Portions of each scene's pairs."""
+    portions = []
+    for name, scene in data_of(settings).scenes.items():
+        count = min(len(near_pairs(scene, distance_m(settings, scene))), settings.pairs_max)
+        starts = range(0, count, settings.pairs_per_cell)
+        portions += [Cell({"scene": name, "first": start}) for start in starts]
+    return portions
+
+
+def measure(settings: RegistrationSettings, cell: Cell, seed: int) -> Row:
+    """Register one portion of a scene's pairs."""
+    data, name, first = data_of(settings), cell.parameters["scene"], cell.parameters["first"]
+    scene, encoded = data.scenes[name], data.encoded[name]
+    drawn = drawn_pairs(scene, distance_m(settings, scene), settings.pairs_max, seed)
+    pairs = [encoded.pair(i, j) for i, j in drawn[first : first + settings.pairs_per_cell]]
+    limited = replace(scene, position_error_max_m=error_max_m(settings, scene))
+    outcomes, register_s = registered(limited, pairs, encoded, data.skills)
+    return {
+        "distance_m": distance_m(settings, scene),
+        "error_max_m": error_max_m(settings, scene),
+        "register_s": register_s,
+        "outcomes": [outcome_row(outcome, limited.position_error_max_m) for outcome in outcomes],
+    }
+
+
+def outcome_row(outcome: Outcome, limit_m: float) -> Row:
+    """What is kept of one pair."""
+    error_m = outcome.position_error_m
+    return {
+        "query": outcome.query,
+        "match": outcome.match,
+        **{name: getattr(outcome, name) for name in METRICS},
+        "failure": outcome.failure,
+        "rotation_error_deg": outcome.rotation_error_deg,
+        "position_error_m": error_m,
+        "inlier": None if error_m is None else error_m <= limit_m,
+    }
+
+
+def pairs_of(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """All pairs by scene, and pooled where there are several scenes."""
+    scenes: dict[str, list[Row]] = {}
+    for row in rows:
+        scenes.setdefault(row["scene"], []).extend(row["outcomes"])
+    return scenes if len(scenes) < 2 else {**scenes, POOLED: [pair for pairs in scenes.values() for pair in pairs]}
+
+
+def curves_of(pairs: Sequence[Row]) -> dict[str, Curve]:
+    """Curves of the metrics that the method gives, over the pairs with a pose."""
+    posed = [pair for pair in pairs if pair["inlier"] is not None]
+    found = {}
+    for metric in METRICS:
+        scores = [pair[metric] for pair in posed]
+        if None not in scores and (drawn := curve(scores, [pair["inlier"] for pair in posed])) is not None:
+            found[metric] = drawn
+    return found
+
+
+def summarise(_settings: RegistrationSettings, rows: Sequence[Row]) -> Summary:
+    """A row per scene and metric that the method gives."""
+    scenes = pairs_of(rows)
+    curves = {name: curves_of(pairs) for name, pairs in scenes.items()}
+    given = [metric for metric in METRICS if any(metric in found for found in curves.values())]
+    table = [
+        metric_row(name, pairs, metric, curves[name].get(metric)) for name, pairs in scenes.items() for metric in given
+    ]
+    return Summary(table, findings(scenes, curves), [*notes(scenes, rows), *fit_notes(fit_of(rows))])
+
+
+def metric_row(scene: str, pairs: Sequence[Row], metric: str, found: Curve | None) -> Row:
+    """Areas and best thresholds of one metric."""
+    row = {
+        "scene": scene,
+        "metric": METRICS[metric],
+        "pairs": len(pairs),
+        "with_pose": sum(pair["inlier"] is not None for pair in pairs),
+        "inliers": sum(pair["inlier"] is True for pair in pairs),
+    }
+    best = None if found is None else found.best()
+    sure = None if found is None else found.first_with_precision(PRECISION_WANTED)
+    values: dict[str, float | None] = dict.fromkeys(
+        ("average_precision", "roc_auc", "best_threshold", "precision", "recall", "threshold_p95", "recall_p95")
+    )
+    if found is not None and best is not None:
+        values |= {
+            "average_precision": found.average_precision,
+            "roc_auc": found.roc_auc,
+            "best_threshold": float(found.thresholds[best]),
+            "precision": float(found.precision[best]),
+            "recall": float(found.recall[best]),
+        }
+    if found is not None and sure is not None:
+        values |= {"threshold_p95": float(found.thresholds[sure]), "recall_p95": float(found.recall[sure])}
+    return {**row, **values}
+
+
+def findings(scenes: Mapping[str, Sequence[Row]], curves: Mapping[str, Mapping[str, Curve]]) -> list[Finding]:
+    """The paper's claims on the metrics."""
+    name = POOLED if POOLED in curves else next(iter(curves))
+    whole = curves[name]
+    if "ratio" not in whole:
+        return [judged("The correspondence ratio beats similarity", SOURCE, None, "No scene has inliers and outliers.")]
+    single = {name: found for name, found in curves.items() if name != POOLED and "ratio" in found}
+    return [_ratio_beats_similarity(scenes[name], whole, single), _similarity_alone(whole), _unitless(single)]
+
+
+def _ratio_beats_similarity(
+    pairs: Sequence[Row], whole: Mapping[str, Curve], single: Mapping[str, Mapping[str, Curve]]
+) -> Finding:
+    """Decided by the average precision over all pairs, where its difference is not a matter of which pairs came."""
+    ratio, similarity = whole["ratio"], whole["similarity"]
+    low, high = resampled_difference(pairs, "ratio", "similarity")
+    better = [name for name, c in single.items() if c["ratio"].average_precision > c["similarity"].average_precision]
+    numbers = (
+        f"Average precision {ratio.average_precision:.3f} against {similarity.average_precision:.3f} over all pairs "
+        f"with a pose (95 % of resampled differences lie between {low:+.3f} and {high:+.3f}), ROC {ratio.roc_auc:.3f} "
+        f"against {similarity.roc_auc:.3f}; {ratio.right_share:.1%} of them are inliers; better in {len(better)} of "
+        f"{len(single)} scenes ({', '.join(better) or 'none'})."
+    )
+    holds = None if low <= 0.0 <= high else low > 0.0
+    return judged("The correspondence ratio beats similarity", SOURCE, holds, numbers)
+
+
+def resampled_difference(pairs: Sequence[Row], one: str, other: str) -> tuple[float, float]:
+    """Range of 95 % of the differences in average precision when pairs are drawn anew with replacement."""
+    posed = [pair for pair in pairs if pair["inlier"] is not None]
+    right = np.array([pair["inlier"] for pair in posed])
+    scores = [np.array([pair[metric] for pair in posed], dtype=np.float64) for metric in (one, other)]
+    rng = np.random.default_rng(0)
+    differences = []
+    for _ in range(RESAMPLES):
+        drawn = rng.integers(len(posed), size=len(posed))
+        curves = [curve(score[drawn], right[drawn]) for score in scores]
+        if curves[0] is not None and curves[1] is not None:
+            differences.append(curves[0].average_precision - curves[1].average_precision)
+    low, high = np.quantile(differences, (0.025, 0.975)) if differences else (-1.0, 1.0)
+    return float(low), float(high)
+
+
+def _similarity_alone(whole: Mapping[str, Curve]) -> Finding:
+    sure = {metric: _recall_at_precision(whole[metric]) for metric in ("similarity", "ratio")}
+    numbers = (
+        f"At a precision of {PRECISION_WANTED:.0%} similarity keeps {sure['similarity']:.1%} of the inliers, the ratio "
+        f"{sure['ratio']:.1%}; accepting all is right in {whole['ratio'].right_share:.1%}."
+    )
+    return judged("Similarity alone does not tell outliers", SOURCE, sure["similarity"] < 0.5 * sure["ratio"], numbers)
+
+
+def _recall_at_precision(found: Curve) -> float:
+    k = found.first_with_precision(PRECISION_WANTED)
+    return 0.0 if k is None else float(found.recall[k])
+
+
+def _unitless(single: Mapping[str, Mapping[str, Curve]]) -> Finding:
+    """Whether one threshold fits all scenes better for the ratio than for the count."""
+    best = {
+        metric: {name: float(found[metric].thresholds[found[metric].best()]) for name, found in single.items()}
+        for metric in ("ratio", "correspondences")
+    }
+    spreads = {metric: max(values.values()) / max(min(values.values()), 1e-9) for metric, values in best.items()}
+    shown = {
+        metric: ", ".join(f"{name} {value:.3g}" for name, value in values.items()) for metric, values in best.items()
+    }
+    numbers = (
+        f"Best thresholds differ by a factor of {spreads['ratio']:.2g} for the ratio ({shown['ratio']}) and of "
+        f"{spreads['correspondences']:.2g} for the count ({shown['correspondences']})."
+    )
+    holds = None if len(single) < 2 else spreads["ratio"] < spreads["correspondences"]
+    return judged("The ratio is easier to tune than the count, because it has no unit", SOURCE, holds, numbers)
+
+
+def notes(scenes: Mapping[str, Sequence[Row]], rows: Sequence[Row]) -> list[str]:
+    """What the table leaves out."""
+    limits = {row["scene"]: (row["distance_m"], row["error_max_m"]) for row in rows}
+    said = [
+        f"{name}: pairs within {limits[name][0]:g} m, outliers beyond {limits[name][1]:g} m."
+        for name in scenes
+        if name in limits
+    ]
+    said.append(
+        "Pairs nearer than half the limit cannot be outliers by the paper's rule, whatever direction is found; average "
+        "precision of a metric without meaning is the share of inliers among pairs with a pose."
+    )
+    if all(pair["confidence"] is None for pairs in scenes.values() for pair in pairs):
+        said.append("Mean confidence and its ratio are n/a: only MASt3R gives confidences, and this method is another.")
+    return said
+
+
+def fit_of(rows: Iterable[Row]) -> LogisticFit | None:
+    """Eq. (2) fitted to all pairs with a pose and a ratio."""
+    posed = [pair for row in rows for pair in row["outcomes"] if pair["inlier"] is not None]
+    return fit_logistic([pair["ratio"] for pair in posed], [pair["inlier"] for pair in posed])
+
+
+def fit_notes(fit: LogisticFit | None) -> list[str]:
+    """What learning Eq. (2)'s k from the pairs gives."""
+    if fit is None:
+        return ["Eq. (2) cannot be fitted: there are no inliers, or no outliers."]
+    free = (
+        f"with a free midpoint k = {fit.free_steepness:.3g} around a ratio of "
+        f"{'n/a' if fit.free_midpoint is None else f'{fit.free_midpoint:.3g}'} (log loss {fit.free_log_loss:.3f})"
+    )
+    if fit.steepness is None:
+        return [
+            f"Eq. (2) has no k > 0 for these {fit.pairs} registrations: most inliers have a ratio below 1, where "
+            f"Eq. (2) gives less than one half for every k; {free}."
+        ]
+    return [
+        f"Eq. (2) fitted to {fit.pairs} registrations: k = {fit.steepness:.3g} (log loss {fit.log_loss:.3f}); {free}."
+    ]
+
+
+def draw(figure: "Figure", _settings: RegistrationSettings, rows: Sequence[Row]) -> None:
+    """Precision over recall, a panel per scene."""
+    scenes = {name: curves for name, pairs in pairs_of(rows).items() if (curves := curves_of(pairs))}
+    columns = min(max(len(scenes), 1), 3)
+    lines = -(-max(len(scenes), 1) // columns)
+    figure.set_size_inches(4.2 * columns, 3.9 * lines)
+    panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat
+    for panel, (name, curves) in zip(panels, scenes.items(), strict=False):
+        for k, (metric, label) in enumerate(METRICS.items()):
+            if metric in curves:
+                found = curves[metric]
+                text = f"{label} ({found.average_precision:.2f})"
+                panel.plot(found.recall, found.precision, color=COLOURS[k], label=text)
+        share = next(iter(curves.values())).right_share
+        panel.axhline(share, color="#888888", linestyle=":", label=f"all accepted ({share:.2f})")
+        panel.set_title(name)
+        panel.set_xlabel("recall")
+        panel.legend(loc="lower left", fontsize=7, title="average precision", title_fontsize=7)
+    for panel in list(panels):
+        panel.set_visible(False)
+    figure.axes[0].set_ylabel("precision")
+    figure.axes[0].set(xlim=(0, 1.02), ylim=(0, 1.02))
+
+
+REGISTRATION = Experiment(
+    name="registration",
+    title="precision and recall of the numbers that could accept a registration, and the fit of Eq. (2)",
+    settings=RegistrationSettings,
+    quick={
+        "worlds": (),
+        "walks": (3,),
+        "perception": {"method": "synthetic"},
+        "pairs_max": 100,
+        "pairs_per_cell": 50,
+    },
+    cells=cells,
+    measure=measure,
+    summarise=summarise,
+    draw=draw,
+    prepare=prepare,
+)
