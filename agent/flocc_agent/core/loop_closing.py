@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
+from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report, Unicast
 from flocc_agent.core.latents import Latents, Peer, Reach
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -60,9 +61,24 @@ class LoopClosing:
     """Pairs and registrations of one robot."""
 
     def __init__(
-        self, own: LogId, compute_class: int, odometry_pair: OdometryPairOf, parameters: LoopClosingParameters
+        self,
+        own: LogId,
+        compute_class: int,
+        odometry_pair: OdometryPairOf,
+        parameters: LoopClosingParameters,
+        spectral: SpectralOrder | None = None,
     ) -> None:
+        """Start without pairs.
+
+        Args:
+            own: The log that this robot writes.
+            compute_class: 0 (small) to 9.
+            odometry_pair: Gives the neighbour of a keyframe.
+            parameters: Limits and times.
+            spectral: Orders pairs by what they add to the pose graph; None: by similarity.
+        """
         self.latents = Latents(own, parameters)
+        self._spectral = spectral
         self.dropped = 0
         self._own = own
         self._compute_class = compute_class
@@ -131,8 +147,16 @@ class LoopClosing:
         self._resolved.add(pair)
         self._remove(pair)
 
-    def on_keyframe(self) -> None:
+    def on_closure(self, pair: CandidatePair) -> None:
+        """A record of this pair is in a log, and it is a closure."""
+        if self._spectral is not None:
+            self._spectral.on_closure(pair)
+        self.on_resolved(pair)
+
+    def on_keyframe(self, log: LogId) -> None:
         """A log grew: a keyframe may have got the neighbour that it lacked."""
+        if self._spectral is not None:
+            self._spectral.on_keyframe(log)
         self._changed = True
 
     # Latents
@@ -179,6 +203,7 @@ class LoopClosing:
         """A robot in range said how it is; one that comes into range is tried at once."""
         if name not in self._reach:
             self.latents.on_reached(name)
+            self._order = None
         self._changed |= self._reach.update(name, peer)
 
     def on_lost(self, name: str, now: float) -> None:
@@ -188,7 +213,7 @@ class LoopClosing:
         for offer in self._offers.values():
             if offer.to == name:
                 offer.since_s = now
-        self._changed = True
+        self._order, self._changed = None, True
 
     # Time
 
@@ -331,10 +356,16 @@ class LoopClosing:
         return in_reach and self._odometry_of(work) is not None
 
     def _lacking_all(self) -> Iterator[KeyframeId]:
-        """Latents to fetch, the most similar pair's first."""
+        """Latents to fetch, the first pair's first."""
         return (k for work in self._sorted_work() for k in self._lacking(work))
 
     def _sorted_work(self) -> list[_Work]:
+        """All work: the few pairs that were chosen for the pose graph, then the most similar ones."""
         if self._order is None:
             self._order = sorted(self._work.values(), key=_Work.order)
+            if self._spectral is not None:
+                similarities = {work.pair: work.similarity for work in self._order}
+                chosen = self._spectral.chosen(similarities, lambda pair: self._can_be_done(self._work[pair]))
+                rest = (work for work in self._order if work.pair not in chosen)
+                self._order = [*(self._work[pair] for pair in chosen), *rest]
         return self._order

@@ -4,7 +4,7 @@ They are plain dataclasses so that the core stays free of frameworks; `config.py
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 _FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 
@@ -89,6 +89,8 @@ class PlaceRecognitionParameters:
     """A best match of lower cosine similarity is no candidate; the paper's 0.1 is permissive."""
     best_matches: int = 1
     """Candidates per keyframe and other robot; the paper takes the nearest neighbour only."""
+    candidate_order: Literal["similarity", "spectral"] = "similarity"
+    """Which candidates are registered first: the most similar, or those that strengthen the pose graph most."""
 
     def __post_init__(self) -> None:
         _require(-1 <= self.similarity_threshold <= 1, "similarity_threshold must be in [-1, 1]")

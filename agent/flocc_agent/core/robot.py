@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
 from flocc_agent.core.election import LeaderElection
@@ -125,7 +126,8 @@ class Robot:
         self.gossip = Gossip(log, parameters.gossip, sealer)
         self.assembly = GraphAssembly()
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
-        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing)
+        spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
+        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
         self.corrections = Corrections(log, parameters.gossip, parameters.rounds)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
@@ -328,10 +330,12 @@ class Robot:
             self.assembly.add(new)
             match new.record:
                 case KeyframeRecord(index, _, _, descriptor):
-                    self.closing.on_keyframe()
+                    self.closing.on_keyframe(new.log)
                     if descriptor is not None:
                         effects += self._recognise(KeyframeId(new.log, index), descriptor, now)
-                case ClosureRecord(query, match) | RejectionRecord(query, match):
+                case ClosureRecord(query, match):
+                    self.closing.on_closure(CandidatePair.of(query, match))
+                case RejectionRecord(query, match):
                     self.closing.on_resolved(CandidatePair.of(query, match))
                 case _:
                     pass
