@@ -40,6 +40,7 @@ class Kind(StrEnum):
     RECORDS = "records"
     RECORD_REQUEST = "want-records"
     CANDIDATES = "candidates"
+    SEPARATORS = "separators"
 
 
 class Admin(StrEnum):

@@ -43,6 +43,8 @@ MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
 WANTS_MAX = 16
 OFFERS_MAX = 64
+SEPARATORS_MAX = 200
+RANK_MIN, RANK_MAX = 3, 5
 RECORDS_BATCH_MAX = 64
 BATCHES_MAX = 64
 RECORDS_BATCH_BYTES_MAX = 32 * 1024
@@ -342,6 +344,40 @@ class CandidatePair(_PairFields):
         return cls(min(a, b), max(a, b))
 
 
+@dataclass(frozen=True, slots=True)
+class Separators:
+    """The sender's present estimate of keyframes that closures join to other robots' (distributed optimisation).
+
+    Attributes:
+        anchor: Log after which the frame of the poses is named; poses of two frames are not compared.
+        iteration: Counts the sender's block iterations; it only grows within one start.
+        keyframes: Numbers of the keyframes in the sender's log.
+        poses: (N, 4, r) float64: three rows of a 3-frame in r dimensions (a relaxed rotation, transposed), then the
+            position, metres.
+        pairs: Closures between two robots whose robust weight is the sender's to decide.
+        weights: (M,) float32 in [0, 1], one per pair.
+    """
+
+    anchor: LogId
+    iteration: int
+    keyframes: tuple[int, ...]
+    poses: Array
+    pairs: tuple[CandidatePair, ...]
+    weights: Array
+
+    def __post_init__(self) -> None:
+        shape = self.poses.shape
+        if self.poses.dtype != "f8" or len(shape) != 3 or shape[:2] != (len(self.keyframes), 4):
+            raise ValueError("separators have (N, 4, r) float64 poses, one per keyframe")
+        if not RANK_MIN <= shape[2] <= RANK_MAX or len(self.keyframes) > SEPARATORS_MAX:
+            raise ValueError(f"separators have rank {RANK_MIN} to {RANK_MAX} and at most {SEPARATORS_MAX} keyframes")
+        if self.weights.dtype != "f4" or self.weights.shape != (len(self.pairs),) or len(self.pairs) > OFFERS_MAX:
+            raise ValueError(f"separators have one float32 weight per pair, at most {OFFERS_MAX}")
+        _check_lifted(self.poses.numpy())
+        if np.any((self.weights.numpy() < 0.0) | (self.weights.numpy() > 1.0)):
+            raise ValueError("a robust weight lies in [0, 1]")
+
+
 Message = (
     Heartbeat
     | Election
@@ -353,6 +389,7 @@ Message = (
     | CorrectionBatch
     | CorrectionRequest
     | CandidateOffer
+    | Separators
 )
 
 
@@ -369,6 +406,14 @@ def _check_poses(poses: NDArray[np.float64]) -> None:
     norms = np.linalg.norm(poses[:, 3:], axis=1)
     if np.any(np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE) or np.any(np.abs(poses[:, :3]) > COORDINATE_MAX):
         raise ValueError("a correction's poses lie within the map and have unit quaternions")
+
+
+def _check_lifted(poses: NDArray[np.float64]) -> None:
+    """Refuse (N, 4, r) poses that leave the map or whose frames are not orthonormal."""
+    frames = np.clip(poses[:, :3], -2.0, 2.0)
+    gram = frames @ np.swapaxes(frames, 1, 2)
+    if np.any(np.abs(gram - np.eye(3)) > QUATERNION_NORM_TOLERANCE) or np.any(np.abs(poses[:, 3]) > COORDINATE_MAX):
+        raise ValueError("separators lie within the map and have orthonormal frames")
 
 
 _BEAT = integer(0, COUNTER_MAX)
@@ -468,6 +513,18 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     "candidates": (
         CandidateOffer,
         struct(CandidateOffer, pairs=sequence(_PAIR, OFFERS_MAX), transferred=boolean()),
+    ),
+    "separators": (
+        Separators,
+        struct(
+            Separators,
+            anchor=LOG_ID,
+            iteration=COUNT,
+            keyframes=sequence(COUNT, SEPARATORS_MAX),
+            poses=ARRAY,
+            pairs=sequence(_PAIR, OFFERS_MAX),
+            weights=ARRAY,
+        ),
     ),
 }
 _KINDS: dict[type[Message], str] = {cls: kind for kind, (cls, _) in _CODECS.items()}

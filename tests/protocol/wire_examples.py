@@ -15,8 +15,11 @@ from flocc_protocol.messages import (
     HOPS_MAX,
     LOGS_MAX,
     OFFERS_MAX,
+    RANK_MAX,
+    RANK_MIN,
     RECORDS_BATCH_BYTES_MAX,
     RECORDS_BATCH_MAX,
+    SEPARATORS_MAX,
     WANTS_MAX,
     Answer,
     CandidateOffer,
@@ -37,6 +40,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
+    Separators,
 )
 from flocc_protocol.records import (
     REASON_LENGTH_MAX,
@@ -58,6 +62,14 @@ def poses_array(count: int, seed: int = 0) -> Array:
     poses = np.random.default_rng(seed).normal(size=(count, 7))
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     return Array.of(poses, "f4")
+
+
+def lifted_array(count: int, rank: int = 3) -> Array:
+    """(count, 4, rank) float64 relaxed poses: signed unit vectors, then a position; exact in binary."""
+    poses = np.zeros((count, 4, rank))
+    poses[:, :3, :3] = np.diag([1.0, -1.0, 1.0])
+    poses[:, 3] = np.arange(count)[:, None] + 0.5
+    return Array.of(poses, "f8")
 
 
 def descriptor(dimension: int = 512, seed: int = 0) -> Array:
@@ -113,6 +125,14 @@ MESSAGES: tuple[Message, ...] = (
     CorrectionBatch(CORRECTIONS),
     CorrectionRequest((ALICE, BOB)),
     CandidateOffer((CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),), True),
+    Separators(
+        ALICE,
+        17,
+        (3, 8),
+        lifted_array(2),
+        (CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),),
+        Array.of(np.array([0.25])),
+    ),
 )
 ENVELOPES = tuple(Envelope(BOB, message) for message in MESSAGES)
 
@@ -178,6 +198,14 @@ def largest_messages() -> list[Message]:
         CorrectionBatch((correction(0, CORRECTION_KEYFRAMES_MAX),)),
         CorrectionRequest(tuple(_long(k) for k in range(LOGS_MAX))),
         CandidateOffer((CandidatePair(keyframe, other),) * OFFERS_MAX, True),
+        Separators(
+            _long(0),
+            INDEX_MAX,
+            (INDEX_MAX,) * SEPARATORS_MAX,
+            lifted_array(SEPARATORS_MAX, RANK_MAX),
+            (CandidatePair(keyframe, other),) * OFFERS_MAX,
+            Array.of(np.ones(OFFERS_MAX)),
+        ),
     ]
 
 
@@ -299,4 +327,13 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(CorrectionBatch, _tuples(corrections, CORRECTIONS_MAX)),
     st.builds(CorrectionRequest, _tuples(log_ids, LOGS_MAX)),
     st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
+    st.builds(
+        lambda anchor, iteration, n, rank: Separators(
+            anchor, iteration, tuple(range(n)), lifted_array(n, rank), (), Array.of(np.zeros(0))
+        ),
+        log_ids,
+        _counts,
+        st.integers(0, 20),
+        st.integers(RANK_MIN, RANK_MAX),
+    ),
 )
