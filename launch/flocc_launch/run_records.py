@@ -191,6 +191,32 @@ class BytesCounted(Event):
 
     sent: dict[str, int]
     received: dict[str, int]
+    loss: dict[str, float] = {}
+    """Peer in range -> share of its last heartbeats that did not arrive."""
+    queues: dict[str, int] = {}
+    """What waits: events for the core, images for the encoder, candidates for their registration."""
+
+
+class StageCounts(Record):
+    """Histogram of how long a stage took; the buckets are those of `flocc_agent.stages`."""
+
+    counts: list[int]
+    total_s: float
+    max_s: float
+
+
+class AccountKept(Event):
+    """`account`: payload bytes by peer and kind, and time by stage, since this start; the last one counts."""
+
+    since_s: float
+    """When the robot was started, on the run's clock: names the start."""
+    sent_to: dict[str, dict[str, int]]
+    received_from: dict[str, dict[str, int]]
+    lost_from: dict[str, dict[str, int]]
+    """Arrived from a peer, but the emulated radio or a limit kept it away."""
+    repeated_from: dict[str, dict[str, int]]
+    """Of what was received, copies that the emulated radio made."""
+    stages: dict[str, StageCounts]
 
 
 class PeerRefused(Event):
@@ -260,6 +286,7 @@ EVENT_TYPES: Mapping[str, type[Event]] = {
     "optimised": GraphOptimised,
     "correction": CorrectionApplied,
     "bytes": BytesCounted,
+    "account": AccountKept,
     "peer_refused": PeerRefused,
     "duplicate_name": NameTaken,
     "latent_fetched": LatentFetched,

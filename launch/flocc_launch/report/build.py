@@ -7,7 +7,9 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.stages import BOUNDS_S
 from flocc_launch.evaluation import ate_m, relative_pose_error, unaligned_ate_m
+from flocc_launch.report.accounts import links_of, stages_by_robot, stages_of
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import (
     Closures,
@@ -52,6 +54,10 @@ def build(loaded: LoadedRun) -> Report:
         ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
         bytes=total_bytes(by_robot),
         bytes_by_robot=by_robot,
+        links=links_of(loaded.events),
+        stages=stages_of(loaded.events),
+        stages_by_robot=stages_by_robot(loaded.events),
+        stage_bounds_s=list(BOUNDS_S),
         leaders=[
             LeaderSpan(term=span.term, leader=span.leader, from_s=span.from_s, to_s=span.to_s)
             for span in terms_led(loaded.followings)

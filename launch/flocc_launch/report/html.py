@@ -3,7 +3,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-from flocc_launch.report import sections
+from flocc_launch.report import section_accounts, sections
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report
 from flocc_launch.report.svg import element, text_of
@@ -29,6 +29,8 @@ def page(report: Report, loaded: LoadedRun) -> str:
         sections.over_time(report, loaded),
         sections.closures(report, loaded),
         sections.network(report),
+        section_accounts.links(report),
+        section_accounts.stages(report),
         sections.robots(report),
         sections.settings(report, loaded),
         sections.footer(report),

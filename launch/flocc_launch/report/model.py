@@ -3,6 +3,8 @@
 The keys that other programs rely on stand in DESIGN.md section 8, all of them in docs/report.md.
 """
 
+from pydantic import Field
+
 from flocc_launch.run_records import Record
 
 SCHEMA_VERSION = 1
@@ -89,6 +91,44 @@ class RobotBytes(Record):
     received: dict[str, int]
 
 
+class KindBytes(Record):
+    """One kind of message on one link."""
+
+    sent: int | None
+    received: int | None
+
+
+class LinkBytes(Record):
+    """Payload bytes from one robot to another, as both counted them; null where the robot left no account."""
+
+    sender: str
+    receiver: str
+    sent: int | None
+    """Counted by the sender; a broadcast counts on every link that it had then."""
+    received: int | None
+    """Counted by the receiver."""
+    lost: int | None
+    """Counted by the receiver: arrived, but the emulated radio or a limit kept it from the robot."""
+    repeated: int | None
+    """Counted by the receiver: copies that the emulated radio made; they are part of `received`."""
+    unaccounted: int | None
+    """sent + repeated - received - lost: lost by the real network, or on its way at the end."""
+    by_kind: dict[str, KindBytes]
+
+
+class StageTime(Record):
+    """How long one stage of the work took."""
+
+    count: int
+    total_s: float
+    median_s: float
+    """Within its bucket by straight line, as is `p90_s`."""
+    p90_s: float
+    max_s: float
+    counts: list[int]
+    """Per bucket of `stage_bounds_s`, and one more for what took longer."""
+
+
 class Optimisations(Record):
     """What the leaders' solvers did."""
 
@@ -132,6 +172,13 @@ class Report(Record):
     bytes: dict[str, int]
     """Kind -> bytes sent by all robots."""
     bytes_by_robot: dict[str, RobotBytes]
+    links: list[LinkBytes] = Field(default_factory=list)
+    """Payload bytes on every link, as both ends counted them."""
+    stages: dict[str, StageTime] = Field(default_factory=dict)
+    """Stage of the work -> how long it took, all robots together."""
+    stages_by_robot: dict[str, dict[str, StageTime]] = Field(default_factory=dict)
+    stage_bounds_s: list[float] = Field(default_factory=list)
+    """Upper ends of the buckets of all `counts`."""
     leaders: list[LeaderSpan]
     leader_changes: int
     """How often the robots went from one leader to another, the upper median over the robots."""

@@ -22,6 +22,7 @@ def sentences(report: Report) -> list[str]:
         f"leaders       {', '.join(f'{span.leader} (term {span.term})' for span in report.leaders) or 'none'}",
         "",
         *robot_lines(report),
+        *stage_lines(report),
     ]
     lines += [
         f"expected      {e.name} {plain(e.limit)}: {plain(e.value)}, {judged(e.met)}" for e in report.expectations
@@ -32,6 +33,19 @@ def sentences(report: Report) -> list[str]:
 def judged(met: bool | None) -> str:
     """What became of an expectation."""
     return "not measured" if met is None else "met" if met else "MISSED"
+
+
+def stage_lines(report: Report) -> list[str]:
+    """A table of stages, where the run kept account of them."""
+    if not report.stages:
+        return []
+    head = f"{'stage':<14}{'count':>10}{'median, s':>11}{'90 %, s':>10}{'longest':>10}{'together':>10}"
+    rows = [
+        f"{name:<14}{stage.count:>10}{number(stage.median_s):>11}{number(stage.p90_s):>10}{number(stage.max_s):>10}"
+        f"{number(stage.total_s):>10}"
+        for name, stage in report.stages.items()
+    ]
+    return [head, *rows, ""]
 
 
 def robot_lines(report: Report) -> list[str]:

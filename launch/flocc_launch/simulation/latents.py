@@ -51,6 +51,7 @@ class _Fetch:
         self._asker = asker
         self._job = job
         self._life = asker.life
+        self._began_s = fetcher._agenda.now_s
         self._over = False
 
     def ask(self) -> None:
@@ -60,7 +61,7 @@ class _Fetch:
             return
         offset = self._fetcher._progress(self._asker, self._job.keyframe)
         self._fetcher._network.carry(
-            self._asker.name, holder.name, "latent-request", REQUEST_BYTES, lambda: self._serve(holder, offset)
+            self._asker.name, holder.name, "latent-request", 0, REQUEST_BYTES, lambda: self._serve(holder, offset)
         )
         self._fetcher._agenda.after(PIECE_TIMEOUT_S, lambda: self._ask_again(offset))
 
@@ -72,18 +73,29 @@ class _Fetch:
         if self._fetcher._progress(self._asker, self._job.keyframe) == offset:
             self.ask()
 
-    def _serve(self, holder: Station, offset: int) -> None:
-        """At the holder: send a piece, or say that it is not there."""
+    def _serve(self, holder: Station, offset: int) -> bool:
+        """At the holder: send a piece, or say that it is not there. Whether the holder is switched on."""
         if not holder.running:
-            return
+            return False
         latent = holder.disk.latents.get(self._job.keyframe)
         size = 0 if latent is None else min(PIECE_BYTES, len(latent) - offset)
         self._fetcher._network.carry(
-            holder.name, self._asker.name, "latent", REQUEST_BYTES + size, lambda: self._take(latent, offset, size)
+            holder.name,
+            self._asker.name,
+            "latent",
+            size,
+            REQUEST_BYTES + size,
+            lambda: self._arrived(latent, offset, size),
         )
+        return True
+
+    def _arrived(self, latent: bytes | None, offset: int, size: int) -> bool:
+        """At the asker: keep a piece, and ask for the next. Whether the asker is switched on."""
+        running = self._asker.running
+        self._take(latent, offset, size)
+        return running
 
     def _take(self, latent: bytes | None, offset: int, size: int) -> None:
-        """At the asker: keep a piece, and ask for the next."""
         fetcher, keyframe = self._fetcher, self._job.keyframe
         if self._dead() or fetcher._progress(self._asker, keyframe) != offset:
             return
@@ -96,6 +108,7 @@ class _Fetch:
             return
         fetcher._arrived.pop((self._asker.name, keyframe), None)
         self._asker.disk.put_latent(keyframe, latent)
+        self._asker.workers.stages.observe("fetch", fetcher._agenda.now_s - self._began_s)
         self._finish(LatentFetched(keyframe, self._job.holder))
 
     def _dead(self) -> bool:

@@ -142,10 +142,12 @@ class Station:
         T_odom_camera = capture.T_odom_body @ self.playback.T_body_camera
         self.handle(KeyframeCaptured(capture.stamp_s, pose7(T_odom_camera), number))
 
-    def receive(self, envelope: Envelope) -> None:
-        """A message arrived."""
-        if self.core is not None:
-            self.handle(MessageReceived(envelope))
+    def receive(self, envelope: Envelope) -> bool:
+        """A message arrived; whether the robot was switched on."""
+        if self.core is None:
+            return False
+        self.handle(MessageReceived(envelope))
+        return True
 
     def handle(self, event: Event) -> None:
         """Let the core know, and carry out what it wants."""

@@ -7,6 +7,7 @@ from flocc_agent.composition import build_optimiser, build_perception
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
+from flocc_agent.stages import fields_of
 from flocc_launch.expectations import check_measurable
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
@@ -127,6 +128,8 @@ def _write_robot(folder: RunFolder, swarm: Swarm, name: str) -> None:
     if traffic is not None:
         fields = {"sent": dict(sorted(traffic.sent.items())), "received": dict(sorted(traffic.received.items()))}
         swarm.report(name, "bytes", fields)
+    links, stages = swarm.network.links.tables(name), fields_of(station.workers.stages.snapshot())
+    swarm.report(name, "account", {"since_s": 0.0, **links, "stages": stages})
     if station.core is not None:
         fields = result_of(station.core, station.playback.T_body_camera, station.solution)
         folder.write_result(RobotResult.model_validate(fields))

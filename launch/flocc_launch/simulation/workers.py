@@ -26,6 +26,7 @@ from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.stages import StageTimes
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.playback import Capture
 from flocc_protocol.arrays import Array
@@ -64,10 +65,12 @@ class Workers:
 
     Attributes:
         slowness: Factor on every duration.
+        stages: How long what was asked of them takes, on virtual time.
     """
 
     def __init__(self, eyes: Eyes, optimiser: Optimiser, times: WorkTimes, rng: np.random.Generator) -> None:
         self.slowness = 1.0
+        self.stages = StageTimes()
         self._eyes = eyes
         self._optimiser = optimiser
         self._times = times
@@ -76,16 +79,17 @@ class Workers:
 
     def encoded_at_s(self, now_s: float) -> float:
         """When the encoder, which takes one image after the other, is done with one more."""
-        self._encoder_free_s = max(now_s, self._encoder_free_s) + self._lasts(self._times.encode_s)
+        self.stages.observe("encode_wait", max(self._encoder_free_s - now_s, 0.0))
+        self._encoder_free_s = max(now_s, self._encoder_free_s) + self._lasts("encode", self._times.encode_s)
         return self._encoder_free_s
 
     def registered_at_s(self, now_s: float) -> float:
         """When a registration that starts now is done."""
-        return now_s + self._lasts(self._times.register_s)
+        return now_s + self._lasts("register", self._times.register_s)
 
     def optimised_at_s(self, now_s: float) -> float:
         """When an optimisation that starts now is done."""
-        return now_s + self._lasts(self._times.optimise_s)
+        return now_s + self._lasts("optimise", self._times.optimise_s)
 
     def restart(self) -> None:
         """Forget the queue."""
@@ -128,5 +132,7 @@ class Workers:
             return GraphOptimisationFailed(job.term, job.round, solution.reason)
         return GraphOptimised(job.term, job.round, replace(solution, solve_s=0.0, timings_s={}))
 
-    def _lasts(self, typical_s: float) -> float:
-        return self.slowness * typical_s * float(self._rng.uniform(0.5, 1.5))
+    def _lasts(self, stage: str, typical_s: float) -> float:
+        lasts_s = self.slowness * typical_s * float(self._rng.uniform(0.5, 1.5))
+        self.stages.observe(stage, lasts_s)
+        return lasts_s
