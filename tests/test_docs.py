@@ -2,46 +2,126 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from tests.doc_commands import ROOT, SHELL, blocks, command_lines, complaint, parsed_commands, runnable, script
+from tests.doc_props import write_bag, write_own_data
 
 from flocc_launch.config_reference import reference
 
-ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "protocol/README.md", ROOT / "agent/README.md"])
-SHELL_BLOCK = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
-QUICK = ("flocc simulate", "flocc doctor", "flocc evaluate", "flocc launch", "flocc dataset", "flocc optimise")
+LIVE = re.compile(r"^flocc (launch|demo|agent|experiment)\b|^python examples/", re.M)
 
 
-def commands(page: Path) -> list[str]:
-    """Commands of flocc in a page's shell blocks, without comments; lines with placeholders are not commands."""
-    lines = [
-        line.split("  #")[0].strip() for block in SHELL_BLOCK.findall(page.read_text()) for line in block.splitlines()
+def page_id(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def run_pages() -> list[object]:
+    """Pages with something to run; those that start agents are tests of live swarms."""
+    marks = {True: [pytest.mark.swarm, pytest.mark.slow], False: []}
+    scripts = {page: script(page) for page in PAGES}
+    return [
+        pytest.param(page, marks=marks[bool(LIVE.search(text))], id=page_id(page))
+        for page, text in scripts.items()
+        if text
     ]
-    return [line for line in lines if line.startswith(QUICK) and not re.search(r"[A-Z]{3,}|<|\.\.\.|path/to", line)]
+
+
+@pytest.fixture(scope="session")
+def props(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the pages' commands find in their folder, and a cache for what they generate."""
+    folder = tmp_path_factory.mktemp("props")
+    write_own_data(folder / "my_data")
+    for name in ("rover", "drone"):
+        shutil.copytree(folder / "my_data", folder / "my_robots" / name)
+    write_bag(folder / "run.bag")
+    return folder
+
+
+def in_shell(text: str, folder: Path, cache: Path) -> subprocess.CompletedProcess[str]:
+    """Run a script with the installed programs, stopping at the first command that fails."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "FLOCC_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        ["bash", "-euo", "pipefail", "-x", "-c", text],
+        cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=240,
+    )  # fmt: skip
 
 
 def test_the_configuration_reference_is_generated_from_the_models() -> None:
     assert (ROOT / "docs/configuration.md").read_text(encoding="utf-8") == reference()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_every_link_leads_somewhere(page: Path) -> None:
     links = [link for link in LINK.findall(page.read_text(encoding="utf-8")) if "://" not in link]
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
-@pytest.mark.swarm
-@pytest.mark.slow
-def test_the_commands_of_the_readme_run(tmp_path: Path) -> None:
-    found = commands(ROOT / "README.md")
-    assert len(found) >= 5
-    environment = {**os.environ, "FLOCC_CACHE": str(tmp_path / "cache")}
-    for command in found:
-        arguments = [sys.executable, "-m", "flocc_launch.cli", *command.split()[1:]]
-        ran = subprocess.run(arguments, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert ran.returncode == 0, f"{command}: {ran.stdout}{ran.stderr}"
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_every_command_is_known_with_its_options(page: Path) -> None:
+    complaints = {command: complaint(command) for command in parsed_commands(page)}
+    assert {command: why for command, why in complaints.items() if why is not None} == {}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_every_block_is_run_or_says_why_not(page: Path) -> None:
+    shell = [block for block in blocks(page) if block.language in SHELL and block.why_not is None]
+    foreign = [line for block in shell for line in command_lines(block.text) if not runnable(line)]
+    assert foreign == [], "mark the block: <!-- not run: why --> on the line above its fence"
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("page", run_pages())
+def test_the_commands_of_a_page_run(page: Path, props: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(props, tmp_path / "folder"))
+    (folder / "examples").symlink_to(ROOT / "examples")
+    ran = in_shell(script(page), folder, props.parent / "cache")
+    assert ran.returncode == 0, f"{ran.stdout[-2000:]}\n{ran.stderr[-3000:]}"
+
+
+@pytest.mark.parametrize(
+    ("command", "why"),
+    [
+        ("flocc lunch meeting", "no command 'lunch'"),
+        ("flocc dataset konvert x", "no command 'konvert'"),
+        ("flocc launch meeting --losss 0.1", "no option --losss"),
+        ("flocc launch SCENARIO --losss 0.1", "no option --losss"),
+        ("flocc dataset convert path/to/data", "Missing parameter: out"),
+        ("flocc launch meeting --seed four", "not a valid|valid integer"),
+        ("python -m flocc_launch.nothing", "there is no module"),
+        ("python -m flocc_launch.reliability idle --runz 3", "no option --runz"),
+        ("make tset", "no target tset"),
+        ("rosrun flocc", "not a program"),
+    ],
+)
+def test_a_wrong_command_is_noticed(command: str, why: str) -> None:
+    assert re.search(why, complaint(command) or "fine")
+
+
+def test_a_right_command_passes() -> None:
+    for command in ("flocc launch ... --dashboard 8080", "flocc dataset info | convert", "make test", "flocc --help"):
+        assert complaint(command) is None
+
+
+def test_blocks_are_found_with_what_keeps_them_from_running(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```sh\nflocc doctor  # fine\n```\n\n<!-- not run: needs a GPU -->\n```bash\nflocc weights \\\n  status\n```\n"
+        "`flocc keys FOLDER` and\n```toml\n# robot.toml\nname = 'r1'\n```\n```\nflocc status RUN   shows it\n```\n"
+    )
+    assert [(block.language, block.why_not) for block in blocks(page)] == [
+        ("sh", None), ("bash", "needs a GPU"), ("toml", None), ("", None),
+    ]  # fmt: skip
+    assert script(page) == "flocc doctor  # fine\n\ncat > robot.toml <<'END'\n# robot.toml\nname = 'r1'\nEND\n"
+    assert parsed_commands(page) == ["flocc keys FOLDER", "flocc weights status", "flocc status RUN"]
+
+
+def test_a_script_stops_at_the_first_command_that_fails(tmp_path: Path) -> None:
+    assert in_shell("false\necho on", tmp_path, tmp_path).stdout == ""

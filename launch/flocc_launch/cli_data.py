@@ -28,12 +28,10 @@ def add_data(app: typer.Typer) -> None:
 def info(source: Source, format_name: Format = None) -> None:
     """Say what a data set holds, without writing anything."""
     from flocc_launch.datasets.commands import info as look
+    from flocc_launch.datasets.commands import info_lines
 
-    found = look(source, format_name)
-    for field in fields(found):
-        value = getattr(found, field.name)
-        shown = "not known" if value is None else "none" if value == () else value
-        typer.echo(f"{field.name.replace('_', ' '):16} {shown}")
+    for name, value in info_lines(look(source, format_name)):
+        typer.echo(f"{name:14} {value}")
 
 
 @dataset.command()

@@ -36,8 +36,8 @@ def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str
         made = _tracks(scenario.tracks)
     found = {f"r{i + 1}": path for i, path in enumerate(made)}
     given = {
-        name: _recording(robot.recording, progress)
-        for name, robot in scenario.robots.items()
+        name: _recording(robot.recording, progress, seed)
+        for seed, (name, robot) in enumerate(scenario.robots.items())
         if robot.recording is not None
     }
     return {**found, **given}
@@ -61,13 +61,16 @@ def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
     return split(source, out, dataset.robots, seed=dataset.seed, progress=progress)
 
 
-def _recording(path: Path, progress: Progress | None) -> Path:
-    """The folder itself where it is a recording, else one made of the data set or bag."""
-    from flocc_launch.datasets.commands import convert
+def _recording(path: Path, progress: Progress | None, seed: int = 0) -> Path:
+    """The folder itself where it is a recording, else one made of the data set or bag; `seed` is that of drift."""
+    from flocc_launch.datasets.bag_reader import is_bag
+    from flocc_launch.datasets.commands import convert, needed_drift
+    from flocc_launch.datasets.detect import read_source
 
     if all((path / name).exists() for name in RECORDING_FILES):
         return path
-    return convert(path, _dataset_folder(path.resolve(), "whole"), progress=progress)
+    drift = None if is_bag(path) else needed_drift(read_source(path))
+    return convert(path, _dataset_folder(path.resolve(), f"whole {seed}"), drift=drift, seed=seed, progress=progress)
 
 
 def _dataset_folder(source: Path, how: str) -> Path:

@@ -8,8 +8,10 @@ import statistics
 from pathlib import Path
 
 from flocc_launch.datasets.bag_reader import is_bag
-from flocc_launch.datasets.detect import detect_format, read_source
+from flocc_launch.datasets.commands import needed_drift
+from flocc_launch.datasets.detect import detect_format, is_dataset, read_source
 from flocc_launch.datasets.source import DatasetError
+from flocc_launch.scenario import Scenario
 
 ROBOTS = 3
 ROBOTS_MAX = 16
@@ -35,7 +37,7 @@ def scenario_fields(path: Path, agents: int | None = None) -> dict[str, object]:
         DatasetError: There is no data set, or one of them cannot be used.
     """
     fields: dict[str, object] = {"name": robot_name(path)}
-    if is_bag(path) or _is_dataset(path):
+    if is_bag(path) or is_dataset(path):
         fields["dataset"] = {"source": str(path.resolve()), "robots": agents or ROBOTS}
         return {**fields, **_keyframes([path], agents or ROBOTS)}
     found = _robots(path)
@@ -43,6 +45,19 @@ def scenario_fields(path: Path, agents: int | None = None) -> dict[str, object]:
         raise DatasetError(f"{path}: holds {len(found)} robots ({', '.join(found)}), not {agents}")
     fields["robots"] = {name: {"recording": str(folder.resolve())} for name, folder in found.items()}
     return {**fields, **_keyframes(list(found.values()), 1)}
+
+
+def sentence(scenario: Scenario) -> str:
+    """What was made of the data, for whoever gave it without a scenario."""
+    dataset = scenario.dataset
+    if dataset is not None:
+        taken, paths = f"{dataset.source} cut by time into {dataset.robots} robots", [dataset.source]
+    else:
+        taken = f"{len(scenario.robots)} robots: {', '.join(scenario.robots)}"
+        paths = [robot.recording for robot in scenario.robots.values() if robot.recording is not None]
+    made = any(not is_bag(path) and needed_drift(read_source(path)) is not None for path in paths)
+    odometry = "made of ground truth, with seeded drift" if made else "the data's own"
+    return f"data: {taken}; a keyframe every {scenario.keyframes.distance_m:g} m; odometry is {odometry}"
 
 
 def robot_name(path: Path) -> str:
@@ -54,7 +69,7 @@ def robot_name(path: Path) -> str:
 def _robots(path: Path) -> dict[str, Path]:
     """Data sets and bags in a folder, by the robot's name."""
     entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
-    folders = [entry for entry in entries if is_bag(entry) or (entry.is_dir() and _is_dataset(entry))]
+    folders = [entry for entry in entries if is_bag(entry) or (entry.is_dir() and is_dataset(entry))]
     if not folders:
         detect_format(path)  # says what a data set is
     if len(folders) > ROBOTS_MAX:
@@ -66,14 +81,6 @@ def _robots(path: Path) -> dict[str, Path]:
             raise DatasetError(f"{folder}: its robot would be called {name}, as that of {found[name]}")
         found[name] = folder
     return found
-
-
-def _is_dataset(path: Path) -> bool:
-    try:
-        detect_format(path)
-    except DatasetError:
-        return False
-    return True
 
 
 def _keyframes(paths: list[Path], parts: int) -> dict[str, object]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flocc_agent.config import ConfigError
-from flocc_launch.own_data import is_own_data, scenario_fields
+from flocc_launch.own_data import is_own_data, scenario_fields, sentence
 from flocc_launch.scenario import Scenario
 
 FOLDER = Path(__file__).parent / "scenarios"
@@ -38,9 +38,9 @@ def read_scenario(text: str, changes: Mapping[str, object], agents: int | None =
     Raises:
         ConfigError: It cannot be read, or it has no robots that could be counted anew.
     """
-    if text not in names() and is_own_data(Path(text)):
+    if _is_own_data(text):
         return Scenario.of(scenario_fields(Path(text), agents), changes, Path(text))
-    read = Scenario.read if Path(text).suffix == ".toml" or Path(text).exists() else None
+    read = Scenario.read if Path(text).suffix == ".toml" or Path(text).is_file() else None
     scenario = read(Path(text), changes) if read else read_shipped(text, changes)
     if agents is None:
         return scenario
@@ -49,3 +49,12 @@ def read_scenario(text: str, changes: Mapping[str, object], agents: int | None =
         raise ConfigError(f"{text}: its robots are listed one by one; --agents cannot change their number")
     counted = {**changes, f"{source}.robots": agents}
     return read(Path(text), counted) if read else read_shipped(text, counted)
+
+
+def own_data_sentence(text: str, scenario: Scenario) -> str | None:
+    """What was made of the user's own data, or None where a scenario was named."""
+    return sentence(scenario) if _is_own_data(text) else None
+
+
+def _is_own_data(text: str) -> bool:
+    return text not in names() and is_own_data(Path(text))

@@ -1,5 +1,6 @@
 """What `flocc dataset info | convert | split` do: look at a data set, turn it into recordings, cut it into robots."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,8 +71,31 @@ def info(path: Path, format_name: str | None = None) -> Info:
         odometry_poses=len(source.odometry) if source.odometry else None,
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
-        faults=source.faults if source.lens else (*source.faults, f"{path}: intrinsics are missing"),
+        faults=(*source.faults, *_missing(source)),
     )
+
+
+def _missing(source: Source) -> list[str]:
+    """What a recording needs and the data set does not have."""
+    motion, lens = source.odometry or source.truth, source.lens
+    lacks = f"{source.path}: has neither odometry nor ground truth ({expected_files(source.path)})"
+    return [*([] if motion else [lacks]), *([] if lens else [f"{source.path}: intrinsics are missing"])]
+
+
+def info_lines(found: Info) -> Iterator[tuple[str, str]]:
+    """Yield names and values of what was found, for people."""
+    camera, poses = found.camera, {"odometry": found.odometry_poses, "ground truth": found.truth_poses}
+    yield "path", str(found.path)
+    yield "format", found.format
+    yield "images", f"{found.images}, from {found.from_s:.3f} s to {found.to_s:.3f} s"
+    if found.format == "bag":
+        yield from (("topic", topic) for topic in found.topics)
+    else:
+        size = None if camera is None else f"{camera.width}x{camera.height}, fx {camera.fx:g} fy {camera.fy:g}"
+        yield "camera", size or "none"
+        yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
+        yield "length", "not known" if found.length_m is None else f"{found.length_m:.1f} m"
+    yield from (("fault", fault) for fault in found.faults)
 
 
 def _bag_info(path: Path) -> Info:
@@ -156,15 +180,15 @@ def split(
 ) -> list[Path]:
     """Cut one data set by time into recordings of several robots, which then run at the same time.
 
-    Every part starts at 0 s, with its odometry at the identity. Where the data set has ground truth, odometry is made
-    from it with seeded drift.
+    Every part starts at 0 s, with its odometry at the identity. A data set without odometry gets it from its ground
+    truth, with seeded drift.
 
     Args:
         path: The data set, or a recording.
         out: Gets one folder per robot: alpha, bravo, charlie.
         robots: How many parts.
         seed: Of the drift; each robot has its own.
-        drift: How odometry departs from the truth; None takes `HANDHELD_DRIFT`.
+        drift: Makes odometry from the ground truth; None takes the data set's own, else `HANDHELD_DRIFT`.
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
@@ -184,11 +208,16 @@ def split(
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, None, (drift or HANDHELD_DRIFT) if part.truth else None, rng)
+        moved = _odometry(part, None, drift or needed_drift(part), rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
+
+
+def needed_drift(source: Source) -> DriftSpec | None:
+    """How odometry is made of ground truth where a data set has none of its own."""
+    return HANDHELD_DRIFT if source.odometry is None and source.truth is not None else None
 
 
 def _odometry(source: Source, odometry: Path | None, drift: DriftSpec | None, rng: np.random.Generator) -> Trajectory:
@@ -204,7 +233,7 @@ def _odometry(source: Source, odometry: Path | None, drift: DriftSpec | None, rn
     if found is None:
         raise DatasetError(
             f"{source.path}: has neither odometry nor ground truth ({expected_files(source.path)}); "
-            "name a TUM file with --odometry"
+            "name a TUM file with flocc dataset convert --odometry"
         )
     return found.relative_to_first()
 

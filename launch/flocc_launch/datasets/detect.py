@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from flocc_agent.runtime.trajectory import NEAR_S, Trajectory
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.folders import (
@@ -13,6 +15,7 @@ from flocc_launch.datasets.folders import (
     read_tum_rgbd,
 )
 from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.pixels import is_image
 from flocc_launch.datasets.plain import is_plain, read_plain, time_unit
 from flocc_launch.datasets.source import DatasetError, Source
 
@@ -33,6 +36,25 @@ def detect_format(path: Path) -> str:
     """
     if not path.exists():
         raise DatasetError(f"{path}: does not exist")
+    known = _known_format(path)
+    if known is not None:
+        return known
+    if is_bag(path):
+        raise DatasetError(f"{path}: is a bag; make a recording of it first: flocc dataset convert")
+    inside = [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry)] if path.is_dir() else []
+    raise DatasetError(
+        f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
+        "(odometry.tum or groundtruth.tum) and camera.yaml"
+        + (f"; inside of it, {', '.join(inside[:8])} would be" if inside else "")
+    )
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a reader knows what a folder is."""
+    return path.is_dir() and _known_format(path) is not None
+
+
+def _known_format(path: Path) -> str | None:
     if (path / "mav0").is_dir() or (path / "cam0" / "data").is_dir():
         return "euroc"
     if any((path / name).is_dir() for name in ("image_0", "image_l", "image_2")):
@@ -41,14 +63,7 @@ def detect_format(path: Path) -> str:
         return "7scenes"
     if (path / "rgb.txt").exists() and (path / "groundtruth.txt").exists():
         return "tum"
-    if is_bag(path):
-        raise DatasetError(f"{path}: is a bag; make a recording of it first: flocc dataset convert")
-    if is_plain(path):
-        return "plain"
-    raise DatasetError(
-        f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
-        "(odometry.tum or groundtruth.tum) and camera.yaml"
-    )
+    return "plain" if not is_bag(path) and is_plain(path) else None
 
 
 def read_source(path: Path, format_name: str | None = None, camera: Path | None = None) -> Source:
@@ -65,11 +80,23 @@ def read_source(path: Path, format_name: str | None = None, camera: Path | None 
     name = format_name or detect_format(path)
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
-    source = READERS[name](path)
+    source = _images_only(READERS[name](path))
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None:
             check_times(source, trajectory)
     return source if camera is None else replace(source, lens=read_lens(camera))
+
+
+def _images_only(source: Source) -> Source:
+    """The source without files that are no images, with a fault where there are any."""
+    good = tuple((stamp_s, file) for stamp_s, file in source.images if is_image(file))
+    broken = [file for _, file in source.images if not is_image(file)] if len(good) < len(source.images) else []
+    if not broken:
+        return source
+    fault = f"{broken[0]}: is no image" + (f" (and {len(broken) - 1} others)" if len(broken) > 1 else "")
+    if not good:
+        raise DatasetError(fault)
+    return replace(source, images=good, faults=(*source.faults, f"{fault} of a known kind, and was left out"))
 
 
 def check_times(source: Source, trajectory: Trajectory, where: Path | None = None) -> None:
@@ -82,10 +109,16 @@ def check_times(source: Source, trajectory: Trajectory, where: Path | None = Non
     if any(first_s - NEAR_S <= stamp_s <= last_s + NEAR_S for stamp_s, _ in source.images):
         return
     from_s, to_s = source.images[0][0], source.images[-1][0]
-    unit = time_unit(last_s - first_s, to_s - from_s)
-    seconds = unit in (None, "seconds")
     raise DatasetError(
-        f"{where or source.path}: the trajectory is from {first_s:.6g} s to {last_s:.6g} s, but the images are from "
-        f"{from_s:.6g} s to {to_s:.6g} s, so none of them has a pose; "
-        + ("both must be of one clock" if seconds else f"the trajectory's stamps look like {unit}, not seconds")
+        f"{where or source.path}: the trajectory is from {first_s:.3f} s to {last_s:.3f} s, but the images are from "
+        f"{from_s:.3f} s to {to_s:.3f} s, so none of them has a pose; " + _what_stamps_look_like(source, trajectory)
     )
+
+
+def _what_stamps_look_like(source: Source, trajectory: Trajectory) -> str:
+    steps_s = np.diff(trajectory.stamps_s)
+    if len(trajectory) >= len(source.images) and np.all(steps_s == 1.0):
+        return "the trajectory's stamps look like numbers of images, not seconds"
+    unit = time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
+    known = unit not in (None, "seconds")
+    return f"the trajectory's stamps look like {unit}, not seconds" if known else "both must be of one clock"

@@ -9,6 +9,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_launch.datasets.source import DatasetError, Lens
 
 JPEG_QUALITY = 95
+MAGIC = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"P5", b"P6", b"BM", b"II*\0", b"MM\0*")
 
 
 def read_bytes(file: Path) -> bytes:
@@ -35,6 +36,15 @@ def decoded(encoded: bytes, where: str) -> NDArray[np.uint8]:
     if pixels is None:
         raise DatasetError(f"{where}: the image cannot be read: it is damaged or of an unknown format")
     return np.asarray(pixels, dtype=np.uint8)
+
+
+def is_image(file: Path) -> bool:
+    """Whether a file begins as an image does; one that is cut off further on is not noticed."""
+    try:
+        with file.open("rb") as opened:
+            return opened.read(8).startswith(MAGIC)
+    except OSError:
+        return False
 
 
 def image_size(file: Path) -> tuple[int, int]:

@@ -234,7 +234,7 @@ def _checked_lens(source: Source) -> Lens:
     if source.lens is None:
         raise DatasetError(
             f"{source.path}: intrinsics are missing; put a camera.toml or camera.yaml with width, height, fx, fy, cx, "
-            "cy and distortion there, or name such a file with --camera"
+            "cy and distortion there, or name such a file with flocc dataset ... --camera"
         )
     camera = source.lens.camera
     width, height = image_size(source.images[0][1])

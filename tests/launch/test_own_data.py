@@ -1,0 +1,204 @@
+"""A user's own folder runs without a scenario file, and the mistakes that people make with one are said."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from tests.doc_props import IMAGES, PASSES, write_own_data
+from tests.launch.bag_fixtures import walking
+
+from flocc_agent.config import ConfigError
+from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_launch.data import recordings
+from flocc_launch.datasets.commands import convert, split
+from flocc_launch.datasets.detect import detect_format, read_source
+from flocc_launch.datasets.source import DatasetError
+from flocc_launch.shipped import own_data_sentence, read_scenario
+
+COUNT = IMAGES * PASSES
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_own_data(tmp_path_factory.mktemp("own") / "my_data")
+
+
+@pytest.fixture
+def own(pristine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to spoil; generated data goes into the test's own cache."""
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    return Path(shutil.copytree(pristine, tmp_path / "my_data"))
+
+
+def restamp(folder: Path, scale: float, offset_s: float = 0.0) -> None:
+    truth = read_tum(folder / "groundtruth.txt")
+    write_tum(folder / "groundtruth.txt", Trajectory(truth.stamps_s * scale + offset_s, truth.T_fixed_body))
+
+
+def rename(folder: Path, name: str) -> None:
+    """Name the images by their number, in a form such as `img_{}.jpg`."""
+    for k, file in enumerate(sorted((folder / "images").iterdir()), start=1):
+        file.rename(folder / "images" / name.format(k))
+
+
+def test_one_data_set_is_cut_into_robots(own: Path) -> None:
+    scenario = read_scenario(str(own), {"seed": 4}, agents=2)
+    assert (scenario.name, scenario.names(), scenario.seed) == ("my_data", ["r1", "r2"], 4)
+    paths = recordings(scenario)
+    assert [len(Recording.open(path).frames) for path in paths.values()] == [COUNT // 2, COUNT // 2]
+
+
+def test_keyframes_are_closer_where_robots_move_little(own: Path) -> None:
+    keyframes = read_scenario(str(own), {}).keyframes
+    assert keyframes.distance_m == pytest.approx(PASSES * 4.0 / 3 / 25, abs=0.01)
+    assert "a keyframe every 0.16" in str(own_data_sentence(str(own), read_scenario(str(own), {})))
+
+
+def test_a_folder_of_data_sets_is_a_robot_each(own: Path, tmp_path: Path) -> None:
+    team = tmp_path / "team"
+    shutil.copytree(own, team / "Robot A")
+    walking(True, count=4).write(team / "husky.bag")
+    (team / "notes").mkdir()
+    scenario = read_scenario(str(team), {})
+    assert scenario.names() == ["husky", "robot-a"]
+    frames = {name: len(Recording.open(path).frames) for name, path in recordings(scenario).items()}
+    assert frames == {"husky": 4, "robot-a": COUNT}
+
+
+def test_a_bag_is_cut_into_robots(own: Path, tmp_path: Path) -> None:
+    scenario = read_scenario(str(walking(True, count=6).write(tmp_path / "run.bag")), {}, agents=2)
+    assert [len(Recording.open(path).frames) for path in recordings(scenario).values()] == [3, 3]
+
+
+def test_robots_that_are_there_are_not_counted_anew(own: Path, tmp_path: Path) -> None:
+    shutil.copytree(own, tmp_path / "team" / "a")
+    with pytest.raises(DatasetError, match=r"team: holds 1 robots \(a\), not 3"):
+        read_scenario(str(tmp_path / "team"), {}, agents=3)
+
+
+def test_two_folders_of_one_name_are_refused(own: Path, tmp_path: Path) -> None:
+    for name in ("R1", "r1"):
+        shutil.copytree(own, tmp_path / "team" / name)
+    with pytest.raises(DatasetError, match=r"r1: its robot would be called r1, as that of .*R1"):
+        read_scenario(str(tmp_path / "team"), {})
+
+
+def test_a_folder_of_nothing_says_what_a_data_set_is(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"none of the known data sets .* a plain one has images/"):
+        read_scenario(str(tmp_path), {})
+    with pytest.raises(ConfigError, match="neither a file nor a shipped scenario"):
+        read_scenario(str(tmp_path / "nothing"), {})
+
+
+def test_a_folder_beside_does_not_hide_a_shipped_scenario(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(own.parent)
+    own.rename("meeting")
+    assert read_scenario("meeting", {}).tracks is not None
+
+
+def test_data_that_was_mended_is_read_anew(own: Path) -> None:
+    scenario = read_scenario(str(own), {}, agents=1)
+    first = recordings(scenario)["r1"]
+    restamp(own, 1.0, 0.125)
+    assert recordings(scenario)["r1"] != first
+
+
+def test_own_odometry_is_taken_where_there_is_ground_truth_too(own: Path, tmp_path: Path) -> None:
+    truth = read_tum(own / "groundtruth.txt")
+    stretched = truth.T_fixed_body.copy()
+    stretched[:, :3, 3] *= 1.1
+    write_tum(own / "odometry.tum", Trajectory(truth.stamps_s, stretched))
+    first = Recording.open(split(own, tmp_path / "out", 3)[0])
+    assert first.truth is not None
+    assert read_tum(first.path / "odometry.tum").length_m() == pytest.approx(1.1 * first.truth.length_m(), rel=1e-6)
+
+
+def test_images_beside_the_trajectory_are_a_plain_folder(own: Path) -> None:
+    for file in (own / "images").iterdir():
+        file.rename(own / file.name)
+    (own / "images").rmdir()
+    assert detect_format(own) == "plain"
+    assert len(read_source(own).images) == COUNT
+
+
+def test_numbered_images_are_taken_in_the_order_of_their_numbers(own: Path) -> None:
+    rename(own, "My Photo ({}).jpg")
+    names = [file.name for _, file in read_source(own).images]
+    assert names[:2] == ["My Photo (1).jpg", "My Photo (2).jpg"]
+    assert names[-1] == f"My Photo ({COUNT}).jpg"
+
+
+@pytest.mark.parametrize(
+    ("stem", "stamp_s"),
+    [
+        ("1700000000.25", 1700000000.25),
+        ("1700000000", 1700000000.0),
+        ("left_1700000000250", 1700000000.25),
+        ("1700000000250000", 1700000000.25),
+        ("cam0_1700000000250000000", 1700000000.25),
+    ],
+)
+def test_the_unit_of_a_stamp_in_a_name_follows_from_its_digits(own: Path, stem: str, stamp_s: float) -> None:
+    first = next(iter(sorted((own / "images").iterdir())))
+    for file in (own / "images").iterdir():
+        if file != first:
+            file.unlink()
+    first.rename(own / "images" / f"{stem}.jpg")
+    assert [found_s for found_s, _ in read_source(own).images] == [pytest.approx(stamp_s, abs=1e-6)]
+
+
+def test_two_images_of_one_stamp_are_said(own: Path) -> None:
+    shutil.copyfile(own / "images" / "1700000000.000000.jpg", own / "images" / "b_1700000000.000000.jpg")
+    with pytest.raises(DatasetError, match=r"b_1700000000.000000.jpg: has the stamp of another image"):
+        read_source(own)
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset_s", "sentence"),
+    [
+        (1e3, 0.0, "look like milliseconds, not seconds"),
+        (1e9, 0.0, "look like nanoseconds, not seconds"),
+        (1.0, -1.6e9, "both must be of one clock"),
+        (4.0, -6.8e9, "look like numbers of images, not seconds"),
+    ],
+)
+def test_a_trajectory_of_another_time_is_said(own: Path, scale: float, offset_s: float, sentence: str) -> None:
+    restamp(own, scale, offset_s)
+    with pytest.raises(DatasetError, match=f"so none of them has a pose; .*{sentence}"):
+        read_source(own)
+
+
+def test_odometry_beside_the_folder_must_be_of_its_time(own: Path, tmp_path: Path) -> None:
+    shutil.copyfile(own / "groundtruth.txt", tmp_path / "vio.tum")
+    lines = [line.split(" ", 1)[1] for line in (tmp_path / "vio.tum").read_text().splitlines()]
+    (tmp_path / "vio.tum").write_text("".join(f"{k * 0.25} {line}\n" for k, line in enumerate(lines)))
+    with pytest.raises(DatasetError, match=r"vio.tum: the trajectory is from 0.000 s to 14.750 s, but the images"):
+        convert(own, tmp_path / "out", odometry=tmp_path / "vio.tum")
+
+
+def test_one_image_fewer_than_poses_is_no_fault_where_names_are_stamps(own: Path, tmp_path: Path) -> None:
+    sorted((own / "images").iterdir())[30].unlink()
+    assert len(Recording.open(convert(own, tmp_path / "out")).frames) == COUNT - 1
+
+
+def test_one_numbered_image_fewer_than_poses_is_said(own: Path, tmp_path: Path) -> None:
+    rename(own, "img_{}.jpg")
+    (own / "images" / "img_7.jpg").unlink()
+    with pytest.raises(DatasetError, match=r"has 59 images, but the trajectory has 60 poses; name images by their st"):
+        convert(own, tmp_path / "out")
+
+
+def test_what_is_no_image_is_left_out_and_said(own: Path, tmp_path: Path) -> None:
+    (own / "images" / "1700000001.000000.jpg").write_bytes(b"404 not found")
+    with pytest.raises(
+        DatasetError, match=r"1700000001.000000.jpg: is no image .* the 59 images that are good were ke"
+    ):
+        convert(own, tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out").frames) == COUNT - 1
+
+
+def test_no_trajectory_is_said_with_the_names_that_it_could_have(own: Path, tmp_path: Path) -> None:
+    (own / "groundtruth.txt").rename(own / "KeyFrameTrajectory.txt")
+    with pytest.raises(DatasetError, match=r"neither odometry nor ground truth \(odometry, trajectory, .* looked for"):
+        convert(own, tmp_path / "out")
