@@ -160,9 +160,12 @@ def evaluate(
 
 
 def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
-    from flocc_launch.shipped import read_scenario
+    from flocc_launch.shipped import own_data_sentence, read_scenario
 
-    return read_scenario(scenario, changes, agents)
+    read = read_scenario(scenario, changes, agents)
+    if (sentence := own_data_sentence(scenario, read)) is not None:
+        typer.echo(sentence)
+    return read
 
 
 def _changes(
