@@ -62,7 +62,7 @@ def cells(settings: FaultsSettings) -> list[Cell]:
 def measure(settings: FaultsSettings, cell: Cell, seed: int) -> Row:
     """Simulate one swarm."""
     given = cell.parameters
-    report = simulated(scenario(settings, given["robots"], given["loss_ratio"], given["range_m"], seed), seed)
+    report = simulated(scenario(settings, given["robots"], given["loss_ratio"], given["range_m"], seed), seed).report
     return {
         "ate_m": report.ate_joint_m,
         "ate_odometry_m": report.ate_joint_odometry_m,
