@@ -29,6 +29,7 @@ from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver, Skills
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
@@ -158,6 +159,7 @@ class Agent:
         self._ros2: Ros2Adapter | None = None
         self._bridging: asyncio.Task[None] | None = None
         self._radio: Radio | None = None
+        self._metrics: MetricsServer | None = None
         self._workers: Workers | None = None
 
     @property
@@ -169,10 +171,12 @@ class Agent:
         """Open the store and the network, restore what the disk holds, start the loop and the playback."""
         try:
             self._driver = await asyncio.to_thread(self._compose)
+            if self.config.metrics.port is not None:
+                self._metrics = MetricsServer(self.config.metrics, self.config.name, self._driver.look)
             self._run = asyncio.create_task(self._driver.run())
             await self._driver.opened(self._run)
         except BaseException:
-            self._close_store()
+            await self._close()
             raise
         if self._recording is not None:
             self._playing = asyncio.create_task(self._play(self._recording))
@@ -191,7 +195,7 @@ class Agent:
             fed = [task for task in (self._playing, self._bridging) if task is not None]
             await asyncio.gather(*fed, return_exceptions=True)
         finally:
-            self._close_store()
+            await self._close()
 
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.
@@ -244,6 +248,11 @@ class Agent:
         queue = self._started.subscribe()
         while (correction := await queue.get()) is not None:
             yield correction
+
+    @property
+    def robot(self) -> Robot:
+        """The running core, for those who watch: to be read on the event loop's thread only, and never changed."""
+        return self._started.robot
 
     def stop(self) -> None:
         """Ask the agent to hand over and end."""
@@ -375,7 +384,9 @@ class Agent:
         if self._radio is not None:
             self._radio.update_position(self.config.name, position_m)
 
-    def _close_store(self) -> None:
+    async def _close(self) -> None:
+        if self._metrics is not None:
+            await self._metrics.close()
         if self._store is not None:
             self._store.close()
 

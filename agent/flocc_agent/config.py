@@ -476,6 +476,15 @@ class RadioConfig(LinkConfig):
         )
 
 
+class MetricsConfig(Section):
+    """Figures for Prometheus (docs/metrics.md); needs the extra `metrics`."""
+
+    port: int | None = Field(None, ge=1, le=PORT_MAX)
+    """Where `/metrics` is served over HTTP; None serves nothing."""
+    host: str = "127.0.0.1"
+    """Address that is listened on; 0.0.0.0 lets other machines scrape. There is neither encryption nor a password."""
+
+
 class KeyframeConfig(Section):
     """Which images become keyframes: the robot moved or turned enough since the last one."""
 
@@ -619,6 +628,8 @@ class AgentConfig(Section):
     """Bounds of what is kept on disk."""
     radio: RadioConfig = RadioConfig()
     """Emulated links, for tests on one machine."""
+    metrics: MetricsConfig = MetricsConfig()
+    """Figures for Prometheus."""
 
     @model_validator(mode="after")
     def _has_one_source(self) -> "AgentConfig":

@@ -51,6 +51,7 @@ from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseG
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import Persist, write
 from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
 from flocc_agent.runtime.store import Store
@@ -238,12 +239,38 @@ class Driver:
             "busy": self.busy(),
         }
 
+    def look(self) -> Look:
+        """What a scrape of the metrics sees."""
+        robot = self.robot
+        applied, term = robot.corrections.applied, robot.election.term
+        return Look(
+            counters=self._transport.counters(),
+            stages=self._workers.stages.snapshot(),
+            refused=self._refusals(),
+            gauges={
+                "keyframes": robot.gossip.logs[robot.log].keyframes,
+                "closures": robot.assembly.closures,
+                "candidates": robot.closing.load,
+                "neighbours": len(robot.neighbours.names()),
+                "logs": len(robot.gossip.logs),
+                "leading": float(robot.election.leading),
+                "term": 0 if term is None else term.counter,
+                "round": 0 if applied is None else applied.round,
+            },
+            queues={"inbox": (len(self._inbox), INBOX_MAX), "images": (len(self._images), IMAGES_MAX), **robot.sizes()},
+            info={"robot": robot.log.robot, "log": str(robot.log)},
+        )
+
     def counters(self) -> dict[str, int]:
         """What was refused or dropped, by reason."""
+        return {**self._transport.counters().dropped, **self._refusals()}
+
+    def _refusals(self) -> dict[str, int]:
+        """Messages refused by reason, of all peers."""
         refused = Counter[str]()
         for (_, reason), count in self._refused.items():
             refused[f"refused {reason}"] += count
-        return {**self._transport.counters().dropped, **refused}
+        return dict(refused)
 
     def result(self) -> dict[str, Any]:
         """What this robot knows, for `result.json`."""
