@@ -14,6 +14,7 @@ from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.latents import Latents
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
+from flocc_agent.core.offers import Offers
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.robot import Restored, Robot
@@ -113,7 +114,13 @@ def test_robots_that_all_take_a_pair_break_registered_once(monkeypatch: pytest.M
 
 
 def test_a_robot_that_does_not_offer_leaves_pairs_unregistered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(LoopClosing, "_tell", lambda self, now: [])
+    original = Offers.tell
+
+    def silent(self: Offers, *details: Any) -> list[Effect]:
+        original(self, *details)
+        return []
+
+    monkeypatch.setattr(Offers, "tell", silent)
     assert "registered once" in broken(drawn_scenario(0))
 
 
@@ -162,7 +169,7 @@ def test_a_robot_that_sends_before_it_writes_loses_what_it_published(monkeypatch
 
 
 def test_a_table_without_a_maximum_breaks_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def hoard(self: Latents, wants: Any) -> bool:
+    def hoard(self: Latents, wants: Any, now: float) -> bool:
         self._relayed.update(dict.fromkeys(KeyframeId(self._own, k) for k in range(99)))
         return True
 

@@ -1,17 +1,22 @@
 """Latents: which are here, which are being fetched, and which are kept for robots that cannot reach their owner.
 
 A latent out of reach is asked of relays: heartbeats carry what a robot wants, and neighbours that can reach the
-owner fetch and hold it. Failed fetches are tried again after growing pauses.
+owner fetch and hold it, or pass on that the owner has it no more. Failed fetches are tried again after growing pauses.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from bisect import insort
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import chain
 
 from flocc_agent.core.effects import Effect, FetchLatent
 from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_agent.core.pulls import remember
 from flocc_protocol.ids import KeyframeId, LogId
 
 PAUSED_MAX = 1024
+LOST_S = 30.0
+"""A lost latent is told for this long after somebody wanted it last."""
 WANTS_TURN_S = 10.0
 
 
@@ -37,15 +42,25 @@ class Reach:
 
     def __init__(self) -> None:
         self._peers: dict[str, Peer] = {}
+        self._holders: dict[KeyframeId, list[str]] = {}
 
-    def __contains__(self, name: str) -> bool:
+    def __contains__(self, name: object) -> bool:
         return name in self._peers
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._peers)
 
     def update(self, name: str, peer: Peer) -> bool:
         """Note a robot in range; whether that changes what can be had."""
         known = self._peers.get(name)
         self._peers[name] = peer
-        return known is None or replace(known, load=peer.load) != peer
+        if known is None or known.holds != peer.holds:
+            self._note_holds(name, known.holds if known else (), peer.holds)
+        return known is None or (known.compute_class, known.holds, known.log) != (
+            peer.compute_class,
+            peer.holds,
+            peer.log,
+        )
 
     def writes(self, log: LogId) -> bool:
         """Whether the writer of a log is in range; a robot that lost its disk writes another one."""
@@ -54,7 +69,21 @@ class Reach:
 
     def remove(self, name: str) -> None:
         """A robot is out of range."""
-        self._peers.pop(name, None)
+        peer = self._peers.pop(name, None)
+        if peer is not None:
+            self._note_holds(name, peer.holds, ())
+
+    def held_for_others(self) -> list[KeyframeId]:
+        """Latents that robots in range hold for others."""
+        return sorted(self._holders)
+
+    def _note_holds(self, name: str, before: Iterable[KeyframeId], after: Iterable[KeyframeId]) -> None:
+        for keyframe in before:
+            self._holders[keyframe].remove(name)
+            if not self._holders[keyframe]:
+                del self._holders[keyframe]
+        for keyframe in after:
+            insort(self._holders.setdefault(keyframe, []), name)
 
     def stronger(self, compute_class: int) -> str | None:
         """The neighbour of the highest compute class above this one, the least loaded of several."""
@@ -69,7 +98,8 @@ class Reach:
         """Who in range can give a latent: its owner, or a robot that holds it."""
         if keyframe.log.robot in self._peers:
             return keyframe.log.robot
-        return min((name for name, peer in self._peers.items() if keyframe in peer.holds), default=None)
+        holders = self._holders.get(keyframe)
+        return holders[0] if holders else None
 
 
 @dataclass(slots=True)
@@ -95,8 +125,9 @@ class Latents:
         self._held: set[KeyframeId] = set()
         self._fetches: dict[KeyframeId, _Fetch] = {}
         self._relayed: dict[KeyframeId, None] = {}
+        self._lost_until_s: dict[KeyframeId, float] = {}
 
-    def __contains__(self, keyframe: KeyframeId) -> bool:
+    def __contains__(self, keyframe: object) -> bool:
         return keyframe in self._held
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -104,6 +135,7 @@ class Latents:
         limits = self._parameters
         return {
             "relayed": (len(self._relayed), limits.relays_max),
+            "lost": (len(self._lost_until_s), limits.relays_max),
             "fetches": (len(self._fetches), PAUSED_MAX + limits.fetches_max),
         }
 
@@ -137,11 +169,25 @@ class Latents:
             if fetch.holder == name:
                 fetch.in_flight_until_s = None
 
-    def on_wants(self, wants: Iterable[KeyframeId]) -> bool:
+    def on_gone(self, keyframe: KeyframeId, now: float) -> None:
+        """A latent exists no more, its owner or a robot nearer to it says: whoever wanted it here is told."""
+        if keyframe in self._relayed:
+            del self._relayed[keyframe]
+            remember(self._lost_until_s, keyframe, now + LOST_S, self._parameters.relays_max)
+
+    def lost(self, now: float) -> tuple[KeyframeId, ...]:
+        """Latents that neighbours want and that exist no more."""
+        for keyframe in [k for k, until_s in self._lost_until_s.items() if until_s <= now]:
+            del self._lost_until_s[keyframe]
+        return tuple(self._lost_until_s)
+
+    def on_wants(self, wants: Iterable[KeyframeId], now: float) -> bool:
         """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new."""
         new = False
         for keyframe in wants:
-            if keyframe.log != self._own:
+            if keyframe in self._lost_until_s:
+                self._lost_until_s[keyframe] = now + LOST_S
+            elif keyframe.log != self._own:
                 new |= keyframe not in self._relayed
                 self._relayed.pop(keyframe, None)
                 self._relayed[keyframe] = None
@@ -154,24 +200,29 @@ class Latents:
 
         Others have their turn every `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
         """
-        wanted = dict.fromkeys(k for k in (*needed, *self._relayed) if self._out_of_reach(k, reach))
+        wanted = dict.fromkeys(k for k in (*needed, *self._relayed) if self.is_out_of_reach(k, reach))
         count = self._parameters.wants_max
         turns = -(-len(wanted) // count)
         first = count * (int(now // WANTS_TURN_S) % turns) if turns else 0
         return tuple(wanted)[first : first + count]
 
-    def _out_of_reach(self, keyframe: KeyframeId, reach: Reach) -> bool:
+    def is_out_of_reach(self, keyframe: KeyframeId, reach: Reach) -> bool:
+        """Whether a latent is not here and nobody in range can give it."""
         return keyframe not in self._held and keyframe.log != self._own and reach.holder(keyframe) is None
 
     def holds(self) -> tuple[KeyframeId, ...]:
         """Latents of others that this robot holds because somebody wanted them."""
         return tuple(k for k in self._relayed if k in self._held)
 
+    def free(self) -> int:
+        """How many more fetches may start."""
+        return self._parameters.fetches_max - sum(f.in_flight_until_s is not None for f in self._fetches.values())
+
     def fetch(self, needed: Iterable[KeyframeId], reach: Reach, now: float) -> list[Effect]:
         """Start fetches, in the given order and relayed ones last, as many as may be in flight."""
-        free = self._parameters.fetches_max - sum(f.in_flight_until_s is not None for f in self._fetches.values())
+        free = self.free()
         effects: list[Effect] = []
-        for keyframe in (*needed, *self._relayed) if free > 0 else ():
+        for keyframe in chain(needed, self._relayed) if free > 0 else ():
             if len(effects) >= free:
                 break
             holder = self._may_fetch(keyframe, reach, now)

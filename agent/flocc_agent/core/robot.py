@@ -67,6 +67,10 @@ from flocc_protocol.records import (
 )
 
 
+GREETING_RATIO = 0.2
+"""Least pause between heartbeats that greet new neighbours, against the usual one."""
+
+
 @dataclass(frozen=True, slots=True)
 class Restored:
     """What a robot finds on its disk when it starts.
@@ -120,6 +124,7 @@ class Robot:
         self._parameters = parameters
         self._sequence = 0
         self._heartbeat_due_s = now
+        self._heartbeat_s = float("-inf")
         self._pending: list[_Pending] = []
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
@@ -236,13 +241,14 @@ class Robot:
         if sender.robot not in self.neighbours:
             return effects
         if not known:
-            self.gossip.on_neighbour()
-            self.corrections.on_neighbour()
+            self._greet(heartbeat, now)
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self.gossip.on_digests(sender, heartbeat.digests, now)
         effects += self._on_versions(sender, heartbeat.corrections, now)
         self.closing.on_peer(sender.robot, Peer(heartbeat.compute_class, heartbeat.load, heartbeat.holds, sender))
-        self.closing.on_wants(heartbeat.wants)
+        self.closing.on_wants(heartbeat.wants, now)
+        for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
+            effects += self._reject_lost([pair], keyframe, now)
         return effects
 
     def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
@@ -263,7 +269,7 @@ class Robot:
         self.closing.on_fetch_failed(keyframe, now)
         report = Report("latent_failed", {"keyframe": str(keyframe), "holder": holder, "reason": reason})
         lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
-        return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe) if lost else [], keyframe, now)]
+        return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now)]
 
     def _reject_lost(self, pairs: list[CandidatePair], keyframe: KeyframeId, now: float) -> list[Effect]:
         """Pairs whose latent exists no more are rejected, so that nobody waits for them."""
@@ -370,6 +376,7 @@ class Robot:
         self._heartbeat_due_s += period
         if self._heartbeat_due_s <= now:
             self._heartbeat_due_s = now + period
+        self._heartbeat_s = now
         self._sequence += 1
         return [
             Broadcast(
@@ -384,9 +391,20 @@ class Robot:
                     corrections=self.corrections.announced(),
                     wants=self.closing.wants(now),
                     holds=self.closing.holds(),
+                    lost=self.closing.lost(now),
                 )
             )
         ]
+
+    def _greet(self, heartbeat: Heartbeat, now: float) -> None:
+        """Tell a new neighbour everything at once; when groups meet, a leader optimises as soon as the news are here."""
+        self.gossip.on_neighbour()
+        self.corrections.on_neighbour()
+        term = self.election.term
+        if term is None or heartbeat.leader is None or heartbeat.leader.term.leader != term.leader:
+            self.rounds.hurry(now)
+        pause_s = GREETING_RATIO * self._parameters.neighbours.heartbeat_period_s
+        self._heartbeat_due_s = min(self._heartbeat_due_s, max(now, self._heartbeat_s + pause_s))
 
     def _lose_silent(self, now: float) -> list[Effect]:
         gone = self.neighbours.tick(now)

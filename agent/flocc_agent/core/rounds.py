@@ -7,6 +7,8 @@ from flocc_agent.core.pose_graph import ClosureState, GraphSolution
 from flocc_protocol.ids import Term
 
 FAILURES_MAX = 6
+HURRIED_PERIOD_S = 0.5
+"""Least pause between rounds while groups meet."""
 
 
 class Rounds:
@@ -19,6 +21,7 @@ class Rounds:
         self._round = 0
         self._running_until_s: float | None = None
         self._next_s = float("-inf")
+        self._hurried_until_s = float("-inf")
         self._started: tuple[int, int] | None = None
         self._failures = 0
         self._solution: GraphSolution | None = None
@@ -35,6 +38,11 @@ class Rounds:
             self._round = 0
             self._running_until_s = None
             self._started = None
+
+    def hurry(self, now: float) -> None:
+        """Groups meet, and news are to be expected: for one period rounds may follow each other quickly."""
+        self._hurried_until_s = now + self._parameters.period_s
+        self._next_s = min(self._next_s, now + HURRIED_PERIOD_S)
 
     def on_solution(self, term: Term, round_number: int, solution: GraphSolution) -> bool:
         """Take an answer; False for one of an earlier round or term, which counts for nothing."""
@@ -71,7 +79,7 @@ class Rounds:
     def _start(self, term: Term, now: float) -> Effect:
         self._round += 1
         self._running_until_s = now + self._parameters.timeout_s
-        self._next_s = now + self._parameters.period_s
+        self._next_s = now + (HURRIED_PERIOD_S if now < self._hurried_until_s else self._parameters.period_s)
         self._started = (self._assembly.revision, self._assembly.keyframes)
         return Optimise(term, self._round, self._assembly.graph(), self._solution)
 

@@ -55,11 +55,12 @@ class Swarm:
         self.radio = Radio(scenario.links().parameters(), np.random.default_rng([seed, LINKS]))
         self.network = Network(self.agenda, self.radio, self._receive, np.random.default_rng([seed, AIR]))
         self.stations: dict[str, Station] = {}
+        self._named: dict[str, list[Station]] = {}
         self.lines: list[dict[str, Any]] = []
         self.observers: list[Observer] = []
         self._equipment = equipment
         self._seed = seed
-        self._fetcher = LatentFetcher(self.agenda, self.network, self._running)
+        self._fetcher = LatentFetcher(self.agenda, self.network, self._running, scenario.bandwidth_bytes_s)
         self._reporters: dict[str, Reporter] = {}
         self._near: dict[tuple[str, float | None], list[str]] = {}
         self._around = Surroundings(
@@ -101,6 +102,7 @@ class Swarm:
         twin = f"{name}-twin"
         self._add(twin, len(self.stations), self.stations[name].playback)
         self.stations[twin].log = LogId(name, 1)
+        self._named[name] += self._named.pop(twin)
         self._near.clear()
 
     def lose_disk(self, name: str) -> None:
@@ -132,6 +134,7 @@ class Swarm:
             self.agenda,
             self._around,
         )
+        self._named[name] = [self.stations[name]]
         self._reporters[name] = Reporter(name, playback.T_body_camera, self.scenario.backend.steepness)
         self.agenda.at(robot.start_s, lambda: self._first_start(name))
         self._play(self.stations[name], robot.start_s)
@@ -177,7 +180,7 @@ class Swarm:
         self.network.send(sender.name, Envelope(sender.log, message), self._in_range(sender.name))
 
     def _unicast(self, sender: Station, to: str, message: Message) -> None:
-        receivers = [s.name for s in self.stations.values() if s.log.robot == to and s is not sender]
+        receivers = [station.name for station in self._named.get(to, ()) if station is not sender]
         self.network.send(sender.name, Envelope(sender.log, message), receivers)
 
     def _receive(self, receiver: str, envelope: Envelope) -> bool:
@@ -185,7 +188,7 @@ class Swarm:
 
     def _running(self, robot: str) -> Station | None:
         """The station that answers to a robot's name."""
-        return next((s for s in self.stations.values() if s.log.robot == robot and s.running), None)
+        return next((station for station in self._named.get(robot, ()) if station.running), None)
 
     def _observe(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
         for effect in effects:

@@ -270,7 +270,7 @@ def test_wishes_that_nobody_can_grant_do_not_keep_others_waiting() -> None:
 def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     latents = Latents(R1, PARAMETERS)
     for k in range(50):
-        latents.on_wants([keyframe(f"r3/{k}")])
+        latents.on_wants([keyframe(f"r3/{k}")], 0.0)
         latents.add(keyframe(f"r3/{k}"))
     assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - PARAMETERS.relays_max, 50))
 

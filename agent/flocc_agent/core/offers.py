@@ -1,0 +1,154 @@
+"""Pairs that other robots are to register: told to them again and again, and taken over from those that are gone.
+
+Offers to one robot form a group with one due time, so that no step looks through all of them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from flocc_agent.core.effects import Effect, Unicast
+from flocc_agent.core.latents import Latents, Reach
+from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_agent.core.place_recognition import Candidate
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import OFFERS_MAX, CandidateOffer, CandidatePair
+
+FAR_TAKEOVERS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Recipient:
+    """Who is to register a pair.
+
+    Attributes:
+        robot: Its name.
+        log: The log that it must write; None for a stronger robot, to which a pair is transferred.
+    """
+
+    robot: str
+    log: LogId | None
+
+    def is_in(self, reach: Reach) -> bool:
+        """Whether it is there; a robot that lost its disk writes another log."""
+        return self.robot in reach if self.log is None else reach.writes(self.log)
+
+
+@dataclass(slots=True)
+class _Offer:
+    """A pair that another robot is to register; `since_s`: when it was last within reach, or became an offer."""
+
+    candidate: Candidate
+    next_s: float
+    since_s: float
+
+
+@dataclass(slots=True)
+class _Group:
+    """The offers to one robot, and when one of them may be due."""
+
+    offers: dict[CandidatePair, _Offer] = field(default_factory=dict)
+    due_s: float = float("-inf")
+
+
+class Offers:
+    """All such pairs."""
+
+    def __init__(self, latents: Latents, parameters: LoopClosingParameters) -> None:
+        self._latents = latents
+        self._parameters = parameters
+        self._recipients: dict[CandidatePair, Recipient] = {}
+        self._groups: dict[Recipient, _Group] = {}
+
+    def __len__(self) -> int:
+        return len(self._recipients)
+
+    def __contains__(self, pair: CandidatePair) -> bool:
+        return pair in self._recipients
+
+    def __iter__(self) -> Iterator[CandidatePair]:
+        return iter(self._recipients)
+
+    def add(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
+        """Let another robot register a pair."""
+        self.remove(candidate.pair)
+        self._recipients[candidate.pair] = recipient
+        group = self._groups.setdefault(recipient, _Group())
+        group.offers[candidate.pair] = _Offer(candidate, now, now)
+        group.due_s = float("-inf")
+
+    def remove(self, pair: CandidatePair) -> None:
+        """A pair is done, or this robot's own."""
+        recipient = self._recipients.pop(pair, None)
+        if recipient is not None:
+            group = self._groups[recipient]
+            del group.offers[pair]
+            if not group.offers:
+                del self._groups[recipient]
+
+    def drop_worst(self) -> None:
+        """Forget the least similar pair."""
+        offers = (offer.candidate for group in self._groups.values() for offer in group.offers.values())
+        self.remove(max(offers, key=lambda candidate: (-candidate.similarity, candidate.pair)).pair)
+
+    def using(self, keyframe: KeyframeId) -> list[CandidatePair]:
+        """Pairs of a keyframe."""
+        return sorted(pair for pair in self._recipients if keyframe in (pair.low, pair.high))
+
+    def on_peer(self, robot: str) -> None:
+        """A robot came into range, or writes another log."""
+        for recipient, group in self._groups.items():
+            if recipient.robot == robot:
+                group.due_s = float("-inf")
+
+    def on_lost(self, robot: str, now: float) -> None:
+        """A robot is out of range; the pairs that it was to register wait for `takeover_s`."""
+        for recipient, group in self._groups.items():
+            if recipient.robot == robot:
+                group.due_s = float("-inf")
+                for offer in group.offers.values():
+                    offer.since_s = now
+
+    def due_s(self) -> float:
+        """When something is to be said or taken over."""
+        return min((group.due_s for group in self._groups.values()), default=float("inf"))
+
+    def tell(self, reach: Reach, now: float) -> list[Effect]:
+        """Tell robots in range what is theirs to register."""
+        effects: list[Effect] = []
+        for recipient in sorted(self._groups, key=lambda recipient: (recipient.robot, recipient.log is not None)):
+            group = self._groups[recipient]
+            if group.due_s > now or not recipient.is_in(reach):
+                continue
+            pairs = [pair for pair in sorted(group.offers) if group.offers[pair].next_s <= now][:OFFERS_MAX]
+            for pair in pairs:
+                group.offers[pair].next_s = now + self._parameters.offer_period_s
+            next_s = min(offer.next_s for offer in group.offers.values())
+            group.due_s = max(next_s, now + self._parameters.offer_period_s / 8)  # sooner where some are left over
+            effects.append(Unicast(recipient.robot, CandidateOffer(tuple(pairs), transferred=recipient.log is None)))
+        return effects
+
+    def taken_over(self, reach: Reach, now: float) -> list[Candidate]:
+        """Pairs of robots that are gone, which this robot may register itself; they are no offers any more."""
+        candidates: list[Candidate] = []
+        for recipient in sorted(self._groups, key=lambda recipient: (recipient.robot, recipient.log is not None)):
+            group = self._groups[recipient]
+            if group.due_s > now or recipient.is_in(reach):
+                continue
+            at_s = {pair: self._takeover_at_s(recipient, offer, reach) for pair, offer in group.offers.items()}
+            due = sorted(pair for pair in at_s if at_s[pair] <= now)
+            candidates += [group.offers[pair].candidate for pair in due]
+            group.due_s = min((time for time in at_s.values() if time > now), default=float("inf"))
+        for candidate in candidates:
+            self.remove(candidate.pair)
+        return candidates
+
+    def _takeover_at_s(self, recipient: Recipient, offer: _Offer, reach: Reach) -> float:
+        """When the finder may register a pair itself; later where it takes others to bring the latents.
+
+        At once where the robot is here and writes another log: nobody writes the pair's log any more.
+        """
+        if recipient.robot in reach:
+            return offer.since_s
+        pair = offer.candidate.pair
+        at_hand = recipient.log is None or (pair.low in self._latents and pair.high in self._latents)
+        return offer.since_s + self._parameters.takeover_s * (1 if at_hand else FAR_TAKEOVERS)
