@@ -628,6 +628,8 @@ class AgentConfig(Section):
     """Bounds of what is kept on disk."""
     radio: RadioConfig = RadioConfig()
     """Emulated links, for tests on one machine."""
+    bandwidth_bytes_s: float | None = Field(None, gt=0)
+    """What the robot lets itself use of the network: messages always pass and count, latents get the rest."""
     metrics: MetricsConfig = MetricsConfig()
     """Figures for Prometheus."""
 
@@ -639,12 +641,13 @@ class AgentConfig(Section):
 
     @classmethod
     def read(cls, path: Path) -> "AgentConfig":
-        """Read and check a TOML file; paths in it are relative to the file.
+        """Read and check a TOML file, or JSON as `flocc launch` leaves it; paths in it are relative to the file.
 
         Raises:
             ConfigError: The file cannot be used; the message names it and the key.
         """
-        return validated(cls, read_toml(path), str(path), path.resolve().parent)
+        fields = read_json(path) if path.suffix == ".json" else read_toml(path)
+        return validated(cls, fields, str(path), path.resolve().parent)
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -240,6 +240,8 @@ class Scenario(Section):
     """Robots by name; those of world, dataset and tracks are r1, r2, ... and may be listed to change them."""
     radio: RadioConfig = RadioConfig()
     """Emulated links."""
+    bandwidth_bytes_s: float | None = Field(None, gt=0)
+    """What each robot lets itself use of the network; see the agent's."""
     core: CoreParameters = CoreParameters()
     """Parameters of all robots' cores."""
     keyframes: KeyframeConfig = KeyframeConfig()
@@ -356,6 +358,7 @@ def agent_config(scenario: Scenario, name: str, **changes: object) -> AgentConfi
         backend=scenario.backend,
         radio=scenario.links(),
         store=scenario.store,
+        bandwidth_bytes_s=scenario.bandwidth_bytes_s,
         **changes,
     )
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from flocc_agent.budget import Budget
 from flocc_agent.core.effects import FetchLatent
 from flocc_agent.core.events import LATENT_UNKNOWN, Event, LatentFetched, LatentFetchFailed
 from flocc_launch.simulation.agenda import Agenda
@@ -12,13 +13,31 @@ from flocc_protocol.ids import KeyframeId
 REQUEST_BYTES = 96
 PIECE_BYTES = 256 * 1024
 PIECE_TIMEOUT_S = 1.0
+SHARED_BY = 4
+"""A piece is given the time of so many on a slow link, since others use it too."""
 PARTIAL_MAX = 16
 
 
 class LatentFetcher:
     """One robot's fetches; pieces that arrived are kept in its memory."""
 
-    def __init__(self, agenda: Agenda, network: Network, owner_of: Callable[[str], Station | None]) -> None:
+    def __init__(
+        self,
+        agenda: Agenda,
+        network: Network,
+        owner_of: Callable[[str], Station | None],
+        bandwidth_bytes_s: float | None = None,
+    ) -> None:
+        """Start without fetches.
+
+        Args:
+            agenda: The clock.
+            network: Carries requests and pieces.
+            owner_of: The running station of a robot's name.
+            bandwidth_bytes_s: Budget of each robot, None for none.
+        """
+        self._bandwidth_bytes_s = bandwidth_bytes_s
+        self._budgets: dict[str, Budget] = {}
         self._agenda = agenda
         self._network = network
         self._station_of = owner_of
@@ -29,6 +48,13 @@ class LatentFetcher:
         fetch = _Fetch(self, asker, job)
         self._agenda.after(job.deadline_s, lambda: fetch.fail("deadline"))
         fetch.ask()
+
+    def _pause_s(self, asker: Station) -> float:
+        """How long a robot's next piece has to wait for its budget."""
+        if self._bandwidth_bytes_s is None:
+            return 0.0
+        budget = self._budgets.setdefault(asker.name, Budget(self._bandwidth_bytes_s))
+        return budget.pause_s(self._network.used_bytes(asker.name), self._agenda.now_s)
 
     def _progress(self, asker: Station, keyframe: KeyframeId) -> int:
         return self._arrived.get((asker.name, keyframe), 0)
@@ -59,11 +85,16 @@ class _Fetch:
         holder = self._fetcher._station_of(self._job.holder)
         if self._dead() or holder is None:
             return
+        pause_s = self._fetcher._pause_s(self._asker)
+        if pause_s > 0.0:
+            self._fetcher._agenda.after(pause_s, self.ask)
+            return
         offset = self._fetcher._progress(self._asker, self._job.keyframe)
         self._fetcher._network.carry(
             self._asker.name, holder.name, "latent-request", 0, REQUEST_BYTES, lambda: self._serve(holder, offset)
         )
-        self._fetcher._agenda.after(PIECE_TIMEOUT_S, lambda: self._ask_again(offset))
+        lasts_s = self._fetcher._network.lasts_s(holder.name, self._asker.name, PIECE_BYTES)
+        self._fetcher._agenda.after(PIECE_TIMEOUT_S + SHARED_BY * lasts_s, lambda: self._ask_again(offset))
 
     def fail(self, reason: str) -> None:
         """The fetch came to its end without the latent."""

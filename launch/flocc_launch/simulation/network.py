@@ -111,6 +111,16 @@ class Network:
         for time_s in self._transmit(link, payload_bytes, air_bytes):
             self._agenda.at(time_s, lambda: self._settle(link, payload_bytes, arrive()))
 
+    def used_bytes(self, station: str) -> int:
+        """What a robot used of its budget: its messages, sent and received, and the latents that it fetched."""
+        traffic = self._traffic(station)
+        return sum(traffic.received.values()) + sum(traffic.sent.values()) - traffic.sent["latent"]
+
+    def lasts_s(self, sender: str, receiver: str, air_bytes: int) -> float:
+        """How long a link is occupied by something at least."""
+        rate = self._radio.parameters.of(sender, receiver).bandwidth_bytes_s
+        return 0.0 if rate is None else air_bytes / rate
+
     def _transmit(self, link: Link, payload_bytes: int, air_bytes: int, silenced: bool = False) -> list[float]:
         """Ask the radio when something arrives, and keep account."""
         arrivals_s = [] if silenced else self._radio.transmit(*link, air_bytes, self._agenda.now_s)
