@@ -10,13 +10,13 @@ from flocc_agent.core import corrections as corrections_module
 from flocc_agent.core.corrections import Corrections, correction_of
 from flocc_agent.core.effects import Broadcast, Effect, Unicast
 from flocc_agent.core.election import LeaderElection
-from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.latents import Latents
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.offers import Offers
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.pulls import Pulls
 from flocc_agent.core.robot import Restored, Robot
 from flocc_launch.scenario import Fault, FaultKind, Scenario
 from flocc_launch.simulation.campaign import run_checked
@@ -133,7 +133,7 @@ def test_corrections_in_frames_of_their_own_break_one_frame(monkeypatch: pytest.
 
 
 def test_logs_that_are_not_repaired_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Gossip, "_ask", lambda self, peer, log, first, now: [])
+    monkeypatch.setattr(Pulls, "_may_ask", lambda self, *details: False)
     assert "nothing lost" in broken(scenario(**LOSSY))
 
 

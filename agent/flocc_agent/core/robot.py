@@ -66,7 +66,6 @@ from flocc_protocol.records import (
     RejectionRecord,
 )
 
-
 GREETING_RATIO = 0.2
 """Least pause between heartbeats that greet new neighbours, against the usual one."""
 
@@ -397,7 +396,7 @@ class Robot:
         ]
 
     def _greet(self, heartbeat: Heartbeat, now: float) -> None:
-        """Tell a new neighbour everything at once; when groups meet, a leader optimises as soon as the news are here."""
+        """Tell a new neighbour everything at once; where groups meet, a leader expects news."""
         self.gossip.on_neighbour()
         self.corrections.on_neighbour()
         term = self.election.term
