@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend import optimise_graph
-from flocc_agent.config import AgentConfig, BackendConfig, PerceptionConfig, RadioConfig, Ros2Config
+from flocc_agent.backend import iterate_own_block, optimise_graph
+from flocc_agent.config import AgentConfig, BackendConfig, BackendMode, PerceptionConfig, RadioConfig, Ros2Config
+from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, OdometryPair, Registrar
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
@@ -110,6 +111,11 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
 def build_optimiser(config: BackendConfig) -> Optimiser:
     """Make the pose-graph optimiser; it can be sent to a worker process."""
     return partial(optimise_graph, config)
+
+
+def build_iterator(config: BackendConfig) -> Callable[[BlockProblem], BlockStep | OptimisationFailed]:
+    """Make what iterates on a robot's block in distributed mode; it can be sent to a worker process."""
+    return partial(iterate_own_block, config)
 
 
 class Agent:
@@ -316,8 +322,13 @@ class Agent:
         restored = restore(self._store)
         log = self._store.identity.log
         boot = int.from_bytes(os.urandom(6))
-        core = Robot(log, config.compute_class, boot, config.core, self._clock_s(), restored, _sealer(config))
-        transport = ZenohTransport(config.swarm, config.name, config.transport, self._radio, self._clock_s)
+        distributed = config.backend.mode is BackendMode.DISTRIBUTED
+        core = Robot(
+            log, config.compute_class, boot, config.core, self._clock_s(), restored, _sealer(config), distributed
+        )
+        transport = ZenohTransport(
+            config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
+        )
         transport.serve_admin(Admin.STATUS, lambda _: json.dumps(self.status()).encode())
         if config.transport.chaos:
             transport.serve_admin(Admin.CHAOS, self._disturb)
@@ -330,6 +341,7 @@ class Agent:
                 perception.encode,
                 perception.register,
                 build_optimiser(config.backend),
+                build_iterator(config.backend),
                 perception.encoder.part,
                 lambda: perception.encoder.encode_s,
             ),

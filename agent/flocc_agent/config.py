@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -74,9 +74,21 @@ class ScaleInitial(StrEnum):
     GROUND_TRUTH = "ground-truth"
 
 
+class BackendMode(StrEnum):
+    """Who optimises."""
+
+    CENTRALISED = "centralised"
+    DISTRIBUTED = "distributed"
+
+
 class BackendConfig(Section):
     """The pose-graph optimiser."""
 
+    mode: BackendMode = BackendMode.CENTRALISED
+    """centralised: the elected leader optimises everything; distributed: every robot its own block (RBCD), with scales
+    held at their initial values. All robots of a swarm need the same."""
+    rank: int = Field(5, ge=3, le=5)
+    """Dimensions to which distributed mode relaxes rotations; 3 relaxes nothing, more leave fewer local minima."""
     formulation: Formulation = Formulation.INDEPENDENT
     """Scales of closures: fixed, one each, one each but linked within a cluster, or one for all."""
     solver: Solver = Solver.GNC_TLS
@@ -127,6 +139,16 @@ class BackendConfig(Section):
     """Compute the marginal covariance of every robot's T_map_odom."""
     iterations_max: int = Field(100, ge=1)
     """Linear solves in one optimisation."""
+
+    @model_validator(mode="after")
+    def _is_known_to_distributed_mode(self) -> Self:
+        if self.mode is BackendMode.CENTRALISED:
+            return self
+        if self.formulation is not Formulation.BASE:
+            raise ValueError("mode = 'distributed' holds scales constant; it needs formulation = 'base'")
+        if self.solver not in (Solver.LM, Solver.GNC_TLS):
+            raise ValueError("mode = 'distributed' knows the solvers 'lm' and 'gnc-tls'")
+        return self
 
 
 class ClassicalConfig(Section):
@@ -483,6 +505,21 @@ class MetricsConfig(Section):
     """Where `/metrics` is served over HTTP; None serves nothing."""
     host: str = "127.0.0.1"
     """Address that is listened on; 0.0.0.0 lets other machines scrape. There is neither encryption nor a password."""
+
+    @classmethod
+    def at(cls, text: str, robots: int = 1) -> "tuple[MetricsConfig, ...]":
+        """Read [HOST:]PORT, and take one port after the other for several robots.
+
+        Raises:
+            ConfigError: It is not that, or the ports do not suffice.
+        """
+        host, _, port = text.rpartition(":")
+        if not port.isdecimal() or not 1 <= int(port) <= PORT_MAX:
+            raise ConfigError(f"metrics: {text!r} is not [HOST:]PORT, such as 9100 or 0.0.0.0:9100")
+        if int(port) + robots - 1 > PORT_MAX:
+            raise ConfigError(f"metrics: from port {port} there are no ports for {robots} robots")
+        known = {"host": host.strip("[]")} if host else {}
+        return tuple(cls(port=int(port) + k, **known) for k in range(robots))
 
 
 class KeyframeConfig(Section):

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flocc_agent.config import RadioConfig, SourceConfig
+from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
 from flocc_launch.agent_process import Lines, recover_result
 from flocc_launch.data import recordings
 from flocc_launch.expectations import check_measurable
@@ -64,6 +64,7 @@ def launch(
     on_watch: OnWatch | None = None,
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
+    metrics: str | None = None,
 ) -> Report:
     """Run a scenario and write its run folder.
 
@@ -73,15 +74,18 @@ def launch(
         on_watch: Called four times a second.
         progress: Called while data is generated, with (done, all).
         secure: Make keys for this run, and let agents trust those who have them only.
+        metrics: [HOST:]PORT of the first robot's metrics, by name; each further robot has the next port.
 
     Raises:
         FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
     """
     check_faults(scenario)
+    names = scenario.names()
+    served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
     paths = recordings(scenario, progress)
     check_measurable(scenario, paths)
     folder = fresh_folder(out)
-    return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure).run())
+    return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure, served).run())
 
 
 def fresh_folder(out: Path) -> RunFolder:
@@ -112,13 +116,20 @@ class _Launch:
     """One run."""
 
     def __init__(
-        self, scenario: Scenario, folder: RunFolder, paths: dict[str, Path], on_watch: OnWatch, secure: bool
+        self,
+        scenario: Scenario,
+        folder: RunFolder,
+        paths: dict[str, Path],
+        on_watch: OnWatch,
+        secure: bool,
+        metrics: dict[str, MetricsConfig],
     ) -> None:
         self._scenario = scenario
         self._folder = folder
         self._paths = paths
         self._on_watch = on_watch
         self._secure = secure
+        self._metrics = metrics
         self._epoch_s = time.monotonic()
         self._lines = Lines(folder.path / LAUNCHER_EVENTS)
         self._radio = scenario.links()
@@ -156,7 +167,12 @@ class _Launch:
                 start_s=self._scenario.robot(name).start_s,
             )
             config = agent_config(
-                self._scenario, name, source=source, transport=transports[name], folder=folder.resolve()
+                self._scenario,
+                name,
+                source=source,
+                transport=transports[name],
+                folder=folder.resolve(),
+                metrics=self._metrics.get(name, MetricsConfig()),
             )
             agents.append(AgentProcess(config, folder))
         return agents

@@ -164,6 +164,8 @@ class Transport(Protocol):
         ...
 
 
+LATENT = "latent"
+"""The kind under which pieces of latents are counted."""
 KIND_TABLES = ("sent", "received")
 LINK_TABLES = ("sent_to", "received_from", "lost_from", "repeated_from")
 NAMES_MAX = 4096
@@ -201,6 +203,13 @@ class TrafficCounter:
         """A message will reach the robot once more than it was sent."""
         with self._lock:
             _count(self._links["repeated_from"], (sender, kind), payload_bytes)
+
+    def used_bytes(self) -> int:
+        """What counts against a budget: messages, sent and received, and latents fetched; those served do not."""
+        with self._lock:
+            sent, received = self._kinds["sent"], self._kinds["received"]
+            messages = sum(payload_bytes for kind, (_, payload_bytes) in sent.items() if kind != LATENT)
+            return messages + sum(payload_bytes for _, payload_bytes in received.values())
 
     def count_dropped(self, reason: str, count: int = 1) -> None:
         """A message was given up."""

@@ -14,10 +14,11 @@ from typing import Any
 
 import zenoh
 
+from flocc_agent.budget import Budget
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.latent_transfer import UNKNOWN, LinkRates, Partial, Partials, Piece, Server, checked_number
-from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, LatentLookup, TrafficCounter
+from flocc_agent.runtime.transport import LATENT, Fetched, FetchFailed, FetchProblem, LatentLookup, TrafficCounter
 from flocc_agent.runtime.zenoh_session import open_session
 from flocc_protocol import keys
 from flocc_protocol.errors import DecodeError, FloccError
@@ -25,7 +26,6 @@ from flocc_protocol.ids import checked_name
 
 logger = logging.getLogger(__name__)
 
-KIND = "latent"
 SERVERS = 2
 SERVE_PENDING_MAX = 64
 TRIES_MAX = 5
@@ -44,7 +44,9 @@ class BulkService:
         counter: TrafficCounter,
         radio: Radio | None,
         clock_s: Callable[[], float],
+        bandwidth_bytes_s: float | None = None,
     ) -> None:
+        self._budget = None if bandwidth_bytes_s is None else Budget(bandwidth_bytes_s, clock_s())
         self._swarm, self._robot, self._config = swarm, robot, config
         self._counter, self._radio, self._clock_s = counter, radio, clock_s
         self._session: zenoh.Session | None = None
@@ -119,7 +121,7 @@ class BulkService:
             query.reply_err(UNKNOWN)
             return
         query.reply(query.key_expr, piece.payload, attachment=piece.header())
-        self._counter.count_sent(KIND, len(piece.payload), () if asker is None else (asker,))
+        self._counter.count_sent(LATENT, len(piece.payload), () if asker is None else (asker,))
 
     # --- fetching: on the loop, except `_ask_blocking`
 
@@ -145,6 +147,7 @@ class BulkService:
         """Ask for piece after piece until nothing is missing; pieces in a row that do not come end it."""
         partial, tries = self._partials.of(latent, encode_bytes), 0
         while not partial.is_complete:
+            await self._afford()
             asked_s = time.monotonic()
             answer = await self._ask(owner, latent, partial)
             if isinstance(answer, Piece) and await self._is_received(owner, answer):
@@ -162,6 +165,14 @@ class BulkService:
                 partial.ask_for_less()
             await asyncio.sleep(PAUSE_S * 2 ** (tries - 1))
         return None
+
+    async def _afford(self) -> None:
+        """Wait until the budget has room for a piece."""
+        while self._budget is not None:
+            pause_s = self._budget.pause_s(self._counter.used_bytes(), self._clock_s())
+            if pause_s <= 0.0:
+                return
+            await asyncio.sleep(pause_s)
 
     async def _ask(self, owner: str, latent: str, partial: Partial) -> Piece | FetchProblem:
         """Ask for the next piece, on a thread."""
@@ -222,11 +233,11 @@ class BulkService:
         """Count a piece, after the emulated radio let the request and the piece pass."""
         if self._radio is not None:
             now_s = self._clock_s()
-            asked = self._radio.transmit(self._robot, owner, KIND, REQUEST_BYTES, now_s)
-            arrivals = self._radio.transmit(owner, self._robot, KIND, len(piece.payload), asked[0]) if asked else []
+            asked = self._radio.transmit(self._robot, owner, LATENT, REQUEST_BYTES, now_s)
+            arrivals = self._radio.transmit(owner, self._robot, LATENT, len(piece.payload), asked[0]) if asked else []
             if not arrivals:
-                self._counter.count_lost(KIND, len(piece.payload), owner)
+                self._counter.count_lost(LATENT, len(piece.payload), owner)
                 return False
             await asyncio.sleep(arrivals[0] - now_s)
-        self._counter.count_received(KIND, len(piece.payload), owner)
+        self._counter.count_received(LATENT, len(piece.payload), owner)
         return True

@@ -75,6 +75,7 @@ class ZenohTransport:
         config: TransportConfig,
         radio: Radio | None = None,
         clock_s: Callable[[], float] = time.monotonic,
+        bandwidth_bytes_s: float | None = None,
     ) -> None:
         """Prepare; nothing is opened yet.
 
@@ -84,6 +85,7 @@ class ZenohTransport:
             config: Endpoints, limits, TLS.
             radio: Emulated links, None for the real ones only. Touched on the event loop's thread alone.
             clock_s: Time for the radio's schedule, such as seconds since the start of the run.
+            bandwidth_bytes_s: Budget; latents wait for what messages leave of it. None: there is none.
         """
         self.swarm = checked_name(swarm, "swarm name")
         self.robot = checked_name(robot)
@@ -93,7 +95,7 @@ class ZenohTransport:
         self._clock_s = clock_s
         self._counter = TrafficCounter()
         self._limiter = RateLimiter(config.peer_messages_per_s, config.peer_bytes_per_s, config.peers_max)
-        self._bulk = BulkService(self.swarm, self.robot, config, self._counter, radio, clock_s)
+        self._bulk = BulkService(self.swarm, self.robot, config, self._counter, radio, clock_s, bandwidth_bytes_s)
         self._admin = AdminService(self.swarm, self.robot)
         self._receiver: Receiver = lambda *_: None
         self._session: zenoh.Session | None = None
