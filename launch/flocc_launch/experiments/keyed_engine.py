@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 Float32 = NDArray[np.float32]
 
 
-def keyed_engine(network: Literal["none", "tiny", "small", "full"]) -> "Engine":
-    """An engine on the best device that is there, in its best number format.
+def keyed_engine(network: Literal["none", "tiny", "small", "full"], exact: bool = False) -> "Engine":
+    """An engine on the best device that is there, in its best number format, or exactly in fp32.
 
     Raises:
         ExperimentError: torch is not installed.
@@ -30,7 +30,7 @@ def keyed_engine(network: Literal["none", "tiny", "small", "full"]) -> "Engine":
     from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
 
     assert network != "none", "the settings say which"
-    compute = choose_compute("auto", "auto")
+    compute = choose_compute("auto", "fp32" if exact else "auto")
     with torch.device("meta"):
         model = Mast3r(NAMED_SIZES[network])
     model.load_state_dict(keyed_state(model, MAST3R_SEED), strict=True, assign=True)

@@ -44,7 +44,6 @@ METRICS = {
     "ratio": "correspondence ratio, Eq. (1)",
 }
 POOLED = "all"
-PRECISION_WANTED = 0.95
 RESAMPLES = 500
 SOURCE = "Sec. IV-B, precision and recall of five metrics"
 
@@ -135,9 +134,9 @@ def metric_row(scene: str, pairs: Sequence[Row], metric: str, found: Curve | Non
         "inliers": sum(pair["inlier"] is True for pair in pairs),
     }
     best = None if found is None else found.best()
-    sure = None if found is None else found.first_with_precision(PRECISION_WANTED)
+    sure = None if found is None else found.first_with_precision(halved(found))
     values: dict[str, float | None] = dict.fromkeys(
-        ("average_precision", "roc_auc", "best_threshold", "precision", "recall", "threshold_p95", "recall_p95")
+        ("average_precision", "roc_auc", "best_threshold", "precision", "recall", "threshold_half", "recall_half")
     )
     if found is not None and best is not None:
         values |= {
@@ -148,7 +147,7 @@ def metric_row(scene: str, pairs: Sequence[Row], metric: str, found: Curve | Non
             "recall": float(found.recall[best]),
         }
     if found is not None and sure is not None:
-        values |= {"threshold_p95": float(found.thresholds[sure]), "recall_p95": float(found.recall[sure])}
+        values |= {"threshold_half": float(found.thresholds[sure]), "recall_half": float(found.recall[sure])}
     return {**row, **values}
 
 
@@ -195,36 +194,45 @@ def resampled_difference(pairs: Sequence[Row], one: str, other: str) -> tuple[fl
     return float(low), float(high)
 
 
+def halved(found: Curve) -> float:
+    """The precision at which half as large a share of the accepted is wrong as when all are accepted."""
+    return 1.0 - 0.5 * (1.0 - found.right_share)
+
+
 def _similarity_alone(whole: Mapping[str, Curve]) -> Finding:
-    sure = {metric: _recall_at_precision(whole[metric]) for metric in ("similarity", "ratio")}
+    kept = {metric: _recall_when_halved(whole[metric]) for metric in ("similarity", "ratio")}
     numbers = (
-        f"At a precision of {PRECISION_WANTED:.0%} similarity keeps {sure['similarity']:.1%} of the inliers, the ratio "
-        f"{sure['ratio']:.1%}; accepting all is right in {whole['ratio'].right_share:.1%}."
+        f"All accepted, {1.0 - whole['ratio'].right_share:.1%} are outliers; a threshold that halves this share keeps "
+        f"{kept['similarity']:.1%} of the inliers by similarity and {kept['ratio']:.1%} by the ratio."
     )
-    return judged("Similarity alone does not tell outliers", SOURCE, sure["similarity"] < 0.5 * sure["ratio"], numbers)
+    holds = kept["similarity"] < 0.5 and kept["similarity"] < kept["ratio"]
+    return judged("Similarity alone does not tell outliers (it loses half of the inliers)", SOURCE, holds, numbers)
 
 
-def _recall_at_precision(found: Curve) -> float:
-    k = found.first_with_precision(PRECISION_WANTED)
+def _recall_when_halved(found: Curve) -> float:
+    k = found.first_with_precision(halved(found))
     return 0.0 if k is None else float(found.recall[k])
 
 
 def _unitless(single: Mapping[str, Mapping[str, Curve]]) -> Finding:
-    """Whether one threshold fits all scenes better for the ratio than for the count."""
-    best = {
-        metric: {name: float(found[metric].thresholds[found[metric].best()]) for name, found in single.items()}
-        for metric in ("ratio", "correspondences")
-    }
-    spreads = {metric: max(values.values()) / max(min(values.values()), 1e-9) for metric, values in best.items()}
+    """Whether the scenes want thresholds that differ less for the ratio than for the count."""
+    wanted: dict[str, dict[str, float]] = {"ratio": {}, "correspondences": {}}
+    for metric, values in wanted.items():
+        for name, found in single.items():
+            if (k := found[metric].first_with_precision(halved(found[metric]))) is not None:
+                values[name] = float(found[metric].thresholds[k])
+    claim = "The ratio is easier to tune than the count, because it has no unit"
+    if any(len(values) < 2 for values in wanted.values()):
+        return judged(claim, SOURCE, None, "Fewer than two scenes have outliers that a threshold halves.")
+    spreads = {metric: max(values.values()) / min(values.values()) for metric, values in wanted.items()}
     shown = {
-        metric: ", ".join(f"{name} {value:.3g}" for name, value in values.items()) for metric, values in best.items()
+        metric: ", ".join(f"{name} {value:.3g}" for name, value in values.items()) for metric, values in wanted.items()
     }
     numbers = (
-        f"Best thresholds differ by a factor of {spreads['ratio']:.2g} for the ratio ({shown['ratio']}) and of "
-        f"{spreads['correspondences']:.2g} for the count ({shown['correspondences']})."
+        f"The thresholds that halve each scene's outliers differ by a factor of {spreads['ratio']:.2g} for the ratio "
+        f"({shown['ratio']}) and of {spreads['correspondences']:.2g} for the count ({shown['correspondences']})."
     )
-    holds = None if len(single) < 2 else spreads["ratio"] < spreads["correspondences"]
-    return judged("The ratio is easier to tune than the count, because it has no unit", SOURCE, holds, numbers)
+    return judged(claim, SOURCE, spreads["ratio"] < spreads["correspondences"], numbers)
 
 
 def notes(scenes: Mapping[str, Sequence[Row]], rows: Sequence[Row]) -> list[str]:
@@ -237,7 +245,8 @@ def notes(scenes: Mapping[str, Sequence[Row]], rows: Sequence[Row]) -> list[str]
     ]
     said.append(
         "Pairs nearer than half the limit cannot be outliers by the paper's rule, whatever direction is found; average "
-        "precision of a metric without meaning is the share of inliers among pairs with a pose."
+        "precision of a metric without meaning is the share of inliers among pairs with a pose. best_threshold has the "
+        "largest F1; threshold_half is the lowest at which the share of outliers is half of what it is without any."
     )
     if all(pair["confidence"] is None for pairs in scenes.values() for pair in pairs):
         said.append("Mean confidence and its ratio are n/a: only MASt3R gives confidences, and this method is another.")
@@ -275,7 +284,7 @@ def draw(figure: "Figure", _settings: RegistrationSettings, rows: Sequence[Row])
     lines = -(-max(len(scenes), 1) // columns)
     figure.set_size_inches(4.2 * columns, 3.9 * lines)
     panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat
-    for panel, (name, curves) in zip(panels, scenes.items(), strict=False):
+    for (name, curves), panel in zip(scenes.items(), panels, strict=False):
         for k, (metric, label) in enumerate(METRICS.items()):
             if metric in curves:
                 found = curves[metric]
@@ -289,7 +298,8 @@ def draw(figure: "Figure", _settings: RegistrationSettings, rows: Sequence[Row])
     for panel in list(panels):
         panel.set_visible(False)
     figure.axes[0].set_ylabel("precision")
-    figure.axes[0].set(xlim=(0, 1.02), ylim=(0, 1.02))
+    lowest = min((float(c.precision.min()) for curves in scenes.values() for c in curves.values()), default=0.0)
+    figure.axes[0].set(xlim=(0, 1.02), ylim=(max(lowest - 0.15, 0.0), 1.005))
 
 
 REGISTRATION = Experiment(

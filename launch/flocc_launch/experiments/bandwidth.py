@@ -1,0 +1,384 @@
+"""`flocc experiment bandwidth`: bytes per closure, and what smaller descriptors and latents cost in accuracy.
+
+Four parts. bytes: a simulated swarm whose latents have the size of each method's. descriptors: recall@1 on recorded or
+generated images. keypoints: the classical latent, by how many registrations come out right; only the match's latent is
+reduced, because only that one travels. latents: MASt3R's, by what its decoder makes of them with keyed weights.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field
+
+from flocc_agent.config import PerceptionConfig, SyntheticConfig
+from flocc_launch.evaluate_registration import Outcome, cross_pairs, odometry_pair, outcome, recall_at_one
+from flocc_launch.experiments.experiment import Cell, Experiment, ExperimentError, Progress, Row, Settings, Summary
+from flocc_launch.experiments.plots import COLOURS, MARKERS
+from flocc_launch.experiments.reductions import Basis, keypoint_forms, latent_forms, reduced_descriptors
+from flocc_launch.experiments.registration_data import (
+    RegistrationData,
+    RegistrationSettings,
+    data_of,
+    distance_m,
+    drawn_pairs,
+)
+from flocc_launch.experiments.simulated import simulated
+from flocc_launch.experiments.statistics import grouped, middle
+from flocc_launch.registration_scenes import Scene
+from flocc_launch.scenario import Scenario, TracksScenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Part = Literal["bytes", "descriptors", "keypoints", "latents"]
+
+LATENT_SIZES = {"classical": 136_000, "mast3r int8": 790_000, "mast3r fp16": 1_570_000}
+WALK = TracksScenario(robots=3, area_m=12.0, length_m=24.0)
+VIEWS_MIN = 20
+"""A robot with fewer views is no pass through a place."""
+KINDS = ("latent", "records", "correction", "heartbeat", "candidates")
+DESCRIPTORS_LEARNED = 20_000
+SIZES_PX = {"full": (384, 512), "small": (384, 512), "tiny": (96, 128)}
+
+
+class BandwidthSettings(Settings):
+    """Which parts, and on which images."""
+
+    parts: tuple[Part, ...] = ("bytes", "descriptors", "keypoints", "latents")
+    """Which of the four parts."""
+    latents: tuple[str, ...] = tuple(LATENT_SIZES)
+    """Methods of which the simulated swarms' latents have the size."""
+    data: Path | None = None
+    """Folder of the research sets, as ../shared/data; sevenscenes is used where it is there."""
+    worlds: tuple[int, ...] = (7,)
+    """Seeds of generated towns."""
+    walks: tuple[int, ...] = ()
+    """Seeds of walks without images, for synthetic descriptors."""
+    perception: PerceptionConfig = PerceptionConfig()
+    """Whose descriptors: the [perception] of a configuration file. Keypoints are the classical back-end's."""
+    pairs: int = Field(200, ge=2)
+    """Pairs of each scene that are registered with every form of keypoints."""
+    network: Literal["tiny", "small", "full"] = "small"
+    """MASt3R of keyed weights whose latents are reduced."""
+    pictures: int = Field(3, ge=2, le=32)
+    """Pictures whose neighbours are decoded with each other."""
+    runs: int = Field(3, ge=1, le=100)
+    """Repetitions of the simulated swarms."""
+
+
+def scenes_of(settings: BandwidthSettings) -> RegistrationData:
+    """The images; each scene has several robots with many views."""
+    return data_of(
+        RegistrationSettings(
+            data=settings.data, worlds=settings.worlds, walks=settings.walks, perception=settings.perception
+        )
+    )
+
+
+def usable(scene: Scene) -> bool:
+    """Whether a scene is passes of at least three robots: one to learn from, two to compare."""
+    robots = [view.robot for view in scene.views]
+    return sum(robots.count(robot) >= VIEWS_MIN for robot in sorted(set(robots))) >= 3
+
+
+def prepare(settings: BandwidthSettings, progress: Progress) -> None:
+    """Make the scenes and load the back-end, so that bad data and checkpoints are told at once.
+
+    Raises:
+        FloccError: The data cannot be used, or the size of a method's latents is not known.
+    """
+    del progress
+    unknown = sorted(set(settings.latents) - set(LATENT_SIZES))
+    if unknown:
+        raise ExperimentError(f"the size of {unknown[0]!r} latents is not known; there are {', '.join(LATENT_SIZES)}")
+    if {"descriptors", "keypoints"} & set(settings.parts):
+        scenes_of(settings)
+
+
+def cells(settings: BandwidthSettings) -> list[Cell]:
+    """All parts."""
+    needs_scenes = {"descriptors", "keypoints"} & set(settings.parts)
+    names = [name for name, scene in scenes_of(settings).scenes.items() if usable(scene)] if needs_scenes else []
+    by_part = {
+        "bytes": [
+            Cell({"part": "bytes", "on": name}, run) for name in settings.latents for run in range(settings.runs)
+        ],
+        "descriptors": [Cell({"part": "descriptors", "on": name}) for name in names],
+        "keypoints": [Cell({"part": "keypoints", "on": name}) for name in names],
+        "latents": [Cell({"part": "latents", "on": f"keyed {settings.network} network"})],
+    }
+    return [cell for part in settings.parts for cell in by_part[part]]
+
+
+def measure(settings: BandwidthSettings, cell: Cell, seed: int) -> Row:
+    """One part on one scene: its forms, each with bytes and measures."""
+    name = cell.parameters["on"]
+    match cell.parameters["part"]:
+        case "bytes":
+            return {"forms": bytes_by_kind(LATENT_SIZES[name], seed)}
+        case "descriptors":
+            return {"forms": descriptor_forms(scenes_of(settings), name)}
+        case "keypoints":
+            return {"forms": keypoint_accuracy(scenes_of(settings), name, settings.pairs, seed)}
+        case _:
+            return {"forms": latent_accuracy(settings.network, settings.pictures)}
+
+
+def form(name: str, size: float | None, **measures: float | None) -> Row:
+    """One form: its bytes, and what is measured with it."""
+    return {"form": name, "bytes": size, **measures}
+
+
+def bytes_by_kind(latent_bytes: int, seed: int) -> list[Row]:
+    """Bytes of a swarm per closure gained, all together and by kind of message."""
+    perception = PerceptionConfig(method="synthetic", synthetic=SyntheticConfig(latent_bytes=latent_bytes))
+    tracks = WALK.model_copy(update={"seed": seed})
+    report = simulated(Scenario(name="bandwidth", seed=seed, tracks=tracks, perception=perception), seed).report
+    gained = report.closures.accepted_inter_robot
+
+    def per_closure(count: int) -> float | None:
+        return count / gained if gained else None
+
+    whole = form("all", sum(report.bytes.values()), bytes_per_closure=per_closure(sum(report.bytes.values())))
+    counted = {kind: report.bytes.get(kind, 0) for kind in KINDS}
+    counted["others"] = sum(report.bytes.values()) - sum(counted.values())
+    kinds = [form(kind, n, bytes_per_closure=per_closure(n)) for kind, n in counted.items()]
+    return [{**row, "closures": gained} for row in [whole, *kinds]]
+
+
+def learning_robot(scene: Scene) -> str:
+    """The robot on whose views bases are learned, and which is not compared."""
+    return min(view.robot for view in scene.views)
+
+
+def compared(scene: Scene) -> list[int]:
+    """Numbers of the views that are compared."""
+    return [k for k, view in enumerate(scene.views) if view.robot != learning_robot(scene)]
+
+
+def descriptor_forms(data: RegistrationData, name: str) -> list[Row]:
+    """Recall@1 between the robots on whose descriptors nothing was learned."""
+    scene, encoded = data.scenes[name], data.encoded[name]
+    described = np.array([encoded.descriptor(k) for k in range(len(scene.views))])
+    kept = compared(scene)
+    basis = Basis.of(described[[k for k in range(len(scene.views)) if k not in set(kept)]])
+    part = Scene(name, tuple(scene.views[k] for k in kept), *limits(scene))
+    rows = []
+    for form_name, (size, values) in reduced_descriptors(described[kept], basis).items():
+        recall = recall_at_one(cross_pairs(part, values.astype(np.float32)), part)
+        rows.append(form(form_name, size, recall_at_1=recall))
+    return rows
+
+
+def limits(scene: Scene) -> tuple[float, float, float]:
+    """A scene's limits, to make a part of it."""
+    return scene.place_distance_m, scene.place_angle_rad, scene.position_error_max_m
+
+
+def keypoint_accuracy(data: RegistrationData, name: str, pairs: int, seed: int) -> list[Row]:
+    """Right registrations of drawn pairs at one place, with every form of the match's latent."""
+    from flocc_agent.perception.classical.encoder import decode_features, encode_features
+
+    scene, encoded = data.scenes[name], data.encoded[name]
+    kept = set(compared(scene))
+    learned = [decode_features(encoded[k]).descriptors for k in range(len(scene.views)) if k not in kept]
+    samples = np.concatenate(learned)
+    basis = Basis.of(samples[:: max(1, len(samples) // DESCRIPTORS_LEARNED)])
+    near = drawn_pairs(scene, distance_m(RegistrationSettings(), scene), len(scene.views) ** 2, seed)
+    places = [pair for pair in (encoded.pair(i, j) for i, j in near if {i, j} <= kept) if pair.same_place]
+    rng = np.random.default_rng(seed)
+    drawn = [places[k] for k in sorted(rng.choice(len(places), min(pairs, len(places)), replace=False))]
+    rows = []
+    for form_name, reduce in keypoint_forms(basis).items():
+        sizes, outcomes = [], []
+        for pair in drawn:
+            size, features = reduce(decode_features(encoded[pair.match]))
+            match = encode_features(features, {})
+            odometry = odometry_pair(scene, pair.query, encoded)
+            outcomes.append(outcome(scene, pair, data.skills.register(encoded[pair.query], match, odometry)))
+            sizes.append(size)
+        rows.append(form(form_name, float(np.mean(sizes)), **accuracy(outcomes)))
+    return rows
+
+
+def accuracy(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
+    """How many registrations come out right, and how right those are."""
+    posed = [o for o in outcomes if o.failure is None]
+    right = [o for o in posed if o.correct]
+    errors = [o.direction_error_deg for o in right if o.direction_error_deg is not None]
+    return {
+        "pairs": len(outcomes),
+        "right": len(right),
+        "precision": len(right) / len(posed) if posed else None,
+        "direction_error_deg": float(np.median(errors)) if errors else None,
+    }
+
+
+def latent_accuracy(network: Literal["tiny", "small", "full"], pictures: int) -> list[Row]:
+    """Errors of what the decoder makes of reduced latents, against unreduced ones; no pose can be judged."""
+    from flocc_agent.perception.mast3r.matching import MatchParameters
+    from flocc_agent.perception.mast3r.pair import match_pair
+    from flocc_agent.perception.mast3r.relative_pose import PoseFailed
+    from flocc_launch.experiments.keyed_engine import keyed_engine, keyed_pictures
+
+    engine, size = keyed_engine(network, exact=True), SIZES_PX[network]
+    latents = [latent[0].float().cpu().numpy() for latent in engine.encode(keyed_pictures(size, pictures))]
+    rows: dict[str, list[Row]] = {}
+    for query, match in pairwise(latents):
+        reference = None
+        for name, (count, reduced) in latent_forms(match).items():
+            views = engine.decode([(engine.place(query, size), engine.place(reduced, size))])[0]
+            points = [view.pts3d.float().cpu().numpy() for view in views]
+            matches = match_pair(views, MatchParameters())
+            found = set() if isinstance(matches, PoseFailed) else set(map(tuple, np.hstack([matches.xy1, matches.xy2])))
+            reference = reference or (points, found)
+            error = np.linalg.norm(np.subtract(points, reference[0])) / np.linalg.norm(reference[0])
+            same = len(found & reference[1]) / max(len(reference[1]), 1)
+            rows.setdefault(name, []).append({"bytes": count, "pointmap_error": error, "same_matches": same})
+    return [
+        form(name, of_form[0]["bytes"], **{key: middle(of_form, key) for key in ("pointmap_error", "same_matches")})
+        for name, of_form in rows.items()
+    ]
+
+
+def forms_of(rows: Sequence[Row], part: str) -> list[Row]:
+    """All forms of a part, with the scene that they are of."""
+    return [{"on": row["on"], **each} for row in rows if row["part"] == part for each in row["forms"]]
+
+
+def summarise(_settings: BandwidthSettings, rows: Sequence[Row]) -> Summary:
+    """A row per form and measure, with what it is of the unreduced one."""
+    measures = {
+        "bytes": ("bytes_per_closure",),
+        "descriptors": ("recall_at_1",),
+        "keypoints": ("right", "precision", "direction_error_deg"),
+        "latents": ("pointmap_error", "same_matches"),
+    }
+    table: list[Row] = []
+    for part, names in measures.items():
+        for on, of_scene in grouped(forms_of(rows, part), "on").items():
+            whole = of_scene[0]["form"]
+            for (form_name,), group in grouped(of_scene, "form").items():
+                unreduced = [each for each in of_scene if each["form"] == whole]
+                table += [_line(part, on[0], form_name, name, group, unreduced) for name in names]
+    return Summary(table, (), notes(rows))
+
+
+def _line(part: str, on: str, name: str, measure_name: str, group: Sequence[Row], unreduced: Sequence[Row]) -> Row:
+    size, whole_size = middle(group, "bytes"), middle(unreduced, "bytes")
+    return {
+        "part": part,
+        "on": on,
+        "form": name,
+        "bytes": size,
+        "bytes_ratio": size / whole_size if size is not None and whole_size else None,
+        "measure": measure_name,
+        "value": middle(group, measure_name),
+        "unreduced": middle(unreduced, measure_name),
+    }
+
+
+def notes(rows: Sequence[Row]) -> list[str]:
+    """What each part means, and what it cannot show."""
+    parts = {row["part"] for row in rows}
+    said = {
+        "bytes": "bytes: synthetic perception on walks of three robots, latents padded to each method's size; bytes "
+        "that all robots sent, per accepted closure between robots.",
+        "descriptors": "descriptors: int8 is what travels. The basis of the PCA is learned on the first robot's views, "
+        "recall is that between the others.",
+        "keypoints": "keypoints: registrations of pairs at one place, right within 10 degrees and the scene's limit; "
+        "only the match's latent is reduced. 'half' and 'quarter' keep the strongest features.",
+        "latents": "latents: keyed random weights. They show what reductions do to this decoder's numbers; they cannot "
+        "show what they do to the poses of trained weights, whose latents have another spectrum (rank-K may do far "
+        "better there, int8 worse where single channels dwarf others).",
+    }
+    return [text for part, text in said.items() if part in parts]
+
+
+def draw(figure: "Figure", _settings: BandwidthSettings, rows: Sequence[Row]) -> None:
+    """A panel per part."""
+    present = [part for part in ("bytes", "descriptors", "keypoints", "latents") if forms_of(rows, part)]
+    columns = min(len(present), 2)
+    figure.set_size_inches(5.5 * columns, 4.2 * -(-len(present) // columns))
+    panels = figure.subplots(-(-len(present) // columns), columns, squeeze=False).flat
+    for part, panel in zip(present, panels, strict=False):
+        if part == "bytes":
+            _draw_bytes(panel, forms_of(rows, part))
+        elif part == "descriptors":
+            _draw_tradeoff(panel, forms_of(rows, part), "recall_at_1", "bytes of a descriptor", "recall@1")
+        elif part == "keypoints":
+            _draw_tradeoff(panel, forms_of(rows, part), "right", "bytes of a keypoint latent", "right registrations")
+        else:
+            _draw_tradeoff(panel, forms_of(rows, part), "pointmap_error", "bytes of a latent", "error of the pointmaps")
+            panel.set_yscale("symlog", linthresh=1e-4)
+            panel.set_ylim(top=1.0)
+    for panel in list(panels):
+        panel.set_visible(False)
+
+
+def _draw_bytes(panel: "Axes", forms: Sequence[Row]) -> None:
+    """Bytes per closure by kind on a logarithmic scale; all kinds but the latents are the same for every method."""
+    names = [name for (name,) in grouped(forms, "on")]
+    bars = [(f"latent\n{name}", _per_closure(forms, name, "latent")) for name in names]
+    bars += [(kind, _per_closure(forms, names[0], kind)) for kind in (*KINDS[1:], "others")]
+    labels, sizes = zip(*sorted(bars, key=lambda bar: bar[1]), strict=True)
+    drawn = panel.barh(labels, sizes, color=[COLOURS[label.startswith("latent")] for label in labels])
+    panel.bar_label(drawn, fmt="{:.3g}", fontsize=7, padding=2)
+    panel.set_xscale("log")
+    panel.set_xlim(right=8.0 * max(sizes))
+    panel.tick_params(axis="y", labelsize=7)
+    panel.set_xlabel("bytes sent per closure gained")
+    panel.grid(visible=False, axis="y")
+
+
+def _per_closure(forms: Sequence[Row], on: str, kind: str) -> float:
+    return middle([row for row in forms if row["on"] == on and row["form"] == kind], "bytes_per_closure") or 0.0
+
+
+def _draw_tradeoff(panel: "Axes", forms: Sequence[Row], column: str, across: str, up: str) -> None:
+    """A measure over bytes, each form named."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for k, ((on,), of_scene) in enumerate(grouped(forms, "on").items()):
+        known = [row for row in of_scene if row[column] is not None]
+        at = [row["bytes"] for row in known], [row[column] for row in known]
+        panel.plot(*at, linestyle="", color=COLOURS[k], marker=MARKERS[k], label=on)
+        for row in known:
+            beside = (0, 5 if k % 2 == 0 else -10)
+            place = row["bytes"], row[column]
+            panel.annotate(row["form"], place, beside, textcoords="offset points", fontsize=6, ha="center")
+    panel.set_xscale("log")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    panel.margins(x=0.12)
+    panel.set_xlabel(across)
+    panel.set_ylabel(up)
+    panel.set_ylim(0.0, 1.15 * max(row[column] for row in forms if row[column] is not None))
+    panel.legend(fontsize=8)
+
+
+BANDWIDTH = Experiment(
+    name="bandwidth",
+    title="bytes per closure gained, and what smaller descriptors and latents cost in accuracy",
+    settings=BandwidthSettings,
+    quick={
+        "parts": ("bytes", "descriptors", "latents"),
+        "worlds": (),
+        "walks": (3,),
+        "perception": {"method": "synthetic"},
+        "latents": ("classical",),
+        "network": "tiny",
+        "pictures": 2,
+        "runs": 1,
+    },
+    cells=cells,
+    measure=measure,
+    summarise=summarise,
+    draw=draw,
+    prepare=prepare,
+)
