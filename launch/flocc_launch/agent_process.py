@@ -11,12 +11,16 @@ import logging
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_protocol.errors import FloccError
+
+if TYPE_CHECKING:
+    from flocc_launch.dashboard.own import AgentSource
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +54,7 @@ async def run_agent(
     epoch_s: float,
     on_status: Callable[[dict[str, Any]], None],
     orders: asyncio.StreamReader | None = None,
+    dashboard: str | None = None,
 ) -> None:
     """Run one agent until it is told to stop (a signal, an order, or the end of its recording and `hold_s`).
 
@@ -58,20 +63,40 @@ async def run_agent(
         epoch_s: Start of the run on this machine's monotonic clock.
         on_status: Takes a state, twice a second.
         orders: JSON lines from the launcher.
+        dashboard: [HOST:]PORT of a page that shows this agent's own view of its swarm.
 
     Raises:
         FloccError: The configuration, the recording or the network cannot be used.
     """
+    lines = Lines(config.folder / "events.jsonl" if config.folder else None)
+    with _page(config, dashboard, lambda: time.monotonic() - epoch_s) as source:
+        await _run(config, epoch_s, on_status, orders, lines, source)
+
+
+async def _run(
+    config: AgentConfig,
+    epoch_s: float,
+    on_status: Callable[[dict[str, Any]], None],
+    orders: asyncio.StreamReader | None,
+    lines: Lines,
+    source: "AgentSource | None",
+) -> None:
     from flocc_agent.composition import Agent
 
-    lines = Lines(config.folder / "events.jsonl" if config.folder else None)
-    agent = Agent(config, on_line=lines.write, clock_s=lambda: time.monotonic() - epoch_s)
+    def on_line(line: dict[str, Any]) -> None:
+        lines.write(line)
+        if source is not None:
+            source.line(line)
+
+    agent = Agent(config, on_line=on_line, clock_s=lambda: time.monotonic() - epoch_s)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, agent.stop)
     background: list[asyncio.Task[None]] = []
     try:
         async with agent:
+            if source is not None:
+                source.attach(agent)
             background = [asyncio.create_task(_tell(agent, on_status))]
             if orders is not None:
                 background.append(asyncio.create_task(_obey(agent, orders)))
@@ -82,6 +107,26 @@ async def run_agent(
         _write_result(config.folder, agent.result())
         lines.write({"t": round(time.monotonic() - epoch_s, 6), "robot": config.name, "event": "agent_stopped"})
         lines.close()
+
+
+@contextmanager
+def _page(config: AgentConfig, where: str | None, clock_s: Callable[[], float]) -> "Iterator[AgentSource | None]":
+    """The page of one agent, where somebody wants one.
+
+    Raises:
+        DashboardError: Its address is none, or in use.
+    """
+    if where is None:
+        yield None
+        return
+    from flocc_launch.dashboard import Dashboard, address
+    from flocc_launch.dashboard.own import AgentSource
+
+    host, port = address(where)
+    source = AgentSource(config.swarm, config.name, config.backend.steepness, clock_s)
+    with Dashboard(source, port, host) as page:
+        logger.info("%s: dashboard at %s", config.name, page.url)
+        yield source
 
 
 def recover_result(config: AgentConfig) -> None:

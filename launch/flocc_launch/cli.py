@@ -38,7 +38,7 @@ HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
 Latency = Annotated[float | None, typer.Option(help="Delay on every link, seconds.")]
-Bandwidth = Annotated[float | None, typer.Option(help="Capacity of every link, kilobytes per second.")]
+Bandwidth = Annotated[float | None, typer.Option(help="Capacity of every link, and budget of every robot, kB/s.")]
 Range = Annotated[float | None, typer.Option("--range", help="Communication range by true position, metres.")]
 Duration = Annotated[float | None, typer.Option(help="End after this many seconds instead of when all is settled.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
@@ -87,14 +87,15 @@ def launch(
     duration: Duration = None,
     seed: Seed = None,
     rate: Annotated[float | None, typer.Option(help="Playback speed of recordings.")] = None,
-    dashboard: Annotated[int | None, typer.Option(help="Serve a live page on this port of this machine.")] = None,
+    dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
+    metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
     secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
 ) -> None:
     """Run a scenario with one process per robot on this machine, over real zenoh."""
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     if rate is not None:
         changes["rate"] = rate
-    _launch(_read(scenario, changes, agents), out, secure, dashboard)
+    _launch(_read(scenario, changes, agents), out, secure, dashboard, metrics)
 
 
 @app.command()
@@ -132,6 +133,11 @@ def simulate(
 @app.command()
 def agent(
     config: Annotated[Path, typer.Option(help="Configuration of the agent (TOML); see docs/configuration.md.")],
+    dashboard: Annotated[str | None, typer.Option(help="Serve this agent's view of the swarm at [HOST:]PORT.")] = None,
+    metrics: Annotated[str | None, typer.Option(help="Serve metrics for Prometheus at [HOST:]PORT.")] = None,
+    bandwidth: Annotated[
+        float | None, typer.Option(min=0.001, help="Budget of this robot, kilobytes per second.")
+    ] = None,
     verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
 ) -> None:
     """Run one robot's agent until it is stopped."""
@@ -139,12 +145,16 @@ def agent(
     import logging
     import time
 
-    from flocc_agent.config import AgentConfig
+    from flocc_agent.config import AgentConfig, MetricsConfig
     from flocc_launch.agent_process import run_agent
 
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
-    asyncio.run(run_agent(AgentConfig.read(config), time.monotonic(), lambda _: None))
+    given: dict[str, Any] = {} if metrics is None else {"metrics": MetricsConfig.at(metrics)[0]}
+    if bandwidth is not None:
+        given["bandwidth_bytes_s"] = 1000.0 * bandwidth
+    read = AgentConfig.read(config).model_copy(update=given)
+    asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
 
 
 @app.command()
@@ -181,6 +191,7 @@ def _changes(
         "radio.loss_ratio": loss,
         "radio.latency_s": latency,
         "radio.bandwidth_bytes_s": None if bandwidth is None else 1000.0 * bandwidth,
+        "bandwidth_bytes_s": None if bandwidth is None else 1000.0 * bandwidth,
         "radio.range_m": range_m,
         "duration_s": duration,
         "seed": seed,
@@ -188,7 +199,9 @@ def _changes(
     return {key: value for key, value in given.items() if value is not None}
 
 
-def _launch(scenario: "Scenario", out: Path, secure: bool = False, dashboard: int | None = None) -> None:
+def _launch(
+    scenario: "Scenario", out: Path, secure: bool = False, dashboard: str | None = None, metrics: str | None = None
+) -> None:
     from rich.console import Console
 
     from flocc_launch.data import recordings
@@ -198,21 +211,22 @@ def _launch(scenario: "Scenario", out: Path, secure: bool = False, dashboard: in
     with progress_bar("preparing data") as progress:
         recordings(scenario, progress)
     with LiveTable(Console()) as table, _dashboard(out, dashboard, table.show) as show:
-        report = run(scenario, out, show, secure=secure)
+        report = run(scenario, out, show, secure=secure, metrics=metrics)
     show_report(report, out)
 
 
 @contextmanager
-def _dashboard(out: Path, port: int | None, show: "OnWatch") -> "Iterator[OnWatch]":
-    """Serve the dashboard beside the table, where a port is given."""
-    if port is None:
+def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWatch]":
+    """Serve the dashboard beside the table, where somebody wants one."""
+    if where is None:
         yield show
         return
-    from flocc_launch.dashboard import live_dashboard
+    from flocc_launch.dashboard import address, live_dashboard
     from flocc_launch.run_folder import RunFolder
 
-    with live_dashboard(RunFolder(out), port, show) as both:
-        typer.echo(f"dashboard: http://127.0.0.1:{port}/")
+    host, port = address(where)
+    with live_dashboard(RunFolder(out), port, show, host) as both:
+        typer.echo(f"dashboard: http://{host}:{port}/")
         yield both
 
 

@@ -1,8 +1,9 @@
-"""The live page of a run: what every robot does, drawn from the events that it writes anyway.
+"""The live page of a swarm: what every robot does, drawn from events that are written anyway.
 
-The page reads the run folder, never the network, so that looking at a swarm cannot disturb it.
+The page of a run reads its folder, the page of one agent what that agent holds; neither asks the network, so that
+looking at a swarm cannot disturb it.
 """
 
-from flocc_launch.dashboard.server import Dashboard, DashboardError, live_dashboard
+from flocc_launch.dashboard.server import Dashboard, DashboardError, address, live_dashboard
 
-__all__ = ["Dashboard", "DashboardError", "live_dashboard"]
+__all__ = ["Dashboard", "DashboardError", "address", "live_dashboard"]

@@ -10,7 +10,7 @@ from importlib.resources import files
 from types import TracebackType
 from typing import Any, TypeVar
 
-from flocc_launch.dashboard.source import RunSource
+from flocc_launch.dashboard.source import RunSource, SnapshotSource
 from flocc_launch.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 W = TypeVar("W")
 
 PORT = 8642
+PORT_MAX = 65535
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -32,29 +33,31 @@ class DashboardError(FloccError):
 
 
 class Dashboard:
-    """Serves the page of one run folder from a thread of its own, until it is closed.
+    """Serves the page of one swarm from a thread of its own, until it is closed.
 
-    Making it takes the port; `with` starts to answer, and needs `run.json`. `url` is where the page is.
+    Making it takes the port; `with` starts to answer. `url` is where the page is.
     """
 
-    def __init__(self, folder: RunFolder, port: int = PORT, host: str = "127.0.0.1") -> None:
+    def __init__(self, source: RunFolder | SnapshotSource, port: int = PORT, host: str = "127.0.0.1") -> None:
         """Bind the port.
 
         Args:
-            folder: The run folder; its `run.json` need not be there yet.
+            source: A run folder, whose `run.json` need not be there before `start`; or who else knows the swarm.
             port: TCP port; 0 takes a free one.
             host: Address to listen on; 0.0.0.0 shows the page to the whole network.
 
         Raises:
             DashboardError: The port is in use or the address is not this machine's.
         """
-        self._folder = folder
+        self._source = source
         try:
             self._server = ThreadingHTTPServer((host, port), BaseHTTPRequestHandler)
         except OSError as error:
-            raise DashboardError(f"dashboard: port {port} on {host}: {error.strerror}; choose another") from error
+            why = error.strerror or str(error)
+            raise DashboardError(f"dashboard: port {port} on {host}: {why}; choose another") from error
         self._server.daemon_threads = True
-        self.url = f"http://{host}:{self._server.server_address[1]}/"
+        shown = f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._server.serve_forever, name="dashboard", daemon=True)
 
     def __enter__(self) -> "Dashboard":
@@ -67,7 +70,8 @@ class Dashboard:
         Raises:
             RunFolderError: The folder has no `run.json`.
         """
-        self._server.RequestHandlerClass = handler_of(RunSource(self._folder))
+        source = RunSource(self._source) if isinstance(self._source, RunFolder) else self._source
+        self._server.RequestHandlerClass = handler_of(source)
         self._thread.start()
         logger.info("dashboard at %s", self.url)
 
@@ -83,13 +87,16 @@ class Dashboard:
 
 
 @contextmanager
-def live_dashboard(folder: RunFolder, port: int, on_watch: Callable[[W], None]) -> Iterator[Callable[[W], None]]:
+def live_dashboard(
+    folder: RunFolder, port: int, on_watch: Callable[[W], None], host: str = "127.0.0.1"
+) -> Iterator[Callable[[W], None]]:
     """Serve the page of a launch from the first state that its launcher shows.
 
     Args:
         folder: Where the run will lie.
         port: TCP port, taken at once, so that a port in use stops the launch before it begins.
         on_watch: What the launcher shows its states to anyway.
+        host: Address to listen on.
 
     Yields:
         What to give the launcher in its place.
@@ -97,7 +104,7 @@ def live_dashboard(folder: RunFolder, port: int, on_watch: Callable[[W], None]) 
     Raises:
         DashboardError: The port is in use.
     """
-    dashboard = Dashboard(folder, port)
+    dashboard = Dashboard(folder, port, host)
     started = False
 
     def show(watch: W) -> None:
@@ -113,13 +120,25 @@ def live_dashboard(folder: RunFolder, port: int, on_watch: Callable[[W], None]) 
         dashboard.close()
 
 
+def address(text: str) -> tuple[str, int]:
+    """Read [HOST:]PORT; without a host, this machine only.
+
+    Raises:
+        DashboardError: It is not that.
+    """
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or int(port) > PORT_MAX:
+        raise DashboardError(f"dashboard: {text!r} is not [HOST:]PORT, such as 8642 or 0.0.0.0:8642")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
 def page() -> bytes:
     """The page; everything in it is inline."""
     return files("flocc_launch.dashboard").joinpath("page.html").read_bytes()
 
 
-def handler_of(source: RunSource) -> type[BaseHTTPRequestHandler]:
-    """A request handler for one run."""
+def handler_of(source: SnapshotSource) -> type[BaseHTTPRequestHandler]:
+    """A request handler for one source."""
 
     class Handler(BaseHTTPRequestHandler):
         """GET / and /state.json."""
@@ -129,9 +148,15 @@ def handler_of(source: RunSource) -> type[BaseHTTPRequestHandler]:
             if self.path == "/":
                 self._answer(HTTPStatus.OK, "text/html; charset=utf-8", page())
             elif self.path == "/state.json":
-                self._answer(HTTPStatus.OK, "application/json", source.snapshot_text().encode())
+                self._answer_state()
             else:
                 self._answer(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"there is only / and /state.json\n")
+
+        def _answer_state(self) -> None:
+            try:
+                self._answer(HTTPStatus.OK, "application/json", source.snapshot_text().encode())
+            except TimeoutError:
+                self._answer(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", b"too busy\n")
 
         def _answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
             self.send_response(status)

@@ -5,12 +5,20 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import datetime
-from typing import Any
+from typing import Any, Protocol
 
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import RunTail
 from flocc_launch.run_folder import RunFolder
 from flocc_launch.run_records import Run
+
+
+class SnapshotSource(Protocol):
+    """Who knows a swarm's state; asked from the threads of a server."""
+
+    def snapshot_text(self) -> str:
+        """The newest state as JSON."""
+        ...
 
 
 class RunSource:
@@ -27,7 +35,7 @@ class RunSource:
         self._clock_s = clock_s
         self._tail = RunTail(folder.path)
         self._run = folder.run()
-        self._state = SwarmState(self._run.robots)
+        self._state = SwarmState(self._run.robots, self._run.servers)
         self._over = False
         self._lock = threading.Lock()
 
@@ -38,10 +46,10 @@ class RunSource:
             if merged:
                 self._over = True
                 self._run = self._folder.run()
-                self._state = SwarmState(self._run.robots)
+                self._state = SwarmState(self._run.robots, self._run.servers)
             for event in events:
                 self._state.apply(event)
-            return {"scenario": self._run.scenario, "seed": self._run.seed} | self._state.snapshot(self._now_s())
+            return {"scenario": self._run.scenario, "seen_by": None} | self._state.snapshot(self._now_s())
 
     def snapshot_text(self) -> str:
         """The snapshot as JSON."""

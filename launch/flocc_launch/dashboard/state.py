@@ -1,6 +1,7 @@
 """What is known of a swarm at one moment, folded from its events."""
 
 from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from flocc_agent.geometry import pose_from_tq
 from flocc_launch.dashboard.words import sentence_of
 from flocc_launch.run_records import (
+    AccountKept,
     AgentDied,
     AgentStopped,
     BytesCounted,
@@ -31,6 +33,7 @@ Float = NDArray[np.float64]
 
 RECENT_MAX = 60
 PATH_POINTS_MAX = 600
+KEYFRAMES_MAX = 200_000
 CLOSURES_MAX = 2000
 SILENT_S = 20.0
 
@@ -44,12 +47,17 @@ class RobotState:
     neighbours: set[str] = field(default_factory=set)
     map_frame: str | None = None
     T_map_odom: Float = field(default_factory=lambda: np.eye(4))
-    positions_odom_m: list[Float] = field(default_factory=list)
+    positions_odom_m: dict[int, Float] = field(default_factory=dict)
+    incarnation: int = 0
     candidates: int = 0
     accepted: int = 0
     rejected: int = 0
     sent: dict[str, int] = field(default_factory=dict)
     received: dict[str, int] = field(default_factory=dict)
+    sent_to: dict[str, int] = field(default_factory=dict)
+    received_from: dict[str, int] = field(default_factory=dict)
+    loss: dict[str, float] = field(default_factory=dict)
+    queues: dict[str, int] = field(default_factory=dict)
     last_s: float = 0.0
     end: str | None = None
 
@@ -58,14 +66,32 @@ class RobotState:
         if not self.positions_odom_m:
             return np.zeros((0, 3))
         R, t = self.T_map_odom[:3, :3], self.T_map_odom[:3, 3]
-        return np.asarray(np.array(self.positions_odom_m) @ R.T + t)
+        positions_m = [self.positions_odom_m[index] for index in sorted(self.positions_odom_m)]
+        return np.asarray(np.array(positions_m) @ R.T + t)
+
+    def take(self, event: KeyframeCaptured) -> None:
+        """One more keyframe; a robot that lost its disk begins anew."""
+        keyframe = KeyframeId.parse(event.keyframe)
+        if keyframe.log.incarnation != self.incarnation:
+            self.positions_odom_m.clear()
+            self.incarnation = keyframe.log.incarnation
+        if len(self.positions_odom_m) < KEYFRAMES_MAX:
+            self.positions_odom_m[keyframe.index] = pose_from_tq(np.array(event.T_odom_body))[:3, 3]
+        self.end = None
 
 
 class SwarmState:
     """Folds events; `snapshot` is what the page and the table show."""
 
-    def __init__(self, robots: list[str]) -> None:
+    def __init__(self, robots: Iterable[str], servers: Iterable[str] = ()) -> None:
+        """Know the robots that will be heard of.
+
+        Args:
+            robots: Their names; others may come.
+            servers: Those without a camera, which are in no map.
+        """
         self.robots = {robot: RobotState() for robot in sorted(robots)}
+        self.servers = frozenset(servers)
         self.closures: dict[tuple[str, str], float] = {}
         self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT_MAX)
         self.optimised: GraphOptimised | None = None
@@ -84,6 +110,10 @@ class SwarmState:
         if said is not None:
             self.recent.append({"t": event.t, "robot": event.robot, "text": said})
 
+    def heard(self, name: str, t: float) -> None:
+        """A robot was heard of, without an event."""
+        self.robots.setdefault(name, RobotState()).last_s = t
+
     def snapshot(self, now_s: float | None = None) -> dict[str, Any]:
         """Everything as plain JSON values.
 
@@ -91,12 +121,13 @@ class SwarmState:
             now_s: Now on the run's clock; None for a run that is over.
         """
         names = sorted(self.robots)
-        living = {name: robot for name, robot in self.robots.items() if state_of(robot, now_s) == "running"}
+        here = ("running",) if now_s is not None else ("running", "stopped")
+        living = {name: robot for name, robot in self.robots.items() if state_of(robot, now_s) in here}
         return {
             "t": self.t if now_s is None else now_s,
             "running": now_s is not None,
-            "robots": [robot_json(name, self.robots[name], now_s) for name in names],
-            "maps": groups([(name, self.robots[name].map_frame) for name in names]),
+            "robots": [robot_json(name, self.robots[name], now_s) | {"server": name in self.servers} for name in names],
+            "maps": groups([(name, self.robots[name].map_frame) for name in names if name not in self.servers]),
             "ranges": ranges(living),
             "leaders": sorted({robot.leader for robot in living.values() if robot.leader is not None}),
             "closures": [closure_json(self, query, match) for query, match in self.closures],
@@ -109,8 +140,7 @@ def apply_to(robot: RobotState, event: Event) -> None:
     """What an event changes of its robot."""
     match event:
         case KeyframeCaptured():
-            robot.positions_odom_m.append(pose_from_tq(np.array(event.T_odom_body))[:3, 3])
-            robot.end = None
+            robot.take(event)
         case CorrectionApplied():
             robot.map_frame, robot.T_map_odom = event.map_frame, pose_from_tq(np.array(event.T_map_odom))
         case LeaderFollowed():
@@ -129,9 +159,18 @@ def apply_to(robot: RobotState, event: Event) -> None:
             robot.rejected += 1
         case BytesCounted():
             robot.sent, robot.received = event.sent, event.received
+            robot.loss, robot.queues = event.loss, event.queues
+        case AccountKept():
+            robot.sent_to, robot.received_from = totals(event.sent_to), totals(event.received_from)
         case AgentDied() | AgentStopped():
             robot.end = "died" if isinstance(event, AgentDied) else "stopped"
-            robot.leader, robot.neighbours = None, set()
+            if robot.end == "died":
+                robot.leader, robot.neighbours = None, set()
+
+
+def totals(links: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
+    """Bytes by peer, all kinds together."""
+    return {peer: sum(kinds.values()) for peer, kinds in links.items()}
 
 
 def state_of(robot: RobotState, now_s: float | None) -> str:
@@ -154,6 +193,8 @@ def robot_json(name: str, robot: RobotState, now_s: float | None) -> dict[str, A
         "leader": robot.leader,
         "term": robot.term,
         "neighbours": sorted(robot.neighbours),
+        "links": links_json(robot),
+        "queues": robot.queues,
         "map_frame": robot.map_frame,
         "keyframes": len(robot.positions_odom_m),
         "candidates": robot.candidates,
@@ -167,6 +208,20 @@ def robot_json(name: str, robot: RobotState, now_s: float | None) -> dict[str, A
     }
 
 
+def links_json(robot: RobotState) -> dict[str, dict[str, Any]]:
+    """What a robot knows of its links, by peer; null where it does not know."""
+    peers = sorted({*robot.neighbours, *robot.sent_to, *robot.received_from})
+    return {
+        peer: {
+            "hears": peer in robot.neighbours,
+            "loss_ratio": robot.loss.get(peer) if peer in robot.neighbours else None,
+            "sent_bytes": robot.sent_to.get(peer),
+            "received_bytes": robot.received_from.get(peer),
+        }
+        for peer in peers
+    }
+
+
 def closure_json(state: SwarmState, query: str, match: str) -> dict[str, Any]:
     """A closure with the places of its ends, null where they are not known."""
     ends = [place_of(state, KeyframeId.parse(keyframe)) for keyframe in (query, match)]
@@ -176,7 +231,7 @@ def closure_json(state: SwarmState, query: str, match: str) -> dict[str, Any]:
 def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
     """Position of a keyframe in its robot's map frame."""
     robot = state.robots.get(keyframe.log.robot)
-    if robot is None or keyframe.index >= len(robot.positions_odom_m):
+    if robot is None or keyframe.index not in robot.positions_odom_m:
         return None
     p = robot.T_map_odom[:3, :3] @ robot.positions_odom_m[keyframe.index] + robot.T_map_odom[:3, 3]
     return [round(float(v), 3) for v in p]

@@ -1,0 +1,99 @@
+"""What one agent knows of its swarm: its own events, and of the others what their logs and corrections say.
+
+Others' neighbours, bytes and queues are not known to it. Everything is read on the agent's own event loop, and only
+while somebody looks, so that a page nobody has open costs the agent nothing but a little memory.
+"""
+
+import asyncio
+import json
+from collections.abc import Callable
+from typing import Any
+
+from flocc_agent.composition import Agent
+from flocc_agent.core.robot import Robot
+from flocc_launch.dashboard.state import SwarmState
+from flocc_launch.heard import Heard
+from flocc_launch.run_folder import RunFolderError, event_from_line
+from flocc_launch.run_records import (
+    ClosureAccepted,
+    ClosureRejected,
+    CorrectionApplied,
+    Event,
+    KeyframeCaptured,
+)
+from flocc_protocol.ids import LogId
+
+ANSWER_S_MAX = 5.0
+RECORDS_MAX = 2000
+"""Records of one log that one look takes in, so that a long log does not keep the agent from its work."""
+FROM_LOGS = (KeyframeCaptured, ClosureAccepted, ClosureRejected, CorrectionApplied)
+
+
+class AgentSource:
+    """One agent's view as a `SnapshotSource`: `line` takes the agent's events, `attach` the running agent."""
+
+    def __init__(self, swarm: str, robot: str, steepness: float, clock_s: Callable[[], float]) -> None:
+        """Prepare, on the event loop of the agent to come.
+
+        Args:
+            swarm: Name of the swarm.
+            robot: Name of the agent's robot.
+            steepness: k of Eq. (2), for the probability of closures.
+            clock_s: The clock of the agent's events.
+        """
+        self._swarm = swarm
+        self._name = robot
+        self._clock_s = clock_s
+        self._state = SwarmState([robot])
+        self._heard = Heard(steepness)
+        self._read: dict[LogId, int] = {}
+        self._agent: Agent | None = None
+        self._loop = asyncio.get_running_loop()
+
+    def attach(self, agent: Agent) -> None:
+        """Look at this agent, which runs, from now on."""
+        self._agent = agent
+
+    def line(self, line: dict[str, Any]) -> None:
+        """Take one of the agent's events; what stands in its logs is read there, also after a restart."""
+        try:
+            event = event_from_line(json.dumps(line), self._name)
+        except RunFolderError:
+            return
+        if not isinstance(event, FROM_LOGS):
+            self._state.apply(event)
+
+    def snapshot_text(self) -> str:
+        """The newest state as JSON; from any thread but the loop's own.
+
+        Raises:
+            TimeoutError: The agent is too busy to answer.
+        """
+        asked = asyncio.run_coroutine_threadsafe(self._look(), self._loop)
+        return json.dumps(asked.result(ANSWER_S_MAX), allow_nan=False)
+
+    async def _look(self) -> dict[str, Any]:
+        if self._agent is not None:
+            self._read_robot(self._agent.robot)
+        return {"scenario": self._swarm, "seen_by": self._name} | self._state.snapshot(self._clock_s())
+
+    def _read_robot(self, robot: Robot) -> None:
+        """Take in what is new in the core: records, corrections, and whom the neighbours follow."""
+        t = self._clock_s()
+        for log, copy in sorted(robot.gossip.logs.items()):
+            read = self._read.get(log, 0)
+            for record in copy.records[read : read + RECORDS_MAX]:
+                self._apply(self._heard.record(log, record, t))
+            self._read[log] = min(read + RECORDS_MAX, len(copy.records))
+            correction = robot.corrections.of(log)
+            if correction is not None:
+                self._apply(self._heard.correction(correction, t))
+        for name in robot.neighbours.names():
+            neighbour = robot.neighbours.get(name)
+            if neighbour is not None:
+                self._apply(self._heard.heartbeat(neighbour.log, neighbour.heartbeat, t))
+                self._state.heard(name, neighbour.heard_s)
+
+    def _apply(self, event: Event | None) -> None:
+        if event is not None:
+            self._state.apply(event)
