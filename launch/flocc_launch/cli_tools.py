@@ -93,14 +93,39 @@ def dashboard(
 
 
 def view(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: RunArgument = None,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening the viewer.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Show what happens, of a run folder that still grows.")] = False,
+    config: ConfigOption = None,
+    swarm: SwarmOption = None,
+    duration: Annotated[float | None, typer.Option(help="End a live view after this many seconds.")] = None,
 ) -> None:
-    """Show a run in rerun: trajectories, closures, images, leaders and errors over time."""
-    from flocc_launch.run_folder import RunFolder
-    from flocc_launch.view import view as show
+    """Show a run or a running swarm in rerun: trajectories, closures, images, links, leaders, residuals over time.
 
-    typer.echo(f"view: {show(RunFolder.open(run), save)}")
+    A running swarm is listened to by a session that only subscribes, until Ctrl-C.
+    """
+    from flocc_launch.run_folder import RunFolder
+
+    end_s = float("inf") if duration is None else time.monotonic() + duration
+
+    def is_over() -> bool:
+        return time.monotonic() >= end_s
+
+    if run is None:
+        from flocc_agent.config import BackendConfig
+        from flocc_agent.runtime.zenoh_observer import Observer
+        from flocc_launch.view_live import view_swarm
+
+        shown = view_swarm(Observer(*_reach(config, swarm)), save, BackendConfig().steepness, is_over)
+    elif live:
+        from flocc_launch.view_live import view_growing
+
+        shown = view_growing(RunFolder.open(run), save, is_over)
+    else:
+        from flocc_launch.view import view as show
+
+        shown = show(RunFolder.open(run), save)
+    typer.echo(f"view: {shown}")
 
 
 def chaos(
@@ -122,11 +147,10 @@ def _reach(config: Path | None, swarm: str | None) -> "tuple[TransportConfig, st
     Raises:
         ConfigError: The configuration cannot be read, or nothing says which swarm.
     """
-    from flocc_agent.config import AgentConfig, ConfigError, TransportConfig, read_json, validated
+    from flocc_agent.config import AgentConfig, ConfigError, TransportConfig
 
     if config is not None:
-        is_json = config.suffix == ".json"  # as `flocc launch` leaves it in a run folder
-        read = validated(AgentConfig, read_json(config), str(config)) if is_json else AgentConfig.read(config)
+        read = AgentConfig.read(config)
         return read.transport, swarm or read.swarm
     if swarm is None:
         raise ConfigError("give a run folder, --swarm NAME, or --config of an agent")

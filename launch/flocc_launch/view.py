@@ -1,9 +1,11 @@
-"""`flocc view`: a run in rerun, as a recording that its viewer opens or as a live window.
+"""`flocc view`: a run in rerun, in its viewer or as a file that the viewer opens.
 
-Everything is logged on one timeline, seconds since the start of the run: odometry as it was taken, map frames as they
-merge, closures with both images, leaders, neighbours, and at the end the corrected trajectories beside ground truth.
+Everything is logged on one timeline, seconds since the start of the run: what happened (`view_drawing`), and for a run
+that is over its trajectories before and after beside ground truth, its errors, and what is left of each closure.
 """
 
+import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,23 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.recording import Frame, Recording
-from flocc_launch.dashboard.words import sentence_of
+from flocc_agent.geometry import inverse, pose_from_tq
+from flocc_agent.runtime.recording import Recording
 from flocc_launch.report.figure_charts import errors_after
 from flocc_launch.report.figure_map import Scene, scenes
 from flocc_launch.report.load import LoadedRun, load
 from flocc_launch.run_folder import RunFolder
-from flocc_launch.run_records import ClosureAccepted, CorrectionApplied, KeyframeCaptured
+from flocc_launch.run_records import ClosureKnown
+from flocc_launch.view_drawing import COLOURS, GREY, TIMELINE, Colour, Drawing, confidence_colour
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
-
-TIMELINE = "run"
-IMAGES_MAX = 200
-COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (181, 80, 143), (201, 138, 0), (58, 155, 217), (107, 95, 199))
-GREY = (130, 138, 146)
 
 
 class ViewError(FloccError):
@@ -48,15 +45,15 @@ def view(folder: RunFolder, save: Path | None = None) -> str:
         ViewError: rerun is not installed, or there is no display.
     """
     rr = rerun_module()
-    recording = rr.RecordingStream("flocc", recording_id=folder.run().scenario)
-    if save is None:
-        try:
-            recording.spawn()
-        except (RuntimeError, OSError) as error:
-            raise ViewError(f"the viewer cannot be opened ({error}); write a file with --save RUN.rrd") from error
-    else:
-        recording.save(save)
-    log_run(rr, recording, load(folder), images_of(folder))
+    loaded = load(folder)
+    recording = opened(rr, loaded.run.scenario, save)
+    drawing = Drawing(rr, recording, list(loaded.robots), images_of(folder))
+    for event in loaded.events:
+        drawing.take(event)
+    for scene in scenes(loaded):
+        log_scene(rr, recording, loaded, scene)
+    log_errors(rr, recording, loaded)
+    log_residuals(rr, recording, loaded)
     recording.flush()
     return "opened the viewer" if save is None else str(save)
 
@@ -74,6 +71,31 @@ def rerun_module() -> Any:
     return rerun
 
 
+def opened(rr: Any, name: str, save: Path | None) -> Any:
+    """A rerun recording that goes into a file, or into the viewer.
+
+    Raises:
+        ViewError: There is no display, the viewer cannot be opened, or the file cannot be written.
+    """
+    recording = rr.RecordingStream("flocc", recording_id=name)
+    try:
+        if save is not None:
+            recording.save(save)
+        elif has_display():
+            recording.spawn()
+        else:
+            raise ViewError("there is no display to open the viewer on; write a file with --save RUN.rrd")
+    except (RuntimeError, OSError) as error:
+        what = "the viewer cannot be opened" if save is None else f"{save}: cannot be written"
+        raise ViewError(f"{what} ({error}); write a file with --save RUN.rrd") from error
+    return recording
+
+
+def has_display() -> bool:
+    """Whether windows can be opened."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(key) for key in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
 def images_of(folder: RunFolder) -> dict[str, Recording]:
     """Recordings with images, by robot; a recording that cannot be read is left out."""
     found = {}
@@ -85,55 +107,6 @@ def images_of(folder: RunFolder) -> dict[str, Recording]:
         except FloccError:
             continue
     return found
-
-
-def log_run(rr: Any, recording: Any, loaded: LoadedRun, images: dict[str, Recording]) -> None:
-    """Log a whole run: first what moved and happened, then how it ended."""
-    log_events(rr, recording, loaded)
-    log_closure_images(rr, recording, loaded, images)
-    for scene in scenes(loaded):
-        log_scene(rr, recording, loaded, scene)
-    log_errors(rr, recording, loaded)
-
-
-def log_events(rr: Any, recording: Any, loaded: LoadedRun) -> None:
-    """Odometry in its robot's frame, map frames over time, and sentences."""
-    taken: dict[str, list[Float]] = {}
-    for event in loaded.events:
-        recording.set_time(TIMELINE, duration=event.t)
-        where = f"live/{event.robot}"
-        if isinstance(event, KeyframeCaptured):
-            taken.setdefault(event.robot, []).append(np.array(event.T_odom_body[:3]))
-            line = rr.LineStrips3D([np.array(taken[event.robot])], colors=[colour_of(loaded, event.robot)])
-            recording.log(f"{where}/odometry", line)
-        elif isinstance(event, CorrectionApplied):
-            T = pose_from_tq(np.array(event.T_map_odom))
-            recording.log(where, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        said = sentence_of(event)
-        if said is not None:
-            recording.log("events", rr.TextLog(f"{event.robot}: {said}", color=colour_of(loaded, event.robot)))
-
-
-def log_closure_images(rr: Any, recording: Any, loaded: LoadedRun, images: dict[str, Recording]) -> None:
-    """The two images of each accepted closure, when it was accepted; at most `IMAGES_MAX` closures."""
-    accepted = [event for event in loaded.events if isinstance(event, ClosureAccepted)]
-    for event in accepted[:IMAGES_MAX]:
-        recording.set_time(TIMELINE, duration=event.t)
-        for side, keyframe in (("query", event.query), ("match", event.match)):
-            found = frame_of(loaded, images, KeyframeId.parse(keyframe))
-            if found is not None:
-                source, frame = found
-                recording.log(f"closure/{side}", rr.Image(source.load_image(frame).pixels).compress(jpeg_quality=80))
-        recording.log("closure/probability", rr.Scalars(event.probability))
-
-
-def frame_of(loaded: LoadedRun, images: dict[str, Recording], keyframe: KeyframeId) -> tuple[Recording, Frame] | None:
-    """The recording's frame that a keyframe was, None where it is not known."""
-    source, track = images.get(keyframe.log.robot), loaded.tracks.get(keyframe.log.robot)
-    if source is None or track is None or keyframe.index >= len(track):
-        return None
-    frame = min(source.frames, key=lambda frame: abs(frame.stamp_s - track.stamps_s[keyframe.index]))
-    return source, frame
 
 
 def log_scene(rr: Any, recording: Any, loaded: LoadedRun, scene: Scene) -> None:
@@ -150,18 +123,15 @@ def log_scene(rr: Any, recording: Any, loaded: LoadedRun, scene: Scene) -> None:
         recording.log(f"{place}/closures", rr.LineStrips3D(strips, colors=colours), static=True)
 
 
-def closure_lines(loaded: LoadedRun, scene: Scene) -> Iterator[tuple[Float, tuple[int, int, int]]]:
-    """Lines between the ends of accepted closures, from blue (probability 0) to yellow (1)."""
+def closure_lines(loaded: LoadedRun, scene: Scene) -> Iterator[tuple[Float, Colour]]:
+    """Lines between the ends of accepted closures, coloured by their probability."""
     for pair in loaded.pairs:
         ends = [scene.lines_m.get(keyframe.log.robot) for keyframe in (pair.query, pair.match)]
         if not pair.accepted or ends[0] is None or ends[1] is None:
             continue
         if pair.query.index < len(ends[0]) and pair.match.index < len(ends[1]):
-            p = 0.5 if pair.probability is None else pair.probability
-            yield (
-                np.array([ends[0][pair.query.index], ends[1][pair.match.index]]),
-                (int(254 * p), int(34 + 198 * p), 78),
-            )
+            line = np.array([ends[0][pair.query.index], ends[1][pair.match.index]])
+            yield line, confidence_colour(pair.probability)
 
 
 def log_errors(rr: Any, recording: Any, loaded: LoadedRun) -> None:
@@ -174,11 +144,58 @@ def log_errors(rr: Any, recording: Any, loaded: LoadedRun) -> None:
                 recording.log(f"error_m/{robot}", rr.Scalars(float(error)))
 
 
+def log_residuals(rr: Any, recording: Any, loaded: LoadedRun) -> None:
+    """How far each used closure's measurement is from the corrected poses, at the time when it was accepted."""
+    accepted_s = {(str(pair.query), str(pair.match)): pair.at_s for pair in loaded.pairs if pair.accepted}
+    for (query, match), (metres, radians) in sorted(residuals(loaded).items()):
+        at_s = accepted_s.get((query, match))
+        if at_s is not None:
+            recording.set_time(TIMELINE, duration=at_s)
+            recording.log("residual/translation_m", rr.Scalars(metres))
+            recording.log("residual/rotation_rad", rr.Scalars(radians))
+
+
+def residuals(loaded: LoadedRun) -> dict[tuple[str, str], tuple[float, float]]:
+    """Translation (m) and rotation (rad) that are left of each closure whose scale the last solution knows."""
+    T_map_camera = {robot: corrected_cameras(loaded, robot) for robot in loaded.results}
+    closures = {(c.query, c.match): c for result in loaded.results.values() for c in result.closures if c.scale}
+    found = {}
+    for ends, closure in closures.items():
+        poses = [pose_of(T_map_camera, KeyframeId.parse(keyframe)) for keyframe in ends]
+        if poses[0] is not None and poses[1] is not None and closure.T_query_match_unscaled is not None:
+            found[ends] = left_over(closure, inverse(poses[0]) @ poses[1])
+    return found
+
+
+def corrected_cameras(loaded: LoadedRun, robot: str) -> Float:
+    """Corrected camera poses (N, 4, 4) of one robot, NaN where it has none."""
+    mounted = loaded.results[robot].T_body_camera
+    T_body_camera = np.eye(4) if mounted is None else pose_from_tq(np.array(mounted))
+    return np.asarray(loaded.tracks[robot].T_map_body @ T_body_camera)
+
+
+def pose_of(T_map_camera: dict[str, Float], keyframe: KeyframeId) -> Float | None:
+    """A keyframe's corrected camera pose (4, 4), None where it has none."""
+    poses = T_map_camera.get(keyframe.log.robot)
+    if poses is None or keyframe.index >= len(poses) or not np.isfinite(poses[keyframe.index]).all():
+        return None
+    return np.asarray(poses[keyframe.index])
+
+
+def left_over(closure: ClosureKnown, T_query_match: Float) -> tuple[float, float]:
+    """Translation (m) and rotation (rad) between a closure's measurement and where its cameras ended."""
+    measured = pose_from_tq(np.array(closure.T_query_match_unscaled))
+    translation_m = (closure.scale or 1.0) * measured[:3, 3] - T_query_match[:3, 3]
+    turned = measured[:3, :3].T @ T_query_match[:3, :3]
+    cosine = np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)
+    return float(np.linalg.norm(translation_m)), float(np.arccos(cosine))
+
+
 def known(points_m: Float) -> Float:
     """The points without those that are not known."""
     return points_m[np.isfinite(points_m).all(axis=1)]
 
 
-def colour_of(loaded: LoadedRun, robot: str) -> tuple[int, int, int]:
+def colour_of(loaded: LoadedRun, robot: str) -> Colour:
     """A robot's colour, as in the report."""
     return COLOURS[loaded.robots.index(robot) % len(COLOURS)] if robot in loaded.robots else GREY

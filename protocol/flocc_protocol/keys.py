@@ -138,6 +138,11 @@ def broadcasts_pattern(swarm: str) -> str:
     return f"{ROOT}/{VERSION}/{checked_name(swarm, 'swarm name')}/*/*"
 
 
+def kind_pattern(swarm: str, kind: str) -> str:
+    """Matches the broadcasts of one kind in a swarm."""
+    return f"{ROOT}/{VERSION}/{checked_name(swarm, 'swarm name')}/*/{checked_kind(kind)}"
+
+
 def unicasts_pattern(swarm: str, receiver: str) -> str:
     """Matches every message to one robot, whoever sends it."""
     return f"{ROOT}/{VERSION}/{checked_name(swarm, 'swarm name')}/*/{TO}/{checked_name(receiver)}/*"

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Any
 
 import zenoh
 
@@ -115,7 +116,7 @@ def _ask_blocking(
     config: TransportConfig, swarm: str, admin: keys.Admin, request: bytes, robot: str, timeout_s: float
 ) -> dict[str, bytes]:
     settings = session_settings(config, swarm, OPERATOR, Plane.CONTROL, dials_all=True)
-    dialled = sorted({*settings["connect/endpoints"], *_on_this_machine(config)})
+    dialled = endpoints_to_dial(config, settings)
     session = open_session(settings | {"listen/endpoints": [], "connect/endpoints": dialled}, OPERATOR)
     try:
         _find(session, len(dialled), timeout_s)
@@ -130,6 +131,11 @@ def _ask_blocking(
         return dict(sorted(answer for answer in map(_read, replies) if answer is not None))
     finally:
         session.close()
+
+
+def endpoints_to_dial(config: TransportConfig, settings: dict[str, Any]) -> list[str]:
+    """Everybody whom an operator can name: the roster, and the agent whose configuration this is."""
+    return sorted({*settings["connect/endpoints"], *_on_this_machine(config)})
 
 
 def _on_this_machine(config: TransportConfig) -> list[str]:
