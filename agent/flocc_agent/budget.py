@@ -6,6 +6,8 @@ only while the robot is within its budget. A single piece may overdraw it, and t
 
 BURST_S = 1.0
 """Unused budget is kept for so long."""
+OVERDRAWN_MIN_BYTES = 1.0
+"""Less is nothing, so that rounding never makes a pause too short for any clock to show."""
 
 
 class Budget:
@@ -27,4 +29,4 @@ class Budget:
         filled = self._left + self._bytes_s * (now_s - self._at_s)
         self._left = min(filled, self._bytes_s * BURST_S) - (used_bytes - self._used)
         self._used, self._at_s = used_bytes, now_s
-        return max(-self._left / self._bytes_s, 0.0)
+        return 0.0 if self._left > -OVERDRAWN_MIN_BYTES else -self._left / self._bytes_s

@@ -41,3 +41,11 @@ def test_an_idle_budget_is_not_saved_up() -> None:
     budget.pause_s(0, 0.0)
     assert budget.pause_s(0, 1000.0) == 0.0
     assert budget.pause_s(int(RATE * BURST_S) + 100, 1000.0) == pytest.approx(0.1)
+
+
+def test_a_pause_that_was_kept_is_over() -> None:
+    budget, now_s, used = Budget(RATE / 3), 1e6, 0
+    for _ in range(1000):
+        used += 777
+        now_s += budget.pause_s(used, now_s)
+        assert budget.pause_s(used, now_s) == 0.0
