@@ -5,6 +5,7 @@ configuration; must not know images, messages or clocks of others.
 """
 
 from flocc_agent.config import BackendConfig
+from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 
 
@@ -15,3 +16,10 @@ def optimise_graph(
     from flocc_agent.backend.optimiser import optimise
 
     return optimise(graph, config, initial)
+
+
+def iterate_own_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | OptimisationFailed:
+    """Do one iteration of a robot's block (distributed optimisation), in whatever process this is called in."""
+    from flocc_agent.backend.block import iterate_block
+
+    return iterate_block(config, problem)

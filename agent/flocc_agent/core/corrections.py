@@ -4,6 +4,8 @@ A robot holds the newest correction of each log. (term, round) only grows, so a 
 nothing, and a robot that was away gets the newest from whoever it meets.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -103,19 +105,30 @@ class Corrections:
 
     def publish(self, term: Term, round_number: int, solution: GraphSolution) -> list[Effect]:
         """Send what a round changed, as the leader; a log whose solution leaves the map keeps its last correction."""
+        return self._publish(term, round_number, [(c, log) for c in solution.components for log in c.logs])
+
+    def publish_own(self, component: Component, round_number: int) -> list[Effect]:
+        """Send this robot's own part of a distributed optimisation; its term is below every leader's.
+
+        After a leader's correction, of a time when the swarm optimised centrally, the term is above that one.
+        """
+        applied = self.applied
+        counter = 0 if applied is None else applied.term.counter + (applied.term.leader != self._own)
+        return self._publish(Term(counter, self._own), round_number, [(component, self._own)])
+
+    def _publish(self, term: Term, round_number: int, solved: Sequence[tuple[Component, LogId]]) -> list[Effect]:
         effects: list[Effect] = []
         published: list[LogCorrection] = []
-        for component in solution.components:
-            for log in component.logs:
-                try:
-                    message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
-                except ValueError as error:
-                    facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
-                    effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
-                    continue
-                if self._changed(message):
-                    published.append(message)
-                    effects += self.on_message(message)
+        for component, log in solved:
+            try:
+                message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
+            except ValueError as error:
+                facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
+                effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
+                continue
+            if self._changed(message):
+                published.append(message)
+                effects += self.on_message(message)
         return [*(Broadcast(batch) for batch in CorrectionBatch.packed(published)), *effects]
 
     def _changed(self, message: LogCorrection) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.blocks import BlockProblem
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId, Term
@@ -74,6 +75,14 @@ class Optimise:
     round: int
     graph: PoseGraph
     initial: GraphSolution | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IterateBlock:
+    """Do one iteration of the own block (distributed optimisation); answer BlockIterated or BlockIterationFailed."""
+
+    number: int
+    problem: BlockProblem
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +157,7 @@ Effect = (
     | FetchLatent
     | Register
     | Optimise
+    | IterateBlock
     | Deliver
     | PersistRecord
     | PersistTerm

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from flocc_agent.core.blocks import BlockStep
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_protocol.arrays import Array
@@ -102,6 +103,22 @@ class GraphOptimisationFailed:
     reason: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockIterated:
+    """An iteration of the own block ended."""
+
+    number: int
+    step: BlockStep
+
+
+@dataclass(frozen=True, slots=True)
+class BlockIterationFailed:
+    """An iteration without a result; the block stands where it stood."""
+
+    number: int
+    reason: str
+
+
 @dataclass(frozen=True, slots=True)
 class FixMeasured:
     """An absolute position of the last keyframe's camera in a world frame."""
@@ -126,6 +143,8 @@ Event = (
     | LatentMissing
     | GraphOptimised
     | GraphOptimisationFailed
+    | BlockIterated
+    | BlockIterationFailed
     | FixMeasured
     | Leaving
 )

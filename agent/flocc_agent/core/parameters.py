@@ -164,6 +164,34 @@ class RoundParameters:
 
 
 @dataclass(frozen=True, slots=True)
+class DistributedParameters:
+    """Distributed optimisation, where `backend.mode` chooses it."""
+
+    __pydantic_config__ = _FORBID
+
+    period_s: float = 0.2
+    """Shortest time between two iterations of a robot; shorter converges sooner and sends more."""
+    wait_s: float = 1.0
+    """A robot waits this long for news of a neighbour before it iterates on old ones; longer rides out more loss."""
+    repeat_s: float = 0.5
+    """First pause after which a robot at rest says its separators again; doubles up to `repeat_max_s`."""
+    repeat_max_s: float = 16.0
+    """Longest pause between repetitions, for robots that come into range later."""
+    timeout_s: float = 60.0
+    """An iteration without a result by then is given up."""
+    deliver_period_s: float = 2.0
+    """Shortest time between two corrections that a robot gives itself."""
+    tolerance: float = 1e-4
+    """A block whose poses moved less (metres, or entries of a rotation) rests until it hears something new."""
+
+    def __post_init__(self) -> None:
+        _require(0 < self.period_s <= self.wait_s, "period_s must be in (0, wait_s]")
+        _require(0 < self.repeat_s <= self.repeat_max_s, "repeat_s must be in (0, repeat_max_s]")
+        _require(min(self.timeout_s, self.deliver_period_s) > 0, "distributed times must be positive")
+        _require(self.tolerance > 0, "tolerance must be positive")
+
+
+@dataclass(frozen=True, slots=True)
 class CoreParameters:
     """All parameters of the core."""
 
@@ -175,3 +203,4 @@ class CoreParameters:
     place_recognition: PlaceRecognitionParameters = field(default_factory=PlaceRecognitionParameters)
     loop_closing: LoopClosingParameters = field(default_factory=LoopClosingParameters)
     rounds: RoundParameters = field(default_factory=RoundParameters)
+    distributed: DistributedParameters = field(default_factory=DistributedParameters)

@@ -12,10 +12,13 @@ import numpy as np
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.corrections import Corrections
+from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
     LATENT_UNKNOWN,
+    BlockIterated,
+    BlockIterationFailed,
     Event,
     FixMeasured,
     GraphOptimisationFailed,
@@ -57,6 +60,7 @@ from flocc_protocol.messages import (
     LogCorrection,
     RecordRequest,
     Records,
+    Separators,
 )
 from flocc_protocol.records import (
     ClosureRecord,
@@ -115,6 +119,7 @@ class Robot:
         now: float,
         restored: Restored | None = None,
         sealer: Sealer | None = None,
+        distributed: bool = False,
     ) -> None:
         restored = restored or Restored()
         self.log = log
@@ -135,6 +140,7 @@ class Robot:
         self.corrections = Corrections(log, parameters.gossip, parameters.rounds)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
+        self.distributed = self._distributed(restored.correction) if distributed else None
         self._restore(restored, now)
 
     # The three entry points
@@ -159,7 +165,7 @@ class Robot:
             self.neighbours.deadline(),
             self.election.deadline(),
             self.closing.deadline(),
-            self.rounds.deadline(),
+            self.rounds.deadline() if self.distributed is None else self.distributed.deadline(),
         )
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -171,6 +177,7 @@ class Robot:
             **self.closing.sizes(),
             **self.corrections.sizes(),
             **self.election.sizes(),
+            **({} if self.distributed is None else self.distributed.sizes()),
         }
 
     # Events
@@ -201,6 +208,10 @@ class Robot:
             case GraphOptimisationFailed(term, round_number, reason):
                 self.rounds.on_failed(term, round_number, now)
                 return [Report("optimisation_failed", {"term": str(term), "round": round_number, "reason": reason})]
+            case BlockIterated(number, step):
+                return [] if self.distributed is None else self.distributed.on_step(number, step, now)
+            case BlockIterationFailed(number, reason):
+                return [] if self.distributed is None else self.distributed.on_failed(number, reason, now)
             case FixMeasured():
                 return self._on_fix(event, now)
             case Leaving():
@@ -232,6 +243,10 @@ class Robot:
                 return self.corrections.on_request(sender.robot, message)
             case CandidateOffer():
                 self.closing.on_offer(message, now)
+                return []
+            case Separators():
+                if self.distributed is not None:
+                    self.distributed.on_separators(sender, message)
                 return []
 
     def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
@@ -352,6 +367,13 @@ class Robot:
         candidates = [c for c in found if (keyframe, c.pair.other(keyframe).log) not in self._partnered]
         return self.closing.on_candidates(candidates, now)
 
+    def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
+        """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
+        iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
+        return DistributedOptimisation(
+            self.log, self.assembly, self._parameters.distributed, self._parameters.rounds, iteration
+        )
+
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
         news = [self.gossip.restore(log, data) for log, records in restored.records for data in records]
@@ -415,8 +437,18 @@ class Robot:
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
+        if self.distributed is not None:
+            return [*self.closing.tick(now), *self._optimise_together(self.distributed, now)]
         self.rounds.on_term(self.election.term if self.election.leading else None)
         return [*self.closing.tick(now), *self.rounds.tick(now)]
+
+    def _optimise_together(self, distributed: DistributedOptimisation, now: float) -> list[Effect]:
+        """Iterate on the own block, and correct itself."""
+        effects = distributed.tick(now)
+        component = distributed.component(now)
+        if component is None:
+            return effects
+        return [*effects, distributed.report(), *self.corrections.publish_own(component, distributed.iteration)]
 
 
 def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:

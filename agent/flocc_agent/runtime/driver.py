@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
@@ -23,6 +24,7 @@ from flocc_agent.core.effects import (
     Effect,
     Encode,
     FetchLatent,
+    IterateBlock,
     Optimise,
     PersistCorrection,
     PersistRecord,
@@ -32,6 +34,8 @@ from flocc_agent.core.effects import (
     Unicast,
 )
 from flocc_agent.core.events import (
+    BlockIterated,
+    BlockIterationFailed,
     Event,
     FixMeasured,
     GraphOptimisationFailed,
@@ -96,6 +100,7 @@ class Skills:
         encode: Image to descriptor and latent.
         register: (query latent, match latent, odometry pair) to a relative pose up to scale.
         optimise: Pose graph and last solution to a solution; must be importable by a worker process.
+        iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
         part: (latent, what the link carries while the asker encodes a picture) to what is sent; see `Encoder.part`.
         encode_s: See `Encoder.encode_s`.
     """
@@ -103,6 +108,7 @@ class Skills:
     encode: Callable[[Image], Encoded]
     register: Callable[[bytes, bytes, OdometryPair | None], Registration | RegistrationFailed]
     optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+    iterate: Callable[[BlockProblem], BlockStep | OptimisationFailed]
     part: Callable[[bytes, int | None], bytes]
     encode_s: Callable[[], float | None]
 
@@ -410,6 +416,8 @@ class Driver:
                 self._start(self._register(effect))
             case Optimise():
                 self._start(self._optimise(effect))
+            case IterateBlock():
+                self._start(self._iterate(effect))
             case _:
                 raise AssertionError(f"no way to carry out {type(effect).__name__}")
 
@@ -482,6 +490,14 @@ class Driver:
             return
         self.last_solution = solution
         self.put(GraphOptimised(effect.term, effect.round, solution))
+
+    async def _iterate(self, effect: IterateBlock) -> None:
+        result = await self._workers.run("optimise", self._skills.iterate, effect.problem)
+        step = result if isinstance(result, WorkFailed) else result.value
+        if isinstance(step, (WorkFailed, OptimisationFailed)):
+            self.put(BlockIterationFailed(effect.number, step.reason))
+            return
+        self.put(BlockIterated(effect.number, step))
 
     # Reports
 

@@ -14,6 +14,7 @@ from flocc_agent.core.effects import (
     Effect,
     Encode,
     FetchLatent,
+    IterateBlock,
     Optimise,
     PersistCorrection,
     PersistRecord,
@@ -117,12 +118,15 @@ class Station:
         """What its own clock shows."""
         return self.clock.local_s(self._agenda.now_s)
 
-    def start(self, boot: int, parameters: CoreParameters) -> None:
+    def start(self, boot: int, parameters: CoreParameters, distributed: bool = False) -> None:
         """Switch on, with what the disk holds."""
         assert self.core is None
         self.life += 1
         self.workers.restart()
-        self.core = Robot(self.log, self._compute_class, boot, parameters, self.now_s(), self.disk.restored())
+        restored = self.disk.restored()
+        self.core = Robot(
+            self.log, self._compute_class, boot, parameters, self.now_s(), restored, distributed=distributed
+        )
         self._tick_s = float("inf")
         self._arm()
 
@@ -228,6 +232,8 @@ class Station:
                 self.later(self.workers.registered_at_s(now_s), lambda: self.workers.register(effect, self.disk))
             case Optimise():
                 self.later(self.workers.optimised_at_s(now_s), lambda: self.workers.optimise(effect))
+            case IterateBlock():
+                self.later(self.workers.iterated_at_s(now_s), lambda: self.workers.iterate(effect))
             case PersistRecord(log, number, data):
                 self.disk.put_record(log, number, data)
             case PersistTerm(counter):

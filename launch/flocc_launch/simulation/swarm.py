@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from flocc_agent.composition import build_iterator
+from flocc_agent.config import BackendMode
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
 from flocc_agent.radio import Radio
@@ -78,7 +80,7 @@ class Swarm:
         """Switch a robot on."""
         station = self.stations[name]
         boot = int(np.random.default_rng([self._seed, BOOTS, *name.encode(), station.life]).integers(2**52))
-        station.start(boot, self.scenario.core)
+        station.start(boot, self.scenario.core, self.scenario.backend.mode is BackendMode.DISTRIBUTED)
 
     def kill(self, name: str) -> None:
         """A robot dies; its disk stays."""
@@ -128,7 +130,13 @@ class Swarm:
             LogId(name),
             robot.compute_class,
             playback,
-            Workers(self._equipment.eyes, self._equipment.optimiser, self._equipment.times, rng),
+            Workers(
+                self._equipment.eyes,
+                self._equipment.optimiser,
+                build_iterator(self.scenario.backend),
+                self._equipment.times,
+                rng,
+            ),
             Disk(self.scenario.store.latent_bytes_max),
             Clock(robot.clock_offset_s, robot.clock_drift_ratio),
             self.agenda,

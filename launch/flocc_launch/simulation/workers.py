@@ -12,8 +12,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.effects import Optimise, Register
+from flocc_agent.core.blocks import BlockProblem, BlockStep
+from flocc_agent.core.effects import IterateBlock, Optimise, Register
 from flocc_agent.core.events import (
+    BlockIterated,
+    BlockIterationFailed,
     Event,
     GraphOptimisationFailed,
     GraphOptimised,
@@ -37,6 +40,7 @@ logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+Iterator = Callable[[BlockProblem], BlockStep | OptimisationFailed]
 
 
 class Eyes(Protocol):
@@ -58,6 +62,7 @@ class WorkTimes:
     encode_s: float = 0.1
     register_s: float = 0.25
     optimise_s: float = 0.15
+    iterate_s: float = 0.05
 
 
 class Workers:
@@ -68,11 +73,14 @@ class Workers:
         stages: How long what was asked of them takes, on virtual time.
     """
 
-    def __init__(self, eyes: Eyes, optimiser: Optimiser, times: WorkTimes, rng: np.random.Generator) -> None:
+    def __init__(
+        self, eyes: Eyes, optimiser: Optimiser, iterator: Iterator, times: WorkTimes, rng: np.random.Generator
+    ) -> None:
         self.slowness = 1.0
         self.stages = StageTimes()
         self._eyes = eyes
         self._optimiser = optimiser
+        self._iterator = iterator
         self._times = times
         self._rng = rng
         self._encoder_free_s = 0.0
@@ -90,6 +98,10 @@ class Workers:
     def optimised_at_s(self, now_s: float) -> float:
         """When an optimisation that starts now is done."""
         return now_s + self._lasts("optimise", self._times.optimise_s)
+
+    def iterated_at_s(self, now_s: float) -> float:
+        """When an iteration of the own block that starts now is done."""
+        return now_s + self._lasts("iterate", self._times.iterate_s)
 
     def restart(self) -> None:
         """Forget the queue."""
@@ -131,6 +143,13 @@ class Workers:
         if isinstance(solution, OptimisationFailed):
             return GraphOptimisationFailed(job.term, job.round, solution.reason)
         return GraphOptimised(job.term, job.round, replace(solution, solve_s=0.0, timings_s={}))
+
+    def iterate(self, job: IterateBlock) -> Event:
+        """Do one iteration of a robot's block."""
+        step = self._iterator(job.problem)
+        if isinstance(step, OptimisationFailed):
+            return BlockIterationFailed(job.number, step.reason)
+        return BlockIterated(job.number, step)
 
     def _lasts(self, stage: str, typical_s: float) -> float:
         lasts_s = self.slowness * typical_s * float(self._rng.uniform(0.5, 1.5))

@@ -1,0 +1,294 @@
+"""One iteration of a robot's block in a distributed optimisation: extend, align, weigh, descend, extrapolate.
+
+All robots may iterate at the same time: a step goes half of the way to the block's minimum, because the whole
+quadratic form is at most twice the sum of the blocks' own ones (`|a - b|^2 <= 2 |a|^2 + 2 |b|^2` on every edge).
+Nesterov's extrapolation makes up for it and starts anew where it points uphill. Closures' robust weights are decided
+by graduated non-convexity (Yang 2020), each by the lower of its two robots. Scales are constants: those of Eq. (6).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from flocc_agent.backend import rbcd
+from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
+from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
+from flocc_agent.backend.rbcd import Block, Links
+from flocc_agent.backend.solvers import gnc_finished, gnc_weights, initial_control
+from flocc_agent.config import BackendConfig, Solver
+from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep, decides
+from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed
+from flocc_agent.core.registration import closure_probability
+from flocc_agent.geometry import inverse
+from flocc_protocol.ids import KeyframeId
+from flocc_protocol.messages import CandidatePair
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+STAGE_ITERATIONS = 5
+"""Iterations between two decisions on robust weights."""
+FIRST_STEPS = 30
+STEPS = 2
+INNER_STEPS = 20
+TOGETHER_RATIO = 0.5
+MOMENTUM_MAX = 0.995
+LEAVE_RATIO = 1.2
+"""A used closure is dropped only this far beyond its bound, so that weights come to rest."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Closures as arrays, all of them, usable now or not.
+
+    Attributes:
+        pairs: The pair of keyframes of each closure.
+        i: (E,) index of its query in the block, -1 where it is another robot's.
+        j: (E,) the same of its match.
+        T: (E, 4, 4) metric measurement.
+        kappa: (E,) rotation weight.
+        tau: (E,) translation weight.
+        fixed: (E, 4, r) the other robot's pose, zero where there is none.
+        known: (E,) both ends have a pose in this frame.
+        own: (E,) its robust weight is this robot's to decide.
+    """
+
+    pairs: tuple[CandidatePair, ...]
+    i: Int
+    j: Int
+    T: Float
+    kappa: Float
+    tau: Float
+    fixed: Float
+    known: NDArray[np.bool_]
+    own: NDArray[np.bool_]
+
+    def residuals(self, X: Float) -> Float:
+        """Squared residuals (E,) without robust weights."""
+        X_i = np.where((self.i >= 0)[:, None, None], X[np.maximum(self.i, 0)], self.fixed)
+        X_j = np.where((self.j >= 0)[:, None, None], X[np.maximum(self.j, 0)], self.fixed)
+        return rbcd.squared_residuals(X_i, X_j, self.T, self.kappa, self.tau)
+
+
+def iterate_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | OptimisationFailed:
+    """Do one iteration of a block.
+
+    Args:
+        config: Noise model, solver (lm or gnc-tls), rank of the relaxation.
+        problem: The block, and what others said.
+
+    Returns:
+        Where the block stands now, or why it could not be moved.
+    """
+    try:
+        return _iterated(config, problem)
+    except (np.linalg.LinAlgError, RuntimeError, FloatingPointError) as error:
+        return OptimisationFailed(str(error).strip().split("\n")[0])
+
+
+def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
+    state = problem.state or _first_state(config, problem)
+    state = _extended(state, problem.trajectory.T_odom_keyframe)
+    aligned = False
+    if problem.align_to:
+        moved = _aligned(config, problem, state)
+        if moved is not None:
+            state, aligned = moved, True
+            anchored = replace(problem, others=problem.align_to, anchored=False, align_to={})
+            problem = anchored
+    measured = _measured(config, problem, state.X.shape[2])
+    state = _weighed(config, measured, state)
+    weights = _weights_of(config, problem, measured, state)
+    links = _links(config, problem, measured, weights)
+    block = Block(len(state.X), links)
+    descended = rbcd.descend(block, state.X, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
+    together = bool(np.any((weights > 0) & ((measured.i < 0) | (measured.j < 0))))
+    X = descended.X
+    if together:
+        X = rbcd.retracted(state.X, TOGETHER_RATIO * (descended.X - state.X))
+    moved_most = float(np.abs(X - state.X_before).max())
+    decided = sum(weight == 0.0 for weight in state.weights.values())
+    next_state = _extrapolated(state, X, together)
+    finished = state.control is None
+    return BlockStep(next_state, rbcd.rounded(X), moved_most, descended.cost, aligned, finished, decided)
+
+
+def _first_state(config: BackendConfig, problem: BlockProblem) -> BlockState:
+    """The robot alone: its odometry, and the closures within it, in its own frame."""
+    X = rbcd.lifted(np.asarray(problem.trajectory.T_odom_keyframe), config.rank)
+    own = tuple(c for c in problem.closures if c.query.log == c.match.log)
+    state = BlockState(X, X)
+    if not own:
+        return state
+    alone = replace(problem, closures=own, others={}, anchored=True, align_to={})
+    measured = _measured(config, alone, config.rank)
+    weights = np.ones(len(own)) if config.solver is Solver.LM else np.zeros(len(own))
+    block = Block(len(X), _links(config, alone, measured, weights))
+    X = rbcd.descend(block, X, FIRST_STEPS, INNER_STEPS, config.relative_tolerance).X
+    return BlockState(X, X)
+
+
+def _extended(state: BlockState, T_odom: Float) -> BlockState:
+    """Append keyframes that came since, by odometry from the last one."""
+    n = len(state.X)
+    if len(T_odom) <= n:
+        return state
+    T_last = inverse(T_odom[n - 1]) @ T_odom[n:]
+    return replace(
+        state,
+        X=np.concatenate([state.X, np.swapaxes(T_last, 1, 2) @ state.X[n - 1]]),
+        X_before=np.concatenate([state.X_before, np.swapaxes(T_last, 1, 2) @ state.X_before[n - 1]]),
+    )
+
+
+def _aligned(config: BackendConfig, problem: BlockProblem, state: BlockState) -> BlockState | None:
+    """Move the whole block into the frame of others, by the pose that the most closures agree with; None if too few."""
+    closures = [c for c in problem.closures if c.query in problem.align_to or c.match in problem.align_to]
+    T_own = rbcd.rounded(state.X)
+    pair = align_pair(_rays(config, problem, closures, T_own))
+    if len(pair.agreeing) < config.closures_to_join_min:
+        return None
+    X = rbcd.lifted(pair.T_a_b @ T_own, state.X.shape[2])
+    kept = {p: w for p, w in state.weights.items() if p.low.log == p.high.log}
+    return BlockState(X, X, weights=kept)
+
+
+def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopClosure], T_own: Float) -> Rays:
+    """Closures as rays from the others' frame (a) into the own one (b)."""
+    path_m = travelled_m(problem.trajectory)
+    far = [c.match if c.query.log == problem.log else c.query for c in closures]
+    near = [c.query if c.query.log == problem.log else c.match for c in closures]
+    T_far = rbcd.rounded(np.array([problem.align_to[keyframe] for keyframe in far]))
+    T_hat = np.array([np.asarray(c.T_query_match_unscaled, dtype=float) for c in closures])
+    flipped = np.array([c.query.log == problem.log for c in closures])
+    T_hat[flipped] = inverse(T_hat[flipped])
+    scale = np.array([initial_scale(c, config) for c in closures])
+    norms = np.linalg.norm(T_hat[:, :3, 3], axis=1)
+    u = np.einsum("kij,kj->ki", T_far[:, :3, :3], T_hat[:, :3, 3]) / np.maximum(norms, 1e-12)[:, None]
+    weight = np.array([closure_probability(c.match_ratio, config.steepness) for c in closures])
+    indices = np.array([keyframe.index for keyframe in near])
+    return Rays(
+        tuple(range(len(closures))), T_far, T_own[indices], T_hat[:, :3, :3], u, norms * scale,
+        np.array([c.metric for c in closures]), weight, path_m[indices], path_m[indices],
+    )  # fmt: skip
+
+
+def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measured:
+    """The block's closures as arrays, with the poses of others as last heard."""
+    closures, log = problem.closures, problem.log
+    E = len(closures)
+    scale = np.array([initial_scale(c, config) for c in closures])
+    T = np.array([c.T_query_match_unscaled for c in closures], dtype=float).reshape(E, 4, 4)
+    T[:, :3, 3] *= scale[:, None]
+    kappa, tau = isotropic_weights(closure_covariances(closures, scale, config).reshape(E, 6, 6))
+    fixed, known = np.zeros((E, 4, rank)), np.ones(E, dtype=bool)
+    for k, closure in enumerate(closures):
+        for end in (closure.query, closure.match):
+            if end.log != log:
+                known[k] = _usable(problem.others, end, rank)
+                fixed[k] = problem.others[end] if known[k] else 0.0
+    i = np.array([c.query.index if c.query.log == log else -1 for c in closures], dtype=np.int64)
+    j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
+    own = np.array([decides(c) == log for c in closures], dtype=bool)
+    pairs = tuple(CandidatePair.of(c.query, c.match) for c in closures)
+    return Measured(pairs, i, j, T, kappa, tau, fixed, known, own)
+
+
+def _usable(others: Mapping[KeyframeId, Float], keyframe: KeyframeId, rank: int) -> bool:
+    """Whether another robot's pose is known, of the rank that this robot relaxes to."""
+    return keyframe in others and others[keyframe].shape == (4, rank)
+
+
+def isotropic_weights(covariances: Float) -> tuple[Float, Float]:
+    """SE-Sync's weights of covariances (E, 6, 6), rotation first: `kappa = 3 / (2 tr)`, `tau = 3 / tr`.
+
+    Traces are those of the inverse information blocks; of an isotropic covariance, twice the back end's cost is then
+    `sum kappa |R_j - R_i R|^2 + tau |t_j - t_i - R_i t|^2`.
+    """
+    if len(covariances) == 0:
+        return np.zeros(0), np.zeros(0)
+    information = np.linalg.inv(covariances)
+    rotation = np.linalg.inv(information[:, :3, :3])
+    translation = np.linalg.inv(information[:, 3:, 3:])
+    return 1.5 / np.trace(rotation, axis1=1, axis2=2), 3.0 / np.trace(translation, axis1=1, axis2=2)
+
+
+def _weighed(config: BackendConfig, measured: Measured, state: BlockState) -> BlockState:
+    """Decide robust weights that are this robot's: at once for new closures, the others once per stage."""
+    if config.solver is Solver.LM:
+        return state
+    usable = np.flatnonzero(measured.own & measured.known)
+    if len(usable) == 0:
+        return state
+    bound = np.full(len(usable), float(chdtri(6.0, 1.0 - config.inlier_probability)))
+    squared = measured.residuals(state.X)[usable]
+    pairs = [measured.pairs[k] for k in usable]
+    new = np.array([pair not in state.weights for pair in pairs])
+    if np.any(new & (squared > bound)):
+        control = initial_control(Solver.GNC_TLS, squared, bound, config.gnc_start_ratio)
+        return _decided(state, pairs, gnc_weights(Solver.GNC_TLS, squared, bound, control), control)
+    before = np.array([state.weights.get(pair, 1.0) for pair in pairs])
+    if state.in_stage < STAGE_ITERATIONS:
+        return _decided(state, pairs, before, state.control, state.in_stage) if np.any(new) else state
+    if state.control is None:
+        within = np.where(before > 0.5, squared <= LEAVE_RATIO * bound, squared <= bound)
+        return _decided(state, pairs, within.astype(float), None)
+    control = state.control * config.gnc_step
+    weights = gnc_weights(Solver.GNC_TLS, squared, bound, control)
+    if gnc_finished(Solver.GNC_TLS, weights, control):
+        return _decided(state, pairs, (squared <= bound).astype(float), None)
+    return _decided(state, pairs, weights, control)
+
+
+def _decided(
+    state: BlockState, pairs: Sequence[CandidatePair], weights: Float, control: float | None, in_stage: int = 0
+) -> BlockState:
+    chosen = {**state.weights, **dict(zip(pairs, weights.tolist(), strict=True))}
+    age = state.age if chosen == state.weights else 0
+    return replace(state, weights=chosen, control=control, in_stage=in_stage, age=age)
+
+
+def _weights_of(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> Float:
+    """Robust weights (E,): decided here, or heard; a closure that nobody decided yet does not count, except in LM."""
+    if config.solver is Solver.LM:
+        return measured.known.astype(float)
+    source = {True: state.weights, False: problem.heard}
+    weights = [source[bool(own)].get(pair, 0.0) for pair, own in zip(measured.pairs, measured.own, strict=True)]
+    return np.where(measured.known, weights, 0.0)
+
+
+def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, weights: Float) -> Links:
+    """Closures with weight, then odometry, then what holds the anchor's first keyframe."""
+    T_odom = np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)
+    n, rank = len(T_odom), measured.fixed.shape[2]
+    used = weights > 0
+    covariances = problem.trajectory.edge_covariances
+    if covariances is None:
+        one = diagonal_covariance(config.odometry_rotation_sigma_rad, config.odometry_translation_sigma_m)
+        covariances = np.broadcast_to(one, (n - 1, 6, 6))
+    kappa, tau = isotropic_weights(np.asarray(covariances, dtype=float))
+    before = np.arange(n - 1)
+    i, j, T = (
+        [measured.i[used], before],
+        [measured.j[used], before + 1],
+        [measured.T[used], inverse(T_odom[:-1]) @ T_odom[1:]],
+    )
+    kappas, taus = [(weights * measured.kappa)[used], kappa], [(weights * measured.tau)[used], tau]
+    fixed = [measured.fixed[used], np.zeros((n - 1, 4, rank))]
+    if problem.anchored:
+        strength = kappa.max(initial=1.0), tau.max(initial=1.0)
+        i, j, T = [*i, np.array([-1])], [*j, np.array([0])], [*T, T_odom[:1]]
+        kappas, taus = [*kappas, np.array([strength[0]])], [*taus, np.array([strength[1]])]
+        fixed = [*fixed, rbcd.lifted(np.eye(4)[None], rank)]
+    return Links(*(np.concatenate(part) for part in (i, j, T, kappas, taus, fixed)))
+
+
+def _extrapolated(state: BlockState, X: Float, together: bool) -> BlockState:
+    """Nesterov's extrapolation; where it points back (O'Donoghue 2015), and alone, it starts anew."""
+    step = X - state.X_before
+    age = 0 if not together or np.sum((state.X - X) * step) > 0 else state.age
+    momentum = min(age / (age + 3.0), MOMENTUM_MAX)
+    return replace(state, X=rbcd.retracted(X, momentum * step), X_before=X, age=age + 1, in_stage=state.in_stage + 1)
