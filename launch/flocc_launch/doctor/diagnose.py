@@ -72,11 +72,11 @@ def stop(loaded: LoadedRun, a: str, b: str) -> tuple[int, Finding]:
 
 
 def together(findings: Iterable[Finding]) -> list[Finding]:
-    """Findings with equal sentences become one."""
+    """Findings with equal sentences become one, as severe as the first."""
     found: dict[tuple[str, str], Finding] = {}
     for finding in findings:
         key = (finding.cause, finding.sentence)
         known = found.get(key)
         robots = finding.robots if known is None else tuple(sorted({*known.robots, *finding.robots}))
-        found[key] = replace(finding, robots=robots)
+        found[key] = replace(known or finding, robots=robots)
     return list(found.values())

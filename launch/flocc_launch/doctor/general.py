@@ -7,7 +7,7 @@ from flocc_launch.report.build import how_it_died
 from flocc_launch.report.closures import Pair
 from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import seconds
-from flocc_launch.run_records import AgentDied, EncodingFailed, GraphOptimised, of_kind
+from flocc_launch.run_records import AgentDied, EncodingFailed, GraphOptimised, NameTaken, of_kind
 
 LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3
@@ -64,6 +64,21 @@ def unsteady_leaders(loaded: LoadedRun) -> list[Finding]:
     return findings
 
 
+def shared_names(loaded: LoadedRun) -> list[Finding]:
+    """Names that two agents run with."""
+    names = sorted({event.peer for event in of_kind(loaded.events, NameTaken)})
+    return [
+        Finding(
+            "duplicate-name",
+            Severity.HINDERS,
+            f"Two agents run with the name {name}.",
+            "Give every robot a name of its own.",
+            (name,),
+        )
+        for name in names
+    ]
+
+
 def weak_links(loaded: LoadedRun) -> list[Finding]:
     """Robots that hang on their common map by so few closures that one false one misplaces them."""
     used = [robots_of(pair) for pair in loaded.pairs if pair.used]
@@ -92,6 +107,7 @@ def robots_of(pair: Pair) -> set[str]:
 
 GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     deaths,
+    shared_names,
     weak_links,
     solver_warnings,
     encoding_failures,

@@ -9,6 +9,7 @@ from flocc_launch.doctor.evidence import (
     best_similarity,
     components_join,
     heard_s,
+    held_records,
     holds,
     last_correction_s,
     named,
@@ -94,14 +95,17 @@ def never_met(loaded: LoadedRun, a: str, b: str) -> Finding | None:
 
 
 def heard_one_way(loaded: LoadedRun, a: str, b: str) -> Finding | None:
-    """One hears the other but is not heard."""
+    """One hears the other but is not heard, and nobody carries its records to the one that is deaf."""
     one, other = heard_s(loaded, a, b), heard_s(loaded, b, a)
-    if bool(one) == bool(other) or pairs_between(loaded, a, b) or holds(loaded, a, b):
+    if bool(one) == bool(other) or any(pair.accepted for pair in pairs_between(loaded, a, b)):
         return None
-    hearing, silent = (a, b) if one else (b, a)
+    hearing, deaf = (a, b) if one else (b, a)
+    result = loaded.results.get(deaf)
+    if holds(loaded, a, b) if result is None else held_records(result.logs, hearing):
+        return None
     return blocked(
         "one-way-link",
-        f"{hearing} hears {silent}, but {silent} does not hear {hearing}.",
+        f"{hearing} hears {deaf}, but {deaf} does not hear {hearing}.",
         "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power.",
         a,
         b,
