@@ -155,6 +155,11 @@ def _unpack_log_id(value: Any) -> LogId:
     return _log_id(value[0], value[1])
 
 
+def _as_it_is(value: Any) -> Any:
+    """Identifiers are checked tuples, which msgpack writes as lists."""
+    return value
+
+
 _POSE = binary.Struct("<7d")
 
 
@@ -192,9 +197,9 @@ def _unpack_array(value: Any) -> Array:
 POSE: Codec[Pose7] = Codec(_pack_pose, _unpack_pose)
 ARRAY: Codec[Array] = Codec(lambda a: [a.dtype, list(a.shape), a.data, float(a.scale)], _unpack_array)
 COUNT = integer(0, INDEX_MAX)
-LOG_ID: Codec[LogId] = Codec(lambda log: [log.robot, log.incarnation], _unpack_log_id)
-KEYFRAME_ID = struct(KeyframeId, log=LOG_ID, index=COUNT)
-TERM = struct(Term, counter=integer(0, TERM_COUNTER_MAX), leader=LOG_ID)
+LOG_ID: Codec[LogId] = Codec(_as_it_is, _unpack_log_id)
+KEYFRAME_ID = Codec(_as_it_is, struct(KeyframeId, log=LOG_ID, index=COUNT).unpack)
+TERM = Codec(_as_it_is, struct(Term, counter=integer(0, TERM_COUNTER_MAX), leader=LOG_ID).unpack)
 
 
 def to_bytes(value: Any) -> bytes:

@@ -5,7 +5,7 @@ Every message but a heartbeat may be lost: heartbeats repeat, and what they say 
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -55,23 +55,23 @@ HOPS_MAX = 255
 COUNTER_MAX = 2**53 - 1
 CHECKSUM_MAX = 2**32 - 1
 REPEATED_MAX = 8192
+CORRECTIONS_KEPT_MAX = 256
+"""Corrections whose bytes are kept, because most are heard from several neighbours and passed on."""
 
 
 class UnknownVersion(DecodeError):
     """The sender speaks another version of this protocol."""
 
 
-@dataclass(frozen=True, slots=True)
-class LogDigest:
+class LogDigest(NamedTuple):
     """How much of one log the sender holds, with the chained checksum of those records."""
 
     log: LogId
-    count: int
+    count: int  # type: ignore[assignment]  # tuples have a method of this name, which nobody needs here
     checksum: int
 
 
-@dataclass(frozen=True, slots=True)
-class CorrectionVersion:
+class CorrectionVersion(NamedTuple):
     """Which correction of one log the sender holds."""
 
     log: LogId
@@ -241,7 +241,7 @@ class LogCorrection:
         first: Number of the first corrected keyframe.
         step: Every `step`-th keyframe is listed; those between are interpolated.
         T_map_camera: (N, 7) float32 poses, translation and quaternion w x y z.
-        signature: The leader's, over `signed_part`; empty where the swarm has no keys.
+        signature: The leader's, over `encode_correction`; empty where the swarm has no keys.
     """
 
     log: LogId
@@ -452,18 +452,41 @@ def _unpack_version(value: Any) -> CorrectionVersion:
         raise DecodeError("expected the version of a correction") from error
 
 
-def _pack_digest(value: LogDigest) -> list[Any]:
-    log, count, checksum = value.log, value.count, value.checksum
+def _pack_digest(value: LogDigest) -> LogDigest:
+    """A digest is a tuple as it is on the wire."""
+    log, count, checksum = value
     if not 0 <= count <= INDEX_MAX or not 0 <= checksum <= CHECKSUM_MAX:
         raise DecodeError(f"digest of {log} is out of range")
-    return [[log.robot, log.incarnation], count, checksum]
+    return value
+
+
+def _pack_version(value: CorrectionVersion) -> CorrectionVersion:
+    if not 0 <= value.round <= INDEX_MAX:
+        raise DecodeError(f"version of the correction of {value.log} is out of range")
+    return value
 
 
 _DIGEST = Codec(_pack_digest, _unpack_digest)
-_VERSION = Codec(_ANY_VERSION.pack, _unpack_version)
+_VERSION = Codec(_pack_version, _unpack_version)
 _PAIR = struct(CandidatePair, low=KEYFRAME_ID, high=KEYFRAME_ID)
-_CORRECTION = struct(
-    LogCorrection,
+
+
+def _unsigned(
+    log: LogId,
+    term: Term,
+    round: int,
+    anchor: LogId,
+    T_map_odom: Pose7,
+    covariance: Array | None,
+    first: int,
+    step: int,
+    T_map_camera: Array,
+) -> LogCorrection:
+    return LogCorrection(log, term, round, anchor, T_map_odom, covariance, first, step, T_map_camera)
+
+
+_UNSIGNED = struct(
+    _unsigned,
     log=LOG_ID,
     term=TERM,
     round=COUNT,
@@ -473,8 +496,31 @@ _CORRECTION = struct(
     first=COUNT,
     step=integer(1, 2**31 - 1),
     T_map_camera=ARRAY,
-    signature=blob(SIGNATURE_BYTES),
 )
+
+
+@lru_cache(maxsize=CORRECTIONS_KEPT_MAX)
+def encode_correction(correction: LogCorrection) -> bytes:
+    """A correction without its signature, as it is on the wire; every relay passes on the same bytes."""
+    return to_bytes(_UNSIGNED.pack(correction))
+
+
+@lru_cache(maxsize=CORRECTIONS_KEPT_MAX)
+def _read_correction(data: bytes, signature: bytes) -> LogCorrection:
+    unsigned = _UNSIGNED.unpack(from_bytes(data, MESSAGE_BYTES_MAX))
+    return replace(unsigned, signature=signature) if signature else unsigned
+
+
+def _unpack_correction(value: Any) -> LogCorrection:
+    if type(value) is not list or len(value) != 2 or type(value[0]) is not bytes or type(value[1]) is not bytes:
+        raise DecodeError("expected a correction and its signature")
+    try:
+        return _read_correction(*value)
+    except ValueError as error:
+        raise DecodeError(str(error)) from error
+
+
+_CORRECTION = Codec(lambda correction: [encode_correction(correction), correction.signature], _unpack_correction)
 _POSITION = struct(LogPosition, log=LOG_ID, first=COUNT)
 _BATCH = struct(
     RecordBatch,
@@ -534,11 +580,6 @@ MESSAGE_KINDS: tuple[str, ...] = tuple(_CODECS)
 def kind_of(message: Message) -> str:
     """Name of a message's kind, as accounting and key expressions use it."""
     return _KINDS[type(message)]
-
-
-def signed_part(correction: LogCorrection) -> bytes:
-    """What a correction's signature covers: all its other fields, as they are on the wire."""
-    return to_bytes(_CORRECTION.pack(correction)[:-1])
 
 
 def encode(envelope: Envelope) -> bytes:

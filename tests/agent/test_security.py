@@ -94,6 +94,29 @@ def test_a_signature_is_of_one_swarm(tmp_path: Path, folders: dict[str, Path]) -
         sealer(folders, "r2").opened(LogId("r1"), 0, sealed)
 
 
+def test_a_correction_is_signed_by_its_leader_and_by_nobody_else(folders: dict[str, Path]) -> None:
+    leader, judge, correction = LogId("r1", 3), sealer(folders, "r2"), b"a correction"
+    signature = sealer(folders, "r1").sign_correction(correction)
+    judge.check_correction(leader, correction, signature)
+    forged = [
+        (leader, b"another", signature),
+        (leader, correction, b""),
+        (leader, correction, sealer(folders, "r3").sign_correction(correction)),
+        (LogId("r2"), correction, signature),
+        (LogId("r9"), correction, signature),
+        (leader, correction, RecordSealer("farm", sealer(folders, "r1")._signing_key, {}).sign_correction(correction)),
+    ]
+    for claim in forged:
+        with pytest.raises(DecodeError):
+            judge.check_correction(*claim)
+
+
+def test_a_signed_record_is_no_signed_correction(folders: dict[str, Path]) -> None:
+    sealed = sealer(folders, "r1").seal(LogId("r1"), 0, b"record")
+    with pytest.raises(DecodeError):
+        sealer(folders, "r2").check_correction(LogId("r1"), b"record", sealed[len(b"record") :])
+
+
 # --- files
 
 

@@ -159,7 +159,9 @@ def test_a_correction_on_the_wire_has_unit_quaternions() -> None:
     version, kind, sender, fields = from_bytes(
         encode(Envelope(ALICE, CorrectionBatch((CORRECTION,)))), MESSAGE_BYTES_MAX
     )
-    fields[0][0][-2] = ["f4", [1, 7], bytes(28), 1.0]
+    correction = from_bytes(fields[0][0][0], MESSAGE_BYTES_MAX)
+    correction[-1] = ["f4", [1, 7], bytes(28), 1.0]
+    fields[0][0][0] = to_bytes(correction)
     with pytest.raises(DecodeError, match="unit quaternions"):
         decode(to_bytes([version, kind, sender, fields]))
 

@@ -5,33 +5,47 @@ nothing, and a robot that was away gets the newest from whoever it meets.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, remember
 from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import CorrectionBatch, CorrectionRequest, CorrectionVersion, LogCorrection
+from flocc_protocol.messages import (
+    CorrectionBatch,
+    CorrectionRequest,
+    CorrectionVersion,
+    LogCorrection,
+    encode_correction,
+)
 
 Float = NDArray[np.float64]
 
 _UPPER = np.triu_indices(6)
+ANSWERS_MAX = 8
+"""Messages with which one request is answered."""
 
 
 class Corrections:
     """The newest correction of every log, as one robot knows them."""
 
-    def __init__(self, own: LogId, gossip: GossipParameters, rounds: RoundParameters) -> None:
+    def __init__(
+        self, own: LogId, gossip: GossipParameters, rounds: RoundParameters, sealer: Sealer | None = None
+    ) -> None:
         self._own = own
         self._gossip = gossip
         self._rounds = rounds
+        self._sealer = sealer
         self._newest: dict[LogId, LogCorrection] = {}
         self._asked_until_s: dict[LogId, float] = {}
         self._agreed: dict[LogId, CorrectionVersion] = {}
@@ -84,20 +98,32 @@ class Corrections:
         return [Unicast(peer, CorrectionRequest(tuple(wanted)))] if wanted else []
 
     def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
-        """Pass corrections on."""
+        """Pass corrections on, so many that a request cannot call forth a flood."""
         held = [self._newest[log] for log in request.logs if log in self._newest]
-        return [Unicast(peer, batch) for batch in CorrectionBatch.packed(held)]
+        return [Unicast(peer, batch) for batch in CorrectionBatch.packed(held)[:ANSWERS_MAX]]
 
-    def on_message(self, message: LogCorrection) -> list[Effect]:
-        """Keep a newer correction; apply it when it is this robot's."""
+    def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
+        """Keep a newer correction that its leader made; apply it when it is this robot's."""
         held = self._newest.get(message.log)
         if held is not None and (message.term, message.round) <= (held.term, held.round):
             return []
         if held is None and len(self._newest) >= self._gossip.logs_max:
-            return [Report("peer_refused", {"peer": message.term.leader.robot, "reason": "too many corrections"})]
+            return [Report("peer_refused", {"peer": peer, "reason": "too many corrections"})]
+        if not self._is_signed(message):
+            return [Report("peer_refused", {"peer": peer, "reason": "correction without its leader's signature"})]
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
+
+    def _is_signed(self, message: LogCorrection) -> bool:
+        """Whether the leader of a correction's term made it, where the swarm has keys."""
+        if self._sealer is None:
+            return True
+        try:
+            self._sealer.check_correction(message.term.leader, encode_correction(message), message.signature)
+        except DecodeError:
+            return False
+        return True
 
     def _keep(self, message: LogCorrection) -> None:
         self._newest[message.log] = message
@@ -127,9 +153,15 @@ class Corrections:
                 effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
                 continue
             if self._changed(message):
+                message = self._signed(message)
                 published.append(message)
-                effects += self.on_message(message)
+                effects += self.on_message(self._own.robot, message)
         return [*(Broadcast(batch) for batch in CorrectionBatch.packed(published)), *effects]
+
+    def _signed(self, message: LogCorrection) -> LogCorrection:
+        if self._sealer is None:
+            return message
+        return replace(message, signature=self._sealer.sign_correction(encode_correction(message)))
 
     def _changed(self, message: LogCorrection) -> bool:
         """Whether a follower would notice: another term, frame or thinning, or poses that moved."""

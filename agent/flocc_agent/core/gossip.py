@@ -29,7 +29,10 @@ DECODED_MAX = 1024
 
 
 class Sealer(Protocol):
-    """Proves who wrote a record, over any number of relays. Logs hold, send and persist sealed records."""
+    """Proves who wrote a record or made a correction, over any number of relays.
+
+    Logs hold, send and persist sealed records; a correction carries its leader's signature.
+    """
 
     def seal(self, log: LogId, number: int, record: bytes) -> bytes:
         """Add this robot's proof to a record of its own log."""
@@ -40,6 +43,18 @@ class Sealer(Protocol):
 
         Raises:
             DecodeError: It is not a record of that log at that number.
+        """
+        ...
+
+    def sign_correction(self, correction: bytes) -> bytes:
+        """This robot's signature of a correction that it made as a leader."""
+        ...
+
+    def check_correction(self, leader: LogId, correction: bytes, signature: bytes) -> None:
+        """Check who made a correction.
+
+        Raises:
+            DecodeError: It is not that leader's.
         """
         ...
 

@@ -137,7 +137,7 @@ class Robot:
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
         self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
-        self.corrections = Corrections(log, parameters.gossip, parameters.rounds)
+        self.corrections = Corrections(log, parameters.gossip, parameters.rounds, sealer)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -268,7 +268,7 @@ class Robot:
     def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
         """A correction of an absurd term would fence out every leader to come."""
         refused = self.election.on_applied(sender, message.term)
-        return refused or self.corrections.on_message(message)
+        return refused or self.corrections.on_message(sender.robot, message)
 
     def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """What others apply: a leader outbids it, and whoever has something older asks for it."""

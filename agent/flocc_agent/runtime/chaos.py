@@ -13,6 +13,8 @@ from flocc_agent.radio import Blackout, RadioParameters
 from flocc_protocol.errors import FloccError
 
 ROBOTS_MAX = 1000
+SLOW_MIN, SLOW_MAX = 1.0, 1000.0
+"""Bounds of a robot's slowness; work that lasts longer would outlast every deadline, and the end of the order."""
 NEEDS_VALUE = frozenset({"loss", "latency", "range", "slow"})
 
 
@@ -40,6 +42,8 @@ class Order(BaseModel):
             raise ValueError(f"'{self.kind}' needs a value")
         if self.kind == "loss" and self.value is not None and self.value > 1.0:
             raise ValueError("a loss is between 0 and 1")
+        if self.kind == "slow" and self.value is not None and not SLOW_MIN <= self.value <= SLOW_MAX:
+            raise ValueError(f"'slow' takes a factor from {SLOW_MIN:g} to {SLOW_MAX:g}, not {self.value:g}")
         if self.kind == "partition" and not self.groups:
             raise ValueError("a partition names its groups")
         if self.kind in ("blackout", "slow", "kill") and not self.robots:

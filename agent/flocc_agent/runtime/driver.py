@@ -72,6 +72,8 @@ logger = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 
 INBOX_MAX = 8192
+REFUSED_MAX = 512
+"""Refusals that are counted apart, by peer and reason."""
 IMAGES_MAX = 8
 CORRECTIONS_MAX = 16
 BYTES_PERIOD_S = 1.0
@@ -365,6 +367,8 @@ class Driver:
         self.put(MessageReceived(envelope))
 
     def _refuse(self, peer: str, reason: str) -> None:
+        if len(self._refused) >= REFUSED_MAX and (peer, reason) not in self._refused:
+            peer, reason = "others", "for more reasons than are kept"
         self._refused[peer, reason] += 1
         if self._refused[peer, reason] == 1:
             logger.warning("%s: refused %s: %s", self.robot.log, peer, reason)
@@ -385,6 +389,9 @@ class Driver:
             match effect:
                 case PersistRecord() | PersistTerm() | PersistCorrection():
                     written.append(effect)
+                    continue
+                case Report("peer_refused", fields):
+                    self._refuse(str(fields["peer"]), str(fields["reason"]))
                     continue
                 case Report():
                     self._report(effect)

@@ -146,7 +146,8 @@ def _rule(name: str, messages: list[str], key_exprs: list[str], flows: list[str]
 class RecordSealer:
     """Signs this robot's records and checks those of all members: record bytes in, record bytes plus 64 out.
 
-    The signature covers swarm, log and number as well, so that a record cannot be moved to another place.
+    The signature covers swarm, log and number as well, so that a record cannot be moved to another place. Corrections
+    are signed by the leader that made them, apart from their bytes.
     """
 
     def __init__(self, swarm: str, signing_key: "Ed25519PrivateKey", members: Mapping[str, bytes]) -> None:
@@ -185,23 +186,55 @@ class RecordSealer:
         Raises:
             DecodeError: The robot is no member, or its signature is missing or wrong.
         """
+        record, signature = sealed[:-SIGNATURE_BYTES], sealed[-SIGNATURE_BYTES:]
+        if not self._is_of(log, signature, signed_text(self._swarm, log, number, record)):
+            raise DecodeError(f"record {number} of log {log} carries no signature of {log.robot}")
+        return record
+
+    def sign_correction(self, correction: bytes) -> bytes:
+        """Give this robot's signature of a correction that it made as a leader."""
+        return self._signing_key.sign(signed_correction(self._swarm, correction))
+
+    def check_correction(self, leader: LogId, correction: bytes, signature: bytes) -> None:
+        """Check who made a correction.
+
+        Raises:
+            DecodeError: The leader is no member, or its signature is missing or wrong.
+        """
+        if not self._is_of(leader, signature, signed_correction(self._swarm, correction)):
+            raise DecodeError(f"a correction carries no signature of {leader.robot}")
+
+    def _is_of(self, log: LogId, signature: bytes, text: bytes) -> bool:
+        """Whether the robot of a log signed a text.
+
+        Raises:
+            DecodeError: The robot is no member.
+        """
         from cryptography.exceptions import InvalidSignature
 
         verifying_key = self._verifying_keys.get(log.robot)
         if verifying_key is None:
             raise DecodeError(f"log {log} is of no member of the swarm")
-        record, signature = sealed[:-SIGNATURE_BYTES], sealed[-SIGNATURE_BYTES:]
         try:
-            verifying_key.verify(signature, signed_text(self._swarm, log, number, record))
-        except InvalidSignature as error:
-            raise DecodeError(f"record {number} of log {log} carries no signature of {log.robot}") from error
-        return record
+            verifying_key.verify(signature, text)
+        except InvalidSignature:
+            return False
+        return True
 
 
 def signed_text(swarm: str, log: LogId, number: int, record: bytes) -> bytes:
-    """Give what a signature covers: where the record stands, unambiguously, then the record."""
-    place = f"{keys.ROOT}/{keys.VERSION}/{swarm}/{log}/{number}".encode()
-    return struct.pack(">H", len(place)) + place + record
+    """Give what a record's signature covers: where the record stands, unambiguously, then the record."""
+    return _placed(f"{keys.ROOT}/{keys.VERSION}/{swarm}/{log}/{number}", record)
+
+
+def signed_correction(swarm: str, correction: bytes) -> bytes:
+    """Give what a correction's signature covers; no log's place ends in this word, since that is a number."""
+    return _placed(f"{keys.ROOT}/{keys.VERSION}/{swarm}/correction", correction)
+
+
+def _placed(place: str, content: bytes) -> bytes:
+    data = place.encode()
+    return struct.pack(">H", len(data)) + data + content
 
 
 def _public_key(raw: bytes) -> "Ed25519PublicKey":

@@ -1,10 +1,12 @@
 """Corrections are fenced by (term, round), passed on, and asked for."""
 
+from dataclasses import replace
+
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.corrections import Corrections, pose7
-from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Unicast
+from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
@@ -12,8 +14,10 @@ from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.robot import Restored
 from flocc_agent.geometry import pose
 from flocc_protocol.arrays import Array
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
 from flocc_protocol.messages import CorrectionBatch, CorrectionRequest, CorrectionVersion, Envelope, LogCorrection
+from flocc_protocol.records import SIGNATURE_BYTES
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
@@ -39,7 +43,7 @@ def solution(shift_m: float = 0.0, keyframes: int = 3) -> GraphSolution:
 
 
 def test_a_newer_correction_is_applied_and_persisted_first() -> None:
-    effects = corrections().on_message(correction(Term(1, R2), 1))
+    effects = corrections().on_message("r2", correction(Term(1, R2), 1))
     kinds = [type(effect) for effect in effects]
     assert delivered(effects) == [(1, 1, False)]
     assert kinds.index(PersistCorrection) < kinds.index(Deliver)
@@ -47,28 +51,28 @@ def test_a_newer_correction_is_applied_and_persisted_first() -> None:
 
 def test_an_older_or_equal_correction_is_not_applied() -> None:
     machine = corrections()
-    machine.on_message(correction(Term(2, R2), 5))
+    machine.on_message("r2", correction(Term(2, R2), 5))
     for late in (correction(Term(2, R2), 5), correction(Term(2, R2), 4), correction(Term(1, R3), 9)):
-        assert machine.on_message(late) == []
+        assert machine.on_message("r2", late) == []
 
 
 def test_of_one_counter_the_higher_leader_log_is_newer() -> None:
     machine = corrections()
-    machine.on_message(correction(Term(2, R3), 1))
-    assert machine.on_message(correction(Term(2, R2), 9)) == []
+    machine.on_message("r2", correction(Term(2, R3), 1))
+    assert machine.on_message("r2", correction(Term(2, R2), 9)) == []
 
 
 def test_a_jump_of_the_frame_is_told() -> None:
     machine = corrections(R2)
-    machine.on_message(correction(Term(1, R2), 1, log=R2, anchor=R2))
-    assert delivered(machine.on_message(correction(Term(1, R2), 2, log=R2, anchor=R1))) == [(1, 2, True)]
+    machine.on_message("r2", correction(Term(1, R2), 1, log=R2, anchor=R2))
+    assert delivered(machine.on_message("r2", correction(Term(1, R2), 2, log=R2, anchor=R1))) == [(1, 2, True)]
 
 
 def test_what_was_applied_before_a_restart_still_fences() -> None:
     machine = corrections()
     machine.restore(correction(Term(4, R2), 3))
-    assert machine.on_message(correction(Term(4, R2), 2)) == []
-    assert delivered(machine.on_message(correction(Term(4, R2), 4, anchor=R2))) == [(4, 4, True)]
+    assert machine.on_message("r2", correction(Term(4, R2), 2)) == []
+    assert delivered(machine.on_message("r2", correction(Term(4, R2), 4, anchor=R2))) == [(4, 4, True)]
 
 
 def test_a_restarted_robot_bids_above_what_it_applied() -> None:
@@ -77,7 +81,7 @@ def test_a_restarted_robot_bids_above_what_it_applied() -> None:
 
 def test_another_robots_correction_is_kept_and_passed_on() -> None:
     machine, message = corrections(R1), correction(Term(1, R2), 1, log=R3)
-    assert machine.on_message(message) == []
+    assert machine.on_message("r2", message) == []
     assert machine.on_request("r3", CorrectionRequest((R3,))) == [Unicast("r3", CorrectionBatch((message,)))]
 
 
@@ -112,6 +116,44 @@ def test_a_long_trajectory_is_thinned_and_keeps_its_last_keyframe() -> None:
     count = message.T_map_camera.shape[0]
     assert count <= RoundParameters().correction_keyframes_max
     assert message.first + message.step * (count - 1) == 1000
+
+
+class Seals:
+    """Signatures that name their signer."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+
+    def seal(self, log: LogId, number: int, record: bytes) -> bytes:
+        return record
+
+    def opened(self, log: LogId, number: int, sealed: bytes) -> bytes:
+        return sealed
+
+    def sign_correction(self, correction: bytes) -> bytes:
+        return self._robot.encode().ljust(SIGNATURE_BYTES, b".")
+
+    def check_correction(self, leader: LogId, correction: bytes, signature: bytes) -> None:
+        if signature.rstrip(b".") != leader.robot.encode():
+            raise DecodeError("forged")
+
+
+def test_a_relay_cannot_forge_a_correction() -> None:
+    machine = Corrections(R1, GossipParameters(), RoundParameters(), Seals("r1"))
+    genuine = replace(correction(Term(1, R2), 1), signature=Seals("r2").sign_correction(b""))
+    for forged in (replace(genuine, signature=b""), replace(genuine, term=Term(9, R3))):
+        effects = machine.on_message("r3", forged)
+        assert effects == [
+            Report("peer_refused", {"peer": "r3", "reason": "correction without its leader's signature"})
+        ]
+    assert delivered(machine.on_message("r3", genuine)) == [(1, 1, False)]
+
+
+def test_a_leader_signs_what_it_publishes() -> None:
+    machine = Corrections(R2, GossipParameters(), RoundParameters(), Seals("r2"))
+    (sent,) = [e.message for e in machine.publish(Term(1, R2), 1, solution()) if isinstance(e, Broadcast)]
+    assert isinstance(sent, CorrectionBatch)
+    assert [c.signature.rstrip(b".") for c in sent.corrections] == [b"r2"]
 
 
 def test_a_correction_of_an_absurd_term_is_refused() -> None:

@@ -35,6 +35,12 @@ def test_nonsense_is_one_sentence_that_repeats_it(words: str) -> None:
     assert repr(words) in str(error.value)
 
 
+@pytest.mark.parametrize("words", ["slow r1 1e9", "slow r1 0", "slow r1 1001x"])
+def test_a_robot_is_slowed_down_within_bounds(words: str) -> None:
+    with pytest.raises(ChaosError, match="'slow' takes a factor from 1 to 1000"):
+        parse_order(words)
+
+
 @pytest.mark.parametrize(
     "request_bytes",
     [b"", b"{}", b"\xff", b'{"kind": "rm"}', b'{"kind": "heal", "x": 1}', b'{"kind": "loss", "value": NaN}'],
