@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 Part = Literal["bytes", "descriptors", "keypoints", "latents"]
 
 LATENT_SIZES = {"classical": 136_000, "mast3r int8": 790_000, "mast3r fp16": 1_570_000}
-WALK = TracksScenario(robots=3, area_m=12.0, length_m=24.0)
+WALKERS, AREA_M = 3, 12.0
 VIEWS_MIN = 20
 """A robot with fewer views is no pass through a place."""
 KINDS = ("latent", "records", "correction", "heartbeat", "candidates")
@@ -52,6 +52,8 @@ class BandwidthSettings(Settings):
     """Which of the four parts."""
     latents: tuple[str, ...] = tuple(LATENT_SIZES)
     """Methods of which the simulated swarms' latents have the size."""
+    length_m: float = Field(24.0, gt=0)
+    """Length of the walks of the simulated swarms."""
     data: Path | None = None
     """Folder of the research sets, as ../shared/data; sevenscenes is used where it is there."""
     worlds: tuple[int, ...] = (7,)
@@ -119,7 +121,7 @@ def measure(settings: BandwidthSettings, cell: Cell, seed: int) -> Row:
     name = cell.parameters["on"]
     match cell.parameters["part"]:
         case "bytes":
-            return {"forms": bytes_by_kind(LATENT_SIZES[name], seed)}
+            return {"forms": bytes_by_kind(LATENT_SIZES[name], settings.length_m, seed)}
         case "descriptors":
             return {"forms": descriptor_forms(scenes_of(settings), name)}
         case "keypoints":
@@ -133,10 +135,10 @@ def form(name: str, size: float | None, **measures: float | None) -> Row:
     return {"form": name, "bytes": size, **measures}
 
 
-def bytes_by_kind(latent_bytes: int, seed: int) -> list[Row]:
+def bytes_by_kind(latent_bytes: int, length_m: float, seed: int) -> list[Row]:
     """Bytes of a swarm per closure gained, all together and by kind of message."""
     perception = PerceptionConfig(method="synthetic", synthetic=SyntheticConfig(latent_bytes=latent_bytes))
-    tracks = WALK.model_copy(update={"seed": seed})
+    tracks = TracksScenario(robots=WALKERS, seed=seed, area_m=AREA_M, length_m=length_m)
     report = simulated(Scenario(name="bandwidth", seed=seed, tracks=tracks, perception=perception), seed).report
     gained = report.closures.accepted_inter_robot
 
@@ -372,6 +374,7 @@ BANDWIDTH = Experiment(
         "walks": (3,),
         "perception": {"method": "synthetic"},
         "latents": ("classical",),
+        "length_m": 8.0,
         "network": "tiny",
         "pictures": 2,
         "runs": 1,

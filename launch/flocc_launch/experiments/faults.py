@@ -164,10 +164,17 @@ FAULTS = Experiment(
     name="faults",
     title="loss, range and number of robots, on virtual time",
     settings=FaultsSettings,
-    quick={"losses": (0.0, 0.5), "ranges_m": (), "robot_counts": (2,), "robots": 2, "area_m": 8.0, "length_m": 20.0,
-           "runs": 1},
+    quick={
+        "losses": (0.0, 0.5),
+        "ranges_m": (),
+        "robot_counts": (),
+        "robots": 2,
+        "area_m": 8.0,
+        "length_m": 12.0,
+        "runs": 1,
+    },
     cells=cells,
     measure=measure,
     summarise=summarise,
     draw=draw,
-)  # fmt: skip
+)

@@ -39,7 +39,7 @@ NO_ROTATION_RAD = 10.0
 """More than any rotation: turning calls for no keyframe."""
 SPARSE_M = 4.0
 """Up to here the paper's ATE stays low."""
-WALK = TracksScenario(robots=3, area_m=20.0, length_m=60.0)
+WALKERS = 3
 MEASURES = {
     "ate_m": "joint ATE, m",
     "closures": "closures between robots",
@@ -60,6 +60,10 @@ class SparseKeyframesSettings(Settings):
     """The configured back-end, such as mast3r with its checkpoints: the [perception] of a configuration file."""
     scenario: str = "demo"
     """Scenario with images, a file or a shipped one, for the image-based back-ends; its keyframes are replaced."""
+    area_m: float = Field(20.0, gt=0)
+    """Edge of the town of the synthetic back-end's walks."""
+    length_m: float = Field(60.0, gt=0)
+    """Length of each of these walks."""
     runs: int = Field(3, ge=1, le=100)
     """Repetitions with other seeds: links and workers, and for synthetic also walks and drift."""
 
@@ -116,7 +120,7 @@ def scenario(settings: SparseKeyframesSettings, backend: str, distance_m: float,
     keyframes = KeyframeConfig(distance_m=distance_m, rotation_rad=NO_ROTATION_RAD)
     match backend:
         case "synthetic":
-            tracks = WALK.model_copy(update={"seed": seed})
+            tracks = TracksScenario(robots=WALKERS, seed=seed, area_m=settings.area_m, length_m=settings.length_m)
             perception = PerceptionConfig(method="synthetic")
             return Scenario(name="walks", seed=seed, tracks=tracks, keyframes=keyframes, perception=perception)
         case "classical" | "configured":
@@ -205,7 +209,7 @@ SPARSE_KEYFRAMES = Experiment(
     name="sparse-keyframes",
     title="error, memory and bytes against the distance between keyframes",
     settings=SparseKeyframesSettings,
-    quick={"backends": (SYNTHETIC,), "distances_m": (1.0, 4.0), "runs": 1},
+    quick={"backends": (SYNTHETIC,), "distances_m": (1.0, 4.0), "area_m": 8.0, "length_m": 20.0, "runs": 1},
     cells=cells,
     measure=measure,
     summarise=summarise,

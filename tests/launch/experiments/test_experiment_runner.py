@@ -12,12 +12,20 @@ from typing import Any
 import pytest
 from tests.launch.experiments.toy_experiment import TOY, ToySettings
 
+from flocc_launch.experiments import outputs
 from flocc_launch.experiments.experiment import ExperimentError
 from flocc_launch.experiments.outputs import markdown_table
 from flocc_launch.experiments.runner import Interrupted, Result, processes_of, run_experiment
 
+pytestmark = pytest.mark.usefixtures("without_figures")
 ROOT = Path(__file__).resolve().parents[3]
 START_S = 60.0
+
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures take a second each; `test_experiment_cli` draws those of every experiment."""
+    monkeypatch.setattr(outputs, "write_figures", lambda *_: None)
 
 
 def run(out: Path, processes: int = 1, seed: int = 5, **settings: Any) -> Result:
@@ -33,10 +41,10 @@ def config(out: Path) -> dict[str, Any]:
     return read
 
 
-def test_an_experiment_leaves_rows_tables_figures_findings_and_its_configuration(tmp_path: Path) -> None:
+def test_an_experiment_leaves_rows_tables_findings_and_its_configuration(tmp_path: Path) -> None:
     run(tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"config.json", "rows.jsonl", "findings.json", "toy.csv", "toy.md", "toy.png", "toy.svg"}
+    assert names == {"config.json", "rows.jsonl", "findings.json", "toy.csv", "toy.md"}
     assert [(row["cell"], row["height"], row["missing"]) for row in rows(tmp_path / "out")] == [
         ("level=1 run=0", 15.0, None),
         ("level=2 run=0", 25.0, None),
