@@ -350,7 +350,8 @@ class Separators:
 
     Attributes:
         anchor: Log after which the frame of the poses is named; poses of two frames are not compared.
-        iteration: Counts the sender's block iterations; it only grows within one start.
+        iteration: Counts the sender's block iterations; it only grows.
+        epoch: Counts graduations of robust weights; who hears of a later one begins it, too.
         keyframes: Numbers of the keyframes in the sender's log.
         poses: (N, 4, r) float64: three rows of a 3-frame in r dimensions (a relaxed rotation, transposed), then the
             position, metres.
@@ -360,6 +361,7 @@ class Separators:
 
     anchor: LogId
     iteration: int
+    epoch: int
     keyframes: tuple[int, ...]
     poses: Array
     pairs: tuple[CandidatePair, ...]
@@ -566,6 +568,7 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             Separators,
             anchor=LOG_ID,
             iteration=COUNT,
+            epoch=COUNT,
             keyframes=sequence(COUNT, SEPARATORS_MAX),
             poses=ARRAY,
             pairs=sequence(_PAIR, OFFERS_MAX),

@@ -128,6 +128,7 @@ MESSAGES: tuple[Message, ...] = (
     Separators(
         ALICE,
         17,
+        2,
         (3, 8),
         lifted_array(2),
         (CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),),
@@ -200,6 +201,7 @@ def largest_messages() -> list[Message]:
         CandidateOffer((CandidatePair(keyframe, other),) * OFFERS_MAX, True),
         Separators(
             _long(0),
+            INDEX_MAX,
             INDEX_MAX,
             (INDEX_MAX,) * SEPARATORS_MAX,
             lifted_array(SEPARATORS_MAX, RANK_MAX),
@@ -329,7 +331,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
     st.builds(
         lambda anchor, iteration, n, rank: Separators(
-            anchor, iteration, tuple(range(n)), lifted_array(n, rank), (), Array.of(np.zeros(0))
+            anchor, iteration, n, tuple(range(n)), lifted_array(n, rank), (), Array.of(np.zeros(0))
         ),
         log_ids,
         _counts,

@@ -31,6 +31,8 @@ Int = NDArray[np.int64]
 
 STAGE_ITERATIONS = 5
 """Iterations between two decisions on robust weights."""
+REST_ITERATIONS = 20
+"""Iterations that final weights stand before a closure that does not agree makes all robots decide again."""
 FIRST_STEPS = 30
 STEPS = 2
 INNER_STEPS = 20
@@ -100,7 +102,7 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
             anchored = replace(problem, others=problem.align_to, anchored=False, align_to={})
             problem = anchored
     measured = _measured(config, problem, state.X.shape[2])
-    state = _weighed(config, measured, state)
+    state = _weighed(config, problem, measured, state)
     weights = _weights_of(config, problem, measured, state)
     links = _links(config, problem, measured, weights)
     block = Block(len(state.X), links)
@@ -112,7 +114,7 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     moved_most = float(np.abs(X - state.X_before).max())
     decided = sum(weight == 0.0 for weight in state.weights.values())
     next_state = _extrapolated(state, X, together)
-    finished = state.control is None
+    finished = state.control is None and not state.has_unjudged
     return BlockStep(next_state, rbcd.rounded(X), moved_most, descended.cost, aligned, finished, decided)
 
 
@@ -153,7 +155,7 @@ def _aligned(config: BackendConfig, problem: BlockProblem, state: BlockState) ->
         return None
     X = rbcd.lifted(pair.T_a_b @ T_own, state.X.shape[2])
     kept = {p: w for p, w in state.weights.items() if p.low.log == p.high.log}
-    return BlockState(X, X, weights=kept)
+    return BlockState(X, X, weights=kept, epoch=state.epoch)
 
 
 def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopClosure], T_own: Float) -> Rays:
@@ -216,26 +218,33 @@ def isotropic_weights(covariances: Float) -> tuple[Float, Float]:
     return 1.5 / np.trace(rotation, axis1=1, axis2=2), 3.0 / np.trace(translation, axis1=1, axis2=2)
 
 
-def _weighed(config: BackendConfig, measured: Measured, state: BlockState) -> BlockState:
-    """Decide robust weights that are this robot's: at once for new closures, the others once per stage."""
+def _weighed(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> BlockState:
+    """Decide robust weights that are this robot's: at once for new closures, the others once per stage.
+
+    A new closure that does not agree waits until the weights have been final for a while; then all robots of the
+    frame graduate their weights again, from the most convex cost on.
+    """
     if config.solver is Solver.LM:
         return state
     usable = np.flatnonzero(measured.own & measured.known)
-    if len(usable) == 0:
-        return state
     bound = np.full(len(usable), float(chdtri(6.0, 1.0 - config.inlier_probability)))
     squared = measured.residuals(state.X)[usable]
     pairs = [measured.pairs[k] for k in usable]
-    new = np.array([pair not in state.weights for pair in pairs])
-    if np.any(new & (squared > bound)):
+    state = _with_new(state, pairs, squared <= bound)
+    waited = state.control is None and state.in_stage >= REST_ITERATIONS
+    if problem.epoch > state.epoch or (state.has_unjudged and waited):
+        epoch = max(problem.epoch, state.epoch + (not problem.epoch > state.epoch))
+        if len(usable) == 0:
+            return replace(state, epoch=epoch, has_unjudged=False)
         control = initial_control(Solver.GNC_TLS, squared, bound, config.gnc_start_ratio)
-        return _decided(state, pairs, gnc_weights(Solver.GNC_TLS, squared, bound, control), control)
-    before = np.array([state.weights.get(pair, 1.0) for pair in pairs])
-    if state.in_stage < STAGE_ITERATIONS:
-        return _decided(state, pairs, before, state.control, state.in_stage) if np.any(new) else state
+        begun = _decided(state, pairs, gnc_weights(Solver.GNC_TLS, squared, bound, control), control)
+        return replace(begun, epoch=epoch, has_unjudged=False)
+    if state.in_stage < STAGE_ITERATIONS or len(usable) == 0:
+        return state
     if state.control is None:
+        before = np.array([state.weights[pair] for pair in pairs])
         within = np.where(before > 0.5, squared <= LEAVE_RATIO * bound, squared <= bound)
-        return _decided(state, pairs, within.astype(float), None)
+        return state if np.array_equal(within, before > 0.5) else _decided(state, pairs, within.astype(float), None)
     control = state.control * config.gnc_step
     weights = gnc_weights(Solver.GNC_TLS, squared, bound, control)
     if gnc_finished(Solver.GNC_TLS, weights, control):
@@ -243,12 +252,19 @@ def _weighed(config: BackendConfig, measured: Measured, state: BlockState) -> Bl
     return _decided(state, pairs, weights, control)
 
 
-def _decided(
-    state: BlockState, pairs: Sequence[CandidatePair], weights: Float, control: float | None, in_stage: int = 0
-) -> BlockState:
+def _with_new(state: BlockState, pairs: Sequence[CandidatePair], agrees: NDArray[np.bool_]) -> BlockState:
+    """Use new closures that agree; the others wait."""
+    new = {pair: float(fits) for pair, fits in zip(pairs, agrees.tolist(), strict=True) if pair not in state.weights}
+    if not new:
+        return state
+    unjudged = state.has_unjudged or not all(new.values())
+    return replace(state, weights={**state.weights, **new}, has_unjudged=unjudged)
+
+
+def _decided(state: BlockState, pairs: Sequence[CandidatePair], weights: Float, control: float | None) -> BlockState:
+    """New weights: a new stage, and the extrapolation starts anew."""
     chosen = {**state.weights, **dict(zip(pairs, weights.tolist(), strict=True))}
-    age = state.age if chosen == state.weights else 0
-    return replace(state, weights=chosen, control=control, in_stage=in_stage, age=age)
+    return replace(state, weights=chosen, control=control, in_stage=0, age=0)
 
 
 def _weights_of(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> Float:

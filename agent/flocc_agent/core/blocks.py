@@ -27,6 +27,8 @@ class BlockState:
         weights: Robust weight of each closure that is this robot's to decide.
         control: Control parameter of graduated non-convexity; None where it has ended.
         in_stage: Iterations since the weights were last decided.
+        epoch: Number of the graduation that the weights come from.
+        has_unjudged: A closure came since that did not agree; it waits, without weight, for the next graduation.
     """
 
     X: Float
@@ -35,6 +37,8 @@ class BlockState:
     weights: Mapping[CandidatePair, float] = field(default_factory=dict)
     control: float | None = None
     in_stage: int = 0
+    epoch: int = 0
+    has_unjudged: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +51,7 @@ class BlockProblem:
         closures: Closures with at least one end in it.
         others: (4, r) pose of other robots' keyframes at the far ends of closures, as last heard, in this frame.
         heard: Robust weights that other robots decided.
+        epoch: Latest graduation that another robot began.
         anchored: The block holds the anchor: its first keyframe stays where its odometry has it.
         align_to: Other robots' keyframes in another frame into which the block is to be moved first; else empty.
         state: Where the block stands; None before the first iteration.
@@ -57,6 +62,7 @@ class BlockProblem:
     closures: tuple[LoopClosure, ...]
     others: Mapping[KeyframeId, Float]
     heard: Mapping[CandidatePair, float]
+    epoch: int
     anchored: bool
     align_to: Mapping[KeyframeId, Float]
     state: BlockState | None

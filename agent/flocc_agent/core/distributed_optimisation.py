@@ -84,6 +84,7 @@ class DistributedOptimisation:
         self._rounds = rounds
         self._neighbours: dict[LogId, _Neighbour] = {}
         self._heard: dict[CandidatePair, float] = {}
+        self._epoch = 0
         self._seen: tuple[int, int] | None = None
         self._trajectory = Trajectory(np.zeros((0, 4, 4)))
         self._closures: tuple[LoopClosure, ...] = ()
@@ -115,6 +116,9 @@ class DistributedOptimisation:
             self._has_news = True
         held.is_news = held.is_news or message.iteration > held.iteration
         held.iteration = message.iteration
+        if held.anchor == self.anchor and message.epoch > self._epoch:
+            self._epoch = message.epoch
+            self._has_news = True
         self._has_news |= self._take_poses(held, message) | self._take_weights(sender, message)
 
     def on_step(self, number: int, step: BlockStep, now: float) -> list[Effect]:
@@ -273,6 +277,7 @@ class DistributedOptimisation:
                 closures=self._closures,
                 others=self._poses_of(log for log, n in self._neighbours.items() if n.anchor == self.anchor),
                 heard=dict(self._heard),
+                epoch=self._epoch,
                 anchored=self.anchor == self._own,
                 align_to=align_to,
                 state=self._state,
@@ -313,6 +318,7 @@ class DistributedOptimisation:
                 Separators(
                     self.anchor,
                     self.iteration,
+                    state.epoch,
                     tuple(keyframes),
                     Array.of(state.X[keyframes], "f8"),
                     tuple(pair for pair, _ in part),

@@ -181,7 +181,7 @@ class DistributedParameters:
     """An iteration without a result by then is given up."""
     deliver_period_s: float = 2.0
     """Shortest time between two corrections that a robot gives itself."""
-    tolerance: float = 1e-4
+    tolerance: float = 1e-3
     """A block whose poses moved less (metres, or entries of a rotation) rests until it hears something new."""
 
     def __post_init__(self) -> None:
