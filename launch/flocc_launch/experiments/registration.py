@@ -171,7 +171,8 @@ def _ratio_beats_similarity(
     numbers = (
         f"Average precision {ratio.average_precision:.3f} against {similarity.average_precision:.3f} over all pairs "
         f"with a pose (95 % of resampled differences lie between {low:+.3f} and {high:+.3f}), ROC {ratio.roc_auc:.3f} "
-        f"against {similarity.roc_auc:.3f}; {ratio.right_share:.1%} of them are inliers; better in {len(better)} of "
+        f"against {similarity.roc_auc:.3f}; {ratio.right_share:.1%} of them are inliers. The count of "
+        f"correspondences has {whole['correspondences'].average_precision:.3f}. The ratio is better in {len(better)} of "
         f"{len(single)} scenes ({', '.join(better) or 'none'})."
     )
     holds = None if low <= 0.0 <= high else low > 0.0
@@ -288,7 +289,7 @@ def draw(figure: "Figure", _settings: RegistrationSettings, rows: Sequence[Row])
         for k, (metric, label) in enumerate(METRICS.items()):
             if metric in curves:
                 found = curves[metric]
-                text = f"{label} ({found.average_precision:.2f})"
+                text = f"{label} ({found.average_precision:.3f})"
                 panel.plot(found.recall, found.precision, color=COLOURS[k], label=text)
         share = next(iter(curves.values())).right_share
         panel.axhline(share, color="#888888", linestyle=":", label=f"all accepted ({share:.2f})")
