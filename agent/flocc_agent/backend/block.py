@@ -294,7 +294,7 @@ def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, wei
     )
     kappas, taus = [(weights * measured.kappa)[used], kappa], [(weights * measured.tau)[used], tau]
     fixed = [measured.fixed[used], np.zeros((n - 1, 4, rank))]
-    if problem.anchored:
+    if problem.anchored and not np.any(used & ((measured.i < 0) | (measured.j < 0))):
         strength = kappa.max(initial=1.0), tau.max(initial=1.0)
         i, j, T = [*i, np.array([-1])], [*j, np.array([0])], [*T, T_odom[:1]]
         kappas, taus = [*kappas, np.array([strength[0]])], [*taus, np.array([strength[1]])]

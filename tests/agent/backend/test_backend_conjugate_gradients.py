@@ -1,0 +1,116 @@
+"""Conjugate gradients against elimination: the same step, for every kind of edge."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from flocc_agent.backend import conjugate_gradients
+from flocc_agent.backend.conjugate_gradients import SEGMENT_POSES, segments_of
+from flocc_agent.backend.edges import Edges, State, jacobians, residuals, state_of
+from flocc_agent.backend.initial import initial_poses
+from flocc_agent.backend.linear import LinearSolver
+from flocc_agent.backend.optimiser import optimise
+from flocc_agent.backend.problem import Problem, build
+from flocc_agent.config import BackendConfig, Formulation, Solver
+from flocc_agent.core.pose_graph import AbsoluteFix, GraphSolution
+from flocc_launch.generated_graph import GeneratedGraph, generate
+from flocc_protocol.ids import KeyframeId, LogId
+
+FORMULATIONS = (Formulation.BASE, Formulation.INDEPENDENT, Formulation.SMOOTHED, Formulation.SHARED)
+
+
+def generated(keyframes: int = 120, closures: int = 240, seed: int = 1) -> GeneratedGraph:
+    return generate(np.random.default_rng(seed), 3, keyframes, closures)
+
+
+def fixes_of(graph: GeneratedGraph) -> list[AbsoluteFix]:
+    log = LogId("r01")
+    truth = graph.T_world_keyframe[log]
+    return [AbsoluteFix(KeyframeId(log, k), truth[k, :3, 3], np.eye(3)) for k in range(0, 80, 10)]
+
+
+def problem_of(graph: GeneratedGraph, formulation: Formulation, fixes: list[AbsoluteFix]) -> tuple[Problem, State]:
+    config = BackendConfig(formulation=formulation)
+    closures = dict(enumerate(graph.graph.closures))
+    T_initial = initial_poses(graph.graph.trajectories, closures, 4.0, None)[0]
+    problem = build(graph.graph.trajectories, closures, fixes, config, T_initial, np.eye(4))
+    poses = [T_initial[log] for log in problem.logs] + ([np.eye(4)[None]] if fixes else [])
+    return problem, state_of(np.concatenate(poses), problem.clusters)
+
+
+def steps(problem: Problem, state: State, weights: np.ndarray, hold: bool, damping: float) -> list[np.ndarray]:
+    at = residuals(problem.edges, state, hold)
+    jac = jacobians(problem.edges, at)
+    solvers = (LinearSolver(0, 20.0, iterative_poses_min=least) for least in (1, 10**9))
+    return [solver.step(problem.edges, state, at, jac, weights, damping) for solver in solvers]
+
+
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Iterate until nothing is left."""
+    monkeypatch.setattr(conjugate_gradients, "TOLERANCE_RATIO", 1e-9)
+
+
+def assert_same_step(iterated: np.ndarray, eliminated: np.ndarray) -> None:
+    """The same but for rounding, and not because the iterations gave up and elimination did it."""
+    assert not np.array_equal(iterated, eliminated)
+    assert np.abs(eliminated).max() > 1e-3, "a step that tells nothing"
+    np.testing.assert_allclose(iterated, eliminated, rtol=0.0, atol=1e-5 * np.abs(eliminated).max())
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("damping", [0.0, 100.0])
+@pytest.mark.parametrize("with_fixes", [False, True])
+@pytest.mark.usefixtures("exact")
+def test_both_ways_give_the_same_step(formulation: Formulation, damping: float, with_fixes: bool) -> None:
+    graph = generated()
+    problem, state = problem_of(graph, formulation, fixes_of(graph) if with_fixes else [])
+    weights = np.ones(len(problem.edges))
+    weights[problem.closure_rows] = np.random.default_rng(1).choice([1.0, 0.3, 1e-6], len(problem.closure_ids))
+    iterated, eliminated = steps(problem, state, weights, False, damping)
+    assert_same_step(iterated, eliminated)
+    np.testing.assert_array_equal(iterated[:6], 0.0)
+
+
+@pytest.mark.usefixtures("exact")
+def test_scales_that_are_held_at_their_bound_give_the_same_step() -> None:
+    problem, state = problem_of(generated(), Formulation.SMOOTHED, [])
+    folded = State(state.q, np.zeros_like(state.t), state.scale - 0.9)
+    assert np.any(residuals(problem.edges, folded, hold=True).held)
+    assert_same_step(*steps(problem, folded, np.ones(len(problem.edges)), True, 0.0))
+
+
+def test_a_whole_solve_reaches_the_same_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = generated(keyframes=600, closures=2500)
+    config = BackendConfig(formulation=Formulation.SMOOTHED, solver=Solver.GNC_TLS, covariances=False)
+    iterated = optimise(graph.graph, config)
+    by_elimination = partial(LinearSolver, iterative_poses_min=10**9)
+    monkeypatch.setattr("flocc_agent.backend.optimiser.LinearSolver", by_elimination)
+    eliminated = optimise(graph.graph, config)
+    assert isinstance(iterated, GraphSolution)
+    assert isinstance(eliminated, GraphSolution)
+    assert iterated.components[0].cost == pytest.approx(eliminated.components[0].cost, rel=1e-5)
+    assert [c.state for c in iterated.closures] == [c.state for c in eliminated.closures]
+
+
+def test_a_system_that_needs_too_many_iterations_is_eliminated(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, state = problem_of(generated(), Formulation.INDEPENDENT, [])
+    monkeypatch.setattr(conjugate_gradients, "ITERATIONS_MAX", 1)
+    iterated, eliminated = steps(problem, state, np.ones(len(problem.edges)), False, 0.0)
+    np.testing.assert_array_equal(iterated, eliminated)
+
+
+def test_segments_end_where_a_chain_ends() -> None:
+    i = np.array([0, 1, 2, 5, 6])
+    edges = _edges(np.concatenate([i, [0]]), np.concatenate([i + 1, [5]]))
+    np.testing.assert_array_equal(segments_of(edges, 8), [0, 0, 0, 0, 1, 2, 2, 2])
+    long = np.arange(2 * SEGMENT_POSES)
+    segments = segments_of(_edges(long[:-1], long[1:]), len(long))
+    np.testing.assert_array_equal(np.bincount(segments), [SEGMENT_POSES, SEGMENT_POSES])
+
+
+def _edges(i: np.ndarray, j: np.ndarray) -> Edges:
+    n = len(i)
+    L = np.zeros((n, 6, 6))
+    return Edges(i, j, np.zeros((n, 4)), np.zeros((n, 6)), L, L, np.zeros(n), np.full(n, -1))
