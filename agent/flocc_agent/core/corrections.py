@@ -82,7 +82,8 @@ class Corrections:
 
     def news(self, versions: tuple[CorrectionVersion, ...]) -> tuple[CorrectionVersion, ...]:
         """Those versions that were not yet found to be no newer than this robot's own."""
-        return tuple(version for version in versions if version is not self._agreed.get(version.log))
+        agreed = self._agreed
+        return tuple([version for version in versions if version is not agreed.get(version.log)])
 
     def on_versions(self, peer: str, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """Ask a peer for corrections that are newer than this robot's."""

@@ -8,7 +8,7 @@ Rules:
   a counter not below its own claims anew, so that what it says is never older than what its followers applied.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
@@ -98,18 +98,24 @@ class LeaderElection:
     def advert(self) -> LeaderAdvert | None:
         """What a heartbeat says of the leader; a leader's beat grows with each call."""
         if self._leader is not None and self.leading:
-            self._leader = replace(self._leader, beat=self._leader.beat + 1)
+            leader = self._leader
+            self._leader = LeaderAdvert(leader.term, leader.compute_class, leader.beat + 1, leader.hops)
         return self._leader
 
     def on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Learn of a robot in range and of the leader it follows."""
-        self._peers[sender.robot] = _Peer(rank(heartbeat.compute_class, sender), sender.robot)
+        self._meet(sender, heartbeat.compute_class)
         refused = self._learn_counter(sender, heartbeat.term_counter_max)
         if refused:
             return refused
         if heartbeat.leader is None:
             return self._renew_if_overtaken(now)
         return self._on_advert(heartbeat.leader, now) + self._renew_if_overtaken(now)
+
+    def _meet(self, sender: LogId, compute_class: int) -> None:
+        known = self._peers.get(sender.robot)
+        if known is None or known.rank != (-compute_class, sender):
+            self._peers[sender.robot] = _Peer(rank(compute_class, sender), sender.robot)
 
     def on_election(self, sender: LogId, now: float) -> list[Effect]:
         """Answer a robot that this one outranks, and take the election over.
@@ -191,9 +197,9 @@ class LeaderElection:
         return self._due_s
 
     def _on_advert(self, advert: LeaderAdvert, now: float) -> list[Effect]:
-        heard = replace(advert, hops=advert.hops + 1)
-        if advert.term.leader == self._own or heard.hops > self._parameters.hops_max:
+        if advert.term.leader == self._own or advert.hops >= self._parameters.hops_max:
             return []
+        heard = LeaderAdvert(advert.term, advert.compute_class, advert.beat, advert.hops + 1)
         if heard.beat <= self._lost.get(heard.term, -1):
             return []
         if self._leader is not None and heard.term == self._leader.term:

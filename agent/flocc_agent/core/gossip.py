@@ -161,20 +161,20 @@ class Gossip:
 
     def on_digests(self, sender: LogId, digests: tuple[LogDigest, ...], now: float) -> list[Effect]:
         """Ask for what others have more of."""
-        effects: list[Effect] = []
-        for digest in digests if digests != self._announcer.all() else ():
-            if digest is not self._agreed.get(digest.log):
-                effects += self._on_digest(sender.robot, digest)
+        agreed = self._agreed
+        news = [digest for digest in digests if digest is not agreed.get(digest.log)]
+        effects = [effect for digest in news for effect in self._on_digest(sender.robot, digest)]
         return effects + self._pulls.ask(now)
 
     def _on_digest(self, peer: str, digest: LogDigest) -> list[Effect]:
-        copy = self.logs.get(digest.log)
-        if digest.count > (len(copy) if copy else 0):
-            return self._behind(peer, digest.log, digest.count)
-        self._pulls.on_level(peer, digest.log)
-        if copy is not None and copy.checksums[digest.count] != digest.checksum:
-            return self._fork(peer, digest.log, "two writers of one log")
-        remember(self._agreed, digest.log, digest)
+        log, count, checksum = digest
+        copy = self.logs.get(log)
+        if copy is None or count > len(copy.encoded):
+            return self._behind(peer, log, count) if count else []
+        self._pulls.on_level(peer, log)
+        if copy.checksums[count] != checksum:
+            return self._fork(peer, log, "two writers of one log")
+        remember(self._agreed, log, digest)
         return []
 
     def _behind(self, peer: str, log: LogId, count: int) -> list[Effect]:
@@ -220,7 +220,9 @@ class Gossip:
         peer = sender.robot
         if batch.log == self._own:
             return [], self._own_log_elsewhere(sender, batch)
-        copy = self.logs.get(batch.log) or LogCopy()
+        copy = self.logs.get(batch.log)
+        if copy is None:
+            copy = LogCopy()
         if batch.first > len(copy):
             return [], self._behind(peer, batch.log, batch.first + len(batch.records))
         if not copy.continues(batch):
@@ -253,7 +255,7 @@ class Gossip:
 
     def _held(self, log: LogId) -> int:
         copy = self.logs.get(log)
-        return len(copy) if copy else 0
+        return 0 if copy is None else len(copy.encoded)
 
     def _announce(self, log: LogId, copy: LogCopy) -> None:
         self._announcer.put(log, LogDigest(log, len(copy), copy.checksums[-1]))

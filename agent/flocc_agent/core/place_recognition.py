@@ -66,7 +66,9 @@ class PlaceRecognition:
         if descriptor is None or not self._fits(keyframe.log, descriptor):
             self.refused += 1
             return []
-        known = self._by_log.setdefault(keyframe.log, _Descriptors(len(descriptor)))
+        known = self._by_log.get(keyframe.log)
+        if known is None:
+            known = self._by_log[keyframe.log] = _Descriptors(len(descriptor))
         known.append(keyframe.index, descriptor)
         found = [c for log in self._partners(keyframe.log) for c in self._best(keyframe, descriptor, log)]
         return sorted(found, key=lambda candidate: (-candidate.similarity, candidate.pair))
@@ -83,9 +85,10 @@ class PlaceRecognition:
 
     def _best(self, keyframe: KeyframeId, descriptor: NDArray[np.float32], log: LogId) -> list[Candidate]:
         others = self._by_log[log]
-        if others.matrix.shape[1] != len(descriptor):
+        matrix = others.matrix
+        if matrix.shape[1] != len(descriptor):
             return []
-        similarities = others.matrix @ descriptor
+        similarities = matrix @ descriptor
         if self._parameters.best_matches == 1:
             best = [int(similarities.argmax())]
         else:

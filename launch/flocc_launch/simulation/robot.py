@@ -108,6 +108,7 @@ class Station:
         self._around = around
         self._images: dict[int, Capture] = {}
         self._tick_s = float("inf")
+        self._due_s = float("inf")
 
     @property
     def running(self) -> bool:
@@ -127,7 +128,7 @@ class Station:
         self.core = Robot(
             self.log, self._compute_class, boot, parameters, self.now_s(), restored, distributed=distributed
         )
-        self._tick_s = float("inf")
+        self._tick_s = self._due_s = float("inf")
         self._arm()
 
     def kill(self) -> None:
@@ -172,7 +173,7 @@ class Station:
 
     def _tick(self) -> None:
         """Wake up; deadlines that moved on since are waited for again."""
-        self._tick_s = float("inf")
+        self._tick_s = self._due_s = float("inf")
         if self.core is None:
             return
         now_s = self.now_s()
@@ -187,8 +188,9 @@ class Station:
         """See to it that the core is woken at its deadline, on its own clock."""
         assert self.core is not None
         due_s = self.core.deadline()
-        if due_s == float("inf"):
+        if due_s >= self._due_s:
             return
+        self._due_s = due_s
         wake_s = self.clock.true_s(due_s)
         while self.clock.local_s(wake_s) < due_s:
             wake_s += max(abs(wake_s), 1.0) * 1e-15
@@ -218,6 +220,8 @@ class Station:
     def _do(self, effect: Effect) -> None:
         now_s = self._agenda.now_s
         match effect:
+            case PersistRecord(log, number, data):
+                self.disk.put_record(log, number, data)
             case Broadcast(message):
                 self._around.broadcast(self, message)
             case Unicast(to, message):
@@ -234,8 +238,6 @@ class Station:
                 self.later(self.workers.optimised_at_s(now_s), lambda: self.workers.optimise(effect))
             case IterateBlock():
                 self.later(self.workers.iterated_at_s(now_s), lambda: self.workers.iterate(effect))
-            case PersistRecord(log, number, data):
-                self.disk.put_record(log, number, data)
             case PersistTerm(counter):
                 self.disk.term_counter = max(self.disk.term_counter, counter)
             case PersistCorrection(correction):
