@@ -29,6 +29,7 @@ from flocc_agent.geometry import is_rigid
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver, Skills
+from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.persistence import restore
@@ -329,7 +330,7 @@ class Agent:
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
         )
-        transport.serve_admin(Admin.STATUS, lambda _: json.dumps(self.status()).encode())
+        transport.serve_admin(Admin.STATUS, lambda _: json.dumps({**self.status(), **self._evidence()}).encode())
         if config.transport.chaos:
             transport.serve_admin(Admin.CHAOS, self._disturb)
         return Driver(
@@ -349,6 +350,14 @@ class Agent:
             self._on_line,
             self._clock_s,
         )
+
+    def _evidence(self) -> dict[str, Any]:
+        """What an operator may want to know of maps that have not merged."""
+        driver = self._started
+        return {
+            "compute_class": self.config.compute_class,
+            **evidence_of(driver.robot, self.config.core, driver.last_solution),
+        }
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""

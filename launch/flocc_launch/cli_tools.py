@@ -31,9 +31,11 @@ def doctor(
     run: RunArgument = None,
     config: ConfigOption = None,
     swarm: SwarmOption = None,
+    installation: Annotated[bool, typer.Option("--installation", help="Check this machine for --config.")] = False,
     json_out: JsonOption = False,
 ) -> None:
     """Say why maps have or have not merged: of a run folder, of a running swarm, or check this installation."""
+    from flocc_agent.config import AgentConfig
     from flocc_launch.doctor import diagnose
     from flocc_launch.doctor.installation import check_installation
     from flocc_launch.doctor.live import diagnose_live
@@ -42,6 +44,9 @@ def doctor(
 
     if run is not None:
         findings = diagnose(RunFolder.open(run))
+    elif installation and config is not None:
+        read = AgentConfig.read(config)
+        findings = check_installation(read.folder, read.transport, read.perception)
     elif config is not None or swarm is not None:
         findings = diagnose_live(status_of_swarm(*_reach(config, swarm)))
     else:

@@ -25,6 +25,29 @@ class StatusError(FloccError):
     """Nobody answered; one sentence says who was asked."""
 
 
+class PairStatus(BaseModel):
+    """What came of pairs of keyframes of two robots, as one robot's logs tell."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    robots: tuple[str, str]
+    accepted: int = 0
+    rejected: int = 0
+    best_ratio: float | None = None
+    reason: str | None = None
+
+
+class SolverStatus(BaseModel):
+    """What the last solution that a robot made used and warned of."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    components: list[list[str]] = []
+    closures_used: int = 0
+    closures_rejected: int = 0
+    warnings: list[str] = []
+
+
 class RobotStatus(BaseModel):
     """What one robot says of itself; what it does not say is null."""
 
@@ -42,6 +65,15 @@ class RobotStatus(BaseModel):
     sent_bytes: int | None = None
     received_bytes: int | None = None
     refused: dict[str, int] = {}
+    compute_class: int = 0
+    logs: dict[str, Any] = {}
+    loss: dict[str, float] = {}
+    queues: dict[str, int] = {}
+    best_similarities: dict[str, float] = {}
+    similarity_threshold: float | None = None
+    match_ratio_threshold: float | None = None
+    pairs: list[PairStatus] = []
+    solver: SolverStatus | None = None
 
 
 def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0) -> list[RobotStatus]:

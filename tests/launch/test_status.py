@@ -10,9 +10,9 @@ from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 from typer.testing import CliRunner
 
-from flocc_agent.config import ConfigError, TransportConfig
+from flocc_agent.config import ConfigError, Mast3rConfig, PerceptionConfig, TransportConfig
 from flocc_launch.cli_tools import add_tools
-from flocc_launch.doctor import Finding, Severity, finding_lines, installation
+from flocc_launch.doctor import Finding, Severity, finding_lines, installation, network
 from flocc_launch.doctor.live import diagnose_live
 from flocc_launch.status import RobotStatus, StatusError, status_from, status_json, status_of_run, status_of_swarm
 
@@ -20,6 +20,21 @@ from flocc_launch.status import RobotStatus, StatusError, status_from, status_js
 def row(robot: str, neighbours: str = "", **fields: object) -> RobotStatus:
     healthy = {"leader": "r1", "term": 1, "keyframes": 5, "map_frame": "map/r1", "neighbours": neighbours.split()}
     return RobotStatus.model_validate({"robot": robot} | healthy | fields)
+
+
+def apart(peer_logs: object = None, **fields: object) -> list[RobotStatus]:
+    """Two robots that hear each other and are in two maps, and what the first one says on top."""
+    said = {"logs": {"r1": [9, 1], "r2": [9, 1]}, "similarity_threshold": 0.5, "match_ratio_threshold": 0.3}
+    peer = said | ({} if peer_logs is None else {"logs": peer_logs})
+    return [row("r1", "r2", **(said | fields)), row("r2", "r1", map_frame="map/r2", **peer)]
+
+
+def pair(**fields: object) -> dict[str, object]:
+    return {"robots": ["r1", "r2"], "reason": "match ratio too low", **fields}
+
+
+def server(name: str, neighbours: str) -> RobotStatus:
+    return row(name, neighbours, keyframes=0, map_frame=None, compute_class=9)
 
 
 def tools() -> typer.Typer:
@@ -66,10 +81,25 @@ def test_a_swarm_that_nobody_is_in_is_one_sentence() -> None:
         ([row("r1", "r2"), row("r2", "r1", map_frame="map/r2")], ["not-merged-yet"]),
         ([row("r1", "r2"), row("r2", "r1", refused={"refused unknown version": 3})], ["merged", "refused"]),
         ([row("r1")], []),
+        (apart(logs={"r1": [9, 1]}, peer_logs={"r2": [9, 1]}), ["no-descriptors"]),
+        (apart(best_similarities={"r2": 0.41}), ["low-similarity"]),
+        (apart(pairs=[pair(rejected=3, best_ratio=0.21)]), ["registrations-rejected"]),
+        (apart(pairs=[pair(accepted=3)], solver={"components": [["r1"], ["r2"]]}), ["closures-not-connecting"]),
+        (apart(pairs=[pair(accepted=3)], solver={"components": [["r1", "r2"]]}), ["not-merged-yet"]),
+        (apart(pairs=[pair(accepted=3)]), ["not-merged-yet"]),
+        ([row("r1", "r2 s"), row("r2", "r1 s"), server("s", "r1 r2")], ["merged"]),
+        ([row("r1", "s"), server("s", "r1")], ["not-merged-yet"]),
     ],
 )
 def test_the_doctor_of_a_running_swarm_names_the_cause(rows: list[RobotStatus], causes: list[str]) -> None:
     assert [finding.cause for finding in diagnose_live(rows)] == causes
+
+
+def test_the_figures_of_a_running_swarm_stand_in_the_sentence() -> None:
+    (similar,) = diagnose_live(apart(best_similarities={"r2": 0.41}))
+    assert "the best similarity so far is 0.41, below the threshold of 0.5" in similar.sentence
+    (rejected,) = diagnose_live(apart(pairs=[pair(rejected=3, best_ratio=0.21)]))
+    assert "the best match ratio is 0.210 (match ratio too low), R_thr is 0.3" in rejected.sentence
 
 
 def test_a_port_in_use_is_found_before_the_agent_finds_it() -> None:
@@ -77,7 +107,7 @@ def test_a_port_in_use_is_found_before_the_agent_finds_it() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        (finding,) = installation.ports(TransportConfig(control_listen=(endpoint,)))
+        (finding,) = network.ports(TransportConfig(control_listen=(endpoint,)))
     assert (finding.cause, finding.severity) == ("port", Severity.BLOCKS)
     assert endpoint in finding.sentence
 
@@ -92,9 +122,31 @@ def test_a_package_that_cannot_be_imported_is_named() -> None:
     assert installation.import_problem("json") is None
 
 
+def test_checkpoints_are_asked_for_only_where_perception_needs_them(tmp_path: Path) -> None:
+    assert [finding.severity for finding in installation.networks(PerceptionConfig())] == [Severity.GOOD]
+    pytest.importorskip("torch")
+    torn = tmp_path / "mast3r.pth"
+    torn.write_bytes(b"PK\x03\x04 cut off")
+    config = PerceptionConfig(method="mast3r", mast3r=Mast3rConfig(weights=torn, device="cpu"))
+    findings = installation.networks(config)
+    assert [(finding.cause, finding.severity) for finding in findings] == [
+        ("torch", Severity.GOOD),
+        ("checkpoint", Severity.BLOCKS),
+        ("checkpoint", Severity.BLOCKS),
+    ]
+    assert "cpu" in findings[0].sentence
+    assert str(torn) in findings[1].sentence
+    assert "perception.mast3r.place_weights is not set" in findings[2].sentence
+
+
+@pytest.mark.swarm
+def test_two_zenoh_peers_find_each_other_through_a_third() -> None:
+    assert network.by_gossip(TransportConfig())
+
+
 @pytest.mark.swarm
 def test_two_zenoh_peers_of_this_machine_find_each_other() -> None:
-    assert installation.two_peers(TransportConfig(), by_multicast=False)
+    assert network.two_peers(TransportConfig(), by_multicast=False)
 
 
 def test_findings_read_as_lines() -> None:

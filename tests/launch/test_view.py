@@ -5,10 +5,34 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.launch import synthetic_run
+from tests.launch.test_dashboard import growing, kill_the_leader, start_swarm
 
-from flocc_launch.view import ViewError, view
+from flocc_agent.geometry import pose, so3_exp
+from flocc_launch.data import recordings
+from flocc_launch.report.load import load
+from flocc_launch.run_folder import RunFolder
+from flocc_launch.run_records import ClosureKnown
+from flocc_launch.shipped import read_shipped
+from flocc_launch.simulation.simulate import simulate
+from flocc_launch.view import ViewError, left_over, residuals, view
+from flocc_launch.view_live import view_growing
+
+ENTITIES = (
+    b"before/r1",
+    b"after/closures",
+    b"live/r2/odometry",
+    b"live/r2/here",
+    b"error_m/r3",
+    b"after/truth/r1",
+    b"links",
+    b"closures",
+    b"closure/probability",
+    b"solver/cost",
+    b"solver/closures_used",
+)
 
 
 def test_a_run_becomes_a_file_for_the_viewer(tmp_path: Path) -> None:
@@ -17,8 +41,58 @@ def test_a_run_becomes_a_file_for_the_viewer(tmp_path: Path) -> None:
     assert view(synthetic_run.write(tmp_path / "run"), out) == str(out)
     content = out.read_bytes()
     assert content[:4] in (b"RRF2", b"RRIO")
-    for entity in (b"before/r1", b"after/closures", b"live/r2/odometry", b"error_m/r3", b"after/truth/r1"):
+    for entity in ENTITIES:
         assert entity in content, entity
+
+
+def test_a_simulated_run_shows_what_is_left_of_its_closures_and_their_images(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    scenario = read_shipped("corridor")
+    paths = recordings(scenario)
+    simulate(scenario, tmp_path / "run", recordings=paths)
+    folder = RunFolder.open(tmp_path / "run")
+    folder.write_run(folder.run().model_copy(update={"recordings": {name: str(path) for name, path in paths.items()}}))
+    view(folder, tmp_path / "run.rrd")
+    content = (tmp_path / "run.rrd").read_bytes()
+    for entity in (b"residual/translation_m", b"residual/rotation_rad", b"closure/query", b"closure/match"):
+        assert entity in content, entity
+    assert np.median([metres for metres, _ in residuals(load(folder)).values()]) < 0.5
+
+
+def test_a_run_that_goes_on_is_drawn_as_it_grows(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    folder = growing(tmp_path / "run")
+    looks = iter(range(4))
+
+    def is_over() -> bool:
+        look = next(looks)
+        if look == 1:
+            start_swarm(folder)
+        if look == 2:
+            kill_the_leader(folder)
+        return look == 3
+
+    view_growing(folder, tmp_path / "run.rrd", is_over)
+    content = (tmp_path / "run.rrd").read_bytes()
+    for entity in (b"live/r3/odometry", b"live/r2/here", b"links", b"lost its leader"):
+        assert entity in content, entity
+
+
+def test_no_display_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rerun")
+    for key in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(key, raising=False)
+    with pytest.raises(ViewError, match=r"there is no display to open the viewer on; write a file with --save"):
+        view(synthetic_run.write(tmp_path / "run"))
+
+
+def test_what_is_left_of_a_closure_is_measured_between_its_cameras() -> None:
+    closure = ClosureKnown(
+        query="r1/0", match="r2/0", T_query_match_unscaled=[0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], scale=2.0
+    )
+    apart = pose(so3_exp(np.array([0.0, 0.0, 0.1])), np.array([1.0, 0.3, 0.0]))
+    metres, radians = left_over(closure, apart)
+    assert (round(metres, 9), round(radians, 9)) == (0.3, 0.1)
 
 
 def test_rerun_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

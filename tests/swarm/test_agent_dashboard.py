@@ -16,7 +16,7 @@ from tests.launch.test_dashboard import browse, rows
 
 from flocc_agent.config import AgentConfig, PerceptionConfig, SourceConfig
 from flocc_launch.data import recordings
-from flocc_launch.doctor.installation import free_port
+from flocc_launch.doctor.network import free_port
 from flocc_launch.processes import loopback_transports
 from flocc_launch.shipped import read_shipped
 
@@ -47,7 +47,11 @@ def test_one_agent_shows_every_robot_of_its_swarm(tmp_path: Path) -> None:
     for name in ("r1", "r2"):
         source = SourceConfig(recording=paths[name].resolve(), rate=4.0)
         config = AgentConfig(
-            name=name, source=source, transport=transports[name], perception=PerceptionConfig(method="synthetic")
+            name=name,
+            incarnation=0,
+            source=source,
+            transport=transports[name],
+            perception=PerceptionConfig(method="synthetic"),
         )
         path = tmp_path / f"{name}.json"
         path.write_text(config.model_dump_json(), encoding="utf-8")

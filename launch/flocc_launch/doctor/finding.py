@@ -46,3 +46,8 @@ def finding_lines(findings: Iterable[Finding]) -> list[str]:
 def blocked(cause: str, sentence: str, advice: str, *robots: str) -> Finding:
     """A finding that blocks merging."""
     return Finding(cause, Severity.BLOCKS, sentence, advice, robots)
+
+
+def good(cause: str, sentence: str) -> Finding:
+    """A finding that all is well."""
+    return Finding(cause, Severity.GOOD, sentence)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from flocc_launch.doctor.evidence import named
 from flocc_launch.doctor.finding import Finding, Severity, blocked
+from flocc_launch.doctor.live_steps import apart, is_server
 from flocc_launch.status import RobotStatus
 
 
@@ -20,18 +21,23 @@ def diagnose_live(rows: Sequence[RobotStatus]) -> list[Finding]:
 
 def merging(rows: Sequence[RobotStatus], explained: bool) -> list[Finding]:
     """Whether all that answered share one map."""
-    frames = sorted({row.map_frame for row in rows if row.map_frame is not None})
-    if len(rows) > 1 and len(frames) == 1 and all(row.map_frame for row in rows):
-        robots = tuple(row.robot for row in rows)
-        return [
-            Finding("merged", Severity.GOOD, f"All {len(rows)} robots that answered are in {frames[0]}.", "", robots)
-        ]
+    moving = [row for row in rows if not is_server(row)]
+    frames = sorted({row.map_frame for row in moving if row.map_frame is not None})
+    if len(moving) > 1 and len(frames) == 1 and all(row.map_frame for row in moving):
+        robots = tuple(row.robot for row in moving)
+        sentence = f"All {len(moving)} robots that answered are in {frames[0]}."
+        return [Finding("merged", Severity.GOOD, sentence, "", robots)]
     if explained or len(rows) < 2:
         return []
+    return apart(rows) or [not_merged_yet(rows, len(frames))]
+
+
+def not_merged_yet(rows: Sequence[RobotStatus], maps: int) -> Finding:
+    """All is as it should be, but for the map."""
     closures = max(row.closures or 0 for row in rows)
-    sentence = f"{len(frames)} maps, {closures} closures known so far, and all robots hear and follow each other."
+    sentence = f"{maps} maps, {closures} closures known so far, and all robots hear and follow each other."
     advice = "Give it time; once the run is over, flocc doctor on its run folder names the step that failed."
-    return [Finding("not-merged-yet", Severity.NOTE, sentence, advice)]
+    return Finding("not-merged-yet", Severity.NOTE, sentence, advice)
 
 
 def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:
@@ -68,7 +74,7 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
 
 def without_keyframes(rows: Sequence[RobotStatus]) -> list[Finding]:
     """Robots that took no keyframe."""
-    empty = [row.robot for row in rows if row.keyframes == 0]
+    empty = [row.robot for row in rows if row.keyframes == 0 and not is_server(row)]
     advice = "Check that images and odometry of one clock arrive and that the robot moves; see keyframes.distance_m."
     return [blocked("no-keyframes", f"{named(empty)} took no keyframe.", advice, *empty)] if empty else []
 

@@ -1,0 +1,96 @@
+"""What one robot can tell an operator who asks why maps have not merged: made on demand, from what its logs hold."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.pose_graph import ClosureState, GraphSolution
+from flocc_agent.core.robot import Robot
+from flocc_agent.runtime.reporting import best_similarities
+from flocc_protocol.records import ClosureRecord, RejectionRecord
+
+PAIRS_MAX = 64
+"""Pairs of robots that an answer tells of; of more, those with the fewest closures."""
+
+
+@dataclass(slots=True)
+class PairEvidence:
+    """What came of the pairs of keyframes of two robots, as the logs that a robot holds tell.
+
+    Attributes:
+        accepted: Pairs that became closures.
+        rejected: Pairs that were registered, or given up, and refused.
+        best_ratio: Best match ratio of those that were refused, Eq. (1).
+        reason: Why the best one was refused.
+    """
+
+    accepted: int = 0
+    rejected: int = 0
+    best_ratio: float | None = None
+    reason: str | None = None
+
+    def reject(self, record: RejectionRecord) -> None:
+        """Count a refused pair."""
+        expected = record.odometry_correspondences
+        ratio = record.correspondences / expected if expected else 0.0
+        self.rejected += 1
+        if self.best_ratio is None or ratio > self.best_ratio:
+            self.best_ratio, self.reason = ratio, record.reason
+
+
+def evidence_of(robot: Robot, parameters: CoreParameters, solution: GraphSolution | None) -> dict[str, Any]:
+    """Similarities and thresholds, closures and refusals by pair of robots, and what the last own solution said."""
+    found = sorted(pairs_of(robot).items(), key=lambda item: (item[1].accepted, item[0]))[:PAIRS_MAX]
+    return {
+        "best_similarities": best_similarities(robot),
+        "similarity_threshold": parameters.place_recognition.similarity_threshold,
+        "match_ratio_threshold": parameters.loop_closing.match_ratio_threshold,
+        "pairs": [
+            {
+                "robots": list(robots),
+                "accepted": pair.accepted,
+                "rejected": pair.rejected,
+                "best_ratio": None if pair.best_ratio is None else round(pair.best_ratio, 4),
+                "reason": pair.reason,
+            }
+            for robots, pair in found
+        ],
+        "solver": None if solution is None else solver_of(solution),
+    }
+
+
+def pairs_of(robot: Robot) -> dict[tuple[str, str], PairEvidence]:
+    """Evidence by pair of robots, each pair of keyframes once."""
+    found: dict[tuple[str, str], PairEvidence] = {}
+    seen = set()
+    for record in judgements(robot):
+        ends = tuple(sorted((record.query, record.match)))
+        if ends in seen:
+            continue
+        seen.add(ends)
+        robots = (ends[0].log.robot, ends[1].log.robot)
+        pair = found.setdefault((min(robots), max(robots)), PairEvidence())
+        if isinstance(record, ClosureRecord):
+            pair.accepted += 1
+        else:
+            pair.reject(record)
+    return found
+
+
+def judgements(robot: Robot) -> Iterator[ClosureRecord | RejectionRecord]:
+    """Every judgement in all logs, closures first: what anybody accepted is accepted."""
+    records = [record for _, copy in sorted(robot.gossip.logs.items()) for record in copy.records]
+    yield from (record for record in records if isinstance(record, ClosureRecord))
+    yield from (record for record in records if isinstance(record, RejectionRecord))
+
+
+def solver_of(solution: GraphSolution) -> dict[str, Any]:
+    """What the last solution of this robot used and warned of."""
+    used = sum(closure.state is ClosureState.USED for closure in solution.closures)
+    return {
+        "components": [sorted({log.robot for log in component.logs}) for component in solution.components],
+        "closures_used": used,
+        "closures_rejected": len(solution.closures) - used,
+        "warnings": list(solution.warnings[:8]),
+    }
