@@ -352,6 +352,8 @@ class Separators:
         anchor: Log after which the frame of the poses is named; poses of two frames are not compared.
         iteration: Counts the sender's block iterations; it only grows.
         epoch: Counts graduations of robust weights; who hears of a later one begins it, too.
+        origin: (4, r) float64: where the map frame lies among the poses, as the sender last heard from the anchor.
+        origin_iteration: Iteration of the anchor from which that is.
         keyframes: Numbers of the keyframes in the sender's log.
         poses: (N, 4, r) float64: three rows of a 3-frame in r dimensions (a relaxed rotation, transposed), then the
             position, metres.
@@ -362,6 +364,8 @@ class Separators:
     anchor: LogId
     iteration: int
     epoch: int
+    origin: Array
+    origin_iteration: int
     keyframes: tuple[int, ...]
     poses: Array
     pairs: tuple[CandidatePair, ...]
@@ -371,11 +375,14 @@ class Separators:
         shape = self.poses.shape
         if self.poses.dtype != "f8" or len(shape) != 3 or shape[:2] != (len(self.keyframes), 4):
             raise ValueError("separators have (N, 4, r) float64 poses, one per keyframe")
+        if self.origin.dtype != "f8" or self.origin.shape != shape[1:]:
+            raise ValueError("the origin is a float64 pose like the separators")
         if not RANK_MIN <= shape[2] <= RANK_MAX or len(self.keyframes) > SEPARATORS_MAX:
             raise ValueError(f"separators have rank {RANK_MIN} to {RANK_MAX} and at most {SEPARATORS_MAX} keyframes")
         if self.weights.dtype != "f4" or self.weights.shape != (len(self.pairs),) or len(self.pairs) > OFFERS_MAX:
             raise ValueError(f"separators have one float32 weight per pair, at most {OFFERS_MAX}")
         _check_lifted(self.poses.numpy())
+        _check_lifted(self.origin.numpy()[None])
         if np.any((self.weights.numpy() < 0.0) | (self.weights.numpy() > 1.0)):
             raise ValueError("a robust weight lies in [0, 1]")
 
@@ -569,6 +576,8 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             anchor=LOG_ID,
             iteration=COUNT,
             epoch=COUNT,
+            origin=ARRAY,
+            origin_iteration=COUNT,
             keyframes=sequence(COUNT, SEPARATORS_MAX),
             poses=ARRAY,
             pairs=sequence(_PAIR, OFFERS_MAX),

@@ -72,6 +72,11 @@ def lifted_array(count: int, rank: int = 3) -> Array:
     return Array.of(poses, "f8")
 
 
+def lifted_origin(rank: int = 3) -> Array:
+    """(4, rank) float64: the identity."""
+    return Array.of(np.eye(4, rank), "f8")
+
+
 def descriptor(dimension: int = 512, seed: int = 0) -> Array:
     """A unit vector as int8."""
     values = np.random.default_rng(seed).normal(size=dimension)
@@ -129,6 +134,8 @@ MESSAGES: tuple[Message, ...] = (
         ALICE,
         17,
         2,
+        lifted_origin(),
+        16,
         (3, 8),
         lifted_array(2),
         (CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),),
@@ -202,6 +209,8 @@ def largest_messages() -> list[Message]:
         Separators(
             _long(0),
             INDEX_MAX,
+            INDEX_MAX,
+            lifted_origin(RANK_MAX),
             INDEX_MAX,
             (INDEX_MAX,) * SEPARATORS_MAX,
             lifted_array(SEPARATORS_MAX, RANK_MAX),
@@ -331,7 +340,15 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
     st.builds(
         lambda anchor, iteration, n, rank: Separators(
-            anchor, iteration, n, tuple(range(n)), lifted_array(n, rank), (), Array.of(np.zeros(0))
+            anchor,
+            iteration,
+            n,
+            lifted_origin(rank),
+            n,
+            tuple(range(n)),
+            lifted_array(n, rank),
+            (),
+            Array.of(np.zeros(0)),
         ),
         log_ids,
         _counts,

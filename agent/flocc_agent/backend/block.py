@@ -38,6 +38,7 @@ STEPS = 2
 INNER_STEPS = 20
 TOGETHER_RATIO = 0.5
 MOMENTUM_MAX = 0.995
+TILT = 1e-3
 LEAVE_RATIO = 1.2
 """A used closure is dropped only this far beyond its bound, so that weights come to rest."""
 
@@ -99,8 +100,7 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
         moved = _aligned(config, problem, state)
         if moved is not None:
             state, aligned = moved, True
-            anchored = replace(problem, others=problem.align_to, anchored=False, align_to={})
-            problem = anchored
+            problem = replace(problem, others=problem.align_to, anchored=False, align_to={})
     measured = _measured(config, problem, state.X.shape[2])
     state = _weighed(config, problem, measured, state)
     weights = _weights_of(config, problem, measured, state)
@@ -115,22 +115,39 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     decided = sum(weight == 0.0 for weight in state.weights.values())
     next_state = _extrapolated(state, X, together)
     finished = state.control is None and not state.has_unjudged
-    return BlockStep(next_state, rbcd.rounded(X), moved_most, descended.cost, aligned, finished, decided)
+    origin = _origin(problem, next_state.X, aligned)
+    T_map_keyframe = rbcd.rounded(X, _origin(problem, X, aligned))
+    return BlockStep(next_state, T_map_keyframe, origin, moved_most, descended.cost, aligned, finished, decided)
+
+
+def _origin(problem: BlockProblem, X: Float, aligned: bool) -> Float:
+    """Where the map frame lies (4, r): at the anchor's first keyframe, less its odometry; else as heard."""
+    if problem.origin is not None and (aligned or not problem.anchored):
+        return problem.origin
+    return rbcd.composed(X[0], inverse(np.asarray(problem.trajectory.T_odom_keyframe[0], dtype=float)))
 
 
 def _first_state(config: BackendConfig, problem: BlockProblem) -> BlockState:
     """The robot alone: its odometry, and the closures within it, in its own frame."""
-    X = rbcd.lifted(np.asarray(problem.trajectory.T_odom_keyframe), config.rank)
+    X = _tilted(rbcd.lifted(np.asarray(problem.trajectory.T_odom_keyframe, dtype=float), config.rank))
     own = tuple(c for c in problem.closures if c.query.log == c.match.log)
     state = BlockState(X, X)
     if not own:
         return state
-    alone = replace(problem, closures=own, others={}, anchored=True, align_to={})
+    alone = replace(problem, closures=own, others={}, align_to={})
     measured = _measured(config, alone, config.rank)
     weights = np.ones(len(own)) if config.solver is Solver.LM else np.zeros(len(own))
     block = Block(len(X), _links(config, alone, measured, weights))
     X = rbcd.descend(block, X, FIRST_STEPS, INNER_STEPS, config.relative_tolerance).X
     return BlockState(X, X)
+
+
+def _tilted(X: Float) -> Float:
+    """Tilt frames (n, 4, r) a little out of their three dimensions; otherwise no step would ever leave them."""
+    out = X.copy()
+    out[:, :3] += TILT * np.random.default_rng(0).normal(size=out[:, :3].shape)
+    out[:, :3] = rbcd.orthonormal(out[:, :3])
+    return out if X.shape[2] > 3 else X
 
 
 def _extended(state: BlockState, T_odom: Float) -> BlockState:
@@ -149,11 +166,12 @@ def _extended(state: BlockState, T_odom: Float) -> BlockState:
 def _aligned(config: BackendConfig, problem: BlockProblem, state: BlockState) -> BlockState | None:
     """Move the whole block into the frame of others, by the pose that the most closures agree with; None if too few."""
     closures = [c for c in problem.closures if c.query in problem.align_to or c.match in problem.align_to]
-    T_own = rbcd.rounded(state.X)
+    assert problem.origin is not None, "poses are aligned to a frame whose origin was heard"
+    T_own = rbcd.rounded(state.X, state.X[0])
     pair = align_pair(_rays(config, problem, closures, T_own))
     if len(pair.agreeing) < config.closures_to_join_min:
         return None
-    X = rbcd.lifted(pair.T_a_b @ T_own, state.X.shape[2])
+    X = _tilted(rbcd.composed(problem.origin, pair.T_a_b @ T_own))
     kept = {p: w for p, w in state.weights.items() if p.low.log == p.high.log}
     return BlockState(X, X, weights=kept, epoch=state.epoch)
 
@@ -163,7 +181,8 @@ def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopC
     path_m = travelled_m(problem.trajectory)
     far = [c.match if c.query.log == problem.log else c.query for c in closures]
     near = [c.query if c.query.log == problem.log else c.match for c in closures]
-    T_far = rbcd.rounded(np.array([problem.align_to[keyframe] for keyframe in far]))
+    assert problem.origin is not None
+    T_far = rbcd.rounded(np.array([problem.align_to[keyframe] for keyframe in far]), problem.origin)
     T_hat = np.array([np.asarray(c.T_query_match_unscaled, dtype=float) for c in closures])
     flipped = np.array([c.query.log == problem.log for c in closures])
     T_hat[flipped] = inverse(T_hat[flipped])
@@ -294,11 +313,6 @@ def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, wei
     )
     kappas, taus = [(weights * measured.kappa)[used], kappa], [(weights * measured.tau)[used], tau]
     fixed = [measured.fixed[used], np.zeros((n - 1, 4, rank))]
-    if problem.anchored and not np.any(used & ((measured.i < 0) | (measured.j < 0))):
-        strength = kappa.max(initial=1.0), tau.max(initial=1.0)
-        i, j, T = [*i, np.array([-1])], [*j, np.array([0])], [*T, T_odom[:1]]
-        kappas, taus = [*kappas, np.array([strength[0]])], [*taus, np.array([strength[1]])]
-        fixed = [*fixed, rbcd.lifted(np.eye(4)[None], rank)]
     return Links(*(np.concatenate(part) for part in (i, j, T, kappas, taus, fixed)))
 
 

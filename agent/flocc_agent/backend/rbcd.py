@@ -50,20 +50,25 @@ class Links:
 
 
 def lifted(T: Float, rank: int) -> Float:
-    """Poses (n, 4, 4) as (n, 4, r): the first three of r dimensions are the map's."""
+    """Poses (n, 4, 4) as (n, 4, r): the first three of r dimensions are the frame's own."""
     X = np.zeros((len(T), 4, rank))
     X[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
     X[:, 3, :3] = T[:, :3, 3]
     return X
 
 
-def rounded(X: Float) -> Float:
-    """Nearest poses (n, 4, 4) to lifted ones in the map's three dimensions."""
+def composed(origin: Float, T: Float) -> Float:
+    """Poses (n, 4, 4) in a frame that lies at a lifted pose (4, r), as (n, 4, r)."""
+    return np.asarray(np.swapaxes(T, -1, -2) @ origin)
+
+
+def rounded(X: Float, origin: Float) -> Float:
+    """Nearest poses (n, 4, 4), in the frame that lies at a lifted pose (4, r), to lifted ones."""
     T = np.zeros((len(X), 4, 4))
-    U, _, Vt = np.linalg.svd(np.swapaxes(X[:, :3, :3], 1, 2))
+    U, _, Vt = np.linalg.svd(origin[:3] @ np.swapaxes(X[:, :3], 1, 2))
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     T[:, :3, :3] = U @ Vt
-    T[:, :3, 3] = X[:, 3, :3]
+    T[:, :3, 3] = (X[:, 3] - origin[3]) @ origin[:3].T
     T[:, 3, 3] = 1.0
     return T
 
@@ -138,7 +143,7 @@ def _stiffness(poses: int, i: bytes, j: bytes, T: bytes, kappa: bytes, tau: byte
     Omega = _weights(np.frombuffer(kappa), np.frombuffer(tau))
     Q = _quadratic(poses, np.frombuffer(i, dtype=np.int64), np.frombuffer(j, dtype=np.int64), shaped, Omega)
     diagonal = Q.diagonal()
-    shift = diags_array(np.full(len(diagonal), REGULARISATION_RATIO * float(diagonal.mean())))
+    shift = diags_array(np.full(len(diagonal), REGULARISATION_RATIO * float(diagonal.mean()) or 1.0))
     factor = splu(
         csc_array(Q + shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )

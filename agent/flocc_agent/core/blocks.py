@@ -52,7 +52,8 @@ class BlockProblem:
         others: (4, r) pose of other robots' keyframes at the far ends of closures, as last heard, in this frame.
         heard: Robust weights that other robots decided.
         epoch: Latest graduation that another robot began.
-        anchored: The block holds the anchor: its first keyframe stays where its odometry has it.
+        anchored: The block is the anchor's: its first keyframe's odometry says where the map frame lies.
+        origin: (4, r) where the map frame lies among the poses, as last heard; of the frame of `align_to`, if any.
         align_to: Other robots' keyframes in another frame into which the block is to be moved first; else empty.
         state: Where the block stands; None before the first iteration.
     """
@@ -64,6 +65,7 @@ class BlockProblem:
     heard: Mapping[CandidatePair, float]
     epoch: int
     anchored: bool
+    origin: Float | None
     align_to: Mapping[KeyframeId, Float]
     state: BlockState | None
 
@@ -74,7 +76,8 @@ class BlockStep:
 
     Attributes:
         state: Where the block stands now.
-        T_map_keyframe: (n, 4, 4) rounded poses in the frame of the block.
+        T_map_keyframe: (n, 4, 4) rounded poses in the map frame.
+        origin: (4, r) where the map frame lies among the poses of the state.
         moved: Largest change of a number of a pose: metres, or entries of a rotation.
         cost: Half the sum of the weighted squared residuals that concern the block.
         aligned: The block moved into the frame it was asked to move into.
@@ -84,6 +87,7 @@ class BlockStep:
 
     state: BlockState
     T_map_keyframe: Float
+    origin: Float
     moved: float
     cost: float
     aligned: bool

@@ -6,7 +6,7 @@ that double. Every robot starts in its own frame and moves into that of a neighb
 frame survives: the lowest robot's. A robot gives corrections to itself only, with its iteration as the round.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,7 +19,7 @@ from flocc_agent.core.parameters import DistributedParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import inverse
 from flocc_protocol.arrays import Array
-from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
+from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
 from flocc_protocol.messages import OFFERS_MAX, SEPARATORS_MAX, CandidatePair, Separators
 
 Float = NDArray[np.float64]
@@ -54,6 +54,8 @@ class _Neighbour:
 
     anchor: LogId
     iteration: int
+    origin: Float
+    origin_iteration: int
     poses: dict[int, Float] = field(default_factory=dict)
     is_news: bool = True
 
@@ -85,6 +87,8 @@ class DistributedOptimisation:
         self._neighbours: dict[LogId, _Neighbour] = {}
         self._heard: dict[CandidatePair, float] = {}
         self._epoch = 0
+        self._origin: Float | None = None
+        self._origin_iteration = -1
         self._seen: tuple[int, int] | None = None
         self._trajectory = Trajectory(np.zeros((0, 4, 4)))
         self._closures: tuple[LoopClosure, ...] = ()
@@ -93,7 +97,7 @@ class DistributedOptimisation:
         self._step: BlockStep | None = None
         self._has_news = False
         self._running_until_s: float | None = None
-        self._aligning: LogId | None = None
+        self._aligning: _Neighbour | None = None
         self._next_s = float("-inf")
         self._wait_until_s = float("-inf")
         self._repeat_at_s = float("inf")
@@ -112,13 +116,18 @@ class DistributedOptimisation:
         if held is None and len(self._neighbours) >= NEIGHBOURS_MAX:
             return
         if held is None or held.anchor != message.anchor:
-            held = self._neighbours[sender] = _Neighbour(message.anchor, message.iteration)
+            origin = message.origin.numpy()
+            held = self._neighbours[sender] = _Neighbour(message.anchor, message.iteration, origin, -1)
             self._has_news = True
         held.is_news = held.is_news or message.iteration > held.iteration
         held.iteration = message.iteration
         if held.anchor == self.anchor and message.epoch > self._epoch:
             self._epoch = message.epoch
             self._has_news = True
+        if message.origin_iteration > held.origin_iteration:
+            held.origin, held.origin_iteration = message.origin.numpy(), message.origin_iteration
+        if held.anchor == self.anchor and held.origin_iteration > self._origin_iteration:
+            self._origin, self._origin_iteration = held.origin, held.origin_iteration
         self._has_news |= self._take_poses(held, message) | self._take_weights(sender, message)
 
     def on_step(self, number: int, step: BlockStep, now: float) -> list[Effect]:
@@ -129,8 +138,12 @@ class DistributedOptimisation:
         self._failures = 0
         self._state, self._step = step.state, step
         if step.aligned and self._aligning is not None:
-            self.anchor = self._aligning
+            self.anchor = self._aligning.anchor
+            self._origin_iteration = self._aligning.origin_iteration
         self._aligning = None
+        self._origin = step.origin
+        if self.anchor == self._own:
+            self._origin_iteration = number
         self.is_settled = step.moved <= self._parameters.tolerance and step.finished
         self._has_news |= not self.is_settled or step.aligned
         self._undelivered = True
@@ -146,7 +159,7 @@ class DistributedOptimisation:
         self._failures = min(self._failures + 1, FAILURES_MAX)
         self._next_s = now + self._parameters.period_s * 2**self._failures
         self._has_news = True
-        return [Report("optimisation_failed", {"round": number, "reason": reason})]
+        return [Report("optimisation_failed", {"term": str(Term(0, self._own)), "round": number, "reason": reason})]
 
     # Time
 
@@ -268,46 +281,44 @@ class DistributedOptimisation:
         self._has_news = self.is_settled = False
         for neighbour in self._neighbours.values():
             neighbour.is_news = False
-        self._aligning, align_to = self._lower_frame()
+        self._aligning = self._in_lower_frame()
+        align_to = {} if self._aligning is None else self._poses_in(self._aligning.anchor)
         return IterateBlock(
             self.iteration,
             BlockProblem(
                 log=self._own,
                 trajectory=self._trajectory,
                 closures=self._closures,
-                others=self._poses_of(log for log, n in self._neighbours.items() if n.anchor == self.anchor),
+                others=self._poses_in(self.anchor),
                 heard=dict(self._heard),
                 epoch=self._epoch,
                 anchored=self.anchor == self._own,
+                origin=self._origin if self._aligning is None else self._aligning.origin,
                 align_to=align_to,
                 state=self._state,
             ),
         )
 
-    def _lower_frame(self) -> tuple[LogId | None, Mapping[KeyframeId, Float]]:
-        """The lowest frame that a neighbour with closures is in, where it is lower than this robot's."""
+    def _in_lower_frame(self) -> _Neighbour | None:
+        """A neighbour with closures in the lowest frame that is lower than this robot's; the freshest of several."""
         joined = {end.log for end in self._far_ends()}
-        lower = [n.anchor for log, n in self._neighbours.items() if log in joined and n.anchor < self.anchor]
-        if not lower:
-            return None, {}
-        anchor = min(lower)
-        return anchor, self._poses_of(log for log, n in self._neighbours.items() if n.anchor == anchor)
+        lower = [n for log, n in sorted(self._neighbours.items()) if log in joined and n.anchor < self.anchor]
+        return min(lower, key=lambda n: (n.anchor, -n.origin_iteration), default=None)
 
-    def _poses_of(self, logs: Iterable[LogId]) -> dict[KeyframeId, Float]:
-        """Poses of the far ends of closures, as far as these robots said them."""
-        wanted = set(logs)
+    def _poses_in(self, anchor: LogId) -> dict[KeyframeId, Float]:
+        """Poses of the far ends of closures, of robots in a frame, as far as they said them."""
         found = {}
         for end in self._far_ends():
-            pose = self._neighbours[end.log].poses.get(end.index) if end.log in wanted else None
-            if pose is not None:
-                found[end] = pose
+            neighbour = self._neighbours.get(end.log)
+            if neighbour is not None and neighbour.anchor == anchor and end.index in neighbour.poses:
+                found[end] = neighbour.poses[end.index]
         return found
 
     def _said(self) -> list[Separators]:
         """This robot's separators and the weights that are its to decide, in as many messages as they need."""
-        state = self._state
+        state, origin = self._state, self._origin
         known = [] if state is None else [index for index in self._separators if index < len(state.X)]
-        if state is None or not known:
+        if state is None or origin is None or not known:
             return []
         weighed = [(pair, w) for pair, w in sorted(state.weights.items()) if pair.low.log != pair.high.log]
         messages = []
@@ -319,6 +330,8 @@ class DistributedOptimisation:
                     self.anchor,
                     self.iteration,
                     state.epoch,
+                    Array.of(origin, "f8"),
+                    max(self._origin_iteration, 0),
                     tuple(keyframes),
                     Array.of(state.X[keyframes], "f8"),
                     tuple(pair for pair, _ in part),
