@@ -76,7 +76,8 @@ def script(page: Path) -> str:
 def parsed_commands(page: Path) -> list[str]:
     """Commands of a page that are parsed only: in blocks that are not run, in synopses and in running text."""
     text = page.read_text(encoding="utf-8")
-    found = [" ".join(match.split()) for match in SPAN.findall(FENCE.sub("", text))]
+    spans = [" ".join(match.split()) for match in SPAN.findall(FENCE.sub("", text))]
+    found = [f"{span} ..." if span.rsplit(" ", 1)[-1].startswith("--") else span for span in spans]
     for block in blocks(page):
         if block.language in SHELL and block.why_not is not None:
             found += command_lines(block.text)
@@ -150,7 +151,7 @@ def _strictly(command: Any, name: str, words: list[str]) -> str | None:
 
 
 def _make_complaint(words: list[str]) -> str | None:
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
     unknown = [word for word in words if "=" not in word and word not in targets]
     return f"the Makefile has no target {unknown[0]}" if unknown else None
 
