@@ -29,6 +29,7 @@ FILE_NAME = re.compile(r"# (?:[^\s]*/)?([\w.-]+\.(?:toml|yaml))\b")
 SHELL = ("sh", "bash")
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|^[A-Z]$|<|\.\.\.")
 RUNNABLE = {"flocc", "python", "cd", "cp", "mkdir", "ls", "cat", "echo", "kill", "wait", "sleep", "sed", "evo_ape"}
+ENDLESS = (["flocc", "agent"], ["flocc", "dashboard"])
 OTHER_PROGRAMS = {
     "apt", "apt-get", "cd", "cp", "curl", "docker", "evo_ape", "export", "git", "ip", "journalctl", "mkdir", "pip",
     "python3", "ros2", "scp", "ssh", "sudo", "sysctl", "systemctl", "tc", "useradd", "install", "source", "openssl",
@@ -98,7 +99,8 @@ def runnable(line: str) -> bool:
     words = shlex.split(line)
     while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
         words = words[1:]
-    return bool(words) and words[0] in RUNNABLE and words[1:3] not in (["-m", "pip"], ["-m", "pytest"])
+    forbidden = (["-m", "pip"], ["-m", "pytest"])
+    return bool(words) and words[0] in RUNNABLE and words[1:3] not in forbidden and words[:2] not in ENDLESS
 
 
 def complaint(command: str) -> str | None:

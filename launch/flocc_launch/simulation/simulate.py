@@ -75,7 +75,7 @@ def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str
     walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
     playbacks = {}
     for name in scenario.names():
-        path = scenario.robot(name).recording or recordings.get(name)
+        path = recordings.get(name) or scenario.robot(name).recording
         if path is not None:
             playbacks[name] = of_recording(Recording.open(path), scenario.keyframes)
         elif name in walked:
