@@ -229,10 +229,13 @@ class Ros2Adapter:
             self._refused["image without intrinsics"] += 1
             return
         message = self._types.read(posed.payload, COMPRESSED_IMAGE if self._config.is_compressed() else IMAGE)
+        mounted = self._T_body_camera is not None
         T_body_camera = self._mounting(message.header.frame_id.lstrip("/"))
         if T_body_camera is None:
             self._refused["image without mounting"] += 1
             return
+        if not mounted:
+            await self._put_path()
         image = await asyncio.to_thread(image_of, message, lens)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
@@ -256,9 +259,12 @@ class Ros2Adapter:
         while (correction := await corrections.get()) is not None:
             self._correction = correction
             self._put("map_frame", self._outgoing.text(correction.map_frame))
-            message = await asyncio.to_thread(self._path)
-            if message is not None:
-                await asyncio.to_thread(self._put, "path", message)
+            await self._put_path()
+
+    async def _put_path(self) -> None:
+        message = await asyncio.to_thread(self._path)
+        if message is not None:
+            await asyncio.to_thread(self._put, "path", message)
 
     def _path(self) -> Any:
         """The corrected path, of at most `path_poses_max` keyframes and the last; None where it is not known yet."""
@@ -269,7 +275,7 @@ class Ros2Adapter:
             return None
         step = -(-len(stamps_s) // self._config.path_poses_max)
         chosen = sorted({*range(0, len(stamps_s), step), len(stamps_s) - 1})
-        stamps_ns = [round(stamps_s[i] * 1e9) for i in chosen]
+        stamps_ns = [round(stamps_s[i] * 1e6) * 1000 for i in chosen]  # a double holds today's seconds to 0.2 us
         return self._outgoing.path(T_map_body[chosen], stamps_ns, stamps_ns[-1])
 
     def _place(self, stamp_ns: int, T_odom_body: Float) -> None:

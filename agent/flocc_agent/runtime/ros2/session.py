@@ -109,7 +109,7 @@ class Ros2Session:
         """Tell of every publisher in the domain, those that are there first."""
 
         def read(sample: zenoh.Sample) -> None:
-            offer = read_offer(str(sample.key_expr)) if sample.kind is zenoh.SampleKind.PUT else None
+            offer = read_offer(str(sample.key_expr)) if sample.kind == zenoh.SampleKind.PUT else None
             if offer is not None:
                 on_offer(offer)
 

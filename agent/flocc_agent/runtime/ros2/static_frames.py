@@ -1,12 +1,14 @@
 """Where the camera sits on the body, from /tf_static: a bounded tree of frames that do not move."""
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import inverse, is_rigid, pose_from_tq
+from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.runtime.ros2.types import BadMessage
+from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
 
 Float = NDArray[np.float64]
 
@@ -65,9 +67,7 @@ def pose_of_numbers(numbers: tuple[float, ...], where: str) -> Float:
         BadMessage: A number is not finite, or the quaternion is not of unit length.
     """
     x, y, z, qx, qy, qz, qw = (float(number) for number in numbers)
-    norm = float(np.linalg.norm([qx, qy, qz, qw]))
-    if not np.isfinite(norm) or abs(norm - 1.0) > 1e-2 or not np.all(np.isfinite([x, y, z])):
+    norm = math.hypot(qx, qy, qz, qw)
+    if not math.isfinite(norm) or abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE or not np.all(np.isfinite([x, y, z])):
         raise BadMessage(f"{where}: position ({x:g}, {y:g}, {z:g}) with a quaternion of length {norm:.3g} is no pose")
-    T = pose_from_tq(np.array([x, y, z, qw, qx, qy, qz]))
-    assert is_rigid(T)
-    return T
+    return pose_from_tq(np.array([x, y, z, qw, qx, qy, qz]))

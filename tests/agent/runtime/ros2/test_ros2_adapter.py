@@ -1,0 +1,313 @@
+"""The adapter against a raw zenoh node that speaks the documented form: keyframes in, corrections out, faults said."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.agent.runtime.loopback import free_ports, until
+from tests.agent.runtime.ros2 import cdr_by_hand
+from tests.agent.runtime.ros2.cdr_by_hand import Stamped
+from tests.agent.runtime.ros2.raw_node import RawNode, gid, open_router
+
+from flocc_agent.config import KeyframeConfig, Ros2Config
+from flocc_agent.core.effects import Correction
+from flocc_agent.core.interfaces import Image
+from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
+from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.ros2 import Host, Ros2Adapter
+from flocc_protocol.ids import LogId, Term
+
+EPOCH_S = 1_700_000_000
+SIZE = (4, 6)
+MOUNTING = (0.1, 0.0, 0.5, -0.5, 0.5, -0.5, 0.5)
+T_BODY_CAMERA = pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.0, 0.5]))
+T_MAP_ODOM = pose(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, -2.0, 0.1]))
+INFO, PICTURE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image"
+TF, PATH, POSE = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Path", "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+def stamp(t_ms: int) -> tuple[int, int]:
+    return EPOCH_S + t_ms // 1000, t_ms % 1000 * 1_000_000
+
+
+class Robot:
+    """A robot's drivers: moves along x by 1 m/s."""
+
+    def __init__(self, node: RawNode) -> None:
+        self.node = node
+        self.advertised: set[str] = set()
+
+    def _publish(self, topic: str, kind: str, payload: bytes, latched: bool = False) -> None:
+        if topic not in self.advertised:
+            self.node.advertise(topic, kind, latched)
+            self.advertised.add(topic)
+        self.node.publish(topic, payload)
+
+    def odometry(self, t_ms: int, frame: str = "odom") -> None:
+        sample = Stamped(stamp(t_ms), frame, "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        self._publish("/r1/odom", "nav_msgs/msg/Odometry", cdr_by_hand.odometry(sample))
+
+    def image(self, t_ms: int, encoding: str = "mono8", frame: str = "optical") -> None:
+        payload = cdr_by_hand.image(stamp(t_ms), frame, SIZE, encoding, bytes([t_ms % 251]) * 24, 6)
+        self._publish("/r1/camera/image_raw", PICTURE, payload)
+
+    def camera_info(self) -> None:
+        K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
+        self._publish(
+            "/r1/camera/camera_info", INFO, cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P)
+        )
+
+    def mounting(self) -> None:
+        placed = Stamped((0, 0), "base_link", "optical", MOUNTING[:3], MOUNTING[3:])
+        self._publish("/tf_static", TF, cdr_by_hand.transforms([placed]), latched=True)
+
+
+class Agent:
+    """What the adapter gave its agent, and what it is given."""
+
+    def __init__(self) -> None:
+        self.keyframes: list[tuple[Image, Float, float]] = []
+        self.mounted: list[Float] = []
+        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
+
+    async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
+        self.keyframes.append((image, T_odom_camera, stamp_s))
+
+    def trajectory(self) -> tuple[list[float], Float]:
+        return [EPOCH_S + 0.25, EPOCH_S + 1.0], np.stack([np.eye(4), T_MAP_ODOM])
+
+    def host(self) -> Host:
+        return Host(self.add_keyframe, self.mounted.append, self.trajectory, lambda *event: self.events.append(event))
+
+    def problems(self) -> list[str]:
+        return [fields["sentence"] for event, fields in self.events if event == "ros2_problem"]
+
+
+def correction(covariance: Float | None = None) -> Correction:
+    term = Term(1, LogId("r1", 0))
+    return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, 0, 1, np.zeros((0, 4, 4)))
+
+
+@contextmanager
+def ros(port: int, domain_id: int = 0) -> Iterator[Robot]:
+    """A router and a robot's drivers."""
+    router = open_router(port)
+    try:
+        with RawNode(port, domain_id) as node:
+            yield Robot(node)
+    finally:
+        router.close()
+
+
+@asynccontextmanager
+async def adapted(port: int, **options: Any) -> AsyncIterator[tuple[Agent, Ros2Adapter]]:
+    """An adapter that runs; it must end when its corrections end."""
+    config = Ros2Config(router=f"tcp/127.0.0.1:{port}", namespace="/r1", **options)
+    agent = Agent()
+    adapter = Ros2Adapter(config, "r-1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
+    running = asyncio.create_task(adapter.run(agent.corrections))
+    try:
+        yield agent, adapter
+    finally:
+        agent.corrections.put_nowait(None)
+        async with asyncio.timeout(10.0):
+            await running
+
+
+def drive(robot: Robot, agent: Agent, count: int = 3) -> Any:
+    """Send one more odometry message and image, until enough keyframes were taken."""
+    steps = iter(range(0, 100_000, 50))
+
+    def step() -> None:
+        t = next(steps)
+        robot.camera_info()
+        robot.mounting()
+        robot.image(t)
+        robot.odometry(t)
+
+    return until(lambda: len(agent.keyframes) >= count, act=step)
+
+
+async def test_images_and_odometry_become_keyframes_where_the_robot_moved_enough() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port) as (agent, adapter):
+            await drive(robot, agent)
+    for image, T_odom_camera, stamp_s in agent.keyframes:
+        t_s = stamp_s - EPOCH_S
+        np.testing.assert_allclose(T_odom_camera, pose(np.eye(3), np.array([t_s, 0.0, 0.0])) @ T_BODY_CAMERA, atol=1e-6)
+        assert np.all(image.pixels == round(t_s * 1000) % 251)
+        assert (image.camera.height, image.camera.width) == SIZE
+    steps_s = np.diff([stamp_s for *_, stamp_s in agent.keyframes])
+    np.testing.assert_allclose(steps_s, 0.1, atol=1e-6)
+    assert len(agent.mounted) == 1
+    np.testing.assert_allclose(agent.mounted[0], T_BODY_CAMERA, atol=1e-12)
+    assert agent.problems() == []
+    assert "ros2 image refused" not in adapter.counters()
+
+
+async def test_a_correction_goes_out_as_transform_pose_path_and_frame() -> None:
+    (port,) = free_ports(1)
+    with ros(port, domain_id=9) as robot:
+        node = robot.node
+        node.subscribe("/tf", TF)
+        node.subscribe("/r1/flocc/pose", POSE)
+        async with adapted(port, domain_id=9, tf_tolerance_s=0.25) as (agent, _):
+            agent.corrections.put_nowait(correction(np.eye(6)))
+            await drive(robot, agent, 1)
+            times = iter(range(100_000, 200_000, 20))
+            await until(lambda: len(node.received["/r1/flocc/pose"]) >= 4, act=lambda: robot.odometry(next(times)))
+            node.subscribe("/r1/flocc/path", PATH, latched=True)
+            node.subscribe("/r1/flocc/map_frame", "std_msgs/msg/String", latched=True)
+            await until(lambda: bool(node.received["/r1/flocc/path"] and node.received["/r1/flocc/map_frame"]))
+            token = next(token for token in node.tokens if "%tf/" in token and "flocc_r_1" in token)
+    x, y, z, w, qx, qy, qz = tq_from_pose(T_MAP_ODOM).tolist()
+    placed = [cdr_by_hand.read_transforms(each.payload)[0] for each in node.received["/tf"]]
+    expected = ("map", "odom", (x, y, z), (qx, qy, qz, w))
+    assert {(p.frame, p.child, p.position, p.quaternion) for p in placed} == {expected}
+    poses = [cdr_by_hand.read_pose(each.payload) for each in node.received["/r1/flocc/pose"]]
+    placed_ns, posed_ns = ([s * 10**9 + ns for s, ns in (p.stamp for p in each)] for each in (placed, poses))
+    assert {a - b for a, b in zip(placed_ns, posed_ns, strict=False)} == {250_000_000}
+    assert np.all(np.diff(posed_ns) >= 50_000_000)
+    t_s = poses[-1].stamp[0] - EPOCH_S + poses[-1].stamp[1] * 1e-9
+    np.testing.assert_allclose(poses[-1].position, (T_MAP_ODOM @ [t_s, 0, 0, 1])[:3], atol=1e-5)
+    assert poses[-1].covariance[0] > 0
+    _, frame, path = cdr_by_hand.read_path(node.received["/r1/flocc/path"][0].payload)
+    assert (frame, [p.stamp for p in path]) == ("map", [stamp(250), stamp(1000)])
+    assert cdr_by_hand.read_text(node.received["/r1/flocc/map_frame"][0].payload) == "map/r1"
+    attached = [cdr_by_hand.read_attachment(each.attachment or b"") for each in node.received["/tf"]]
+    assert [number for number, *_ in attached] == list(range(attached[0][0], attached[0][0] + len(attached)))
+    assert {identifier for *_, identifier in attached} == {gid(token)}
+
+
+async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port):
+            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 9)
+            ours = [token.split("/") for token in robot.node.tokens if "flocc_r_1" in token]
+    assert {chunks[2] for chunks in ours} != {str(robot.node.session.zid())}
+    assert {tuple(chunks[6:9]) for chunks in ours} == {("%", "%r1", "flocc_r_1")}
+    assert {(chunks[5], chunks[9], chunks[12]) for chunks in ours if len(chunks) == 13} == {
+        ("MP", "%tf", "::,100:,:,:,,"),
+        ("MP", "%r1%flocc%path", ":1:,1:,:,:,,"),
+        ("MP", "%r1%flocc%pose", "::,10:,:,:,,"),
+        ("MP", "%r1%flocc%map_frame", ":1:,1:,:,:,,"),
+        ("MS", "%r1%odom", "::,50:,:,:,,"),
+        ("MS", "%r1%camera%image_raw", "2::,5:,:,:,,"),
+        ("MS", "%r1%camera%camera_info", "2::,5:,:,:,,"),
+        ("MS", "%tf_static", ":1:,100:,:,:,,"),
+    }
+    assert len({chunks[4] for chunks in ours}) == 9
+
+
+async def test_a_topic_of_another_type_is_said() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        robot.node.advertise("/r1/camera/image_raw", "sensor_msgs/msg/CompressedImage")
+        robot.node.advertise("/r1/odom", "nav_msgs/msg/Odometry", hash_="RIHS01_" + "0" * 64)
+        async with adapted(port) as (agent, _):
+            await until(lambda: len(agent.problems()) == 2)
+    assert sorted(agent.problems()) == [
+        "/r1/camera/image_raw: /driver publishes it as sensor_msgs/msg/CompressedImage, but sensor_msgs/msg/Image is "
+        "needed",
+        f"/r1/odom: /driver publishes it as nav_msgs/msg/Odometry of another definition (RIHS01_{'0' * 64}), but "
+        "nav_msgs/msg/Odometry is needed",
+    ]
+
+
+async def test_what_cannot_be_used_is_said_once_counted_and_left_out() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port, camera_frame="optical") as (agent, adapter):
+            await drive(robot, agent, 1)
+            depth_ms = iter(range(200_000, 300_000, 200))
+
+            def wrong() -> None:
+                t = next(depth_ms)
+                robot.odometry(t, frame="world")
+                robot.odometry(t)
+                robot.odometry(5)
+                robot.image(t, encoding="16UC1")
+                robot.image(t, frame="left")
+                robot.image(5)
+                robot.node.publish("/r1/odom", b"\x00\x01\x00\x00junk")
+
+            reasons = {"odometry refused", "image refused", "odometry back in time", "image back in time"}
+            await until(lambda: reasons <= {key.removeprefix("ros2 ") for key in adapter.counters()}, act=wrong)
+            before = len(agent.keyframes)
+            later = iter(range(400_000, 500_000, 50))
+
+            def right() -> None:
+                t = next(later)
+                robot.image(t)
+                robot.odometry(t)
+
+            await until(lambda: len(agent.keyframes) > before, act=right)
+    said = " | ".join(agent.problems())
+    assert "odometry is of 'base_link' in 'world', but the configuration says 'base_link' in 'odom'" in said
+    assert "/r1/camera/image_raw: images are encoded as '16UC1'" in said
+    assert "images are in frame 'left', but the configuration says 'optical'" in said
+    assert said.count("time goes backwards") == 2
+    assert "are no nav_msgs/msg/Odometry" in said
+    assert len(agent.problems()) == len(set(agent.problems())) == 6
+
+
+async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None:
+    (port,) = free_ports(1)
+    async with adapted(port, camera_mounting=MOUNTING) as (agent, _):
+        await until(lambda: agent.problems() != [])
+        assert agent.problems() == [f"ROS 2: nobody answers at tcp/127.0.0.1:{port}; is rmw_zenohd running?"]
+        with ros(port) as robot:
+            await drive(robot, agent, 2)
+            linked = {"router": f"tcp/127.0.0.1:{port}", "connected": True}
+            await until(lambda: ("ros2_router", linked) in agent.events)
+
+
+async def test_what_an_image_waits_for_is_said() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port) as (agent, adapter):
+            times = iter(range(0, 100_000, 50))
+
+            def step() -> None:
+                t = next(times)
+                robot.image(t)
+                robot.odometry(t)
+
+            await until(lambda: any("CameraInfo" in said for said in agent.problems()), act=step)
+
+            def calibrated_step() -> None:
+                robot.camera_info()
+                step()
+
+            await until(lambda: "ros2 image without mounting" in adapter.counters(), act=calibrated_step)
+    assert "/r1/camera/camera_info: no sensor_msgs/msg/CameraInfo has come yet" in agent.problems()
+    assert "/tf_static: no tf2_msgs/msg/TFMessage has come yet" in agent.problems()
+    assert agent.keyframes == []
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"image_topic": "camera//image"}, "no ROS name"),
+        ({"odometry_topic": ""}, "images need odometry_topic"),
+        ({"map_frame": "odom"}, "map_frame and odom_frame must differ"),
+        ({"camera_mounting": (0, 0, 0, 0, 0, 0, 0.5)}, "quaternion of unit length"),
+        ({"path_topic": ""}, "path_topic must not be empty"),
+        ({"domain_id": 500}, "less than or equal to 232"),
+    ],
+)
+def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Ros2Config(**options)
+
+
+def test_the_type_of_images_follows_from_the_topics_name_unless_it_is_said() -> None:
+    assert not Ros2Config().is_compressed()
+    assert Ros2Config(image_topic="camera/image_raw/compressed").is_compressed()
+    assert Ros2Config(image_type="compressed").is_compressed()
