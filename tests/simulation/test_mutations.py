@@ -113,6 +113,11 @@ def test_robots_that_all_take_a_pair_break_registered_once(monkeypatch: pytest.M
     assert "registered once" in broken(scenario())
 
 
+def test_a_robot_that_forgets_what_is_resolved_breaks_registered_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LoopClosing, "on_resolved", lambda self, pair: self._work.remove(pair))
+    assert "registered once" in broken(scenario(**LOSSY))
+
+
 def test_a_robot_that_does_not_offer_leaves_pairs_unregistered(monkeypatch: pytest.MonkeyPatch) -> None:
     original = Offers.tell
 

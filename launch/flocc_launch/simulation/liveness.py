@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from flocc_agent.core.pose_graph import components_of, map_frame
-from flocc_launch.simulation.invariants import core, groups, hear_each_other, names
+from flocc_launch.simulation.invariants import core, groups, names
 from flocc_launch.simulation.robot import Station
 from flocc_launch.simulation.swarm import Swarm
 from flocc_protocol.messages import CandidatePair
@@ -34,16 +34,15 @@ def uncorrected(swarm: Swarm) -> Iterator[str]:
 def unregistered(swarm: Swarm) -> Iterator[str]:
     """Once: pairs that nobody registered, or rejected, though both owners are here, and one has an odometry pair.
 
-    An owner that lost its disk counts where it is in direct range: it is asked itself, and says that a latent is lost.
+    An owner that lost its disk counts as here: it is asked, directly or by relays, and says that a latent is lost.
     """
     for group in groups(swarm):
         for station in group:
-            here = {other.log for other in group}
-            near = {other.log.robot for other in group if other is station or hear_each_other(swarm, station, other)}
+            here = {other.log.robot for other in group}
             logs = core(station).gossip.logs
             for pair in core(station).closing.open_pairs():
                 ends = (pair.low.log, pair.high.log)
-                reachable = all(log in here or log.robot in near for log in ends)
+                reachable = all(log.robot in here for log in ends)
                 if reachable and any(logs[log].keyframes > 1 for log in ends if log in logs):
                     yield f"{station.name} still has {pair.low} {pair.high}"
 

@@ -4,15 +4,30 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from flocc_agent.core.effects import Broadcast, Correction, Deliver, Optimise, Register, Unicast
+from flocc_agent.core.effects import (
+    Broadcast,
+    Correction,
+    Deliver,
+    Optimise,
+    PersistRecord,
+    Register,
+    Report,
+    Unicast,
+)
+from flocc_agent.core.gossip import decoded
+from flocc_agent.core.offers import FAR_TAKEOVERS
+from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.invariants import Invariant, Step, core
 from flocc_launch.simulation.robot import Station
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, Records
+from flocc_protocol.records import ClosureRecord, Record, RejectionRecord
 
 SIZES_EVERY = 25
 TICKS_PER_S_MAX = 200
+APART_S = FAR_TAKEOVERS * LoopClosingParameters().takeover_s + 10.0
+"""So long after two robots lost or found each other a pair may be taken over, and its latents be fetched."""
 
 
 def all_invariants(separated: bool) -> list[Invariant]:
@@ -88,26 +103,56 @@ class _Registered:
 
 @dataclass(slots=True)
 class Once:
-    """Each pair is registered by one robot, and again only where that robot died or was out of reach."""
+    """Each pair is registered by one robot, and again only where that could not be known.
+
+    A second registration is excused where the first robot died, or where robots were apart: the one that registers
+    took the pair over while the owner in charge, or the first robot, was out of its hearing. It never is where the
+    robot holds a record of the pair already.
+    """
 
     separated: bool = False
     _begun: dict[CandidatePair, list[_Registered]] = field(default_factory=lambda: defaultdict(list))
+    _records: dict[CandidatePair, set[tuple[LogId, int]]] = field(default_factory=lambda: defaultdict(set))
+    _changed_s: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
         """A second registration of a pair without an excuse."""
-        station = step.station
         for effect in step.effects:
-            if isinstance(effect, Register):
-                earlier = self._begun[effect.pair]
-                for registered in earlier:
-                    if not self._excused(registered, station):
-                        pair = f"{effect.pair.low} {effect.pair.high}"
-                        yield f"{station.name} registers {pair} after {registered.by.name}"
-                earlier.append(_Registered(station, station.life))
+            match effect:
+                case PersistRecord(log, number, data):
+                    self._note_record(log, number, decoded(data))
+                case Report("neighbour_up" | "neighbour_down", fields):
+                    self._changed_s[step.station.name, str(fields["peer"])] = step.at_s
+                case Register(pair):
+                    yield from self._registers(step, pair)
 
-    def _excused(self, earlier: _Registered, again: Station) -> bool:
-        died = earlier.by.life != earlier.life
-        return died or (self.separated and earlier.by is not again)
+    def _note_record(self, log: LogId, number: int, record: Record) -> None:
+        if isinstance(record, ClosureRecord | RejectionRecord):
+            self._records[CandidatePair.of(record.query, record.match)].add((log, number))
+
+    def _registers(self, step: Step, pair: CandidatePair) -> Iterator[str]:
+        station, logs = step.station, core(step.station).gossip.logs
+        name = f"{station.name} registers {pair.low} {pair.high}"
+        if any(log in logs and number < len(logs[log]) for log, number in self._records[pair]):
+            yield f"{name}, of which it holds a record"
+        earlier = self._begun[pair]
+        for registered in earlier:
+            if not self._excused(registered, step, pair):
+                yield f"{name} after {registered.by.name}"
+        earlier.append(_Registered(station, station.life))
+
+    def _excused(self, earlier: _Registered, again: Step, pair: CandidatePair) -> bool:
+        if earlier.by.life != earlier.life:
+            return True
+        if not self.separated or earlier.by is again.station:
+            return False
+        involved = sorted({earlier.by.log.robot, again.station.log.robot, pair.low.log.robot, pair.high.log.robot})
+        return any(self._apart(one, other, again) for one in involved for other in involved if one != other)
+
+    def _apart(self, one: str, other: str, step: Step) -> bool:
+        """Whether a robot did not hear another one lately, as far as pairs are taken over for that."""
+        changed_s = self._changed_s.get((one, other))
+        return changed_s is None or step.at_s - changed_s <= APART_S
 
 
 @dataclass(slots=True)

@@ -351,6 +351,25 @@ def test_a_latent_that_its_owner_lost_rejects_its_pairs_for_everybody() -> None:
     assert reasons == {"a latent was lost"}
 
 
+def test_a_lost_latent_is_known_to_robots_that_only_hear_the_owner_through_others() -> None:
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, FetchLatent) and effect.keyframe.log == R1:
+            return LatentFetchFailed(effect.keyframe, effect.holder, LATENT_UNKNOWN)
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2", "r3", "r4"):
+        robots.add(name)
+    robots.separate("r1", "r3 r4")
+    robots.cut.add(frozenset(("r2", "r4")))
+    meet(robots, "r1", "r4")
+    robots.run(60.0)
+    assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
+    assert {r.fields["reason"] for r in robots.reports("r4", "closure_rejected")} == {"a latent was lost"}
+    robots.run(60.0)
+    assert all(core.closing.lost(robots.now_s) == () for core in robots.cores.values())
+
+
 def test_an_own_latent_that_the_store_evicted_rejects_its_pair() -> None:
     def work(robots: Robots, name: str, effect: Effect) -> Event | None:
         if isinstance(effect, Register):
