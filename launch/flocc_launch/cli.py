@@ -119,6 +119,7 @@ def simulate(
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
     from flocc_launch.data import cache_folder, recordings
+    from flocc_launch.expectations import check_measurable
     from flocc_launch.launching import fresh_folder
     from flocc_launch.simulation.simulate import simulate as run
 
@@ -126,6 +127,7 @@ def simulate(
     read = _read(scenario, changes, agents)
     with progress_bar("preparing data") as progress:
         paths = recordings(read, progress)
+    check_measurable(read, paths)
     fresh_folder(out)
     show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out)
 
