@@ -54,8 +54,8 @@ def test_an_error_without_ground_truth_cannot_be_expected(
         for file in ("odometry.tum", "camera.toml", "images.txt", "images"):
             if (path / file).exists():
                 (tmp_path / robot / file).symlink_to(path / file)
-    path = scenario(tmp_path, f"{TWO_ROBOTS}[expectations]\n{name} = 1.0\n")
-    assert run(monkeypatch, driver, path, "--out", str(tmp_path / "out")) == 2
+    text = f"{TWO_ROBOTS}[expectations]\n{name} = 1.0\n"
+    assert run(monkeypatch, driver, scenario(tmp_path, text), "--out", str(tmp_path / "out")) == 2
     assert f"expectations.{name} cannot be measured: {tmp_path / 'r1'} has no groundtruth.tum" in sentence(capsys)
     assert not (tmp_path / "out").exists()
 
