@@ -7,7 +7,6 @@ from flocc_agent.core.parameters import NeighbourParameters
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Heartbeat
 
-
 LOSS_WEIGHT = 0.05
 """How much one heartbeat weighs in the running share of lost ones: about the last twenty count."""
 
@@ -47,6 +46,10 @@ class Neighbours:
     def get(self, name: str) -> Neighbour | None:
         """The neighbour of that name, or None where it is not in range."""
         return self._by_name.get(name)
+
+    def is_double(self, name: str) -> bool:
+        """Whether two robots were heard under this name."""
+        return name in self._duplicates
 
     def names(self) -> list[str]:
         """Names of all robots in range, sorted."""

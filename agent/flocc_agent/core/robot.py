@@ -70,6 +70,8 @@ from flocc_protocol.records import (
     RejectionRecord,
 )
 
+NOBODY = -1
+"""Compute class, as loop closing sees it, of a name under which two robots run: both would register what it gets."""
 GREETING_RATIO = 0.2
 """Least pause between heartbeats that greet new neighbours, against the usual one."""
 
@@ -259,7 +261,8 @@ class Robot:
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self.gossip.on_digests(sender, heartbeat.digests, now)
         effects += self._on_versions(sender, heartbeat.corrections, now)
-        self.closing.on_peer(sender.robot, Peer(heartbeat.compute_class, heartbeat.load, heartbeat.holds, sender))
+        helps = NOBODY if self.neighbours.is_double(sender.robot) else heartbeat.compute_class
+        self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
         self.closing.on_wants(heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
             effects += self._reject_lost([pair], keyframe, now)

@@ -5,14 +5,15 @@ import math
 import numpy as np
 from tests.agent.core.virtual_time import Robots, answer, descriptor, keyframe
 
-from flocc_agent.core.effects import Broadcast, Effect, Encode, PersistRecord, Register, Report
+from flocc_agent.core.effects import Broadcast, Effect, Encode, PersistRecord, Register, Report, Unicast
 from flocc_agent.core.events import Event, KeyframeEncoded, MessageReceived
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters, NeighbourParameters
+from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.robot import Restored
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import Envelope, Heartbeat, Records
+from flocc_protocol.messages import CandidateOffer, CandidatePair, Envelope, Heartbeat, Records
 from flocc_protocol.records import KeyframeRecord
 
 R1, R2 = LogId("r1"), LogId("r2")
@@ -215,6 +216,19 @@ def test_two_robots_with_one_name_corrupt_neither_log() -> None:
     robots.run(3.0)
     assert robots.cores["r2"].gossip.logs[R1].encoded == kept
     assert len(robots.reports("r2", "log_forked")) == 1
+
+
+def test_no_pair_is_handed_to_a_name_under_which_two_robots_run() -> None:
+    robots = Robots()
+    robot = robots.add("r1")
+    for boot in (7, 8, 7):
+        message = Heartbeat(boot, boot, 9, None, 0, 0, ())
+        robots.put("r1", MessageReceived(Envelope(LogId("server", boot), message)))
+    found = Candidate(CandidatePair.of(keyframe("r3/1"), keyframe("r4/1")), 0.9)
+    robots.carry_out("r1", robot.closing.on_candidates([found], robots.now_s))
+    robots.carry_out("r1", robot.closing.tick(robots.now_s))
+    assert not [e for e in robots.effects("r1", Unicast) if isinstance(e.message, CandidateOffer)]  # type: ignore[attr-defined]
+    assert robot.closing.roles(found.pair) is not None
 
 
 def test_neighbours_beyond_the_maximum_are_refused() -> None:
