@@ -60,7 +60,7 @@ class LinearSolver:
     ) -> Float | None:
         """The step by conjugate gradients; None where they do not get there."""
         if self._structure is None:
-            self._structure = Structure.of(edges, len(state.q))
+            self._structure = Structure.of(edges, len(state.q), self.fixed)
         of_scales, D = self._scale_terms(edges, state, at, jac, weights, damping)
         b = right_side(edges, at, jac, weights, len(state.q), of_scales)
         b[6 * self.fixed : 6 * self.fixed + 6] = 0.0

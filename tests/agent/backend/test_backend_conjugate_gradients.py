@@ -101,13 +101,13 @@ def test_a_system_that_needs_too_many_iterations_is_eliminated(monkeypatch: pyte
     np.testing.assert_array_equal(iterated, eliminated)
 
 
-def test_segments_end_where_a_chain_ends() -> None:
+def test_segments_end_where_a_chain_ends_and_the_fixed_pose_stands_alone() -> None:
     i = np.array([0, 1, 2, 5, 6])
     edges = _edges(np.concatenate([i, [0]]), np.concatenate([i + 1, [5]]))
-    np.testing.assert_array_equal(segments_of(edges, 8), [0, 0, 0, 0, 1, 2, 2, 2])
-    long = np.arange(2 * SEGMENT_POSES)
-    segments = segments_of(_edges(long[:-1], long[1:]), len(long))
-    np.testing.assert_array_equal(np.bincount(segments), [SEGMENT_POSES, SEGMENT_POSES])
+    np.testing.assert_array_equal(segments_of(edges, 8, 0), [0, 1, 1, 1, 2, 3, 3, 3])
+    long = np.arange(2 * SEGMENT_POSES + 1)
+    segments = segments_of(_edges(long[:-1], long[1:]), len(long), 0)
+    np.testing.assert_array_equal(np.bincount(segments), [1, SEGMENT_POSES, SEGMENT_POSES])
 
 
 def _edges(i: np.ndarray, j: np.ndarray) -> Edges:
