@@ -1,6 +1,9 @@
 """Bags of every kind become recordings; each bad one is refused in one sentence and its good part is kept."""
 
+import signal
 import sqlite3
+import subprocess
+import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -139,6 +142,35 @@ def test_a_conversion_that_was_killed_goes_on(tmp_path: Path, kind: str, monkeyp
     assert len(reread) < 25
     for name in ("images.txt", "odometry.tum"):
         assert (out / name).read_text() == (whole / name).read_text()
+
+
+KILLED_CONVERSION = """
+import os, signal, sys
+from pathlib import Path
+from flocc_launch.datasets import bag_convert
+
+bag_convert.CHECKPOINT_MESSAGES = 25
+kill_at = int(sys.argv[3])
+bag_convert.convert_bag(
+    Path(sys.argv[1]), Path(sys.argv[2]),
+    progress=lambda done, total: os.kill(os.getpid(), signal.SIGKILL) if done == kill_at else None,
+)
+"""
+
+
+@pytest.mark.parametrize(("kind", "kills"), [("bag", (3, 61, 139)), ("db3", (118,)), ("mcap", (33, 140))])
+def test_a_conversion_that_met_kill_9_loses_nothing(tmp_path: Path, kind: str, kills: tuple[int, ...]) -> None:
+    bag = walking(kind == "bag", 140).write(bag_path(tmp_path, kind), kind)
+    whole, out = convert(bag, tmp_path / "whole"), tmp_path / "out"
+    killed = 0
+    for kill_at in kills:
+        ran = subprocess.run([sys.executable, "-c", KILLED_CONVERSION, str(bag), str(out), str(kill_at)], check=False)
+        killed += ran.returncode == -signal.SIGKILL
+    assert killed == len(kills)
+    convert(bag, out)
+    images = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
+    assert sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file()) == images
+    assert [file for file in images if (out / file).read_bytes() != (whole / file).read_bytes()] == []
 
 
 @pytest.mark.parametrize("kind", KINDS)

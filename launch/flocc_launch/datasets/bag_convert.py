@@ -213,8 +213,13 @@ class _Conversion:
         return int(state["bag_ns"])
 
     def _save(self, path: Path, bag_ns: int) -> None:
+        """Note where to go on, once all that came before is written; a file is there whole or not at all."""
+        self.writer.flush()
+        self.log.flush()
         state = {"bag_ns": bag_ns, "zero_ns": self.zero_ns, "images_seen": self.images_seen}
-        path.write_text(json.dumps(state), encoding="utf-8")
+        partial = path.with_suffix(".part")
+        partial.write_text(json.dumps(state), encoding="utf-8")
+        partial.replace(path)
 
     def _finish(self) -> None:
         """Write what stands in files beside the bag, and raise the first fault."""

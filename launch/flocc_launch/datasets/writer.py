@@ -65,11 +65,15 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            while self._pending:
-                self._pending.popleft().result()
+            self.flush()
         finally:
             self._thread.shutdown()
             self._file.close()
+
+    def flush(self) -> None:
+        """Wait until every image that was added stands in the recording, also for whoever comes after a `kill -9`."""
+        while self._pending:
+            self._pending.popleft().result()
 
     def _write(self, name: str, encoded: bytes, line: str) -> None:
         _write(f"{self.path}/{name}", encoded)
@@ -152,11 +156,16 @@ class PoseWriter:
             self._file.write(line % (*divmod(stamp_ns, 10**9), *numbers))
             self._last_ns = stamp_ns
 
+    def flush(self) -> None:
+        """Hand every pose that was added to the system."""
+        if self._wanted:
+            self._file.flush()
+
     def finish(self, zero_ns: int = 0) -> None:
         """Make the trajectory of what was written, with stamps in seconds from `zero_ns`."""
         if not self._wanted:
             return
-        self._file.flush()
+        self.flush()
         if zero_ns == 0:
             shutil.copyfile(self._partial, self._path)
             return
