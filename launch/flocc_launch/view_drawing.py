@@ -198,11 +198,8 @@ class Drawing:
 
 def place(robot: RobotState) -> list[float] | None:
     """Where a robot was last, in its map frame."""
-    if not robot.positions_odom_m:
-        return None
-    here_m = robot.positions_odom_m[max(robot.positions_odom_m)]
-    p = robot.T_map_odom[:3, :3] @ here_m + robot.T_map_odom[:3, 3]
-    return [float(v) for v in p]
+    position_m = robot.position_m(max(robot.positions_odom_m, default=-1))
+    return None if position_m is None else [float(v) for v in position_m]
 
 
 def confidence_colour(probability: float | None) -> Colour:

@@ -9,6 +9,8 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from flocc_agent.composition import Agent
 from flocc_agent.core.robot import Robot
 from flocc_launch.dashboard.state import SwarmState
@@ -22,6 +24,7 @@ from flocc_launch.run_records import (
     KeyframeCaptured,
 )
 from flocc_protocol.ids import LogId
+from flocc_protocol.messages import LogCorrection
 
 ANSWER_S_MAX = 5.0
 RECORDS_MAX = 2000
@@ -87,12 +90,21 @@ class AgentSource:
             self._read[log] = min(read + RECORDS_MAX, len(copy.records))
             correction = robot.corrections.of(log)
             if correction is not None:
-                self._apply(self._heard.correction(correction, t))
+                self._correct(correction, t)
         for name in robot.neighbours.names():
             neighbour = robot.neighbours.get(name)
             if neighbour is not None:
                 self._apply(self._heard.heartbeat(neighbour.log, neighbour.heartbeat, t))
                 self._state.heard(name, neighbour.heard_s)
+
+    def _correct(self, correction: LogCorrection, t: float) -> None:
+        """Take a newer correction with the keyframes that it lists."""
+        event = self._heard.correction(correction, t)
+        if event is not None:
+            self._state.apply(event)
+            listed = enumerate(correction.T_map_camera.numpy()[:, :3].astype(np.float64))
+            positions_m = {correction.first + correction.step * k: position_m for k, position_m in listed}
+            self._state.place(correction.log.robot, positions_m)
 
     def _apply(self, event: Event | None) -> None:
         if event is not None:

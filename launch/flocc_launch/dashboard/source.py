@@ -7,9 +7,11 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import Any, Protocol
 
+import numpy as np
+
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import RunTail
-from flocc_launch.run_folder import RunFolder
+from flocc_launch.run_folder import RunFolder, RunFolderError
 from flocc_launch.run_records import Run
 
 
@@ -49,7 +51,19 @@ class RunSource:
                 self._state = SwarmState(self._run.robots, self._run.servers)
             for event in events:
                 self._state.apply(event)
+            if merged:
+                self._place()
             return {"scenario": self._run.scenario, "seen_by": None} | self._state.snapshot(self._now_s())
+
+    def _place(self) -> None:
+        """Take the corrected trajectories of a run that is over, of the robots that left one that can be read."""
+        for name in self._run.robots:
+            try:
+                result = self._folder.result(name)
+            except RunFolderError:
+                continue
+            keyframes = [] if result is None else result.keyframes
+            self._state.place(name, {k.index: np.array(k.T_map_body[:3]) for k in keyframes if k.T_map_body})
 
     def snapshot_text(self) -> str:
         """The snapshot as JSON."""

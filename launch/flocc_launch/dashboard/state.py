@@ -48,6 +48,7 @@ class RobotState:
     map_frame: str | None = None
     T_map_odom: Float = field(default_factory=lambda: np.eye(4))
     positions_odom_m: dict[int, Float] = field(default_factory=dict)
+    corrected_m: dict[int, Float] = field(default_factory=dict)
     incarnation: int = 0
     candidates: int = 0
     accepted: int = 0
@@ -62,18 +63,28 @@ class RobotState:
     end: str | None = None
 
     def path_m(self) -> Float:
-        """Positions (N, 3) in the map frame of the last correction; in odom before the first."""
-        if not self.positions_odom_m:
-            return np.zeros((0, 3))
-        R, t = self.T_map_odom[:3, :3], self.T_map_odom[:3, 3]
-        positions_m = [self.positions_odom_m[index] for index in sorted(self.positions_odom_m)]
-        return np.asarray(np.array(positions_m) @ R.T + t)
+        """Positions (N, 3) in the map frame of the last correction; in odom before the first.
+
+        Where corrected positions of single keyframes are known, they stand in place of the others up to the last one.
+        """
+        last = max(self.corrected_m, default=-1)
+        indices = sorted({*self.corrected_m, *(index for index in self.positions_odom_m if index > last)})
+        found = [position for index in indices if (position := self.position_m(index)) is not None]
+        return np.array(found) if found else np.zeros((0, 3))
+
+    def position_m(self, index: int) -> Float | None:
+        """Position of one keyframe in the map frame, None where it is not known."""
+        if index in self.corrected_m:
+            return self.corrected_m[index]
+        odom_m = self.positions_odom_m.get(index)
+        return None if odom_m is None else np.asarray(self.T_map_odom[:3, :3] @ odom_m + self.T_map_odom[:3, 3])
 
     def take(self, event: KeyframeCaptured) -> None:
         """One more keyframe; a robot that lost its disk begins anew."""
         keyframe = KeyframeId.parse(event.keyframe)
         if keyframe.log.incarnation != self.incarnation:
             self.positions_odom_m.clear()
+            self.corrected_m.clear()
             self.incarnation = keyframe.log.incarnation
         if len(self.positions_odom_m) < KEYFRAMES_MAX:
             self.positions_odom_m[keyframe.index] = pose_from_tq(np.array(event.T_odom_body))[:3, 3]
@@ -110,6 +121,10 @@ class SwarmState:
         if said is not None:
             self.recent.append({"t": event.t, "robot": event.robot, "text": said})
 
+    def place(self, name: str, corrected_m: Mapping[int, Float]) -> None:
+        """Corrected positions (3,) of single keyframes by their index, in the map frame of the last correction."""
+        self.robots.setdefault(name, RobotState()).corrected_m = dict(corrected_m)
+
     def heard(self, name: str, t: float) -> None:
         """A robot was heard of, without an event."""
         self.robots.setdefault(name, RobotState()).last_s = t
@@ -143,6 +158,7 @@ def apply_to(robot: RobotState, event: Event) -> None:
             robot.take(event)
         case CorrectionApplied():
             robot.map_frame, robot.T_map_odom = event.map_frame, pose_from_tq(np.array(event.T_map_odom))
+            robot.corrected_m = {}
         case LeaderFollowed():
             robot.leader, robot.term = event.leader, event.term
         case LeaderLost():
@@ -231,10 +247,8 @@ def closure_json(state: SwarmState, query: str, match: str) -> dict[str, Any]:
 def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
     """Position of a keyframe in its robot's map frame."""
     robot = state.robots.get(keyframe.log.robot)
-    if robot is None or keyframe.index not in robot.positions_odom_m:
-        return None
-    p = robot.T_map_odom[:3, :3] @ robot.positions_odom_m[keyframe.index] + robot.T_map_odom[:3, 3]
-    return [round(float(v), 3) for v in p]
+    position_m = None if robot is None else robot.position_m(keyframe.index)
+    return None if position_m is None else [round(float(v), 3) for v in position_m]
 
 
 def groups(members: list[tuple[str, str | None]]) -> list[dict[str, Any]]:
