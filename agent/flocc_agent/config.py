@@ -604,6 +604,8 @@ class Ros2Config(Section):
     """Least time between two transforms, and between two poses."""
     tf_tolerance_s: float = Field(0.1, ge=0)
     """The transform is dated so far ahead, so that it can be looked up until the next one."""
+    path_period_s: float = Field(1.0, gt=0)
+    """Least time between two paths."""
     odometry_gap_max_s: float = Field(0.5, gt=0)
     """Images in a longer pause of the odometry are left out."""
     images_max: int = Field(8, ge=1, le=256)

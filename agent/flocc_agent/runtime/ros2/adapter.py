@@ -51,6 +51,7 @@ INBOX_BYTES_MAX = 64 * 1024 * 1024
 PROBLEMS_MAX = 64
 WATCH_PERIOD_S = 1.0
 PATIENCE_S = 5.0
+PATH_PAUSE_RATIO = 9.0
 BACK_IN_TIME = "time goes backwards; such messages are left out. After a reset of the clock, restart the agent"
 
 SENSOR = Qos(5, best_effort=True)
@@ -102,6 +103,7 @@ class Ros2Adapter:
         self._T_body_camera: Float | None = None
         self._correction: Correction | None = None
         self._tf_last_ns: int | None = None
+        self._path_changed = False
         self._posed = asyncio.Event()
         self._session: Ros2Session | None = None
         self._publishers: dict[str, Publisher] = {}
@@ -126,7 +128,7 @@ class Ros2Adapter:
         try:
             await asyncio.to_thread(self._open, inbox, loop)
             async with asyncio.TaskGroup() as tasks:
-                others = [tasks.create_task(work) for work in (self._feed(), self._watch(), self._beat())]
+                others = [tasks.create_task(work) for work in (self._feed(), self._draw(), self._watch(), self._beat())]
                 await self._tell(corrections)
                 for other in others:
                     other.cancel()
@@ -229,16 +231,14 @@ class Ros2Adapter:
             self._refused["image without intrinsics"] += 1
             return
         message = self._types.read(posed.payload, COMPRESSED_IMAGE if self._config.is_compressed() else IMAGE)
-        mounted = self._T_body_camera is not None
         T_body_camera = self._mounting(message.header.frame_id.lstrip("/"))
         if T_body_camera is None:
             self._refused["image without mounting"] += 1
             return
-        if not mounted:
-            await self._put_path()
         image = await asyncio.to_thread(image_of, message, lens)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
+        self._path_changed = True
 
     def _mounting(self, camera_frame: str) -> Float | None:
         """`T_body_camera`, found once; None while /tf_static does not connect the two."""
@@ -259,12 +259,21 @@ class Ros2Adapter:
         while (correction := await corrections.get()) is not None:
             self._correction = correction
             self._put("map_frame", self._outgoing.text(correction.map_frame))
-            await self._put_path()
+            self._path_changed = True
 
-    async def _put_path(self) -> None:
-        message = await asyncio.to_thread(self._path)
-        if message is not None:
-            await asyncio.to_thread(self._put, "path", message)
+    async def _draw(self) -> None:
+        """Publish the path when it changed, for at most a tenth of the time: it grows with the run."""
+        pause_s = self._config.path_period_s
+        while True:
+            await asyncio.sleep(pause_s)
+            if not self._path_changed:
+                continue
+            self._path_changed = False
+            began_s = time.monotonic()
+            message = await asyncio.to_thread(self._path)
+            if message is not None:
+                await asyncio.to_thread(self._put, "path", message)
+            pause_s = max(self._config.path_period_s, PATH_PAUSE_RATIO * (time.monotonic() - began_s))
 
     def _path(self) -> Any:
         """The corrected path, of at most `path_poses_max` keyframes and the last; None where it is not known yet."""

@@ -106,7 +106,7 @@ def ros(port: int, domain_id: int = 0) -> Iterator[Robot]:
 @asynccontextmanager
 async def adapted(port: int, **options: Any) -> AsyncIterator[tuple[Agent, Ros2Adapter]]:
     """An adapter that runs; it must end when its corrections end."""
-    config = Ros2Config(router=f"tcp/127.0.0.1:{port}", namespace="/r1", **options)
+    config = Ros2Config(router=f"tcp/127.0.0.1:{port}", namespace="/r1", path_period_s=0.1, **options)
     agent = Agent()
     adapter = Ros2Adapter(config, "r-1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
     running = asyncio.create_task(adapter.run(agent.corrections))
