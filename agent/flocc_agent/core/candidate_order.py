@@ -1,9 +1,11 @@
 """The order of candidates under a budget: which closure would strengthen the pose graph most.
 
 Each candidate costs latents, and where these are dear the first few closures decide. The criterion is that of
-Swarm-SLAM (Lajoie and Beltrame 2024): the algebraic connectivity, the second smallest eigenvalue of the pose graph's
-Laplacian, which bounds the error of its worst determined part. Candidates are taken greedily by the first-order gain
-(Doherty et al. 2022): with the Fiedler vector v, an edge of weight w between i and j adds about w (v_i - v_j)^2.
+Swarm-SLAM (Lajoie and Beltrame 2024), the spectrum of the pose graph's Laplacian: the algebraic connectivity, its
+second smallest eigenvalue, bounds the error of the worst determined part, and the expected squared error of all
+keyframes is the sum of 1 / lambda, which it dominates. Candidates are taken greedily, as there and by Doherty et al.
+(2022), but by what they take off the whole sum: the gain of the connectivity alone is zero for all candidates where the
+weakest mode is one that none of them touches.
 
 Odometry chains are contracted to the keyframes that have closures or candidates (a chain of n edges is one edge of
 weight 1 / n), each with the mass of the keyframes around it, and neighbours are merged until `NODES_MAX` remain. Parts
@@ -119,7 +121,7 @@ class Reduced:
         self._add_edges(Edges(np.array([a]), np.array([b]), np.array([CLOSURE_WEIGHT])))
 
     def gains(self, pairs: Sequence[CandidatePair]) -> list[float]:
-        """What each pair would add: infinite where it joins two parts, else relative to its part's connectivity."""
+        """What each pair would add: infinite where it joins two parts, else the fall of its part's uncertainty."""
         a = np.array([self._node(pair.low) for pair in pairs])
         b = np.array([self._node(pair.high) for pair in pairs])
         parts = self._parts()
@@ -128,11 +130,12 @@ class Reduced:
             return [float(gain) for gain in gains]
         for part in np.unique(parts[a]):
             nodes = np.flatnonzero(parts == part)
-            connectivity, fiedler = fiedler_vector(self._laplacian[np.ix_(nodes, nodes)], self._masses[nodes])
-            values = np.zeros(len(parts))
-            values[nodes] = fiedler
+            values, modes = spectrum(self._laplacian[np.ix_(nodes, nodes)], self._masses[nodes])
+            places = np.zeros(len(parts), dtype=int)
+            places[nodes] = np.arange(len(nodes))
             inside = parts[a] == part
-            gains[inside] = CLOSURE_WEIGHT * (values[a] - values[b])[inside] ** 2 / max(connectivity, 1e-12)
+            stretch = modes[places[a[inside]]] - modes[places[b[inside]]]
+            gains[inside] = uncertainty_removed(stretch, values, CLOSURE_WEIGHT)
         return [float(f"{gain:.{GAIN_DIGITS}g}") for gain in gains]
 
     def _add_chain(self, log: LogId, ends: list[int], length: int) -> tuple[Float, Edges]:
@@ -141,7 +144,8 @@ class Reduced:
         first = len(self._nodes)
         for k, place in enumerate(places):
             self._nodes[log, int(place)] = first + k
-        borders = np.concatenate([[0.0], (places[1:] + places[:-1]) / 2, [max(length, ends[-1] + 1)]])
+        last = max(length, ends[-1] + 1) - 0.5
+        borders = np.concatenate([[-0.5], (places[1:] + places[:-1]) / 2, [last]])
         numbers = first + np.arange(len(places))
         return np.maximum(np.diff(borders), 0.5), Edges(numbers[:-1], numbers[1:], 1.0 / np.diff(places))
 
@@ -176,19 +180,29 @@ def step_for(ends: Iterable[set[int]]) -> int:
     return step
 
 
-def fiedler_vector(laplacian: Float, masses: Float) -> tuple[float, Float]:
-    """Algebraic connectivity and Fiedler vector of a connected graph whose nodes have masses.
+def spectrum(laplacian: Float, masses: Float) -> tuple[Float, Float]:
+    """Eigenvalues and modes of a connected graph whose nodes have masses, `L v = lambda M v`, but for the constant one.
 
     Args:
         laplacian: (N, N).
         masses: (N,), positive.
 
     Returns:
-        The second smallest eigenvalue of `L v = lambda M v` and its vector (N,), of unit length in M; zero where there
-        is one node only.
+        (N-1,) ascending, the algebraic connectivity first, and the modes (N, N-1), of unit length in M, the Fiedler
+        vector first.
     """
-    if len(masses) < 2:
-        return 0.0, np.zeros(len(masses))
     roots = 1.0 / np.sqrt(masses)
     values, vectors = np.linalg.eigh(laplacian * roots[:, None] * roots[None, :])
-    return float(values[1]), np.asarray(vectors[:, 1] * roots)
+    return np.asarray(values[1:]), np.asarray(vectors[:, 1:] * roots[:, None])
+
+
+def uncertainty_removed(stretch: Float, values: Float, weight: float) -> Float:
+    """How much one more edge lowers the sum of all 1 / lambda (Sherman and Morrison).
+
+    Args:
+        stretch: (K, N-1) difference of each mode between the two ends of each edge.
+        values: (N-1,) eigenvalues.
+        weight: Of an edge.
+    """
+    resistance = (stretch**2 / values).sum(axis=1)
+    return np.asarray(weight * (stretch**2 / values**2).sum(axis=1) / (1.0 + weight * resistance))

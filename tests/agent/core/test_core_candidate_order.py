@@ -1,0 +1,190 @@
+"""Claims on the spectral order of candidates."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flocc_agent.core.candidate_order import (
+    NODES_MAX,
+    PICKS,
+    Reduced,
+    SpectralOrder,
+    spectrum,
+    step_for,
+    uncertainty_removed,
+)
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import CandidatePair
+
+R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
+LENGTH = 60
+
+
+def pair(one: LogId, i: int, other: LogId, j: int) -> CandidatePair:
+    return CandidatePair.of(KeyframeId(one, i), KeyframeId(other, j))
+
+
+def side_by_side(best: int = 30) -> dict[CandidatePair, float]:
+    """Two robots that walk side by side: a candidate per keyframe, the most similar around one place."""
+    similarities = {pair(R1, i, R2, i): 0.95 - 0.005 * abs(i - best) for i in range(LENGTH)}
+    return dict(sorted(similarities.items(), key=lambda item: (-item[1], item[0])))
+
+
+def order_of(*logs: LogId, length: int = LENGTH) -> SpectralOrder:
+    order = SpectralOrder()
+    for log in logs:
+        for _ in range(length):
+            order.on_keyframe(log)
+    return order
+
+
+def always(_: CandidatePair) -> bool:
+    return True
+
+
+def taken(order: SpectralOrder, candidates: dict[CandidatePair, float], count: int) -> list[CandidatePair]:
+    """Register so many candidates, each as soon as it is chosen; all become closures."""
+    left = dict(candidates)
+    done: list[CandidatePair] = []
+    while len(done) < count:
+        chosen = order.chosen(left, always)[0]
+        del left[chosen]
+        order.on_closure(chosen)
+        done.append(chosen)
+    return done
+
+
+def eigenvalues(closures: list[CandidatePair]) -> NDArray[np.float64]:
+    """Those of two whole chains of `LENGTH` keyframes, joined by closures, but for the first; nothing is contracted."""
+    laplacian = np.zeros((2 * LENGTH, 2 * LENGTH))
+    ends = [(r * LENGTH + i, r * LENGTH + i + 1) for r in range(2) for i in range(LENGTH - 1)]
+    ends += [(closure.low.index, LENGTH + closure.high.index) for closure in closures]
+    for a, b in ends:
+        laplacian[[a, b], [a, b]] += 1.0
+        laplacian[[a, b], [b, a]] -= 1.0
+    return np.asarray(np.linalg.eigvalsh(laplacian)[1:])
+
+
+def uncertainty(closures: list[CandidatePair]) -> float:
+    return float((1.0 / eigenvalues(closures)).sum())
+
+
+def test_the_first_candidate_is_the_most_similar_that_joins_two_parts() -> None:
+    candidates = side_by_side()
+    assert order_of(R1, R2).chosen(candidates, always)[0] == pair(R1, 30, R2, 30)
+
+
+def test_the_next_ones_are_spread_where_similarity_would_stay_at_one_place() -> None:
+    indices = [closure.low.index for closure in taken(order_of(R1, R2), side_by_side(), 4)]
+    assert max(indices) - min(indices) > LENGTH / 2
+    similar = [closure.low.index for closure in list(side_by_side())[:4]]
+    assert max(similar) - min(similar) <= 3
+
+
+@pytest.mark.parametrize("best", [5, 30, 50])
+def test_half_the_closures_connect_the_whole_graph_better_than_the_most_similar_ones(best: int) -> None:
+    candidates = side_by_side(best)
+    spectral, similar = taken(order_of(R1, R2), candidates, 5), list(candidates)[:10]
+    assert uncertainty(spectral) < uncertainty(similar)
+    assert eigenvalues(spectral)[0] >= eigenvalues(similar)[0] * (1 - 1e-9)
+
+
+def test_what_is_chosen_stays_chosen_until_it_is_done() -> None:
+    order, candidates = order_of(R1, R2), side_by_side()
+    first = order.chosen(candidates, always)
+    assert len(first) == PICKS
+    more = {pair(R1, 0, R2, 59): 0.99, **candidates}
+    assert order.chosen(more, always) == first
+    del candidates[first[0]]
+    assert order.chosen(candidates, always) == first[1:]
+
+
+def test_only_what_can_be_registered_is_chosen() -> None:
+    candidates = side_by_side()
+    chosen = order_of(R1, R2).chosen(candidates, lambda one: one.low.index >= 40)
+    assert chosen
+    assert all(one.low.index >= 40 for one in chosen)
+
+
+def test_parts_are_joined_before_any_is_strengthened() -> None:
+    order = order_of(R1, R2, R3)
+    order.on_closure(pair(R1, 0, R2, 0))
+    candidates = {pair(R1, 59, R2, 59): 0.99, pair(R2, 30, R3, 30): 0.55, pair(R2, 31, R3, 31): 0.6}
+    assert order.chosen(candidates, always)[0] == pair(R2, 31, R3, 31)
+
+
+def test_the_order_is_the_same_whenever_it_is_asked_for() -> None:
+    rng = np.random.default_rng(4)
+    logs = (R1, R2, R3)
+    candidates: dict[CandidatePair, float] = {}
+    for _ in range(200):
+        a, b = rng.choice(3, size=2, replace=False)
+        i, j = (int(k) for k in rng.integers(LENGTH, size=2))
+        candidates[pair(logs[a], i, logs[b], j)] = round(float(rng.uniform(0.5, 1.0)), 2)
+    assert taken(order_of(*logs), candidates, 30) == taken(order_of(*logs), candidates, 30)
+
+
+def test_chains_are_contracted_without_losing_what_decides() -> None:
+    """The connectivity of the contracted graph, with masses, is close to that of the whole one."""
+    closures = [pair(R1, i, R2, i) for i in (3, 20, 55)]
+    filler = [pair(R1, i, R2, i) for i in range(0, LENGTH, 4)]
+    graph = Reduced([*closures, *filler], {R1: LENGTH, R2: LENGTH})
+    for closure in closures:
+        graph.add(closure)
+    values, _ = spectrum(graph._laplacian, graph._masses)
+    assert graph._masses.sum() == 2 * LENGTH
+    assert values[0] == pytest.approx(eigenvalues(closures)[0], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("logs", "length", "candidates"), [(2, 50, 20), (6, 500, 512), (16, 5000, 512), (200, 40, 512)]
+)
+def test_the_matrix_stays_small_and_a_choice_fast(logs: int, length: int, candidates: int) -> None:
+    rng = np.random.default_rng(7)
+    names = [LogId(f"r{k}") for k in range(logs)]
+    given: dict[CandidatePair, float] = {}
+    while len(given) < candidates:
+        a, b = rng.choice(logs, size=2, replace=False)
+        i, j = (int(k) for k in rng.integers(length, size=2))
+        given[pair(names[a], i, names[b], j)] = 0.5
+    graph = Reduced(given, dict.fromkeys(names, length))
+    assert len(graph._masses) <= max(NODES_MAX, logs)
+    order = order_of(*names, length=length)
+    began_s = time.process_time()
+    assert len(order.chosen(given, always)) == PICKS
+    assert time.process_time() - began_s < 1.0
+
+
+def test_neighbours_are_merged_no_further_than_needed() -> None:
+    assert step_for([set(range(NODES_MAX))]) == 1
+    assert step_for([set(range(NODES_MAX + 1))]) == 2
+    assert step_for([set(range(NODES_MAX * 4))]) == 4
+    assert step_for([{k} for k in range(3 * NODES_MAX)]) == 1
+
+
+def test_the_first_mode_of_a_chain_is_a_cosine() -> None:
+    n = 20
+    laplacian = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    laplacian[0, 0] = laplacian[-1, -1] = 1.0
+    values, modes = spectrum(laplacian, np.ones(n))
+    expected = np.cos(np.pi * (np.arange(n) + 0.5) / n)
+    assert values[0] == pytest.approx(2.0 - 2.0 * np.cos(np.pi / n))
+    assert abs(modes[:, 0] @ expected) == pytest.approx(np.linalg.norm(expected), rel=1e-9)
+
+
+def test_a_gain_is_what_the_sum_of_inverse_eigenvalues_loses() -> None:
+    closures = [pair(R1, 3, R2, 3), pair(R1, 40, R2, 41)]
+    added = pair(R1, 20, R2, 22)
+    everything = [pair(R1, i, R2, i) for i in range(LENGTH)]
+    graph = Reduced([*closures, added, *everything], {R1: LENGTH, R2: LENGTH})
+    assert len(graph._masses) == 2 * LENGTH
+    for closure in closures:
+        graph.add(closure)
+    (gain,) = graph.gains([added])
+    assert gain == pytest.approx(uncertainty(closures) - uncertainty([*closures, added]), rel=1e-5)
+
+
+def test_an_edge_between_equal_values_removes_nothing() -> None:
+    assert uncertainty_removed(np.zeros((1, 3)), np.ones(3), 1.0) == pytest.approx([0.0])
