@@ -7,7 +7,7 @@ click in some versions, so click's types have no name here.
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 from typer.core import TyperGroup
@@ -155,9 +155,16 @@ def _option(field: "FieldInfo") -> Any:
     kind, default = field.annotation, field.default
     is_list, is_section = get_origin(kind) is tuple, isinstance(default, BaseModel)
     shown = ",".join(map(str, default)) if is_list else "its defaults" if is_section else str(default)
-    single = next((inner for inner in get_args(kind) if isinstance(inner, type)), str)
-    metavar = "LIST" if is_list else "FILE" if is_section else getattr(kind, "__name__", single.__name__).upper()
+    metavar = "LIST" if is_list else "FILE" if is_section else _kind_name(kind)
     return Annotated[str | None, typer.Option(help=f"{field.description} [{shown or 'none'}]", metavar=metavar)]
+
+
+def _kind_name(kind: Any) -> str:
+    """What an option takes: its choices, or the name of its type."""
+    if get_origin(kind) is Literal:
+        return "|".join(map(str, get_args(kind)))
+    single = next((inner for inner in get_args(kind) if isinstance(inner, type)), kind)
+    return str(single.__name__).upper()
 
 
 def _run(chosen: "Experiment[Any]", settings: Any, seed: int, out: Path, processes: int | None) -> None:

@@ -12,9 +12,9 @@ from pydantic import Field
 from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig
 from flocc_agent.core.parameters import CoreParameters, RoundParameters
 from flocc_launch.experiments.experiment import Cell, Experiment, Finding, Row, Settings, Summary, judged
-from flocc_launch.experiments.plots import from_zero, spread_line
+from flocc_launch.experiments.plots import drawn_values, from_zero, spread_line
 from flocc_launch.experiments.simulated import simulated
-from flocc_launch.experiments.statistics import grouped, middle, values, with_spread
+from flocc_launch.experiments.statistics import grouped, middle, with_spread
 from flocc_launch.scenario import Scenario, TracksScenario
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ LABELS = {"loss": "share of messages lost", "range": "communication range, m", "
 MEASURES = {
     "ate_m": "joint ATE, m",
     "merged_after_s": "one map after, s",
-    "bytes": "bytes sent by all robots",
+    "bytes": "sent by all robots, MB",
     "leader_changes": "changes of the leader",
 }
 LATENCY_S = 0.02
@@ -161,7 +161,7 @@ def draw(figure: "Figure", _settings: FaultsSettings, rows: Sequence[Row]) -> No
                 panel.set_ylabel(label)
         panels[-1][column].set_xlabel(LABELS[axis])
     for line, measure_name in zip(panels, MEASURES, strict=True):
-        from_zero(line[0], values(rows, measure_name))
+        from_zero(line[0], drawn_values(rows, measure_name))
 
 
 FAULTS = Experiment(

@@ -172,8 +172,8 @@ def _ratio_beats_similarity(
         f"Average precision {ratio.average_precision:.3f} against {similarity.average_precision:.3f} over all pairs "
         f"with a pose (95 % of resampled differences lie between {low:+.3f} and {high:+.3f}), ROC {ratio.roc_auc:.3f} "
         f"against {similarity.roc_auc:.3f}; {ratio.right_share:.1%} of them are inliers. The count of "
-        f"correspondences has {whole['correspondences'].average_precision:.3f}. The ratio is better in {len(better)} of "
-        f"{len(single)} scenes ({', '.join(better) or 'none'})."
+        f"correspondences has {whole['correspondences'].average_precision:.3f}. The ratio is better in {len(better)} "
+        f"of {len(single)} scenes ({', '.join(better) or 'none'})."
     )
     holds = None if low <= 0.0 <= high else low > 0.0
     return judged("The correspondence ratio beats similarity", SOURCE, holds, numbers)
