@@ -117,7 +117,7 @@ def summarise(_settings: RegistrationSettings, rows: Sequence[Row]) -> Summary:
     """A row per scene and metric that the method gives."""
     scenes = pairs_of(rows)
     curves = {name: curves_of(pairs) for name, pairs in scenes.items()}
-    given = [metric for metric in METRICS if any(metric in found for found in curves.values())]
+    given = [metric for metric in METRICS if any(metric in found for found in curves.values())] or ["ratio"]
     table = [
         metric_row(name, pairs, metric, curves[name].get(metric)) for name, pairs in scenes.items() for metric in given
     ]
@@ -249,7 +249,10 @@ def notes(scenes: Mapping[str, Sequence[Row]], rows: Sequence[Row]) -> list[str]
         "precision of a metric without meaning is the share of inliers among pairs with a pose. best_threshold has the "
         "largest F1; threshold_half is the lowest at which the share of outliers is half of what it is without any."
     )
-    if all(pair["confidence"] is None for pairs in scenes.values() for pair in pairs):
+    posed = [pair for pairs in scenes.values() for pair in pairs if pair["inlier"] is not None]
+    if not posed:
+        said.append("No pair has a pose, so nothing can be judged; keyed random weights of MASt3R recognise nothing.")
+    elif all(pair["confidence"] is None for pair in posed):
         said.append("Mean confidence and its ratio are n/a: only MASt3R gives confidences, and this method is another.")
     return said
 

@@ -118,6 +118,14 @@ def test_confidences_are_compared_where_the_method_gives_them() -> None:
     assert metrics[1:3] == ["mean confidence", "confidence ratio"]
 
 
+def test_where_no_pair_has_a_pose_the_counts_stand_and_nothing_is_claimed() -> None:
+    nothing = [{**outcome(0.5, 0.5, False), "inlier": None} for _ in range(3)]
+    summary = summarise(RegistrationSettings(), [row(nothing)])
+    assert [(line["pairs"], line["with_pose"], line["average_precision"]) for line in summary.table] == [(3, 0, None)]
+    assert summary.findings[0].verdict is Verdict.NOT_SHOWN
+    assert any("No pair has a pose" in note for note in summary.notes)
+
+
 def finished(path: Path, outcomes: list[dict[str, Any]]) -> Path:
     folder = ExperimentFolder.start(path, configuration_of(REGISTRATION.name, {}, 1))
     folder.append(row(outcomes))
