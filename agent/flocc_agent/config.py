@@ -6,7 +6,7 @@ Parameters of the core are plain dataclasses in `core/parameters.py`; pydantic c
 import json
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeVar
@@ -679,14 +679,50 @@ class AgentConfig(Section):
         return self
 
     @classmethod
-    def read(cls, path: Path) -> "AgentConfig":
+    def read(cls, path: Path, changes: Iterable[str] = ()) -> "AgentConfig":
         """Read and check a TOML file, or JSON as `flocc launch` leaves it; paths in it are relative to the file.
+
+        Args:
+            path: The file.
+            changes: Keys with other values, as `name=r2` or `radio.loss_ratio=0.3`.
 
         Raises:
             ConfigError: The file cannot be used; the message names it and the key.
         """
         fields = read_json(path) if path.suffix == ".json" else read_toml(path)
+        for change in changes:
+            put_value(fields, *parsed_change(change))
         return validated(cls, fields, str(path), path.resolve().parent)
+
+
+def parsed_change(text: str) -> tuple[str, object]:
+    """Key and value of `KEY=VALUE`; the value is TOML, or text as it stands.
+
+    Raises:
+        ConfigError: There is no key.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"{text!r} is no change of the configuration; one looks like radio.loss_ratio=0.3")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+def put_value(fields: dict[str, object], key: str, value: object) -> None:
+    """Put a value at a dotted key, such as `radio.loss_ratio`.
+
+    Raises:
+        ConfigError: A part of the key is no table.
+    """
+    *tables, name = key.split(".")
+    for table in tables:
+        inner = fields.setdefault(table, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{key}: {table} is no table")
+        fields = inner
+    fields[name] = value
 
 
 def read_toml(path: Path) -> dict[str, object]:

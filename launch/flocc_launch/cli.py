@@ -135,6 +135,9 @@ def simulate(
 @app.command()
 def agent(
     config: Annotated[Path, typer.Option(help="Configuration of the agent (TOML); see docs/configuration.md.")],
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="Another value for a key: name=r2, radio.loss_ratio=0.3.")
+    ] = None,
     dashboard: Annotated[str | None, typer.Option(help="Serve this agent's view of the swarm at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics for Prometheus at [HOST:]PORT.")] = None,
     bandwidth: Annotated[
@@ -155,7 +158,7 @@ def agent(
     given: dict[str, Any] = {} if metrics is None else {"metrics": MetricsConfig.at(metrics)[0]}
     if bandwidth is not None:
         given["bandwidth_bytes_s"] = 1000.0 * bandwidth
-    read = AgentConfig.read(config).model_copy(update=given)
+    read = AgentConfig.read(config, changes or ()).model_copy(update=given)
     asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
 
 

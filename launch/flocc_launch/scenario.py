@@ -21,6 +21,7 @@ from flocc_agent.config import (
     RadioConfig,
     Section,
     StoreConfig,
+    put_value,
     read_toml,
     validated,
 )
@@ -340,7 +341,7 @@ class Scenario(Section):
     def of(cls, fields: dict[str, object], changes: Mapping[str, object], path: Path) -> "Scenario":
         """Check fields that a file, or a folder of data in its place, gave; arguments and errors as of `read`."""
         for key, value in changes.items():
-            _put(fields, key.split("."), value)
+            put_value(fields, key, value)
         return validated(cls, fields, str(path), path.resolve().parent)
 
 
@@ -387,11 +388,3 @@ def _groups(meetings: Sequence[Rendezvous], names: Sequence[str], at_s: float) -
             joined = [group for group in groups if group & set(meeting.robots)]
             groups = [group for group in groups if group not in joined] + [set().union(*joined)]
     return tuple(sorted(tuple(sorted(group)) for group in groups))
-
-
-def _put(fields: dict[str, object], keys: list[str], value: object) -> None:
-    for key in keys[:-1]:
-        inner = fields.setdefault(key, {})
-        assert isinstance(inner, dict), f"{key} is a table"
-        fields = inner
-    fields[keys[-1]] = value
