@@ -4,6 +4,8 @@ Every robot takes in every record, and only a leader asks for the graph: records
 matrices when somebody wants them.
 """
 
+from bisect import insort
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,7 +60,9 @@ class GraphAssembly:
         self.revision = 0
         self._odometry: dict[LogId, _Odometry] = {}
         self._closures: dict[CandidatePair, tuple[LogId, int, ClosureRecord]] = {}
+        self._unbuilt: set[CandidatePair] = set()
         self._built: dict[CandidatePair, LoopClosure] = {}
+        self._order: list[CandidatePair] = []
         self._early: dict[KeyframeId, int] = {}
         self._fixes: list[AbsoluteFix] = []
         self._odometry_pairs: dict[KeyframeId, tuple[KeyframeId, Pose7]] = {}
@@ -102,16 +106,17 @@ class GraphAssembly:
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
         trajectories = {log: Trajectory(odometry.matrices()) for log, odometry in sorted(self._odometry.items())}
-        closures = tuple(
-            self._closure(pair) for pair in sorted(self._closures) if self._known(pair.low) and self._known(pair.high)
-        )
+        self._build()
+        closures = tuple([self._built[pair] for pair in self._order])
         return PoseGraph(trajectories, closures, tuple(fix for fix in self._fixes if self._known(fix.keyframe)))
 
-    def _closure(self, pair: CandidatePair) -> LoopClosure:
-        built = self._built.get(pair)
-        if built is None:
-            built = self._built[pair] = _loop_closure(self._closures[pair][2])
-        return built
+    def _build(self) -> None:
+        """Build the closures that are new since the last graph, and those whose keyframes came meanwhile."""
+        for pair in sorted(pair for pair in self._unbuilt if self._known(pair.low) and self._known(pair.high)):
+            if pair not in self._built:
+                insort(self._order, pair)
+            self._built[pair] = _loop_closure(self._closures[pair][2])
+            self._unbuilt.remove(pair)
 
     def _known(self, keyframe: KeyframeId) -> bool:
         odometry = self._odometry.get(keyframe.log)
@@ -134,7 +139,7 @@ class GraphAssembly:
         held = self._closures.get(pair)
         if held is None or (new.log, new.number) < held[:2]:
             self._closures[pair] = (new.log, new.number, record)
-            self._built.pop(pair, None)
+            self._unbuilt.add(pair)
             self.revision += 1
             for keyframe in (record.query, record.match):
                 if not self._known(keyframe):

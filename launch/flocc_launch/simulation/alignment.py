@@ -3,6 +3,9 @@
 Campaigns and large swarms ask who corrects whom and when, not how well; this answers in microseconds per log.
 """
 
+from collections.abc import Mapping
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,19 +23,33 @@ from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 
+CLOSURES_KEPT_MAX = 16_384
+
 
 def align(graph: PoseGraph, _initial: GraphSolution | None = None) -> GraphSolution:
     """Place every log in its component's map frame; trusts the closures it comes across first."""
-    groups = components_of(list(graph.trajectories), graph.closures)
-    used = [ClosureResult(c.query, c.match, ClosureState.USED, 1.0, c.scale_initial, 0.0) for c in graph.closures]
-    return GraphSolution(tuple(_component(logs, graph) for logs in groups), tuple(used))
+    known = [_known(closure) for closure in graph.closures]
+    bridges = {logs: closure for (logs, _), closure in zip(reversed(known), reversed(graph.closures), strict=True)}
+    groups = components_of(list(graph.trajectories), list(bridges.values()))
+    return GraphSolution(tuple(_component(logs, graph, bridges) for logs in groups), tuple([used for _, used in known]))
 
 
-def _component(logs: tuple[LogId, ...], graph: PoseGraph) -> Component:
+@lru_cache(maxsize=CLOSURES_KEPT_MAX)
+def _known(closure: LoopClosure) -> tuple[tuple[LogId, LogId], ClosureResult]:
+    """What is the same in every round: the logs that a closure joins, and that it is used."""
+    low, high = sorted((closure.query.log, closure.match.log))
+    used = ClosureResult(closure.query, closure.match, ClosureState.USED, 1.0, closure.scale_initial, 0.0)
+    return (low, high), used
+
+
+def _component(
+    logs: tuple[LogId, ...], graph: PoseGraph, bridges: Mapping[tuple[LogId, LogId], LoopClosure]
+) -> Component:
     T_map_odom = {logs[0]: np.eye(4)}
-    bridges = {tuple(sorted((c.query.log, c.match.log))): c for c in reversed(graph.closures)}
+    inside = set(logs)
+    ours = [closure for closure in bridges.values() if closure.query.log in inside]
     while len(T_map_odom) < len(logs):
-        for closure in bridges.values():
+        for closure in ours:
             _hang(closure, graph, T_map_odom)
     return Component(
         logs=logs,
@@ -44,13 +61,13 @@ def _component(logs: tuple[LogId, ...], graph: PoseGraph) -> Component:
 
 def _hang(closure: LoopClosure, graph: PoseGraph, T_map_odom: dict[LogId, Float]) -> None:
     """Where a closure joins a placed log and one that is not, place the other one."""
+    query, match = closure.query, closure.match
+    if (query.log in T_map_odom) == (match.log in T_map_odom):
+        return
     T_query_match = closure.T_query_match_unscaled.copy()
     T_query_match[:3, 3] *= closure.scale_initial or 1.0
-    query, match = closure.query, closure.match
     if match.log in T_map_odom:
         query, match, T_query_match = match, query, inverse(T_query_match)
-    if query.log not in T_map_odom or match.log in T_map_odom:
-        return
     T_map_query = T_map_odom[query.log] @ graph.trajectories[query.log].T_odom_keyframe[query.index]
     T_odom_match = graph.trajectories[match.log].T_odom_keyframe[match.index]
     T_map_odom[match.log] = T_map_query @ T_query_match @ inverse(T_odom_match)
