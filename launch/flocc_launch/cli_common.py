@@ -26,11 +26,12 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def show_report(report: "Report", out: Path) -> None:
-    """Print what came of a run; leave with exit code 1 when an expectation was missed or has no value."""
+    """Print what came of a run; leave with exit code 1 when an expectation is missed or unknown, or no robot lived."""
     from flocc_launch.report.text import sentences
 
     for sentence in sentences(report):
         typer.echo(sentence)
     typer.echo(f"report: {(out / 'report.html').resolve()}")
-    if any(expectation.met is not True for expectation in report.expectations):
+    none_lived = bool(report.robot_details) and all(robot.end == "died" for robot in report.robot_details)
+    if none_lived or any(expectation.met is not True for expectation in report.expectations):
         sys.exit(EXIT_MISSED)

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.launch import synthetic_run
 
 from flocc_launch.cli import main
+from flocc_launch.cli_common import show_report
 from flocc_launch.datasets.drift import DriftSpec
+from flocc_launch.report import finish
 from flocc_launch.scenario import TracksScenario
 from flocc_launch.simulation.tracks import walks
 
@@ -133,3 +136,12 @@ def test_the_drift_of_walks_is_seeded() -> None:
     other = walks(TracksScenario(robots=2, seed=6), DriftSpec())
     assert np.array_equal(first[1].odometry.T_fixed_body, again[1].odometry.T_fixed_body)
     assert not np.array_equal(first[1].odometry.T_fixed_body, other[1].odometry.T_fixed_body)
+
+
+def test_a_run_that_no_robot_survived_ends_with_exit_code_1(tmp_path: Path) -> None:
+    report = finish(synthetic_run.write(tmp_path / "run")).model_copy(update={"expectations": []})
+    show_report(report, tmp_path)
+    dead = [robot.model_copy(update={"end": "died"}) for robot in report.robot_details]
+    with pytest.raises(SystemExit) as left:
+        show_report(report.model_copy(update={"robot_details": dead}), tmp_path)
+    assert left.value.code == 1

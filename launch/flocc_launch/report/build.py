@@ -208,10 +208,12 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
 
 
 def how_it_died(event: AgentDied) -> str:
-    """The signal or exit code of an agent's death."""
+    """The signal or exit code of an agent's death, and where it says more."""
     if event.signal is not None:
         return f"signal {event.signal}"
-    return "no reason known" if event.exit_code is None else f"exit code {event.exit_code}"
+    if event.exit_code is None:
+        return "no reason known"
+    return f"exit code {event.exit_code}; robots/{event.robot}/agent.log says why"
 
 
 def registered_by(loaded: LoadedRun) -> Counter[str]:
