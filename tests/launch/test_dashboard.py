@@ -118,6 +118,41 @@ def test_the_snapshot_of_a_finished_run_agrees_with_its_report(tmp_path: Path) -
     json.dumps(snapshot, allow_nan=False)
 
 
+def test_links_have_loss_and_bytes_and_robots_have_queues(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run")
+    start_swarm(folder)
+    add(folder, 4.0, "r1", "bytes", sent={}, received={}, loss={"r2": 0.25}, queues={"inbox": 3})
+    links = {"sent_to": {"r2": {"records": 100, "heartbeat": 20}}, "received_from": {"r2": {"latent": 7}}}
+    add(folder, 4.0, "r1", "account", since_s=0.0, lost_from={}, repeated_from={}, stages={}, **links)
+    r1 = robot_of(RunSource(folder, clock_s=lambda: START_S + 5.0).snapshot(), "r1")
+    assert r1["queues"] == {"inbox": 3}
+    assert r1["links"] == {
+        "r2": {"hears": True, "loss_ratio": 0.25, "sent_bytes": 120, "received_bytes": 7},
+        "r3": {"hears": True, "loss_ratio": None, "sent_bytes": None, "received_bytes": None},
+    }
+    add(folder, 5.0, "r1", "neighbour_down", peer="r2")
+    later = robot_of(RunSource(folder, clock_s=lambda: START_S + 6.0).snapshot(), "r1")
+    assert later["links"]["r2"] == {"hears": False, "loss_ratio": None, "sent_bytes": 120, "received_bytes": 7}
+
+
+def test_a_server_is_in_no_map_and_nobody_waits_for_it(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run")
+    folder.write_run(Run(scenario="growing", robots=["r1", "r2", "r3"], servers=["r3"], start=START_S))
+    start_swarm(folder)
+    snapshot = RunSource(folder, clock_s=lambda: START_S + 5.0).snapshot()
+    assert snapshot["maps"] == [{"frame": "map/r1", "robots": ["r1", "r2"]}]
+    assert [robot["server"] for robot in snapshot["robots"]] == [False, False, True]
+
+
+def test_a_run_that_is_over_is_drawn_as_it_was_corrected(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run")
+    corrected = [keyframe.T_map_body for keyframe in folder.results()["r2"].keyframes]
+    drawn = robot_of(RunSource(folder).snapshot(), "r2")["path_m"]
+    known = [[round(v, 3) for v in pose[:3]] for pose in corrected if pose is not None]
+    assert drawn[: len(known)] == known
+    assert len(drawn) == len(corrected), "a keyframe after the last correction moves with the odom frame"
+
+
 def test_the_server_answers_two_paths_and_nothing_else(tmp_path: Path) -> None:
     with Dashboard(synthetic_run.write(tmp_path / "run"), port=0) as dashboard:
         with urllib.request.urlopen(dashboard.url + "state.json") as answer:

@@ -1,14 +1,20 @@
 """The doctor in broken set-ups that really happened: each is a swarm on virtual time with one thing wrong."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flocc_agent.core.pose_graph import map_frame
+from flocc_agent.runtime.evidence import evidence_of
 from flocc_launch.doctor import Finding, Severity, diagnose
+from flocc_launch.doctor.live import diagnose_live
 from flocc_launch.run_folder import RunFolder
 from flocc_launch.scenario import Scenario
 from flocc_launch.simulation.simulate import playbacks_of, simulate, swarm_of, write
+from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.status import RobotStatus, status_from
 
 LOOP = [[0, 0], [9, 0], [9, 6], [0, 6], [0, 0]]
 FAR_AWAY = [[60, 0], [69, 0], [69, 6], [60, 6], [60, 0]]
@@ -150,3 +156,60 @@ def test_the_best_similarity_and_the_threshold_stand_in_the_sentence(tmp_path: P
     best = max(results["r1"].best_similarities["r2"], results["r2"].best_similarities["r1"])
     assert best < 0.6
     assert f"below the threshold of 0.6, the best was {best:.2f}" in finding.sentence
+
+
+def answers(swarm: Swarm) -> list[RobotStatus]:
+    """What the robots of a simulated swarm would answer an operator."""
+    rows = []
+    for name, station in swarm.stations.items():
+        core = station.core
+        assert core is not None
+        term, applied = core.election.term, core.corrections.applied
+        fields = {
+            "robot": name,
+            "leader": None if term is None else term.leader.robot,
+            "neighbours": core.neighbours.names(),
+            "map_frame": None if applied is None else map_frame(applied.anchor),
+            "keyframes": core.gossip.logs[core.log].keyframes,
+            "closures": core.assembly.closures,
+            "logs": {str(digest.log): [digest.count, digest.checksum] for digest in core.gossip.digests()},
+            "compute_class": swarm.scenario.robot(name).compute_class,
+            **evidence_of(core, swarm.scenario.core, station.solution),
+        }
+        rows.append(status_from(name, json.dumps(fields).encode()))
+    return rows
+
+
+ASKED = {
+    "a radio that only sends": "one-way-link",
+    "kept apart by a partition": "no-peer",
+    "records get lost, all of them": "no-descriptors",
+    "a similarity threshold that nothing reaches": "low-similarity",
+    "a match-ratio threshold that nothing reaches": "registrations-rejected",
+    "maps that take more agreeing closures than there are": "closures-not-connecting",
+    "elections that nobody wins": "no-leader",
+    "a robot that is never switched on": None,
+}
+
+
+@pytest.mark.parametrize("setup", ASKED)
+def test_the_doctor_names_it_while_the_swarm_runs(setup: str) -> None:
+    scenario = broken(**BROKEN[setup][1])
+    swarm = swarm_of(scenario, playbacks_of(scenario, {}), scenario.seed)
+    swarm.run_until(14.0)
+    if ASKED[setup] is None:
+        del swarm.stations["r2"]  # who is off does not answer
+    found = [finding.cause for finding in diagnose_live(answers(swarm)) if finding.severity is Severity.BLOCKS]
+    assert found == [cause for cause in [ASKED[setup]] if cause is not None]
+
+
+def test_what_a_robot_answers_counts_every_pair_once() -> None:
+    scenario = broken(robots={"server": {"compute_class": 9}})
+    swarm = swarm_of(scenario, playbacks_of(scenario, {}), scenario.seed)
+    swarm.run_until(20.0)
+    rows = answers(swarm)
+    assert [finding.cause for finding in diagnose_live(rows)] == ["merged"]
+    for row in rows:
+        (pair,) = row.pairs
+        assert (pair.robots, pair.accepted) == (("r1", "r2"), row.closures)
+        assert pair.best_ratio is None or pair.rejected > 0

@@ -41,8 +41,9 @@ def not_merged_yet(rows: Sequence[RobotStatus], maps: int) -> Finding:
 
 
 def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:
-    """Robots that hear nobody."""
-    alone = [row.robot for row in rows if not row.neighbours]
+    """Robots that hear nobody, and whom nobody hears."""
+    heard = {peer for row in rows for peer in row.neighbours}
+    alone = [row.robot for row in rows if not row.neighbours and row.robot not in heard]
     if not alone or len(rows) < 2:
         return []
     return [
@@ -68,7 +69,7 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         )
         for a in sorted(hears)
         for b in sorted(hears[a])
-        if b in hears and hears[b] and a not in hears[b]
+        if b in hears and a not in hears[b]
     ]
 
 
