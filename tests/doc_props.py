@@ -21,7 +21,7 @@ WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
 K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 WALLS_M = (5.0, 3.0)
 PIXELS_PER_M = 100.0
-LENGTH_M, PASSES, IMAGES, RATE_HZ = 4.0, 3, 20, 4.0
+LENGTH_M, PASSES, IMAGES, RATE_HZ = 3.0, 3, 14, 4.0
 
 
 def write_own_data(folder: Path) -> Path:

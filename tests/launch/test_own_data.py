@@ -51,8 +51,8 @@ def test_one_data_set_is_cut_into_robots(own: Path) -> None:
 
 def test_keyframes_are_closer_where_robots_move_little(own: Path) -> None:
     keyframes = read_scenario(str(own), {}).keyframes
-    assert keyframes.distance_m == pytest.approx(PASSES * 4.0 / 3 / 25, abs=0.01)
-    assert "a keyframe every 0.16" in str(own_data_sentence(str(own), read_scenario(str(own), {})))
+    assert keyframes.distance_m == pytest.approx(PASSES * 3.0 / 3 / 25, abs=0.01)
+    assert "a keyframe every 0.12" in str(own_data_sentence(str(own), read_scenario(str(own), {})))
 
 
 def test_a_folder_of_data_sets_is_a_robot_each(own: Path, tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_odometry_beside_the_folder_must_be_of_its_time(own: Path, tmp_path: Pat
     shutil.copyfile(own / "groundtruth.txt", tmp_path / "vio.tum")
     lines = [line.split(" ", 1)[1] for line in (tmp_path / "vio.tum").read_text().splitlines()]
     (tmp_path / "vio.tum").write_text("".join(f"{k * 0.25} {line}\n" for k, line in enumerate(lines)))
-    with pytest.raises(DatasetError, match=r"vio.tum: the trajectory is from 0.000 s to 14.750 s, but the images"):
+    with pytest.raises(DatasetError, match=r"vio.tum: the trajectory is from 0.000 s to 10.250 s, but the images"):
         convert(own, tmp_path / "out", odometry=tmp_path / "vio.tum")
 
 
@@ -185,14 +185,14 @@ def test_one_image_fewer_than_poses_is_no_fault_where_names_are_stamps(own: Path
 def test_one_numbered_image_fewer_than_poses_is_said(own: Path, tmp_path: Path) -> None:
     rename(own, "img_{}.jpg")
     (own / "images" / "img_7.jpg").unlink()
-    with pytest.raises(DatasetError, match=r"has 59 images, but the trajectory has 60 poses; name images by their st"):
+    with pytest.raises(DatasetError, match="has 41 images, but the trajectory has 42 poses; name images by their st"):
         convert(own, tmp_path / "out")
 
 
 def test_what_is_no_image_is_left_out_and_said(own: Path, tmp_path: Path) -> None:
     (own / "images" / "1700000001.000000.jpg").write_bytes(b"404 not found")
     with pytest.raises(
-        DatasetError, match=r"1700000001.000000.jpg: is no image .* the 59 images that are good were ke"
+        DatasetError, match=r"1700000001.000000.jpg: is no image .* the 41 images that are good were ke"
     ):
         convert(own, tmp_path / "out")
     assert len(Recording.open(tmp_path / "out").frames) == COUNT - 1
