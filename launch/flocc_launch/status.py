@@ -18,6 +18,7 @@ from flocc_launch.dashboard.source import RunSource
 from flocc_launch.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
+OPTIONAL = frozenset({"waiting", "lost %", "refused"})
 LEFT = frozenset({"robot", "state", "leader", "map frame", "hears"})
 
 
@@ -117,7 +118,13 @@ def status_of_run(path: Path) -> list[RobotStatus]:
         RunFolderError: It is not a run folder.
     """
     snapshot = RunSource(RunFolder.open(path)).snapshot()
-    return [RobotStatus.model_validate({**robot, "closures": robot["accepted"]}) for robot in snapshot["robots"]]
+    return [status_of_robot(robot) for robot in snapshot["robots"]]
+
+
+def status_of_robot(robot: dict[str, Any]) -> RobotStatus:
+    """One robot of a snapshot."""
+    known = {peer: link["loss_ratio"] for peer, link in robot["links"].items() if link["loss_ratio"] is not None}
+    return RobotStatus.model_validate({**robot, "closures": robot["accepted"], "loss": known})
 
 
 def status_json(rows: Sequence[RobotStatus]) -> str:
@@ -126,13 +133,14 @@ def status_json(rows: Sequence[RobotStatus]) -> str:
 
 
 def status_table(rows: Sequence[RobotStatus], title: str = "") -> Table:
-    """All rows as a table for the terminal."""
+    """All rows as a table for the terminal; a column of which nothing is known is left out where it is not needed."""
     cells = [cells_of(row) for row in rows]
+    empty = {column for column in OPTIONAL if all(row[column] == "-" for row in cells)}
     table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for column in cells_of(RobotStatus(robot="")):
+    for column in (column for column in cells_of(RobotStatus(robot="")) if column not in empty):
         table.add_column(column, justify="left" if column in LEFT else "right", no_wrap=column == "robot")
     for row in cells:
-        table.add_row(*row.values())
+        table.add_row(*(cell for column, cell in row.items() if column not in empty))
     return table
 
 
@@ -148,6 +156,8 @@ def cells_of(row: RobotStatus) -> dict[str, str]:
         "keyframes": shown(row.keyframes),
         "closures": shown(row.closures),
         "candidates": shown(row.candidates),
+        "waiting": shown(sum(row.queues.values()) if row.queues else None),
+        "lost %": f"{100 * max(row.loss.values()):.0f}" if row.loss else "-",
         "sent kB": kilobytes(row.sent_bytes),
         "received kB": kilobytes(row.received_bytes),
         "refused": shown(sum(row.refused.values()) or None),

@@ -156,7 +156,7 @@ def test_a_page_on_a_port_in_use_is_one_sentence(
 
 
 @pytest.mark.swarm
-@pytest.mark.parametrize("command", ["doctor", "status", "view"])
+@pytest.mark.parametrize("command", ["doctor", "view"])
 def test_a_swarm_that_nobody_answers_for_is_one_sentence(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -106,6 +106,7 @@ def test_a_scenario_that_cannot_be_used_is_named(pytester: pytest.Pytester) -> N
 
 
 @pytest.mark.swarm
+@pytest.mark.scenarios
 def test_a_marked_scenario_is_launched_over_real_zenoh(pytester: pytest.Pytester) -> None:
     result = run(
         pytester,

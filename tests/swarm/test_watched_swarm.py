@@ -19,7 +19,7 @@ PERIOD_S = 0.5
 
 
 @pytest.mark.swarm
-@pytest.mark.slow
+@pytest.mark.scenarios
 def test_a_dashboard_and_a_live_view_cost_next_to_nothing(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     seen = watched(watched_scenario(LATENT_BYTES), tmp_path / "run", observed=True)
@@ -33,7 +33,7 @@ def test_a_dashboard_and_a_live_view_cost_next_to_nothing(tmp_path: Path) -> Non
 
 
 @pytest.mark.swarm
-@pytest.mark.slow
+@pytest.mark.scenarios
 def test_the_doctor_asks_a_running_swarm_why_nothing_merges(tmp_path: Path) -> None:
     changes: dict[str, Any] = {"core.place_recognition.similarity_threshold": 0.9999, "duration_s": 14.0}
     found: list[Finding] = []
