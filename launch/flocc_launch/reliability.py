@@ -11,6 +11,7 @@ Each prints one JSON object. Robots see synthetic images; times come from the ag
 import argparse
 import asyncio
 import json
+import math
 import os
 import shutil
 import statistics
@@ -20,13 +21,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flocc_agent.config import PerceptionConfig, RadioConfig, SourceConfig
+from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig, SourceConfig
+from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
 from flocc_launch.data import recordings
 from flocc_launch.processes import AgentProcess, loopback_transports
 from flocc_launch.scenario import Scenario, TracksScenario, agent_config
 from flocc_protocol.errors import FloccError
 
 START_S = 60.0
+CROWD_START_S = 120.0
 LOOK_S = 0.1
 CLOCK_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -228,34 +231,58 @@ async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
 
 
 async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
-    """Many agents with two keyframes per second each: memory over time, late heartbeats, messages dropped."""
-    scenario = meeting(robots=agents, rate=1.0, length_m=max(40.0, duration_s))
-    swarm = Swarm(scenario, folder)
+    """Many agents with two keyframes per second each: CPU, memory over time, late heartbeats, messages dropped."""
+    swarm = Swarm(crowd(agents, duration_s), folder)
     await swarm.start()
     resident: list[float] = []
     try:
-        await swarm.until(lambda: follow(swarm.agents, "r1"), 2 * START_S, "r1 leads")
-        began_s = swarm.now_s()
+        await swarm.until(lambda: follow(swarm.agents, "r1"), CROWD_START_S, "r1 leads")
+        began_s, used_s, before = swarm.now_s(), sum(map(cpu_s, swarm.agents)), _keyframes(swarm.agents)
         while swarm.now_s() - began_s < duration_s:
+            await asyncio.sleep(min(10.0, duration_s))
             resident.append(statistics.median(resident_bytes(agent) / MEBIBYTE for agent in swarm.agents))
-            await asyncio.sleep(10.0)
+        lasted_s, used_s = swarm.now_s() - began_s, sum(map(cpu_s, swarm.agents)) - used_s
         lost = sum(len(events(agent, "neighbour_down", began_s)) for agent in swarm.agents)
-        refused: dict[str, int] = {}
-        for agent in swarm.agents:
-            for reason, count in agent.status.get("refused", {}).items():
-                refused[reason] = refused.get(reason, 0) + count
-        keyframes = sum(agent.status.get("keyframes", 0) for agent in swarm.agents)
-        elapsed_s = swarm.now_s()
+        keyframes = _keyframes(swarm.agents)
+        rates = [(keyframes[name] - before[name]) / lasted_s for name in before]
+        refused = _refused(swarm.agents)
     finally:
         await swarm.stop()
     return {
         "agents": agents,
-        "duration_s": round(elapsed_s),
-        "keyframes": keyframes,
+        "duration_s": round(lasted_s, 1),
+        "keyframes_per_s": spread(rates),
+        "cores_used": round(used_s / lasted_s, 2),
         "rss_mib_over_time": [round(value, 1) for value in resident],
         "neighbours_lost": lost,
         "refused_or_dropped": refused,
     }
+
+
+def crowd(robots: int, duration_s: float) -> Scenario:
+    """Many robots in one town, all in range of each other, two keyframes per second each: 1 m/s, one every 0.5 m."""
+    return Scenario(
+        name="crowd",
+        tracks=TracksScenario(
+            robots=robots, seed=3, area_m=60.0, speed_m_s=1.0, length_m=CROWD_START_S + duration_s + 30.0
+        ),
+        keyframes=KeyframeConfig(distance_m=0.5, rotation_rad=math.pi),
+        perception=PerceptionConfig(method="synthetic"),
+        core=CoreParameters(place_recognition=PlaceRecognitionParameters(similarity_threshold=0.6)),
+    )
+
+
+def _keyframes(agents: Iterable[AgentProcess]) -> dict[str, int]:
+    return {agent.name: agent.status.get("keyframes", 0) for agent in agents}
+
+
+def _refused(agents: Iterable[AgentProcess]) -> dict[str, int]:
+    """What all agents refused or dropped, by reason."""
+    refused: dict[str, int] = {}
+    for agent in agents:
+        for reason, count in agent.status.get("refused", {}).items():
+            refused[reason] = refused.get(reason, 0) + count
+    return refused
 
 
 def cpu_s(agent: AgentProcess) -> float:

@@ -393,12 +393,26 @@ class Driver:
                 case Report("peer_refused", fields):
                     self._refuse(str(fields["peer"]), str(fields["reason"]))
                     continue
+                case Report("log_forked", fields) if fields["log"] == str(self.robot.log):
+                    self._end_log(str(fields["peer"]))
+                    self._report(effect)
+                    continue
                 case Report():
                     self._report(effect)
                     continue
             await self._write(written)
             self._do(effect)
         await self._write(written)
+
+    def _end_log(self, peer: str) -> None:
+        """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
+        logger.error(
+            "%s: %s holds records of this robot's log that are not on its disk (an older copy of the disk, or a second "
+            "robot of this name): what it records now reaches nobody. Restart it; it then begins a log of its own",
+            self.robot.log,
+            peer,
+        )
+        self._store.end_log()
 
     async def _write(self, written: list[Persist]) -> None:
         """Bring what is to be kept onto the disk before anything is sent that depends on it."""

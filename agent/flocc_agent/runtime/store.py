@@ -105,6 +105,10 @@ class Store:
         """Why the store goes on in memory; None while the disk works."""
         return self._records.failure or self._latents.failure
 
+    def end_log(self) -> None:
+        """The robot's own log cannot be continued: the next start begins another one; this one stays valid."""
+        self._forget_intact()
+
     def close(self) -> None:
         """Close the files; safe to call twice."""
         self._records.close()

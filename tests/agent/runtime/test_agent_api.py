@@ -1,14 +1,20 @@
 """The Python API: bad keyframes and fixes are refused with one sentence, and the agent goes on."""
 
+import asyncio
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from flocc_agent import Agent, AgentConfig
 from flocc_agent.composition import BadFix, BadKeyframe
 from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import Float, pose
 from flocc_agent.perception.synthetic import pose_image
+from flocc_protocol.ids import LogId
+from flocc_protocol.messages import Envelope, Heartbeat, LogDigest
 
 ALONE = TransportConfig(
     control_listen=("tcp/127.0.0.1:0",), bulk_listen=("tcp/127.0.0.1:0",), multicast=False, gossip=False
@@ -43,6 +49,26 @@ async def test_what_cannot_be_used_is_refused_and_the_agent_goes_on() -> None:
             assert correction.map_frame == f"map/{agent.log}"
             assert not correction.frame_changed
             break
+
+
+async def test_a_robot_whose_disk_is_behind_what_it_published_begins_another_log(tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
+    async with Agent(config, camera()) as agent:
+        old = agent.log
+        ahead = Heartbeat(1, 7, 0, None, 0, 0, (LogDigest(old, 5, 77),))
+        assert agent._driver is not None
+        agent._driver.put(MessageReceived(Envelope(LogId("r2"), ahead)))
+        while "ended" not in _log_state(agent):
+            await asyncio.sleep(0.01)
+    async with Agent(config, camera()) as agent:
+        assert agent.log.robot == "r1"
+        assert agent.log != old
+
+
+def _log_state(agent: Agent) -> str:
+    """Whether the robot's log is to be continued after a restart."""
+    assert agent.config.folder is not None
+    return "continued" if (agent.config.folder / "store" / "intact").exists() else "ended"
 
 
 async def test_a_frame_becomes_a_keyframe_when_the_robot_moved_enough() -> None:
