@@ -23,15 +23,13 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="flocc",
     help="Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots.",
+    epilog="Start with 'flocc demo', or 'flocc launch FOLDER' with images and a trajectory of your own.",
+    context_settings={"max_content_width": 110},
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-add_tools(app)
-add_data(app)
-add_measures(app)
-add_experiments(app)
 
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
@@ -60,7 +58,7 @@ def fail(sentence: str) -> NoReturn:
     sys.exit(EXIT_BAD_INPUT)
 
 
-@app.command()
+@app.command(short_help="Robots in a generated town, real zenoh: one map, one report.")
 def demo(
     out: Out = Path("runs/demo"),
     robots: Annotated[int, typer.Option(min=2, max=8, help="Robots in the generated world.")] = 3,
@@ -75,7 +73,7 @@ def demo(
     _launch(scenario, out)
 
 
-@app.command()
+@app.command(short_help="Run a scenario or your own data, a process per robot.")
 def launch(
     scenario: Annotated[str, typer.Argument(help=WHAT_RUNS)],
     out: Out = Path("runs/launch"),
@@ -98,7 +96,7 @@ def launch(
     _launch(_read(scenario, changes, agents), out, secure, dashboard, metrics)
 
 
-@app.command()
+@app.command(short_help="Run the same on virtual time: one process, repeatable.")
 def simulate(
     scenario: Annotated[str | None, typer.Argument(help=WHAT_RUNS)] = None,
     out: Out = Path("runs/simulate"),
@@ -162,7 +160,7 @@ def agent(
     asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
 
 
-@app.command()
+@app.command(short_help="Compute a run's report anew: errors, closures, bytes, leaders.")
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
@@ -234,6 +232,11 @@ def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWat
         typer.echo(f"dashboard: http://{host}:{port}/")
         yield both
 
+
+add_tools(app)
+add_data(app)
+add_measures(app)
+add_experiments(app)
 
 if __name__ == "__main__":
     main()

@@ -12,7 +12,9 @@ dataset = typer.Typer(help="Look at data sets, turn them into recordings, cut th
 weights = typer.Typer(help="Checkpoints of the mast3r front end: needed, checked, fetched.", rich_markup_mode=None)
 
 Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
-Format = Annotated[str | None, typer.Option("--format", help="Name of the format where it is not recognised.")]
+Format = Annotated[
+    str | None, typer.Option("--format", help="tum, euroc, kitti, 7scenes or plain, where it is not recognised.")
+]
 CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML or YAML) for a data set that has none.")]
 Every = Annotated[int, typer.Option(min=1, help="Of a bag, keep one image of so many.")]
 
@@ -42,8 +44,8 @@ def convert(
     camera: CameraFile = None,
     odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
     truth: Annotated[Path | None, typer.Option(help="TUM file with ground truth, for a bag.")] = None,
-    image_topic: Annotated[str | None, typer.Option(help="Of a bag with several.")] = None,
-    odometry_topic: Annotated[str | None, typer.Option(help="Of a bag with several.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Topic of the images, for a bag with several.")] = None,
+    odometry_topic: Annotated[str | None, typer.Option(help="Topic of the odometry, for a bag with several.")] = None,
     every: Every = 1,
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
 ) -> None:
@@ -81,11 +83,11 @@ def split(
     source: Source,
     out: Annotated[Path, typer.Option(help="Folder of the recordings.")],
     robots: Annotated[int, typer.Option(min=1, help="Pieces, one per robot.")] = 3,
-    seed: Annotated[int, typer.Option(help="Seed of the odometry drift.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the drift, where odometry is made from ground truth.")] = 0,
     format_name: Format = None,
     camera: CameraFile = None,
 ) -> None:
-    """Cut a data set by time into recordings of several robots, with seeded odometry drift."""
+    """Cut a data set by time into recordings of several robots; odometry that it lacks is made from ground truth."""
     from flocc_launch.datasets.commands import split as run
 
     with progress_bar("cutting") as progress:
