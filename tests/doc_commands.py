@@ -20,6 +20,7 @@ import typer
 import typer.main
 
 from flocc_launch.cli import app
+from flocc_protocol.errors import FloccError
 
 ROOT = Path(__file__).parents[1]
 USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]  # of typer's own click, whose place changes
@@ -129,9 +130,12 @@ def _flocc_complaint(words: list[str]) -> str | None:
     typed = not any(PLACEHOLDER.search(word) for word in words)
     path = ["flocc"]
     while getattr(command, "commands", None) and words and not words[0].startswith("-"):
-        if words[0] not in command.commands:
+        if PLACEHOLDER.search(words[0]):
+            return None
+        found = _subcommand(command, words[0])
+        if found is None:
             return f"{' '.join(path)} has no command {words[0]!r}"
-        command = command.commands[words[0]]
+        command = found
         path.append(words.pop(0))
     known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
     unknown = [word for word in words if word.startswith("--") and word.split("=")[0] not in {*known, "--help"}]
@@ -139,6 +143,14 @@ def _flocc_complaint(words: list[str]) -> str | None:
         return f"{' '.join(path)} has no option {unknown[0]}"
     complete = typed and words and not getattr(command, "commands", None)
     return _strictly(command, path[-1], words) if complete else None
+
+
+def _subcommand(group: Any, name: str) -> Any:
+    """A command of a group, also of one that makes its commands when they are called for."""
+    try:
+        return group.get_command(None, name)
+    except FloccError:
+        return None
 
 
 def _strictly(command: Any, name: str, words: list[str]) -> str | None:
