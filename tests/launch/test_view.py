@@ -48,10 +48,8 @@ def test_a_run_becomes_a_file_for_the_viewer(tmp_path: Path) -> None:
 def test_a_simulated_run_shows_what_is_left_of_its_closures_and_their_images(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     scenario = read_shipped("corridor")
-    paths = recordings(scenario)
-    simulate(scenario, tmp_path / "run", recordings=paths)
+    simulate(scenario, tmp_path / "run", recordings=recordings(scenario))
     folder = RunFolder.open(tmp_path / "run")
-    folder.write_run(folder.run().model_copy(update={"recordings": {name: str(path) for name, path in paths.items()}}))
     view(folder, tmp_path / "run.rrd")
     content = (tmp_path / "run.rrd").read_bytes()
     for entity in (b"residual/translation_m", b"residual/rotation_rad", b"closure/query", b"closure/match"):

@@ -54,7 +54,7 @@ def simulate(
     playbacks = playbacks_of(scenario, recordings or {})
     swarm = swarm_of(scenario, playbacks, chosen, cache)
     end_s = run(swarm)
-    write(folder, swarm, chosen, end_s)
+    write(folder, swarm, chosen, end_s, recordings)
     return finish(folder)
 
 
@@ -98,9 +98,12 @@ def run(swarm: Swarm) -> float:
     return swarm.agenda.now_s
 
 
-def write(folder: RunFolder, swarm: Swarm, seed: int, end_s: float) -> None:
-    """Write what happened, and what every robot knew at the end."""
+def write(
+    folder: RunFolder, swarm: Swarm, seed: int, end_s: float, recordings: Mapping[str, Path] | None = None
+) -> None:
+    """Write what happened, what every robot knew at the end, and where its images are."""
     scenario = swarm.scenario
+    given = {name: scenario.robot(name).recording or (recordings or {}).get(name) for name in swarm.stations}
     for name, station in swarm.stations.items():
         _write_robot(folder, swarm, name)
         if station.playback.truth is not None:
@@ -115,6 +118,7 @@ def write(folder: RunFolder, swarm: Swarm, seed: int, end_s: float) -> None:
             robots=list(swarm.stations),
             servers=scenario.servers(),
             driver="simulate",
+            recordings={name: str(path.resolve()) for name, path in given.items() if path is not None},
             radio=scenario.links().model_dump(mode="json", exclude_defaults=True),
             settings=scenario.settings(),
             expectations=scenario.expectations.limits(),
