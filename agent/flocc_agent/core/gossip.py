@@ -7,7 +7,7 @@ neighbour about what was sent, so a lost, doubled, late or reordered message can
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
@@ -89,8 +89,7 @@ class LogCopy:
         return not isinstance(record, KeyframeRecord) or record.index == self.keyframes
 
 
-@dataclass(frozen=True, slots=True)
-class NewRecord:
+class NewRecord(NamedTuple):
     """A record that this robot did not hold before."""
 
     log: LogId

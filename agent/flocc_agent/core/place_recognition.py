@@ -28,6 +28,7 @@ class _Descriptors:
 
     def __init__(self, dimension: int) -> None:
         self._rows = np.empty((CAPACITY_FIRST, dimension), dtype=np.float32)
+        self.dimension = dimension
         self.indices: list[int] = []
 
     @property
@@ -71,12 +72,14 @@ class PlaceRecognition:
             known = self._by_log[keyframe.log] = _Descriptors(len(descriptor))
         known.append(keyframe.index, descriptor)
         found = [c for log in self._partners(keyframe.log) for c in self._best(keyframe, descriptor, log)]
-        return sorted(found, key=lambda candidate: (-candidate.similarity, candidate.pair))
+        if len(found) > 1:
+            found.sort(key=lambda candidate: (-candidate.similarity, candidate.pair))
+        return found
 
     def _fits(self, log: LogId, descriptor: NDArray[np.float32]) -> bool:
         """One log has descriptors of one length; another length is another method."""
         known = self._by_log.get(log)
-        return known is None or known.matrix.shape[1] == len(descriptor)
+        return known is None or known.dimension == len(descriptor)
 
     def _partners(self, log: LogId) -> list[LogId]:
         if log == self._own:
@@ -85,10 +88,9 @@ class PlaceRecognition:
 
     def _best(self, keyframe: KeyframeId, descriptor: NDArray[np.float32], log: LogId) -> list[Candidate]:
         others = self._by_log[log]
-        matrix = others.matrix
-        if matrix.shape[1] != len(descriptor):
+        if others.dimension != len(descriptor):
             return []
-        similarities = matrix @ descriptor
+        similarities = others.matrix @ descriptor
         if self._parameters.best_matches == 1:
             best = [int(similarities.argmax())]
         else:

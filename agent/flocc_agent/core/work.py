@@ -141,7 +141,10 @@ class WorkTable:
 
     def on_keyframe(self, log: LogId) -> bool:
         """A log grew: its keyframes may have got the neighbour that they lacked. Whether one did."""
-        found = [self._find_odometry(self._by_pair[pair]) for pair in sorted(self._without_odometry.get(log, ()))]
+        waiting = self._without_odometry.get(log)
+        if waiting is None:
+            return False
+        found = [self._find_odometry(self._by_pair[pair]) for pair in sorted(waiting)]
         return any(found)
 
     def on_held(self, keyframe: KeyframeId) -> None:
