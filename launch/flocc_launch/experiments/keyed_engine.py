@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
 Float32 = NDArray[np.float32]
 
+SIZES_PX = {"full": (384, 512), "small": (384, 512), "tiny": (96, 128)}
+"""Height and width of the pictures; the official network's are 512 wide."""
+
 
 def keyed_engine(network: Literal["none", "tiny", "small", "full"], exact: bool = False) -> "Engine":
     """An engine on the best device that is there, in its best number format, or exactly in fp32.

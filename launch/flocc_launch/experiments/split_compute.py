@@ -25,6 +25,7 @@ from flocc_launch.experiments.experiment import (
     grid,
     judged,
 )
+from flocc_launch.experiments.keyed_engine import SIZES_PX, keyed_engine, keyed_pictures
 from flocc_launch.experiments.plots import COLOURS
 from flocc_launch.experiments.simulated import simulated
 from flocc_launch.experiments.statistics import grouped, middle
@@ -41,7 +42,6 @@ NetworkSize = Literal["none", "tiny", "small", "full"]
 
 COUNTS, TIMES = "counts", "times"
 LATENT_LOST = "a latent was lost"
-SIZES_PX = {"full": (384, 512), "small": (384, 512), "tiny": (96, 128)}
 SOURCE = "Sec. IV-D, split computation"
 
 
@@ -133,8 +133,6 @@ def measured_times(network: NetworkSize, rounds: int) -> Row:
     Raises:
         ExperimentError: torch is not installed.
     """
-    from flocc_launch.experiments.keyed_engine import keyed_engine, keyed_pictures
-
     engine, size = keyed_engine(network), SIZES_PX[network]
     pictures = keyed_pictures(size)
     first, second = (engine.place(latent[0].float().cpu().numpy(), size) for latent in engine.encode(pictures))
