@@ -163,6 +163,59 @@ def test_claims_of_what_nobody_has_do_not_fill_the_memory() -> None:
     assert reader.sizes()["ahead"] == (PARAMETERS.logs_max, PARAMETERS.logs_max)
 
 
+def library(own: LogId, counts: dict[LogId, int]) -> Gossip:
+    """A robot that holds copies of several logs."""
+    gossip = Gossip(own, PARAMETERS)
+    for log, count in counts.items():
+        gossip.on_records(log, batch(writer(log, count), log, 0), 0.0)
+    return gossip
+
+
+def answer_to(source: Gossip, effects: list[Effect]) -> Records:
+    (asked,) = [e.message for e in effects if isinstance(e, Unicast) and isinstance(e.message, RecordRequest)]
+    (given,) = [e.message for e in source.on_request(LogId("asker"), asked) if isinstance(e, Unicast)]
+    assert isinstance(given, Records)
+    return given
+
+
+def test_one_request_names_all_logs_that_a_peer_has_more_of_and_one_message_answers() -> None:
+    source, reader = library(R3, {R1: 4, R2: 6}), Gossip(LogId("r4"), PARAMETERS)
+    effects = reader.on_digests(R3, source.digests(), 0.0)
+    assert requests(effects) == [("r3", 0), ("r3", 0)]
+    reader.on_records(R3, answer_to(source, effects), 0.1)
+    assert reader.digests() == source.digests()
+
+
+def test_what_did_not_fit_an_answer_is_asked_for_at_once_until_all_is_here() -> None:
+    logs = {LogId(f"w{k}"): 60 for k in range(30)}
+    source, reader = library(R3, logs), Gossip(LogId("r4"), PARAMETERS)
+    effects, answers = reader.on_digests(R3, source.digests(), 0.0), 0
+    while requests(effects):
+        effects = reader.on_records(R3, answer_to(source, effects), 0.1)[1]
+        answers += 1
+    assert reader.digests() == source.digests()
+    assert 1 < answers < 30
+
+
+def test_requests_that_heartbeats_call_for_have_a_least_pause() -> None:
+    source, reader, asked = writer(R1, 1), Gossip(R2, PARAMETERS), []
+    for t in range(20):
+        source.append(record(len(source.logs[R1])))
+        effects = reader.on_digests(R1, source.digests(), t / 10)
+        if requests(effects):
+            asked.append(t / 10)
+            reader.on_records(R1, answer_to(source, effects), t / 10)
+    assert min(b - a for a, b in pairwise(asked)) >= PARAMETERS.request_period_s
+    assert len(asked) >= 4
+
+
+def test_what_a_peer_out_of_range_was_to_send_is_asked_of_another_one_without_waiting() -> None:
+    reader, digests = Gossip(R3, PARAMETERS), writer(R1, 5).digests()
+    reader.on_digests(R1, digests, 0.0)
+    reader.on_lost("r1")
+    assert requests(reader.on_digests(R2, digests, 0.5)) == [("r2", 0)]
+
+
 def test_records_cross_robots_that_never_meet() -> None:
     robots = Robots()
     for name in ("r1", "r2", "r3"):

@@ -167,3 +167,19 @@ def test_a_keyframe_that_could_not_be_encoded_is_no_partner_of_an_odometry_pair(
     pair = assembly.odometry_pair(keyframe("r1/2"))
     assert pair is not None
     assert pair[0] == keyframe("r1/0")
+
+
+def test_rounds_follow_each_other_quickly_while_groups_meet() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3", "r4"):
+        robots.add(name)
+    robots.separate("r1 r2", "r3 r4")
+    for name in robots.cores:
+        for k in range(3):
+            robots.capture(name, 2.0 * k, look=k)
+    robots.run(20.0)
+    robots.separate()
+    healed_s = robots.now_s
+    while set(robots.frames().values()) != {"map/r1"}:
+        robots.run(0.1)
+    assert robots.now_s - healed_s < 2.0
