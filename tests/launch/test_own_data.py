@@ -11,7 +11,7 @@ from flocc_agent.config import ConfigError
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
 from flocc_launch.data import recordings
-from flocc_launch.datasets.commands import convert, split
+from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.source import DatasetError
 from flocc_launch.shipped import own_data_sentence, read_scenario
@@ -196,6 +196,12 @@ def test_what_is_no_image_is_left_out_and_said(own: Path, tmp_path: Path) -> Non
     ):
         convert(own, tmp_path / "out")
     assert len(Recording.open(tmp_path / "out").frames) == COUNT - 1
+
+
+def test_info_counts_the_images_that_have_a_pose(own: Path) -> None:
+    lines = (own / "groundtruth.txt").read_text().splitlines(keepends=True)
+    (own / "groundtruth.txt").write_text("".join(lines[10:]))
+    assert dict(info_lines(info(own)))["images"].endswith(f"; {COUNT - 10} of them within the trajectory")
 
 
 def test_no_trajectory_is_said_with_the_names_that_it_could_have(own: Path, tmp_path: Path) -> None:

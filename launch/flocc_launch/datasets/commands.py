@@ -28,6 +28,7 @@ class Info:
         path: The folder.
         format: Which reader read it.
         images: How many.
+        posed: How many of them lie within the trajectory's time.
         from_s: Stamp of the first image.
         to_s: Stamp of the last image.
         camera: Intrinsics.
@@ -41,6 +42,7 @@ class Info:
     path: Path
     format: str
     images: int
+    posed: int | None
     from_s: float
     to_s: float
     camera: Camera | None
@@ -65,6 +67,7 @@ def info(path: Path, format_name: str | None = None) -> Info:
         path=path,
         format=source.format,
         images=len(source.images),
+        posed=_posed(source, travelled),
         from_s=source.images[0][0],
         to_s=source.images[-1][0],
         camera=source.lens.camera if source.lens else None,
@@ -73,6 +76,13 @@ def info(path: Path, format_name: str | None = None) -> Info:
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source)),
     )
+
+
+def _posed(source: Source, trajectory: Trajectory | None) -> int | None:
+    if trajectory is None:
+        return None
+    first_s, last_s = float(trajectory.stamps_s[0]), float(trajectory.stamps_s[-1])
+    return sum(first_s <= stamp_s <= last_s for stamp_s, _ in source.images)
 
 
 def _missing(source: Source) -> list[str]:
@@ -87,7 +97,8 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
     camera, poses = found.camera, {"odometry": found.odometry_poses, "ground truth": found.truth_poses}
     yield "path", str(found.path)
     yield "format", found.format
-    yield "images", f"{found.images}, from {found.from_s:.3f} s to {found.to_s:.3f} s"
+    covered = "" if found.posed in (None, found.images) else f"; {found.posed} of them within the trajectory"
+    yield "images", f"{found.images}, from {found.from_s:.3f} s to {found.to_s:.3f} s{covered}"
     if found.format == "bag":
         yield from (("topic", topic) for topic in found.topics)
     else:
@@ -105,6 +116,7 @@ def _bag_info(path: Path) -> Info:
             path=path,
             format="bag",
             images=sum(images),
+            posed=None,
             from_s=(bag.start_ns or 0) * 1e-9,
             to_s=(bag.end_ns or 0) * 1e-9,
             camera=None,
