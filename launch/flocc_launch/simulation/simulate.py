@@ -103,7 +103,7 @@ def write(
 ) -> None:
     """Write what happened, what every robot knew at the end, and where its images are."""
     scenario = swarm.scenario
-    given = {name: scenario.robot(name).recording or (recordings or {}).get(name) for name in swarm.stations}
+    given = {name: (recordings or {}).get(name) or scenario.robot(name).recording for name in swarm.stations}
     for name, station in swarm.stations.items():
         _write_robot(folder, swarm, name)
         if station.playback.truth is not None:
