@@ -158,7 +158,9 @@ def log_residuals(rr: Any, recording: Any, loaded: LoadedRun) -> None:
 def residuals(loaded: LoadedRun) -> dict[tuple[str, str], tuple[float, float]]:
     """Translation (m) and rotation (rad) that are left of each closure whose scale the last solution knows."""
     T_map_camera = {robot: corrected_cameras(loaded, robot) for robot in loaded.results}
-    closures = {(c.query, c.match): c for result in loaded.results.values() for c in result.closures if c.scale or c.metric}
+    closures = {
+        (c.query, c.match): c for result in loaded.results.values() for c in result.closures if c.scale or c.metric
+    }
     found = {}
     for ends, closure in closures.items():
         poses = [pose_of(T_map_camera, KeyframeId.parse(keyframe)) for keyframe in ends]
