@@ -61,7 +61,7 @@ class Bag:
         try:
             from rosbags.highlevel import AnyReader, AnyReaderError
         except ImportError:
-            raise DatasetError(f"{self.path}: bags are read with rosbags: pip install 'flocc[bags]'") from None
+            raise DatasetError(f"{self.path}: bags are read with rosbags: pip install rosbags") from None
         if not self.path.exists():
             raise DatasetError(f"{self.path}: does not exist")
         self._known_errors = (AnyReaderError, *_storage_errors(), OSError, EOFError, AssertionError)
