@@ -3,6 +3,7 @@
     python -m flocc_launch.simulation.measure loss
     python -m flocc_launch.simulation.measure gossip
     python -m flocc_launch.simulation.measure scale --robots 50 --minutes 10
+    python -m flocc_launch.simulation.measure twice --seeds 200
 
 Each prints one JSON object. Everything but `cpu_s` is the same wherever it runs.
 """
@@ -15,7 +16,11 @@ from typing import Any
 
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
 from flocc_launch.scenario import Scenario
+from flocc_launch.simulation.campaign import prepared
+from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_launch.simulation.invariants import Invariant, Watch
 from flocc_launch.simulation.liveness import not_everywhere
+from flocc_launch.simulation.safety import Once
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.swarm import Swarm
 
@@ -63,6 +68,17 @@ def scale(robots: int, minutes: float) -> dict[str, Any]:
     }
 
 
+def twice(seeds: int) -> dict[str, Any]:
+    """How many pairs of a campaign were registered again, though the robot that began with it lived on."""
+    pairs = again = 0
+    for seed in range(seeds):
+        swarm, once = prepared(drawn_scenario(seed)), Once(separated=True)
+        Watch(swarm, [Invariant("registered once", step=once.step)])
+        swarm.run_until(FAULTS_END_S + SETTLE_S)
+        pairs, again = pairs + once.pairs, again + once.again
+    return {"seeds": seeds, "pairs": pairs, "registered_twice": again}
+
+
 def _with_loss(ratio: float) -> dict[str, Any]:
     swarm = _swarm(_scenario(robots=4, loss_ratio=ratio), 57.0 + SETTLE_S)
     station = next(station for station in swarm.running() if station.core and station.core.election.leading)
@@ -105,15 +121,18 @@ def _scenario(
 def main() -> None:
     """Measure one thing and print it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("loss", "gossip", "scale"))
+    parser.add_argument("what", choices=("loss", "gossip", "scale", "twice"))
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seeds", type=int, default=200)
     given = parser.parse_args()
     match given.what:
         case "loss":
             measured = loss()
         case "gossip":
             measured = gossip()
+        case "twice":
+            measured = twice(given.seeds)
         case _:
             measured = scale(given.robots, given.minutes)
     sys.stdout.write(json.dumps({**measured, "command": " ".join(sys.argv[1:])}) + "\n")

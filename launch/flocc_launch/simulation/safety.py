@@ -108,9 +108,16 @@ class Once:
     A second registration is excused where the first robot died, or where robots were apart: the one that registers
     took the pair over while the owner in charge, or the first robot, was out of its hearing. It never is where the
     robot holds a record of the pair already.
+
+    Attributes:
+        separated: At times robots cannot hear each other.
+        pairs: Pairs that were registered.
+        again: Registrations of a pair that a robot still alive had begun with.
     """
 
     separated: bool = False
+    pairs: int = 0
+    again: int = 0
     _begun: dict[CandidatePair, list[_Registered]] = field(default_factory=lambda: defaultdict(list))
     _records: dict[CandidatePair, set[tuple[LogId, int]]] = field(default_factory=lambda: defaultdict(set))
     _changed_s: dict[tuple[str, str], float] = field(default_factory=dict)
@@ -136,6 +143,8 @@ class Once:
         if any(log in logs and number < len(logs[log]) for log, number in self._records[pair]):
             yield f"{name}, of which it holds a record"
         earlier = self._begun[pair]
+        self.pairs += not earlier
+        self.again += any(registered.by.life == registered.life for registered in earlier)
         for registered in earlier:
             if not self._excused(registered, step, pair):
                 yield f"{name} after {registered.by.name}"
