@@ -64,6 +64,11 @@ def test_every_link_leads_somewhere(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+def test_the_index_names_every_page() -> None:
+    named = set(LINK.findall((ROOT / "docs/README.md").read_text(encoding="utf-8")))
+    assert [page.name for page in ROOT.glob("docs/*.md") if page.name not in {*named, "README.md"}] == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_every_command_is_known_with_its_options(page: Path) -> None:
     complaints = {command: complaint(command) for command in parsed_commands(page)}
