@@ -17,10 +17,10 @@ EXIT_BAD_INPUT = 2
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar that takes (done, all)."""
+    """A progress bar that takes (done, all); nothing is shown where nobody looks at a terminal."""
     from rich.progress import Progress
 
-    with Progress(transient=True) as bar:
+    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
