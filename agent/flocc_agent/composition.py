@@ -103,6 +103,11 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
 
             synthetic = SyntheticPerception(config.synthetic, seed)
             return Perception(synthetic, synthetic, synthetic)
+        case "recorded":
+            from flocc_agent.perception.recorded import RecordedPerception
+
+            recorded = RecordedPerception(config.recorded)
+            return Perception(recorded, recorded, recorded)
         case "mast3r":
             from flocc_agent.perception.mast3r import build
 

@@ -225,6 +225,15 @@ class SyntheticConfig(Section):
     """Latents are padded to this size, to load links like another method's; MASt3R's are 1.5 MB."""
 
 
+class RecordedConfig(Section):
+    """Candidates and registrations that are looked up in a file, such as a benchmark's."""
+
+    file: Path | None = None
+    """The file of recorded registrations (`perception/recorded.py`)."""
+    scale: Literal["removed", "kept"] = "removed"
+    """removed: translations have length one and no scale is known; kept: they are in metres."""
+
+
 class Mast3rConfig(Section):
     """The paper's front end: CosPlace and MASt3R on checkpoints that the user provides."""
 
@@ -291,10 +300,12 @@ class Mast3rConfig(Section):
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
-    method: Literal["classical", "synthetic", "mast3r"] = "classical"
-    """classical: OpenCV, no weights; synthetic: ground truth plus noise; mast3r: CosPlace and MASt3R checkpoints."""
+    method: Literal["classical", "synthetic", "recorded", "mast3r"] = "classical"
+    """classical: OpenCV, no weights; synthetic: ground truth plus noise; recorded: looked up in a file; mast3r:
+    CosPlace and MASt3R checkpoints."""
     classical: ClassicalConfig = ClassicalConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
+    recorded: RecordedConfig = RecordedConfig()
     mast3r: Mast3rConfig = Mast3rConfig()
 
 

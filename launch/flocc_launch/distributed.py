@@ -5,22 +5,23 @@ everything else that an agent does, so that a graph from a file can be given to 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.block import iterate_block
-from flocc_agent.backend.rbcd import squared_residuals
+from flocc_agent.backend.block import isotropic_weights, iterate_block
+from flocc_agent.backend.rbcd import lifted, squared_residuals
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.blocks import BlockStep
 from flocc_agent.core.distributed_optimisation import DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock
 from flocc_agent.core.parameters import DistributedParameters, RoundParameters
-from flocc_agent.core.pose_graph import PoseGraph
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.geometry import between, inverse
 from flocc_launch.simulation.agenda import Agenda
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Message, Separators, decode, encode
 
 Float = NDArray[np.float64]
@@ -191,11 +192,36 @@ class _Air:
         self._wake(log)
 
 
+def cut_by_time(graph: PoseGraph, robots: int) -> PoseGraph:
+    """Give the keyframes of a graph of one robot, in equal parts, to several; odometry over a cut becomes a closure.
+
+    Raises:
+        ValueError: The graph is not one robot's, or has fewer keyframes than robots.
+    """
+    if len(graph.trajectories) != 1 or sum(map(len, graph.trajectories.values())) < robots:
+        raise ValueError(f"only one robot's graph of at least {robots} keyframes can be cut among {robots}")
+    (trajectory,) = graph.trajectories.values()
+    T, covariances = np.asarray(trajectory.T_odom_keyframe), np.asarray(trajectory.edge_covariances)
+    cuts = np.linspace(0, len(T), robots + 1).astype(int)
+    logs = [LogId(f"r{k + 1}") for k in range(robots)]
+
+    def owned(index: int) -> KeyframeId:
+        k = int(np.searchsorted(cuts, index, side="right") - 1)
+        return KeyframeId(logs[k], index - int(cuts[k]))
+
+    parts = {
+        log: Trajectory(T[a:b], covariances[a : b - 1]) for log, a, b in zip(logs, cuts[:-1], cuts[1:], strict=True)
+    }
+    over_cuts = [
+        LoopClosure(owned(b - 1), owned(b), between(T[b - 1], T[b]), covariance=covariances[b - 1], metric=True)
+        for b in cuts[1:-1].tolist()
+    ]
+    closures = [replace(c, query=owned(c.query.index), match=owned(c.match.index)) for c in graph.closures]
+    return PoseGraph(parts, [*closures, *over_cuts])
+
+
 def graph_cost(graph: PoseGraph, T_map_keyframe: Mapping[LogId, Float]) -> float:
     """SE-Sync's objective of metric graphs with isotropic covariances: every odometry edge and closure counts."""
-    from flocc_agent.backend.block import isotropic_weights
-    from flocc_agent.geometry import inverse
-
     total = 0.0
     for log, trajectory in graph.trajectories.items():
         T_odom = np.asarray(trajectory.T_odom_keyframe)
@@ -209,6 +235,4 @@ def graph_cost(graph: PoseGraph, T_map_keyframe: Mapping[LogId, Float]) -> float
 
 
 def _cost(T_i: Float, T_j: Float, T: Float, kappa: Float, tau: Float) -> float:
-    from flocc_agent.backend.rbcd import lifted
-
     return float(np.sum(squared_residuals(lifted(T_i, 3), lifted(T_j, 3), T, kappa, tau)))

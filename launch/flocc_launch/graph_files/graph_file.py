@@ -40,12 +40,16 @@ class GraphFile:
         truth_m: (N, 3) true position of every keyframe of each log, where the file has them.
         T_initial: (N, 4, 4) poses of each log in one frame, where the file has an initialisation.
         outliers: Indices of closures that the file labels as wrong.
+        T_truth: (N, 4, 4) true pose of every keyframe of each log, where the file has whole poses.
+        stamps_s: (N,) time of every keyframe of each log, counted from the file's first, where it has times.
     """
 
     graph: PoseGraph
     truth_m: Mapping[LogId, Float] = field(default_factory=dict)
     T_initial: Mapping[LogId, Float] = field(default_factory=dict)
     outliers: frozenset[int] = frozenset()
+    T_truth: Mapping[LogId, Float] = field(default_factory=dict)
+    stamps_s: Mapping[LogId, Float] = field(default_factory=dict)
 
     def without_outliers(self) -> "GraphFile":
         """The same file without the closures that it labels as wrong."""

@@ -61,8 +61,22 @@ def _graph_file(data: Mapping[str, Any], path: Path) -> GraphFile:
         raise GraphFileError(f"{path}: has no measurements of type {BETWEEN}")
     graph = pose_graph(distinct(measurements, add_up=False), str(path))
     outliers = frozenset(k for k, c in enumerate(graph.closures) if c.T_query_match_unscaled.tobytes() in wrong)
-    truth = {log: T[:, :3, 3] for log, T in _values(data.get("groundtruth", {}), graph).items()}
-    return GraphFile(graph, truth, _values(data.get("initialization", {}), graph), outliers)
+    T_truth = _values(data.get("groundtruth", {}), graph)
+    truth = {log: T[:, :3, 3] for log, T in T_truth.items()}
+    initial = _values(data.get("initialization", {}), graph)
+    return GraphFile(graph, truth, initial, outliers, T_truth, _stamps(data["measurements"], graph))
+
+
+def _stamps(measurements: Mapping[str, Any], graph: PoseGraph) -> dict[LogId, Float]:
+    """Times of each robot's entries, seconds from the first of all; only where every entry is one keyframe's."""
+    stamps: dict[LogId, list[int]] = {}
+    for robot, entries in measurements.items():
+        log = log_of(_number(robot) << INDEX_BITS)
+        found = [int(entry["stamp"]) for entry in entries if "stamp" in entry]
+        if len(found) == len(graph.trajectories.get(log, ())):
+            stamps[log] = found
+    first = min((own[0] for own in stamps.values()), default=0)
+    return {log: np.array([(stamp - first) * 1e-9 for stamp in own]) for log, own in stamps.items()}
 
 
 def _measurement(item: Mapping[str, Any]) -> Measurement:

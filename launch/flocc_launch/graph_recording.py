@@ -1,0 +1,96 @@
+"""A pose graph from a file as recordings that agents play: recorded odometry, and closures to be looked up.
+
+Every keyframe becomes a frame whose picture holds its name; closures between robots become the file that `recorded`
+perception reads. So the whole runtime runs on a benchmark that has no images.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flocc_agent.core.corrections import upper_triangle
+from flocc_agent.core.pose_graph import LoopClosure
+from flocc_agent.geometry import tq_from_pose
+from flocc_agent.perception.recorded import FORMAT, name_image
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_launch.datasets.writer import RecordingWriter
+from flocc_launch.graph_files.graph_file import GraphFile, GraphFileError
+
+REGISTRATIONS = "registrations.json"
+STEP_S = 1.0
+"""Time between keyframes where the file has no times."""
+
+
+@dataclass(frozen=True, slots=True)
+class GraphRecordings:
+    """Where a graph's recordings are.
+
+    Attributes:
+        robots: Folder of each robot's recording.
+        registrations: The file for `perception.recorded.file`.
+    """
+
+    robots: dict[str, Path]
+    registrations: Path
+
+
+def write_recordings(file: GraphFile, out: Path, source: str) -> GraphRecordings:
+    """Write a recording per robot and the file of registrations; what is there already is taken up.
+
+    Args:
+        file: The graph; closures within a robot are left out, agents register pairs of robots only.
+        out: Folder; made where it is missing.
+        source: What the recordings are of, one line.
+
+    Raises:
+        GraphFileError: The file has no whole ground truth of some robot.
+    """
+    robots = {}
+    for log in sorted(file.graph.trajectories):
+        if log not in file.T_truth:
+            raise GraphFileError(f"{source}: has no ground truth of robot {log}")
+        robots[log.robot] = _write_robot(file, log.robot, out / log.robot, source)
+    between = [c for c in file.graph.closures if c.query.log != c.match.log]
+    names = [f"{log.robot}/{k}" for log, t in sorted(file.graph.trajectories.items()) for k in range(len(t))]
+    registrations = out / REGISTRATIONS
+    entries = {"format": FORMAT, "keyframes": names, "pairs": [_entry(c) for c in _once(between)]}
+    registrations.write_text(json.dumps(entries), encoding="utf-8")
+    return GraphRecordings(robots, registrations)
+
+
+def _write_robot(file: GraphFile, robot: str, path: Path, source: str) -> Path:
+    import cv2
+
+    log = next(log for log in file.graph.trajectories if log.robot == robot)
+    T_odom = np.asarray(file.graph.trajectories[log].T_odom_keyframe)
+    stamps_s = file.stamps_s.get(log, np.arange(len(T_odom), dtype=float) * STEP_S)
+    with RecordingWriter(path, source) as writer:
+        for k in range(writer.count, len(T_odom)):
+            image = name_image(f"{robot}/{k}")
+            _, png = cv2.imencode(".png", image.pixels[:, :, ::-1])
+            writer.add(float(stamps_s[k]), png.tobytes(), ".png")
+            if k == 0:
+                writer.write_camera(image.camera, np.eye(4))
+                writer.write_trajectories(Trajectory(stamps_s, T_odom), Trajectory(stamps_s, file.T_truth[log]))
+    return path
+
+
+def _once(closures: Sequence[LoopClosure]) -> list[LoopClosure]:
+    """Of several closures of one pair the first: a pair is registered once."""
+    found: dict[frozenset[object], LoopClosure] = {}
+    for closure in closures:
+        found.setdefault(frozenset((closure.query, closure.match)), closure)
+    return list(found.values())
+
+
+def _entry(closure: LoopClosure) -> dict[str, object]:
+    covariance = closure.covariance
+    return {
+        "query": f"{closure.query.log.robot}/{closure.query.index}",
+        "match": f"{closure.match.log.robot}/{closure.match.index}",
+        "T_query_match": [float(v) for v in tq_from_pose(closure.T_query_match_unscaled)],
+        "covariance": None if covariance is None else upper_triangle(covariance).numpy().tolist(),
+    }
