@@ -173,12 +173,9 @@ def evaluate(
 
 
 def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
-    from flocc_launch.shipped import own_data_sentence, read_scenario
+    from flocc_launch.shipped import read_scenario
 
-    read = read_scenario(scenario, changes, agents)
-    if (sentence := own_data_sentence(scenario, read)) is not None:
-        typer.echo(sentence)
-    return read
+    return read_scenario(scenario, changes, agents, typer.echo)
 
 
 def _changes(

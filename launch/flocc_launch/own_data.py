@@ -1,17 +1,17 @@
 """A folder or a bag of the user's own in place of a scenario file: which robots are in it, and how it is run.
 
-One data set is cut by time into robots; a folder of several is a robot each.
+One data set is cut by time into robots; a folder of several is a robot each. What was chosen is said in a sentence.
 """
 
 import re
 import statistics
+from dataclasses import dataclass
 from pathlib import Path
 
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.commands import needed_drift
 from flocc_launch.datasets.detect import detect_format, is_dataset, read_source
-from flocc_launch.datasets.source import DatasetError
-from flocc_launch.scenario import Scenario
+from flocc_launch.datasets.source import DatasetError, Source
 
 ROBOTS = 3
 ROBOTS_MAX = 16
@@ -26,38 +26,83 @@ def is_own_data(path: Path) -> bool:
     return path.is_dir() or is_bag(path)
 
 
-def scenario_fields(path: Path, agents: int | None = None) -> dict[str, object]:
-    """Fields of a scenario that runs a data set, a bag, or a folder of one per robot.
+@dataclass(frozen=True, slots=True)
+class OwnData:
+    """What was found.
 
-    Args:
-        path: Where the data is.
-        agents: Into how many robots one data set is cut; None means three.
-
-    Raises:
-        DatasetError: There is no data set, or one of them cannot be used.
+    Attributes:
+        path: Where the user said that the data is.
+        folders: One data set or bag, or one of each robot by its name.
+        sources: Those of `folders` that are no bags, read.
+        parts: Into how many robots one data set is cut; 1 where every folder is a robot.
     """
-    fields: dict[str, object] = {"name": robot_name(path)}
-    if is_bag(path) or is_dataset(path):
-        fields["dataset"] = {"source": str(path.resolve()), "robots": agents or ROBOTS}
-        return {**fields, **_keyframes([path], agents or ROBOTS)}
-    found = _robots(path)
-    if agents is not None and agents != len(found):
-        raise DatasetError(f"{path}: holds {len(found)} robots ({', '.join(found)}), not {agents}")
-    fields["robots"] = {name: {"recording": str(folder.resolve())} for name, folder in found.items()}
-    return {**fields, **_keyframes(list(found.values()), 1)}
 
+    path: Path
+    folders: dict[str, Path]
+    sources: dict[str, Source]
+    parts: int
 
-def sentence(scenario: Scenario) -> str:
-    """What was made of the data, for whoever gave it without a scenario."""
-    dataset = scenario.dataset
-    if dataset is not None:
-        taken, paths = f"{dataset.source} cut by time into {dataset.robots} robots", [dataset.source]
-    else:
-        taken = f"{len(scenario.robots)} robots: {', '.join(scenario.robots)}"
-        paths = [robot.recording for robot in scenario.robots.values() if robot.recording is not None]
-    made = any(not is_bag(path) and needed_drift(read_source(path)) is not None for path in paths)
-    odometry = "made of ground truth, with seeded drift" if made else "the data's own"
-    return f"data: {taken}; a keyframe every {scenario.keyframes.distance_m:g} m; odometry is {odometry}"
+    @classmethod
+    def open(cls, path: Path, agents: int | None = None) -> "OwnData":
+        """Look at a data set, a bag, or a folder of one per robot.
+
+        Args:
+            path: Where the data is.
+            agents: Into how many robots one data set is cut; None means three.
+
+        Raises:
+            DatasetError: There is no data set, one of them cannot be used, or there are not `agents` of them.
+        """
+        single = is_bag(path) or is_dataset(path)
+        folders = {robot_name(path): path} if single else _robots(path)
+        if not single and agents not in (None, len(folders)):
+            raise DatasetError(f"{path}: holds {len(folders)} robots ({', '.join(folders)}), not {agents}")
+        sources = {name: read_source(folder) for name, folder in folders.items() if not is_bag(folder)}
+        return cls(path, folders, sources, (agents or ROBOTS) if single else 1)
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one data set, to be cut."""
+        return self.path in self.folders.values()
+
+    def fields(self) -> dict[str, object]:
+        """Fields of a scenario that runs it."""
+        fields: dict[str, object] = {"name": robot_name(self.path)}
+        if self.single:
+            fields["dataset"] = {"source": str(self.path.resolve()), "robots": self.parts}
+        else:
+            starts_s = self._starts_s()
+            fields["robots"] = {
+                name: {"recording": str(folder.resolve()), "start_s": starts_s.get(name, 0.0)}
+                for name, folder in self.folders.items()
+            }
+        near_m = self._near_m()
+        near = {} if near_m is None else {"keyframes": {"distance_m": near_m, "rotation_rad": ROTATION_NEAR_RAD}}
+        return {**fields, **near}
+
+    def sentence(self) -> str:
+        """What was made of it, for whoever gave it without a scenario."""
+        taken = f"cut by time into {self.parts} robots" if self.single else f"robots {', '.join(self.folders)}"
+        near_m = self._near_m()
+        spacing = "" if near_m is None else f"; a keyframe every {near_m:g} m, because robots move little"
+        made = [name for name, source in self.sources.items() if needed_drift(source) is not None]
+        drift = "; odometry is made of ground truth, with seeded drift" if made else ""
+        return f"data: {self.path}, {taken}{spacing}{drift}"
+
+    def _near_m(self) -> float | None:
+        """Distance of keyframes where robots move so little that the usual one gives too few; by the median path."""
+        moved = [source.odometry or source.truth for source in self.sources.values()]
+        lengths_m = [trajectory.length_m() / self.parts for trajectory in moved if trajectory is not None]
+        distance_m = statistics.median(lengths_m) / KEYFRAMES_WANTED if lengths_m else DISTANCE_MAX_M
+        return max(round(distance_m, 3), DISTANCE_MIN_M) if distance_m < DISTANCE_MAX_M else None
+
+    def _starts_s(self) -> dict[str, float]:
+        """When each robot begins, where all recorded at the same time; recordings of different times begin together."""
+        first_s = {name: source.images[0][0] for name, source in self.sources.items()}
+        last_s = [source.images[-1][0] for source in self.sources.values()]
+        together = bool(first_s) and max(first_s.values()) < min(last_s)
+        zero_s = min(first_s.values(), default=0.0)
+        return {name: round(stamp_s - zero_s, 3) for name, stamp_s in first_s.items()} if together else {}
 
 
 def robot_name(path: Path) -> str:
@@ -69,7 +114,7 @@ def robot_name(path: Path) -> str:
 def _robots(path: Path) -> dict[str, Path]:
     """Data sets and bags in a folder, by the robot's name."""
     entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
-    folders = [entry for entry in entries if is_bag(entry) or (entry.is_dir() and is_dataset(entry))]
+    folders = [entry for entry in entries if is_bag(entry) or is_dataset(entry)]
     if not folders:
         detect_format(path)  # says what a data set is
     if len(folders) > ROBOTS_MAX:
@@ -81,15 +126,3 @@ def _robots(path: Path) -> dict[str, Path]:
             raise DatasetError(f"{folder}: its robot would be called {name}, as that of {found[name]}")
         found[name] = folder
     return found
-
-
-def _keyframes(paths: list[Path], parts: int) -> dict[str, object]:
-    """Keyframes closer together where robots move little: about `KEYFRAMES_WANTED` by distance on the median path."""
-    sources = [read_source(path) for path in paths if not is_bag(path)]
-    moved = [source.odometry or source.truth for source in sources]
-    lengths_m = [trajectory.length_m() / parts for trajectory in moved if trajectory is not None]
-    distance_m = statistics.median(lengths_m) / KEYFRAMES_WANTED if lengths_m else DISTANCE_MAX_M
-    if distance_m >= DISTANCE_MAX_M:
-        return {}
-    near_m = max(round(distance_m, 3), DISTANCE_MIN_M)
-    return {"keyframes": {"distance_m": near_m, "rotation_rad": ROTATION_NEAR_RAD}}

@@ -14,7 +14,7 @@ from flocc_launch.data import recordings
 from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.source import DatasetError
-from flocc_launch.shipped import own_data_sentence, read_scenario
+from flocc_launch.shipped import read_scenario
 
 COUNT = IMAGES * PASSES
 
@@ -50,9 +50,12 @@ def test_one_data_set_is_cut_into_robots(own: Path) -> None:
 
 
 def test_keyframes_are_closer_where_robots_move_little(own: Path) -> None:
-    keyframes = read_scenario(str(own), {}).keyframes
+    told: list[str] = []
+    keyframes = read_scenario(str(own), {}, tell=told.append).keyframes
     assert keyframes.distance_m == pytest.approx(PASSES * 3.0 / 3 / 25, abs=0.01)
-    assert "a keyframe every 0.12" in str(own_data_sentence(str(own), read_scenario(str(own), {})))
+    assert len(told) == 1
+    assert "cut by time into 3 robots; a keyframe every 0.12 m, because" in told[0]
+    assert told[0].endswith("odometry is made of ground truth, with seeded drift")
 
 
 def test_a_folder_of_data_sets_is_a_robot_each(own: Path, tmp_path: Path) -> None:
@@ -64,6 +67,16 @@ def test_a_folder_of_data_sets_is_a_robot_each(own: Path, tmp_path: Path) -> Non
     assert scenario.names() == ["husky", "robot-a"]
     frames = {name: len(Recording.open(path).frames) for name, path in recordings(scenario).items()}
     assert frames == {"husky": 4, "robot-a": COUNT}
+
+
+def test_robots_that_recorded_together_keep_their_distance_in_time(own: Path, tmp_path: Path) -> None:
+    team = tmp_path / "team"
+    for name in ("early", "late"):
+        shutil.copytree(own, team / name)
+    for file in sorted((team / "late" / "images").iterdir())[:8]:
+        file.unlink()
+    starts_s = {name: robot.start_s for name, robot in read_scenario(str(team), {}).robots.items()}
+    assert starts_s == {"early": 0.0, "late": 2.0}
 
 
 def test_a_bag_is_cut_into_robots(own: Path, tmp_path: Path) -> None:
