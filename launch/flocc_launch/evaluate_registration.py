@@ -207,9 +207,14 @@ def best_matches(pairs: Sequence[Pair], scene: Scene) -> set[tuple[int, int]]:
 
 def recall_at_one(pairs: Sequence[Pair], scene: Scene) -> float | None:
     """Share of best matches at one place, of the views and robots where that robot was at the view's place."""
+    return _ratio(*recalled(pairs, scene))
+
+
+def recalled(pairs: Sequence[Pair], scene: Scene) -> tuple[int, int]:
+    """Numerator and denominator of `recall_at_one`."""
     possible = {key for key, pair in _by_view_and_robot(pairs, scene) if pair.same_place}
     best = best_by_view(pairs, scene)
-    return _ratio(sum(best[key].same_place for key in possible), len(possible))
+    return sum(best[key].same_place for key in possible), len(possible)
 
 
 def chosen(pairs: Sequence[Pair], best: set[tuple[int, int]]) -> list[Pair]:

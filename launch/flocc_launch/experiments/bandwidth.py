@@ -51,8 +51,8 @@ class BandwidthSettings(Settings):
     """Seeds of walks without images, for synthetic descriptors."""
     perception: PerceptionConfig = PerceptionConfig()
     """Whose descriptors: the [perception] of a configuration file. Keypoints are the classical back-end's."""
-    pairs: int = Field(200, ge=2)
-    """Pairs of each scene that are registered with every form of keypoints."""
+    pairs: int = Field(100, ge=2)
+    """Pairs of every two robots that are registered with every form of keypoints."""
     network: Literal["tiny", "small", "full"] = "small"
     """MASt3R of keyed weights whose latents are reduced."""
     pictures: int = Field(3, ge=2, le=32)
@@ -144,6 +144,7 @@ def _line(part: str, on: str, name: str, measure_name: str, group: Sequence[Row]
         "form": name,
         "bytes": size,
         "bytes_ratio": size / whole_size if size is not None and whole_size else None,
+        "samples": next((n for name in ("pairs", "views", "closures") if (n := middle(group, name)) is not None), None),
         "measure": measure_name,
         "value": middle(group, measure_name),
         "unreduced": middle(unreduced, measure_name),
@@ -156,8 +157,8 @@ def notes(rows: Sequence[Row]) -> list[str]:
     said = {
         "bytes": "bytes: synthetic perception on walks of three robots, latents padded to each method's size; bytes "
         "that all robots sent, per accepted closure between robots.",
-        "descriptors": "descriptors: int8 is what travels. The basis of the PCA is learned on the first robot's views, "
-        "recall is that between the others.",
+        "descriptors": "descriptors: int8 is what travels. The basis of the PCA between two robots is learned on the "
+        "views of a third one.",
         "keypoints": "keypoints: registrations of pairs at one place, right within 10 degrees and the scene's limit; "
         "only the match's latent is reduced. 'half' and 'quarter' keep the strongest features.",
         "latents": "latents: keyed random weights. They show what reductions do to this decoder's numbers; they cannot "

@@ -1,21 +1,40 @@
 """The four measurements of the bandwidth experiment: each gives forms with their bytes and what is measured on them."""
 
-from collections.abc import Sequence
-from itertools import pairwise
-from typing import Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from flocc_agent.config import PerceptionConfig, SyntheticConfig
-from flocc_launch.evaluate_registration import Outcome, cross_pairs, odometry_pair, outcome, recall_at_one
+from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_launch.evaluate_registration import (
+    Outcome,
+    Pair,
+    cross_pairs,
+    is_same_place,
+    odometry_pair,
+    outcome,
+    recalled,
+)
 from flocc_launch.experiments.experiment import Row
 from flocc_launch.experiments.keyed_engine import SIZES_PX, keyed_engine, keyed_pictures
 from flocc_launch.experiments.reductions import Basis, keypoint_forms, latent_forms, reduced_descriptors
-from flocc_launch.experiments.registration_data import RegistrationData, RegistrationSettings, distance_m, drawn_pairs
+from flocc_launch.experiments.registration_data import (
+    Encoded,
+    RegistrationData,
+    RegistrationSettings,
+    distance_m,
+    near_pairs,
+)
 from flocc_launch.experiments.simulated import simulated
 from flocc_launch.experiments.statistics import middle
 from flocc_launch.registration_scenes import Scene
 from flocc_launch.scenario import Scenario, TracksScenario
+
+if TYPE_CHECKING:
+    from flocc_agent.perception.classical.features import Features
 
 KINDS = ("latent", "records", "correction", "heartbeat", "candidates")
 """Kinds of messages that are told apart; the others together are next to nothing."""
@@ -47,59 +66,93 @@ def bytes_by_kind(latent_bytes: int, length_m: float, seed: int) -> list[Row]:
     return [{**row, "closures": gained} for row in [whole, *kinds]]
 
 
-def learning_robot(scene: Scene) -> str:
-    """The robot on whose views bases are learned, and which is not compared."""
-    return min(view.robot for view in scene.views)
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """Two robots that are compared, and a third one on whose views bases are learned.
+
+    Attributes:
+        views: Numbers of the two robots' views in the scene.
+        learned: Numbers of the third robot's views.
+    """
+
+    views: tuple[int, ...]
+    learned: tuple[int, ...]
 
 
-def compared(scene: Scene) -> list[int]:
-    """Numbers of the views that are compared."""
-    return [k for k, view in enumerate(scene.views) if view.robot != learning_robot(scene)]
+def meetings(scene: Scene) -> list[Meeting]:
+    """Every pair of robots of a scene with many views."""
+    by_robot: dict[str, list[int]] = {}
+    for k, view in enumerate(scene.views):
+        by_robot.setdefault(view.robot, []).append(k)
+    robots = sorted(robot for robot, views in by_robot.items() if len(views) >= VIEWS_MIN)
+    found = []
+    for a, b in combinations(robots, 2):
+        others = [robot for robot in robots if robot not in (a, b)]
+        if others:
+            found.append(Meeting((*by_robot[a], *by_robot[b]), tuple(by_robot[others[0]])))
+    return found
 
 
 def descriptor_forms(data: RegistrationData, name: str) -> list[Row]:
-    """Recall@1 between the robots on whose descriptors nothing was learned."""
+    """Recall@1 between robots on whose descriptors nothing was learned."""
     scene, encoded = data.scenes[name], data.encoded[name]
     described = np.array([encoded.descriptor(k) for k in range(len(scene.views))])
-    kept = compared(scene)
-    basis = Basis.of(described[[k for k in range(len(scene.views)) if k not in set(kept)]])
-    part = Scene(name, tuple(scene.views[k] for k in kept), *limits(scene))
-    rows = []
-    for form_name, (size, values) in reduced_descriptors(described[kept], basis).items():
-        recall = recall_at_one(cross_pairs(part, values.astype(np.float32)), part)
-        rows.append(form(form_name, size, recall_at_1=recall))
-    return rows
-
-
-def limits(scene: Scene) -> tuple[float, float, float]:
-    """A scene's limits, to make a part of it."""
-    return scene.place_distance_m, scene.place_angle_rad, scene.position_error_max_m
+    sizes: dict[str, int] = {}
+    found: dict[str, list[tuple[int, int]]] = {}
+    for meeting in meetings(scene):
+        part = replace(scene, views=tuple(scene.views[k] for k in meeting.views))
+        forms = reduced_descriptors(described[list(meeting.views)], Basis.of(described[list(meeting.learned)]))
+        for form_name, (size, values) in forms.items():
+            sizes[form_name] = size
+            found.setdefault(form_name, []).append(recalled(cross_pairs(part, values.astype(np.float32)), part))
+    counted = {form_name: np.sum(hits, axis=0) for form_name, hits in found.items()}
+    return [
+        form(form_name, sizes[form_name], recall_at_1=float(right / possible), views=int(possible))
+        for form_name, (right, possible) in counted.items()
+        if possible
+    ]
 
 
 def keypoint_accuracy(data: RegistrationData, name: str, pairs: int, seed: int) -> list[Row]:
     """Right registrations of drawn pairs at one place, with every form of the match's latent."""
+    scene, encoded = data.scenes[name], data.encoded[name]
+    near = near_pairs(scene, distance_m(RegistrationSettings(), scene))
+    outcomes: dict[str, list[Outcome]] = {}
+    sizes: dict[str, list[int]] = {}
+    for meeting in meetings(scene):
+        forms = keypoint_forms(_descriptor_basis(encoded, meeting.learned))
+        places = [(i, j) for i, j in near if {i, j} <= set(meeting.views) and is_same_place(scene, i, j)]
+        rng = np.random.default_rng(seed)
+        for k in sorted(rng.choice(len(places), min(pairs, len(places)), replace=False)):
+            pair = encoded.pair(*places[k])
+            for form_name, reduce in forms.items():
+                size, result = _registered(data, scene, encoded, pair, reduce)
+                outcomes.setdefault(form_name, []).append(outcome(scene, pair, result))
+                sizes.setdefault(form_name, []).append(size)
+    return [form(each, float(np.mean(sizes[each])), **accuracy(found)) for each, found in outcomes.items()]
+
+
+def _descriptor_basis(encoded: Encoded, views: Sequence[int]) -> Basis:
+    """Principal directions of local descriptors."""
+    from flocc_agent.perception.classical.encoder import decode_features
+
+    samples = np.concatenate([decode_features(encoded[k]).descriptors for k in views])
+    return Basis.of(samples[:: max(1, len(samples) // DESCRIPTORS_LEARNED)])
+
+
+def _registered(
+    data: RegistrationData,
+    scene: Scene,
+    encoded: Encoded,
+    pair: Pair,
+    reduce: "Callable[[Features], tuple[int, Features]]",
+) -> tuple[int, Registration | RegistrationFailed]:
+    """Register a pair of which the match's latent travelled in another form; gives its bytes too."""
     from flocc_agent.perception.classical.encoder import decode_features, encode_features
 
-    scene, encoded = data.scenes[name], data.encoded[name]
-    kept = set(compared(scene))
-    learned = [decode_features(encoded[k]).descriptors for k in range(len(scene.views)) if k not in kept]
-    samples = np.concatenate(learned)
-    basis = Basis.of(samples[:: max(1, len(samples) // DESCRIPTORS_LEARNED)])
-    near = drawn_pairs(scene, distance_m(RegistrationSettings(), scene), len(scene.views) ** 2, seed)
-    places = [pair for pair in (encoded.pair(i, j) for i, j in near if {i, j} <= kept) if pair.same_place]
-    rng = np.random.default_rng(seed)
-    drawn = [places[k] for k in sorted(rng.choice(len(places), min(pairs, len(places)), replace=False))]
-    rows = []
-    for form_name, reduce in keypoint_forms(basis).items():
-        sizes, outcomes = [], []
-        for pair in drawn:
-            size, features = reduce(decode_features(encoded[pair.match]))
-            match = encode_features(features, {})
-            odometry = odometry_pair(scene, pair.query, encoded)
-            outcomes.append(outcome(scene, pair, data.skills.register(encoded[pair.query], match, odometry)))
-            sizes.append(size)
-        rows.append(form(form_name, float(np.mean(sizes)), **accuracy(outcomes)))
-    return rows
+    size, features = reduce(decode_features(encoded[pair.match]))
+    odometry = odometry_pair(scene, pair.query, encoded)
+    return size, data.skills.register(encoded[pair.query], encode_features(features, {}), odometry)
 
 
 def accuracy(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
@@ -142,6 +195,5 @@ def latent_accuracy(network: Literal["tiny", "small", "full"], pictures: int) ->
 
 
 def usable(scene: Scene) -> bool:
-    """Whether a scene is passes of at least three robots: one to learn from, two to compare."""
-    robots = [view.robot for view in scene.views]
-    return sum(robots.count(robot) >= VIEWS_MIN for robot in sorted(set(robots))) >= 3
+    """Whether a scene has robots to compare and one to learn from."""
+    return bool(meetings(scene))

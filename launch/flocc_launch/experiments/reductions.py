@@ -36,8 +36,8 @@ class Basis:
         """Learn from (N, D) samples."""
         data = np.asarray(samples, dtype=np.float64)
         mean = data.mean(axis=0)
-        _, _, directions = np.linalg.svd(data - mean, full_matrices=True)
-        return cls(mean, directions)
+        _, vectors = np.linalg.eigh(np.cov(data, rowvar=False))
+        return cls(mean, np.asarray(vectors.T[::-1]))
 
     def reduce(self, values: NDArray[np.generic], size: int) -> Float:
         """Coordinates (N, size) of (N, D) values."""
