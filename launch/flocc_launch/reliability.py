@@ -260,13 +260,13 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
 
 
 def crowd(robots: int, duration_s: float) -> Scenario:
-    """Many robots in one town, all in range of each other, two keyframes per second each: 1 m/s, one every 0.5 m."""
+    """Many robots in one town, all in range of each other, two keyframes per second each: 1 m/s, one every half metre."""
     return Scenario(
         name="crowd",
         tracks=TracksScenario(
             robots=robots, seed=3, area_m=60.0, speed_m_s=1.0, length_m=CROWD_START_S + duration_s + 30.0
         ),
-        keyframes=KeyframeConfig(distance_m=0.5, rotation_rad=math.pi),
+        keyframes=KeyframeConfig(distance_m=0.45, rotation_rad=math.pi),
         perception=PerceptionConfig(method="synthetic"),
         core=CoreParameters(place_recognition=PlaceRecognitionParameters(similarity_threshold=0.6)),
     )

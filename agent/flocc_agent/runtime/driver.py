@@ -72,6 +72,9 @@ logger = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 
 INBOX_MAX = 8192
+COPIES_MAX = 256
+COPIES_PERIOD_S = 0.5
+"""Copies of others' records are written so many or so long at a time."""
 REFUSED_MAX = 512
 """Refusals that are counted apart, by peer and reason."""
 IMAGES_MAX = 8
@@ -162,6 +165,8 @@ class Driver:
         self._last_graph: PoseGraph | None = None
         self._began_s = clock_s()
         self._bytes_due_s = self._began_s + BYTES_PERIOD_S
+        self._copied: list[Persist] = []
+        self._copies_due_s = self._began_s
         self._account_due_s = self._began_s + ACCOUNT_PERIOD_S
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
@@ -314,6 +319,7 @@ class Driver:
                 self._workers.stages.observe("inbox_wait", now - put_s)
                 await self._carry_out(self.robot.handle(event, now))
             self._count_bytes()
+            await self._write_copies()
             await self._sleep()
 
     async def _sleep(self) -> None:
@@ -322,7 +328,8 @@ class Driver:
             await asyncio.sleep(0)
             return
         self._wake.clear()
-        pause_s = min(self.robot.deadline(), self._bytes_due_s) - self._clock_s()
+        copies_due_s = self._copies_due_s if self._copied else float("inf")
+        pause_s = min(self.robot.deadline(), self._bytes_due_s, copies_due_s) - self._clock_s()
         try:
             await asyncio.wait_for(self._wake.wait(), max(pause_s, 0.0))
         except TimeoutError:
@@ -332,6 +339,7 @@ class Driver:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.to_thread(write, self._store, self._copied)
         self._count_bytes(last=True)
         await self._transport.close()
         await self._workers.close()
@@ -387,6 +395,9 @@ class Driver:
         written: list[Persist] = []
         for effect in effects:
             match effect:
+                case PersistRecord(log=log) if log != self.robot.log:
+                    self._copied.append(effect)
+                    continue
                 case PersistRecord() | PersistTerm() | PersistCorrection():
                     written.append(effect)
                     continue
@@ -417,8 +428,20 @@ class Driver:
     async def _write(self, written: list[Persist]) -> None:
         """Bring what is to be kept onto the disk before anything is sent that depends on it."""
         if written:
-            batch = written.copy()
+            batch = [*self._copied, *written]
             written.clear()
+            self._copied.clear()
+            await asyncio.to_thread(write, self._store, batch)
+
+    async def _write_copies(self) -> None:
+        """Bring copies of others' records onto the disk, many at a time: what a crash loses of them comes again."""
+        now = self._clock_s()
+        if now < self._copies_due_s and len(self._copied) < COPIES_MAX:
+            return
+        self._copies_due_s = now + COPIES_PERIOD_S
+        if self._copied:
+            batch = self._copied.copy()
+            self._copied.clear()
             await asyncio.to_thread(write, self._store, batch)
 
     def _do(self, effect: Effect) -> None:
