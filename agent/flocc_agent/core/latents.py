@@ -18,8 +18,6 @@ PAUSED_MAX = 1024
 LOST_S = 30.0
 """A lost latent is told for this long after somebody wanted it last."""
 WANTS_TURN_S = 10.0
-RELIEF_LOAD_MIN, RELIEF_LOAD_RATIO = 8, 4
-"""From how many waiting registrations on, and how many times those of another robot, the other one takes new pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +84,6 @@ class Reach:
                 del self._holders[keyframe]
         for keyframe in after:
             insort(self._holders.setdefault(keyframe, []), name)
-
-    def is_idler(self, name: str, compute_class: int, load: int) -> bool:
-        """Whether a robot in range is as strong and has far fewer registrations waiting than a robot with this load."""
-        peer = self._peers.get(name)
-        if peer is None or peer.compute_class != compute_class:
-            return False
-        return load >= RELIEF_LOAD_MIN and peer.load * RELIEF_LOAD_RATIO < load
 
     def stronger(self, compute_class: int) -> str | None:
         """The neighbour of the highest compute class above this one, the least loaded of several."""

@@ -1,8 +1,7 @@
 """Loop closing: candidate pairs to registrations, each by one robot (Sec. III-B).
 
 Who registers a pair: one of its two owners, by a checksum of the pair, so that both agree without talking and the
-work is halved between them. A robot that has a neighbour of a higher compute class hands its pairs to it, one whose
-queue has grown long hands new pairs to the other owner, if that one's is short. Whoever
+work is halved between them. A robot that has a neighbour of a higher compute class hands its pairs to it. Whoever
 found a pair that is another's to register tells it so until the record shows. When the other is out of range for
 `takeover_s`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
 exists no more is rejected, by a record like any other.
@@ -233,20 +232,11 @@ class LoopClosing:
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
             self._offer(candidate, Recipient(owner.robot, owner), now)
             return
-        helper = self._helper(candidate.pair)
-        if helper is not None:
-            self._offer(candidate, Recipient(helper, None), now)
-            return
-        self._add(candidate)
-
-    def _helper(self, pair: CandidatePair) -> str | None:
-        """Who registers an own pair instead: a stronger robot, or the other owner when it has less to do."""
         stronger = self._reach.stronger(self._compute_class)
         if stronger is not None:
-            return stronger
-        other = pair.high.log if pair.low.log == self._own else pair.low.log
-        is_idler = self._reach.writes(other) and self._reach.is_idler(other.robot, self._compute_class, self.load)
-        return other.robot if is_idler else None
+            self._offer(candidate, Recipient(stronger, None), now)
+            return
+        self._add(candidate)
 
     def _offer(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
         self._offers.add(candidate, recipient, now)

@@ -12,7 +12,7 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
 )
-from flocc_agent.core.latents import RELIEF_LOAD_MIN, Latents, Peer, Reach
+from flocc_agent.core.latents import Latents, Peer, Reach
 from flocc_agent.core.loop_closing import LoopClosing, registrar_of
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
@@ -113,22 +113,6 @@ def test_a_pair_is_handed_to_the_least_loaded_of_the_strongest_neighbours() -> N
         machine.on_peer(name, peer)
     found(machine, pair_of(R1))
     assert offers(machine.tick(0.0)) == [("s2", True)]
-
-
-def test_a_long_queue_hands_new_pairs_to_the_other_owner_if_its_own_is_short() -> None:
-    handed = []
-    for other_load, compute_class in ((0, 0), (2, 0), (0, 1)):
-        machine = closing(compute_class=compute_class, registrations_max=1)
-        machine.on_peer("r2", Peer(0, load=other_load))
-        pairs = pairs_of(R1, RELIEF_LOAD_MIN + 1)
-        for pair in pairs[:-1]:
-            found(machine, pair)
-            hold_all(machine, pair)
-        assert offers(machine.tick(0.0)) == []
-        assert machine.load == RELIEF_LOAD_MIN
-        found(machine, pairs[-1])
-        handed.append(offers(machine.tick(0.0)))
-    assert handed == [[("r2", True)], [], []], "not to one that is busy itself, and not to a weaker one"
 
 
 def test_an_offer_of_the_other_owner_does_not_take_a_transferred_pair_back() -> None:
