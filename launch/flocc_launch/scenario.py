@@ -50,7 +50,7 @@ class RobotScenario(Section):
     """One robot of a scenario."""
 
     recording: Path | None = None
-    """Its recording; None takes its part of [world], [dataset] or [tracks]."""
+    """Its recording, or a data set or bag to make one of; None takes its part of [world], [dataset] or [tracks]."""
     compute_class: int = Field(0, ge=0, le=9)
     """0: small robot, 9: server with a GPU."""
     start_s: float = Field(0.0, ge=0)
@@ -71,10 +71,10 @@ class WorldScenario(Section):
 
 
 class DatasetScenario(Section):
-    """A recorded data set, cut into robots by time, with seeded odometry drift."""
+    """A recorded data set, cut into robots by time; odometry that it lacks is made from ground truth, with drift."""
 
     source: Path
-    """Folder of the data set: 7-Scenes, TUM RGB-D, KITTI, EuRoC or plain."""
+    """Folder of the data set (7-Scenes, TUM RGB-D, KITTI, EuRoC or plain), or a bag."""
     robots: int = Field(3, ge=1, le=16)
     """Pieces it is cut into."""
     seed: int = Field(7, ge=0)
