@@ -66,6 +66,9 @@ def run(network: Network = "full", rounds: int = 3, threads: int = 2, height: in
         ratios, errors = network_ratios(network, rounds, (height, width)) if cpu_has_fast_bf16() else (_none(), None)
         for name, cells in FIELD_CELLS.items():
             ratios |= matching_ratios(name, cells, rounds, (height, width))
+    with threads_set_to(1):
+        for name, cells in FIELD_CELLS.items():
+            ratios |= matching_ratios(f"{name}_one_thread", cells, rounds, (height, width))
     return {
         "ratios": ratios,
         "limits": LIMITS,
