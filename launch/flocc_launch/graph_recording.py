@@ -1,7 +1,6 @@
 """A pose graph from a file as recordings that agents play: recorded odometry, and closures to be looked up.
 
-Every keyframe becomes a frame whose picture holds its name; closures between robots become the file that `recorded`
-perception reads. So the whole runtime runs on a benchmark that has no images.
+Every keyframe becomes a frame whose picture holds its name; closures become the file that `recorded` perception reads. So the whole runtime runs on a benchmark that has no images.
 """
 
 import json
@@ -41,7 +40,7 @@ def write_recordings(file: GraphFile, out: Path, source: str) -> GraphRecordings
     """Write a recording per robot and the file of registrations; what is there already is taken up.
 
     Args:
-        file: The graph; closures within a robot are left out, agents register pairs of robots only.
+        file: The graph; agents look for closures within a robot where `own_gap_keyframes` says so.
         out: Folder; made where it is missing.
         source: What the recordings are of, one line.
 
@@ -53,10 +52,9 @@ def write_recordings(file: GraphFile, out: Path, source: str) -> GraphRecordings
         if log not in file.T_truth:
             raise GraphFileError(f"{source}: has no ground truth of robot {log}")
         robots[log.robot] = _write_robot(file, log.robot, out / log.robot, source)
-    between = [c for c in file.graph.closures if c.query.log != c.match.log]
     names = [f"{log.robot}/{k}" for log, t in sorted(file.graph.trajectories.items()) for k in range(len(t))]
     registrations = out / REGISTRATIONS
-    entries = {"format": FORMAT, "keyframes": names, "pairs": [_entry(c) for c in _once(between)]}
+    entries = {"format": FORMAT, "keyframes": names, "pairs": [_entry(c) for c in _once(file.graph.closures)]}
     registrations.write_text(json.dumps(entries), encoding="utf-8")
     return GraphRecordings(robots, registrations)
 

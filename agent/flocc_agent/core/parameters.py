@@ -89,12 +89,15 @@ class PlaceRecognitionParameters:
     """A best match of lower cosine similarity is no candidate; the paper's 0.1 is permissive."""
     best_matches: int = 1
     """Candidates per keyframe and other robot; the paper takes the nearest neighbour only."""
+    own_gap_keyframes: int = 0
+    """A robot also looks for its own keyframes that are at least so many apart; 0: only for other robots'."""
     candidate_order: Literal["similarity", "spectral"] = "similarity"
     """Which candidates are registered first: the most similar, or those that strengthen the pose graph most."""
 
     def __post_init__(self) -> None:
         _require(-1 <= self.similarity_threshold <= 1, "similarity_threshold must be in [-1, 1]")
         _require(1 <= self.best_matches <= 16, "best_matches must be in [1, 16]")
+        _require(self.own_gap_keyframes >= 0, "own_gap_keyframes must not be negative")
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,8 @@ class PlaceRecognition:
 
     def _partners(self, log: LogId) -> list[LogId]:
         if log == self._own:
-            return [other for other in sorted(self._by_log) if other.robot != log.robot]
+            within = [log] if self._parameters.own_gap_keyframes > 0 else []
+            return [*within, *(other for other in sorted(self._by_log) if other.robot != log.robot)]
         return [self._own] if self._own in self._by_log and log.robot != self._own.robot else []
 
     def _best(self, keyframe: KeyframeId, descriptor: NDArray[np.float32], log: LogId) -> list[Candidate]:
@@ -91,11 +92,15 @@ class PlaceRecognition:
         if others.dimension != len(descriptor):
             return []
         similarities = others.matrix @ descriptor
+        if log == keyframe.log:
+            apart = keyframe.index - np.array(others.indices)
+            similarities = np.where(apart >= self._parameters.own_gap_keyframes, similarities, -2.0)
         if self._parameters.best_matches == 1:
             best = [int(similarities.argmax())]
         else:
             best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
-        self._note(log.robot if keyframe.log == self._own else keyframe.log.robot, float(similarities[best[0]]))
+        if log != keyframe.log:
+            self._note(log.robot if keyframe.log == self._own else keyframe.log.robot, float(similarities[best[0]]))
         return [
             Candidate(CandidatePair.of(keyframe, KeyframeId(log, others.indices[k])), float(similarities[k]))
             for k in best
