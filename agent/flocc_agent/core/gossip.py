@@ -5,6 +5,7 @@ its chained checksum; whoever has less asks for the rest, of whomever it heard t
 neighbour about what was sent, so a lost, doubled, late or reordered message can do no lasting harm.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -100,12 +101,26 @@ class NewRecord(NamedTuple):
 class Gossip:
     """All logs that one robot holds."""
 
-    def __init__(self, own: LogId, parameters: GossipParameters, sealer: Sealer | None = None) -> None:
+    def __init__(
+        self,
+        own: LogId,
+        parameters: GossipParameters,
+        sealer: Sealer | None = None,
+        near: Callable[[str], bool] = lambda robot: False,  # noqa: ARG005
+    ) -> None:
+        """Start with an empty log.
+
+        Args:
+            own: The log that this robot writes.
+            parameters: Limits and times.
+            sealer: Signs and checks records, where the swarm has keys.
+            near: Whether a robot of this name is in range.
+        """
         self._own = own
         self._parameters = parameters
         self._sealer = sealer
         self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
-        self._pulls = Pulls(self._held, parameters)
+        self._pulls = Pulls(self._held, near, parameters)
         self._forked: dict[tuple[LogId, str], None] = {}
         self._agreed: dict[LogId, LogDigest] = {}
         self._told: dict[tuple[str, str], None] = {}

@@ -2,7 +2,8 @@
 
 Rules: one peer at a time is asked for one log; one request names all logs that a peer is to send; requests that a
 heartbeat calls for have a least pause between them, so that news of many logs are fetched together. A peer that did
-not deliver what it claims is asked ever more rarely. Answers go on until everything is here, without a pause.
+not deliver what it claims is asked ever more rarely. Answers go on until everything is here, without a pause. The last
+few records of a robot in range are not asked of others as long as its own broadcast may still come.
 """
 
 from collections.abc import Callable
@@ -20,6 +21,9 @@ Entry = TypeVar("Entry")
 REMEMBERED_MAX = 1024
 """Open requests and pauses that are remembered; beyond this the oldest are forgotten."""
 PEERS_MAX = 64
+BROADCAST_RECORDS = 3
+BROADCAST_S = 0.2
+"""A robot in range sends its last few records itself; others who heard them sooner are asked only after this time."""
 FIRST_PAUSE_S = 0.25
 
 
@@ -34,10 +38,19 @@ class _Asked:
 class Pulls:
     """What others hold beyond this robot's copies, and what was asked of them."""
 
-    def __init__(self, held: Callable[[LogId], int], parameters: GossipParameters) -> None:
+    def __init__(self, held: Callable[[LogId], int], near: Callable[[str], bool], parameters: GossipParameters) -> None:
+        """Start with nothing to ask for.
+
+        Args:
+            held: How many records of a log this robot holds.
+            near: Whether a robot of this name is in range.
+            parameters: Limits and times.
+        """
         self._held = held
+        self._near = near
         self._parameters = parameters
         self._ahead: dict[str, dict[LogId, int]] = {}
+        self._noticed: dict[LogId, tuple[int, float]] = {}
         self._asked: dict[LogId, _Asked] = {}
         self._pauses_s: dict[tuple[LogId, str], float] = {}
         self._not_before_s: dict[tuple[LogId, str], float] = {}
@@ -49,6 +62,7 @@ class Pulls:
         return {
             "ahead": (longest, self._parameters.logs_max),
             "peers_ahead": (len(self._ahead), PEERS_MAX),
+            "noticed": (len(self._noticed), REMEMBERED_MAX),
             "asked": (len(self._asked), REMEMBERED_MAX),
             "paused": (len(self._not_before_s), REMEMBERED_MAX),
         }
@@ -101,10 +115,22 @@ class Pulls:
             held = self._held(log)
             if count <= held:
                 self.on_level(peer, log)
+            elif not again and self._is_on_its_way(log, held, count, now):
+                continue
             elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again):
                 remember(self._asked, log, _Asked(peer, now + self._parameters.request_timeout_s))
                 positions.append(LogPosition(log, held))
         return [Unicast(peer, RecordRequest(tuple(positions)))] if positions else []
+
+    def _is_on_its_way(self, log: LogId, held: int, count: int, now: float) -> bool:
+        """Whether the records may still come from their writer, who broadcasts them."""
+        if count - held > BROADCAST_RECORDS or not self._near(log.robot):
+            return False
+        noticed = self._noticed.get(log)
+        if noticed is None or noticed[0] != held:
+            noticed = (held, now)
+            remember(self._noticed, log, noticed)
+        return noticed[1] + BROADCAST_S > now
 
     def _may_ask(self, peer: str, log: LogId, now: float, again: bool) -> bool:
         """Whether nobody else is to send the log, and the peer did not disappoint just now."""

@@ -134,7 +134,7 @@ class Robot:
         self._pending: list[_Pending] = []
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
-        self.gossip = Gossip(log, parameters.gossip, sealer)
+        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.__contains__)
         self.assembly = GraphAssembly()
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None

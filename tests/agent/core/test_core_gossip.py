@@ -209,6 +209,20 @@ def test_requests_that_heartbeats_call_for_have_a_least_pause() -> None:
     assert len(asked) >= 4
 
 
+def test_the_last_record_of_a_robot_in_range_is_left_to_its_own_broadcast_for_a_moment() -> None:
+    reader = Gossip(R3, PARAMETERS, near=lambda robot: robot == "r1")
+    source, relay = writer(R1, 5), library(R2, {R1: 6})
+    reader.on_records(R1, batch(source, R1, 0), 0.0)
+    assert requests(reader.on_digests(R2, relay.digests(), 1.0)) == []
+    assert requests(reader.on_digests(R2, relay.digests(), 1.1)) == []
+    assert requests(reader.on_digests(R2, relay.digests(), 1.3)) == [("r2", 5)]
+
+
+def test_many_missing_records_are_asked_for_at_once() -> None:
+    reader = Gossip(R3, PARAMETERS, near=lambda robot: True)
+    assert requests(reader.on_digests(R2, library(R2, {R1: 6}).digests(), 1.0)) == [("r2", 0)]
+
+
 def test_what_a_peer_out_of_range_was_to_send_is_asked_of_another_one_without_waiting() -> None:
     reader, digests = Gossip(R3, PARAMETERS), writer(R1, 5).digests()
     reader.on_digests(R1, digests, 0.0)
