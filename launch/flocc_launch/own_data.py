@@ -53,7 +53,7 @@ class OwnData:
         Raises:
             DatasetError: There is no data set, one of them cannot be used, or there are not `agents` of them.
         """
-        single = is_bag(path) or is_dataset(path)
+        single = not _holds_bags(path) and (is_bag(path) or is_dataset(path))
         folders = {robot_name(path): path} if single else _robots(path)
         if not single and agents not in (None, len(folders)):
             raise DatasetError(f"{path}: holds {len(folders)} robots ({', '.join(folders)}), not {agents}")
@@ -109,6 +109,14 @@ def robot_name(path: Path) -> str:
     """A name that keys can hold, made of a folder's."""
     stem = path.resolve().stem if path.is_file() else path.resolve().name
     return re.sub(r"[^a-z0-9_-]+", "-", stem.lower()).strip("-_")[:NAME_LENGTH_MAX] or "robots"
+
+
+def _holds_bags(path: Path) -> bool:
+    """Whether a folder holds bags of several robots; `run_0.db3` and `run_1.db3` are parts of one, as rosbag2 does."""
+    if not path.is_dir() or (path / "metadata.yaml").exists():
+        return False
+    stems = [re.sub(r"_\d+$", "", entry.stem) for entry in path.iterdir() if entry.is_file() and is_bag(entry)]
+    return len(set(stems)) > 1
 
 
 def _robots(path: Path) -> dict[str, Path]:

@@ -79,6 +79,22 @@ def test_robots_that_recorded_together_keep_their_distance_in_time(own: Path, tm
     assert starts_s == {"early": 0.0, "late": 2.0}
 
 
+def test_a_folder_of_bags_is_a_robot_each(tmp_path: Path) -> None:
+    (tmp_path / "bags").mkdir()
+    for name in ("husky", "jackal"):
+        folder = walking(False, count=3).write(tmp_path / name, "mcap")
+        next(folder.glob("*.mcap")).rename(tmp_path / "bags" / f"{name}.mcap")
+    assert read_scenario(str(tmp_path / "bags"), {}).names() == ["husky", "jackal"]
+
+
+def test_a_bag_in_several_files_is_one(tmp_path: Path) -> None:
+    folder = walking(False, count=3).write(tmp_path / "run", "db3")
+    (folder / "metadata.yaml").unlink()
+    shutil.copyfile(next(folder.glob("*.db3")), folder / "run_1.db3")
+    next(file for file in folder.glob("*.db3") if file.name != "run_1.db3").rename(folder / "run_0.db3")
+    assert read_scenario(str(folder), {}).dataset is not None
+
+
 def test_a_bag_is_cut_into_robots(own: Path, tmp_path: Path) -> None:
     scenario = read_scenario(str(walking(True, count=6).write(tmp_path / "run.bag")), {}, agents=2)
     assert [len(Recording.open(path).frames) for path in recordings(scenario).values()] == [3, 3]
