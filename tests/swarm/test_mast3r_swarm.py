@@ -59,6 +59,7 @@ def test_every_candidate_is_decoded_and_decided(tmp_path: Path) -> None:
                     "network": "tiny",
                     "image_size_px": 224,
                     "threads": 1,
+                    "exchange": "auto",
                 },
             },
         }
