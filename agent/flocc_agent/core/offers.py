@@ -124,7 +124,9 @@ class Offers:
                 group.offers[pair].next_s = now + self._parameters.offer_period_s
             next_s = min(offer.next_s for offer in group.offers.values())
             group.due_s = max(next_s, now + self._parameters.offer_period_s / 8)  # sooner where some are left over
-            effects.append(Unicast(recipient.robot, CandidateOffer(tuple(pairs), transferred=recipient.log is None)))
+            if pairs:
+                offer = CandidateOffer(tuple(pairs), transferred=recipient.log is None)
+                effects.append(Unicast(recipient.robot, offer))
         return effects
 
     def taken_over(self, reach: Reach, now: float) -> list[Candidate]:

@@ -155,6 +155,18 @@ def test_a_registrar_that_comes_back_in_time_keeps_its_pair() -> None:
     assert offers(machine.tick(5.0 + PARAMETERS.takeover_s)) == [("r2", False)]
 
 
+def test_a_registrar_that_comes_back_soon_is_not_told_the_same_again_at_once() -> None:
+    machine, pair = closing(), pair_of(R2)
+    machine.on_peer("r2", Peer(0))
+    found(machine, pair)
+    machine.tick(0.0)
+    machine.on_lost("r2", 0.5)
+    machine.tick(0.5)
+    machine.on_peer("r2", Peer(0))
+    assert machine.tick(1.0) == []
+    assert machine.deadline() == PARAMETERS.offer_period_s
+
+
 def test_pairs_of_a_log_whose_writer_lost_its_disk_are_taken_over_at_once() -> None:
     machine, pair = closing(), pair_of(R2)
     machine.on_peer("r2", Peer(0, log=R2))
