@@ -16,7 +16,10 @@ from flocc_protocol.errors import FloccError
 DISK_FREE_BYTES_MIN = 2_000_000_000
 CLOCK_YEAR_MIN = 2025
 REQUIRED = {"zenoh": "eclipse-zenoh", "gtsam": "gtsam", "cv2": "opencv-python-headless", "scipy": "scipy"}
-OPTIONAL = {"torch": "mast3r", "rerun": "view", "evo": "eval"}
+OPTIONAL = {
+    "rosbags": "bags", "cryptography": "secure", "rerun": "view", "torch": "mast3r", "prometheus_client": "metrics",
+    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval",
+}  # fmt: skip
 
 
 def check_installation(
