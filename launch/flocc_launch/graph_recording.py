@@ -1,6 +1,7 @@
 """A pose graph from a file as recordings that agents play: recorded odometry, and closures to be looked up.
 
-Every keyframe becomes a frame whose picture holds its name; closures become the file that `recorded` perception reads. So the whole runtime runs on a benchmark that has no images.
+Every keyframe becomes a frame whose picture holds its name; closures become the file that `recorded` perception reads.
+So the whole runtime runs on a benchmark that has no images.
 """
 
 import json

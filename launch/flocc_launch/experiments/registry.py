@@ -6,11 +6,20 @@ from flocc_launch.experiments.bandwidth import BANDWIDTH
 from flocc_launch.experiments.distributed import DISTRIBUTED
 from flocc_launch.experiments.experiment import Experiment, ExperimentError
 from flocc_launch.experiments.faults import FAULTS
+from flocc_launch.experiments.full_system import FULL_SYSTEM
 from flocc_launch.experiments.registration import REGISTRATION
 from flocc_launch.experiments.sparse_keyframes import SPARSE_KEYFRAMES
 from flocc_launch.experiments.split_compute import SPLIT_COMPUTE
 
-ALL: tuple[Experiment[Any], ...] = (REGISTRATION, SPLIT_COMPUTE, SPARSE_KEYFRAMES, FAULTS, BANDWIDTH, DISTRIBUTED)
+ALL: tuple[Experiment[Any], ...] = (
+    FULL_SYSTEM,
+    REGISTRATION,
+    SPLIT_COMPUTE,
+    SPARSE_KEYFRAMES,
+    FAULTS,
+    BANDWIDTH,
+    DISTRIBUTED,
+)
 
 
 def names() -> list[str]:

@@ -56,6 +56,24 @@ class GraphFile:
         kept = tuple(c for k, c in enumerate(self.graph.closures) if k not in self.outliers)
         return replace(self, graph=replace(self.graph, closures=kept), outliers=frozenset())
 
+    def shortened(self, keyframes: int) -> "GraphFile":
+        """The same file with at most the first so many keyframes of each robot; labels of closures are left out."""
+
+        def cut(by_log: Mapping[LogId, Float]) -> dict[LogId, Float]:
+            return {log: values[:keyframes] for log, values in by_log.items()}
+
+        trajectories = {
+            log: Trajectory(
+                t.T_odom_keyframe[:keyframes],
+                None if t.edge_covariances is None else t.edge_covariances[: keyframes - 1],
+            )
+            for log, t in self.graph.trajectories.items()
+        }
+        closures = [c for c in self.graph.closures if max(c.query.index, c.match.index) < keyframes]
+        graph = replace(self.graph, trajectories=trajectories, closures=closures)
+        truth_m, T_initial = cut(self.truth_m), cut(self.T_initial)
+        return GraphFile(graph, truth_m, T_initial, frozenset(), cut(self.T_truth), cut(self.stamps_s))
+
     def with_unit_scale(self) -> "GraphFile":
         """The same file with the translations of inter-robot closures reduced to length one and their scale free.
 
