@@ -5,11 +5,14 @@ Swarm-SLAM (Lajoie and Beltrame 2024), the spectrum of the pose graph's Laplacia
 second smallest eigenvalue, bounds the error of the worst determined part, and the expected squared error of all
 keyframes is the sum of 1 / lambda, which it dominates. Candidates are taken greedily, as there and by Doherty et al.
 (2022), but by what they take off the whole sum: the gain of the connectivity alone is zero for all candidates where the
-weakest mode is one that none of them touches.
+weakest mode is one that none of them touches. A weak prior on every place makes the sum finite before all maps are
+joined, so that a pair that joins two of them simply gains most.
 
 Odometry chains are contracted to the keyframes that have closures or candidates (a chain of n edges is one edge of
-weight 1 / n), each with the mass of the keyframes around it, and neighbours are merged until `NODES_MAX` remain. Parts
-of the graph that nothing connects yet are connected first, by the most similar candidates.
+weight 1 / n), each with the mass of the keyframes around it, and neighbours are merged until `NODES_MAX` remain.
+
+Robots choose without talking: both owners of a pair know it, so each counts on the other to register what comes first
+and is the other's, and chooses its own beside that.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,12 +29,18 @@ Float = NDArray[np.float64]
 Indices = NDArray[np.int_]
 
 NODES_MAX = 128
-PICKS = 2
+PICKS = 4
 """Candidates that are chosen ahead; a chosen one stays in front, so that no half fetched latent is left behind."""
-POOL_MAX = 512
-"""Candidates that are compared, the most similar ones."""
+POOL_MAX = 256
+"""Own candidates that are compared, and as many of others; the most similar ones."""
+STEPS_MAX = 12
+"""Pairs that one choice goes through, those that others are to register among them."""
 CLOSURE_WEIGHT = 0.1
 """Of a closure against one odometry edge; the back end's default sigmas, 0.05 m and 0.2 m, would give 1 / 16."""
+PLACE_WEIGHT = 1e-5
+"""Of the prior on a keyframe's place against one odometry edge: 16 m at a sigma of 0.05 m."""
+SIMILARITY_MIN = 0.1
+"""Of a pair that only another robot compared."""
 GAIN_DIGITS = 6
 """Gains that agree to so many digits are equal, so that rounding of one machine or another decides nothing."""
 
@@ -62,34 +71,45 @@ class SpectralOrder:
         self._closures[pair] = None
 
     def chosen(
-        self, candidates: Mapping[CandidatePair, float], able: Callable[[CandidatePair], bool]
+        self,
+        candidates: Mapping[CandidatePair, float],
+        able: Callable[[CandidatePair], bool],
+        elsewhere: Callable[[], Mapping[CandidatePair, float]] = dict,
     ) -> list[CandidatePair]:
         """The few candidates to register first, in order.
 
         Args:
             candidates: Similarity of each, the most similar first.
             able: Whether a candidate can be registered now.
+            elsewhere: Gives those that robots in range are to register.
         """
         self._chosen = [pair for pair in self._chosen if pair in candidates and able(pair)]
-        if len(self._chosen) < PICKS:
-            free = (item for item in candidates.items() if item[0] not in self._chosen and able(item[0]))
-            self._chosen += self._choose(list(islice(free, POOL_MAX)), PICKS - len(self._chosen))
+        wanted = PICKS - len(self._chosen)
+        if wanted > 0:
+            free = (pair for pair in candidates if pair not in self._chosen and able(pair))
+            own = {pair: candidates[pair] for pair in islice(free, POOL_MAX)}
+            self._chosen += list(own) if len(own) <= wanted else self._choose(own, elsewhere(), wanted)
         return self._chosen
 
-    def _choose(self, pool: Sequence[tuple[CandidatePair, float]], count: int) -> list[CandidatePair]:
-        """The next `count` of a pool, greedily."""
+    def _choose(
+        self, own: Mapping[CandidatePair, float], others: Mapping[CandidatePair, float], wanted: int
+    ) -> list[CandidatePair]:
+        """The next few of this robot's candidates, greedily, beside those that others will take."""
+        best_of_others = sorted(others.items(), key=lambda item: (-item[1], item[0]))[:POOL_MAX]
+        left = {**dict(best_of_others), **own}
         known = [*self._closures, *self._chosen]
-        graph = Reduced([*known, *(pair for pair, _ in pool)], self._lengths)
+        graph = Reduced([*known, *left], self._lengths)
         for pair in known:
             graph.add(pair)
         chosen: list[CandidatePair] = []
-        left = list(pool)
-        while left and len(chosen) < count:
-            gains = graph.gains([pair for pair, _ in left])
-            best = min(range(len(left)), key=lambda k: (-gains[k] * left[k][1], -left[k][1], left[k][0]))
-            pair, _ = left.pop(best)
+        for _ in range(STEPS_MAX):
+            pair = graph.best(left)
             graph.add(pair)
-            chosen.append(pair)
+            del left[pair]
+            if pair in own:
+                chosen.append(pair)
+            if len(chosen) == wanted or not left:
+                break
         return chosen
 
 
@@ -120,23 +140,19 @@ class Reduced:
         a, b = self._node(pair.low), self._node(pair.high)
         self._add_edges(Edges(np.array([a]), np.array([b]), np.array([CLOSURE_WEIGHT])))
 
-    def gains(self, pairs: Sequence[CandidatePair]) -> list[float]:
-        """What each pair would add: infinite where it joins two parts, else the fall of its part's uncertainty."""
-        a = np.array([self._node(pair.low) for pair in pairs])
-        b = np.array([self._node(pair.high) for pair in pairs])
-        parts = self._parts()
-        gains = np.where(parts[a] != parts[b], np.inf, 0.0)
-        if np.isinf(gains).any():
-            return [float(gain) for gain in gains]
-        for part in np.unique(parts[a]):
-            nodes = np.flatnonzero(parts == part)
-            values, modes = spectrum(self._laplacian[np.ix_(nodes, nodes)], self._masses[nodes])
-            places = np.zeros(len(parts), dtype=int)
-            places[nodes] = np.arange(len(nodes))
-            inside = parts[a] == part
-            stretch = modes[places[a[inside]]] - modes[places[b[inside]]]
-            gains[inside] = uncertainty_removed(stretch, values, CLOSURE_WEIGHT)
-        return [float(f"{gain:.{GAIN_DIGITS}g}") for gain in gains]
+    def best(self, similarities: Mapping[CandidatePair, float]) -> CandidatePair:
+        """The pair of the largest gain, weighed by how likely its similarity makes it."""
+        pairs = list(similarities)
+        sure = np.maximum(list(similarities.values()), SIMILARITY_MIN)
+        worth = [float(f"{value:.{GAIN_DIGITS}g}") for value in self.gains(pairs) * sure]
+        return min(zip(pairs, worth, strict=True), key=lambda item: (-item[1], -similarities[item[0]], item[0]))[0]
+
+    def gains(self, pairs: Sequence[CandidatePair]) -> Float:
+        """What each pair as an edge would take off the sum of 1 / lambda, (N,)."""
+        a = [self._node(pair.low) for pair in pairs]
+        b = [self._node(pair.high) for pair in pairs]
+        values, modes = spectrum(self._laplacian, self._masses)
+        return uncertainty_removed(modes[a] - modes[b], np.maximum(values, 0.0) + PLACE_WEIGHT, CLOSURE_WEIGHT)
 
     def _add_chain(self, log: LogId, ends: list[int], length: int) -> tuple[Float, Edges]:
         """The nodes of one log, each with its share of the keyframes, and the edges between them."""
@@ -158,19 +174,6 @@ class Reduced:
                 self._laplacian[[a, b], [a, b]] += weight
                 self._laplacian[[a, b], [b, a]] -= weight
 
-    def _parts(self) -> Indices:
-        """Number of the connected part that each node is in, (N,)."""
-        parts = np.arange(len(self._masses))
-        rows, columns = np.nonzero(np.triu(self._laplacian, 1))
-        while True:
-            lowest = parts.copy()
-            np.minimum.at(lowest, rows, parts[columns])
-            np.minimum.at(lowest, columns, parts[rows])
-            lowest = lowest[lowest]
-            if np.array_equal(lowest, parts):
-                return parts
-            parts = lowest
-
 
 def step_for(ends: Iterable[set[int]]) -> int:
     """The smallest power of two that leaves at most `NODES_MAX` nodes when it divides the numbers of keyframes."""
@@ -181,27 +184,27 @@ def step_for(ends: Iterable[set[int]]) -> int:
 
 
 def spectrum(laplacian: Float, masses: Float) -> tuple[Float, Float]:
-    """Eigenvalues and modes of a connected graph whose nodes have masses, `L v = lambda M v`, but for the constant one.
+    """Eigenvalues and modes of a graph whose nodes have masses, `L v = lambda M v`.
 
     Args:
         laplacian: (N, N).
         masses: (N,), positive.
 
     Returns:
-        (N-1,) ascending, the algebraic connectivity first, and the modes (N, N-1), of unit length in M, the Fiedler
-        vector first.
+        (N,) ascending, a zero for each connected part first, then the algebraic connectivity; and the modes (N, N) as
+        columns, of unit length in M; the Fiedler vector is that of the algebraic connectivity.
     """
     roots = 1.0 / np.sqrt(masses)
     values, vectors = np.linalg.eigh(laplacian * roots[:, None] * roots[None, :])
-    return np.asarray(values[1:]), np.asarray(vectors[:, 1:] * roots[:, None])
+    return np.asarray(values), np.asarray(vectors * roots[:, None])
 
 
 def uncertainty_removed(stretch: Float, values: Float, weight: float) -> Float:
     """How much one more edge lowers the sum of all 1 / lambda (Sherman and Morrison).
 
     Args:
-        stretch: (K, N-1) difference of each mode between the two ends of each edge.
-        values: (N-1,) eigenvalues.
+        stretch: (K, N) difference of each mode between the two ends of each edge.
+        values: (N,) eigenvalues, positive.
         weight: Of an edge.
     """
     resistance = (stretch**2 / values).sum(axis=1)

@@ -279,7 +279,9 @@ class LoopClosing:
             return []
         if self._chosen is None:
             similarities = {work.pair: -work.order[0] for work in self._work}
-            self._chosen = self._spectral.chosen(similarities, self._can_be_done)
+            self._chosen = self._spectral.chosen(
+                similarities, self._can_be_done, lambda: self._offers.similarities(self._reach)
+            )
         return self._chosen
 
     def _can_be_done(self, pair: CandidatePair) -> bool:

@@ -68,6 +68,11 @@ class Offers:
     def __iter__(self) -> Iterator[CandidatePair]:
         return iter(self._recipients)
 
+    def similarities(self, reach: Reach) -> dict[CandidatePair, float]:
+        """Similarity of each pair that a robot in range is to register."""
+        near = (group for recipient, group in self._groups.items() if recipient.is_in(reach))
+        return {pair: offer.candidate.similarity for group in near for pair, offer in group.offers.items()}
+
     def add(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
         """Let another robot register a pair."""
         self.remove(candidate.pair)

@@ -10,6 +10,7 @@ from flocc_agent.core.candidate_order import (
     CLOSURE_WEIGHT,
     NODES_MAX,
     PICKS,
+    PLACE_WEIGHT,
     Reduced,
     SpectralOrder,
     spectrum,
@@ -70,7 +71,7 @@ def eigenvalues(closures: list[CandidatePair]) -> NDArray[np.float64]:
 
 
 def uncertainty(closures: list[CandidatePair]) -> float:
-    return float((1.0 / eigenvalues(closures)).sum())
+    return float((1.0 / (eigenvalues(closures) + PLACE_WEIGHT)).sum())
 
 
 def test_the_first_candidate_is_the_most_similar_that_joins_two_parts() -> None:
@@ -113,8 +114,14 @@ def test_only_what_can_be_registered_is_chosen() -> None:
 def test_parts_are_joined_before_any_is_strengthened() -> None:
     order = order_of(R1, R2, R3)
     order.on_closure(pair(R1, 0, R2, 0))
-    candidates = {pair(R1, 59, R2, 59): 0.99, pair(R2, 30, R3, 30): 0.55, pair(R2, 31, R3, 31): 0.6}
-    assert order.chosen(candidates, always)[0] == pair(R2, 31, R3, 31)
+    strengthening = {pair(R1, i, R2, i): 0.99 for i in range(50, LENGTH)}
+    joining = {pair(R2, 31, R3, 31): 0.6, pair(R2, 32, R3, 32): 0.55}
+    assert order.chosen({**strengthening, **joining}, always)[0] in joining
+
+
+def test_few_candidates_need_no_choice() -> None:
+    candidates = dict(list(side_by_side().items())[:PICKS])
+    assert order_of(R1, R2).chosen(candidates, always) == list(candidates)
 
 
 def test_the_order_is_the_same_whenever_it_is_asked_for() -> None:
@@ -137,7 +144,7 @@ def test_chains_are_contracted_without_losing_what_decides() -> None:
         graph.add(closure)
     values, _ = spectrum(graph._laplacian, graph._masses)
     assert graph._masses.sum() == 2 * LENGTH
-    assert values[0] == pytest.approx(eigenvalues(closures)[0], rel=0.1)
+    assert values[1] == pytest.approx(eigenvalues(closures)[0], rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -172,8 +179,19 @@ def test_the_first_mode_of_a_chain_is_a_cosine() -> None:
     laplacian[0, 0] = laplacian[-1, -1] = 1.0
     values, modes = spectrum(laplacian, np.ones(n))
     expected = np.cos(np.pi * (np.arange(n) + 0.5) / n)
-    assert values[0] == pytest.approx(2.0 - 2.0 * np.cos(np.pi / n))
-    assert abs(modes[:, 0] @ expected) == pytest.approx(np.linalg.norm(expected), rel=1e-9)
+    assert values[1] == pytest.approx(2.0 - 2.0 * np.cos(np.pi / n))
+    assert abs(modes[:, 1] @ expected) == pytest.approx(np.linalg.norm(expected), rel=1e-9)
+
+
+def test_what_another_robot_will_register_is_left_to_it() -> None:
+    """The most similar pair joins the maps: where it is another's, this robot chooses beside it."""
+    candidates = side_by_side()
+    best = next(iter(candidates))
+    own = {one: similarity for one, similarity in candidates.items() if one != best}
+    alone, beside = order_of(R1, R2), order_of(R1, R2)
+    near = {one for one in own if abs(one.low.index - best.low.index) < 8}
+    assert alone.chosen(own, always)[0] in near
+    assert near.isdisjoint(beside.chosen(own, always, lambda: {best: 1.0, pair(R1, 31, R2, 31): 1.0}))
 
 
 def test_a_gain_is_what_the_sum_of_inverse_eigenvalues_loses() -> None:
@@ -185,7 +203,7 @@ def test_a_gain_is_what_the_sum_of_inverse_eigenvalues_loses() -> None:
     for closure in closures:
         graph.add(closure)
     (gain,) = graph.gains([added])
-    assert gain == pytest.approx(uncertainty(closures) - uncertainty([*closures, added]), rel=1e-5)
+    assert gain == pytest.approx(uncertainty(closures) - uncertainty([*closures, added]), rel=1e-9)
 
 
 def test_an_edge_between_equal_values_removes_nothing() -> None:
