@@ -13,7 +13,8 @@ from tests.doc_props import write_bag, write_own_data
 
 from flocc_launch.config_reference import reference
 
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "protocol/README.md", ROOT / "agent/README.md"])
+PARTS = ("protocol", "agent", "docker")
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / part / "README.md" for part in PARTS)])
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 LIVE = re.compile(r"^flocc (launch|demo|agent|experiment)\b|^python examples/", re.M)
 

@@ -1,4 +1,6 @@
-"""Checks a compose file against the Compose Specification's own schema (compose-spec.json, Apache-2.0).
+"""Checks a compose file against the Compose Specification's own schema.
+
+`compose-spec.json` is a copy of it, of October 2021: Copyright 2020 The Compose Specification Authors, Apache-2.0.
 
 As much of JSON Schema as that schema uses; variables are filled in as Docker Compose does.
 """

@@ -123,7 +123,8 @@ def run_step(command: str, folder: Path) -> None:
     assert ran.returncode == 0, ran.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.swarm
+@pytest.mark.scenarios  # two minutes: with the other tests of make swarm-test
 def test_the_install_steps_of_the_image_leave_an_agent_that_runs(installed: Path, tmp_path: Path) -> None:
     def run(*command: str) -> subprocess.CompletedProcess[str]:
         environment = {"PATH": f"{installed / 'bin'}:/usr/bin:/bin", "HOME": str(tmp_path)}
