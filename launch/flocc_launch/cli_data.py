@@ -8,7 +8,7 @@ import typer
 
 from flocc_launch.cli_common import progress_bar
 
-dataset = typer.Typer(help="Look at data sets, turn them into recordings, cut them into robots.", rich_markup_mode=None)
+dataset = typer.Typer(help="Look at data sets and bags, convert them, cut them.", rich_markup_mode=None)
 weights = typer.Typer(help="Checkpoints of the mast3r front end: needed, checked, fetched.", rich_markup_mode=None)
 
 Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
@@ -23,7 +23,7 @@ def add_data(app: typer.Typer) -> None:
     """Register the commands."""
     app.add_typer(dataset, name="dataset")
     app.add_typer(weights, name="weights")
-    app.command()(keys)
+    app.command(short_help="Make a swarm's certificates and signing keys.")(keys)
 
 
 @dataset.command()

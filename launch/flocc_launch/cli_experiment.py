@@ -45,7 +45,7 @@ class ExperimentGroup(TyperGroup):
 
 experiment = typer.Typer(
     cls=ExperimentGroup,
-    help="The paper's evaluation: tables, figures and findings from one command each.",
+    help="The paper's evaluation: tables, figures, findings.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -65,7 +65,7 @@ def list_experiments() -> None:
         typer.echo(f"{each.name:18} {each.title}")
 
 
-@experiment.command("steepness")
+@experiment.command("steepness", short_help="Write the k that a registration experiment learned.")
 def write_learned_steepness(
     run: Annotated[Path, typer.Argument(help="Folder of a finished registration experiment.")],
     config: Annotated[Path, typer.Argument(help="Configuration of an agent, or a scenario (TOML).")],

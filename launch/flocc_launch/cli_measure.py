@@ -22,7 +22,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.
 
 def add_measures(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command()(optimise)
+    app.command(short_help="Optimise the pose graph of a file.")(optimise)
     app.add_typer(bench, name="bench")
 
 

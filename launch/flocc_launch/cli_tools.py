@@ -23,8 +23,11 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for script
 
 def add_tools(app: typer.Typer) -> None:
     """Register the commands."""
-    for command in (doctor, status, dashboard, view, chaos):
-        app.command()(command)
+    app.command(short_help="Say why maps have or have not merged; check an installation.")(doctor)
+    app.command(short_help="Show all robots of a swarm or of a run in one table.")(status)
+    app.command(short_help="Serve one page that shows a run while it goes on.")(dashboard)
+    app.command(short_help="Show a run or a running swarm in rerun.")(view)
+    app.command(short_help="Cause a fault in a running swarm, or take it back.")(chaos)
 
 
 def doctor(
