@@ -8,12 +8,14 @@ from flocc_launch.experiments.experiment import Experiment, ExperimentError
 from flocc_launch.experiments.faults import FAULTS
 from flocc_launch.experiments.full_system import FULL_SYSTEM
 from flocc_launch.experiments.registration import REGISTRATION
+from flocc_launch.experiments.scale import SCALE
 from flocc_launch.experiments.sparse_keyframes import SPARSE_KEYFRAMES
 from flocc_launch.experiments.split_compute import SPLIT_COMPUTE
 
 ALL: tuple[Experiment[Any], ...] = (
     FULL_SYSTEM,
     REGISTRATION,
+    SCALE,
     SPLIT_COMPUTE,
     SPARSE_KEYFRAMES,
     FAULTS,
