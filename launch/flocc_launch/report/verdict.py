@@ -8,7 +8,15 @@ COUNT_WORDS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7
 
 def verdict(report: Report) -> str:
     """Whether the maps merged, when, and what it did to the error."""
+    if len(report.robots) == 1:
+        return alone(report)
     return " ".join(sentence for sentence in (map_sentence(report), error_sentence(report)) if sentence)
+
+
+def alone(report: Report) -> str:
+    """What there is to say of a single robot: loops are closed between robots only."""
+    error = "" if report.ate_joint_m is None else f" Its error is {number(report.ate_joint_m, 'm')} after alignment."
+    return f"One robot ran, alone: nothing corrects its odometry.{error}"
 
 
 def map_sentence(report: Report) -> str:
@@ -17,8 +25,6 @@ def map_sentence(report: Report) -> str:
     living = [robot for robot in report.robot_details if robot.end != "died" and not robot.server]
     frames = {robot.map_frame for robot in living}
     who = f"{listed(died)} died; " if died else ""
-    if len(report.robots) == 1:
-        return f"One robot ran, {'with' if report.map_frames else 'without'} corrections."
     if not report.map_frames:
         return f"{who}no robot was ever corrected.".capitalize() if not who else f"{who}no robot was ever corrected."
     if len(living) > 1 and len(frames) == 1 and None not in frames:
