@@ -25,7 +25,8 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 SEGMENT_POSES = 25
-ITERATIONS_MAX = 200
+ITERATIONS_LEAST, POSES_PER_ITERATION, ITERATIONS_MOST = 50, 50, 400
+"""A system of more poses is worth more iterations, because its elimination costs more than in proportion."""
 TOLERANCE_RATIO = 4e-3
 """How far the residual falls, in the preconditioner's norm; the step's cost is then right to its square."""
 RIDGE_RATIO = 1e-10
@@ -226,7 +227,7 @@ class System:
         z = self._preconditioned(r)
         p, rz = z.copy(), float(r @ z)
         goal = TOLERANCE_RATIO**2 * abs(float(b @ self._preconditioned(b)))
-        for _ in range(ITERATIONS_MAX):
+        for _ in range(iterations_max(self._structure.poses.nodes)):
             if rz <= goal:
                 return x
             Ap = self._normal.times(p)
@@ -296,6 +297,11 @@ def factorised(normal: NormalEquations) -> SuperLU:
         return splu(whole.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError as error:
         raise np.linalg.LinAlgError(str(error)) from error
+
+
+def iterations_max(poses: int) -> int:
+    """After how many iterations elimination would have been faster."""
+    return min(max(ITERATIONS_LEAST, poses // POSES_PER_ITERATION), ITERATIONS_MOST)
 
 
 def rigid_motions(state: State, segment: Int) -> Float:

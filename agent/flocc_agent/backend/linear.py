@@ -17,8 +17,8 @@ from flocc_agent.backend.edges import Edges, Jacobians, Residuals, State
 Float = NDArray[np.float64]
 
 SCALE_KEYS_FROM = 1 << 40
-ITERATIVE_POSES_MIN = 1500
-"""From here on conjugate gradients are faster than elimination (`flocc bench solver`)."""
+ITERATIVE_LOOPS_MIN = 2500
+"""From so many edges beyond a tree on, conjugate gradients are faster than elimination (`flocc bench solver`)."""
 
 
 class SingularSystem(Exception):
@@ -29,17 +29,21 @@ class SingularSystem(Exception):
 class LinearSolver:
     """Solves the normal equations of one component again and again; the edges stay the same, their weights do not.
 
+    Where conjugate gradients do not get there once, elimination does the rest: such graphs have long loops of edges
+    that are as stiff as odometry, and few others, so that elimination is fast.
+
     Attributes:
         fixed: Index of the pose that does not move (the anchor's first keyframe).
         scale_prior_sigma: Standard deviation of a cluster's scale around 1.
-        iterative_poses_min: Number of poses from which on conjugate gradients are tried before elimination.
+        iterative_loops_min: Number of edges beyond a tree from which on conjugate gradients are tried first.
     """
 
     fixed: int
     scale_prior_sigma: float
-    iterative_poses_min: int = ITERATIVE_POSES_MIN
+    iterative_loops_min: int = ITERATIVE_LOOPS_MIN
     _ordering: gtsam.Ordering | None = field(default=None, repr=False)
     _structure: Structure | None = field(default=None, repr=False)
+    _gave_up: bool = field(default=False, repr=False)
 
     def step(
         self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float, damping: float = 0.0
@@ -49,10 +53,11 @@ class LinearSolver:
         Raises:
             SingularSystem: Something is not determined.
         """
-        if len(state.q) >= self.iterative_poses_min:
+        if len(edges) - len(state.q) >= self.iterative_loops_min and not self._gave_up:
             found = self._iterated(edges, state, at, jac, weights, damping)
             if found is not None:
                 return found
+            self._gave_up = True
         return self._eliminated(edges, state, at, jac, weights, damping)
 
     def _iterated(
