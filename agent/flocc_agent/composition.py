@@ -48,7 +48,7 @@ from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
 
 if TYPE_CHECKING:
-    from flocc_agent.runtime.ros2 import Ros2Adapter
+    from flocc_agent.runtime.ros2.adapter import Ros2Adapter
 
 Float = NDArray[np.float64]
 
@@ -393,7 +393,7 @@ class Agent:
             self.stop()
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
-        from flocc_agent.runtime.ros2 import Host, Ros2Adapter
+        from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 
         def report(event: str, fields: dict[str, Any]) -> None:
             self._on_line({"t": round(self._clock_s(), 6), "robot": self.config.name, "event": event, **fields})

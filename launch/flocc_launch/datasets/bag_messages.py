@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.runtime.ros2.pixels import camera_of, raw_pixels
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
 from flocc_launch.datasets.bag_reader import Topic
-from flocc_launch.datasets.intrinsics import PINHOLE_MODELS
 from flocc_launch.datasets.pixels import JPEG_QUALITY
 from flocc_launch.datasets.source import DatasetError, Lens
 
@@ -24,8 +23,6 @@ POSE_TYPES = (
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 
 _MAGIC = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))
-_CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 2, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
-_BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
 
 
 def stamp_ns(header: Any) -> int:
@@ -62,25 +59,10 @@ def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
 
 def _pixels(message: Any, topic: Topic) -> Any:
     """RGB (H, W, 3) or grey (H, W) uint8 pixels of a raw image."""
-    import cv2
-
-    encoding = str(message.encoding)
-    bytes_per_pixel = 1 if encoding in _BAYER else _CHANNELS.get(encoding)
-    if bytes_per_pixel is None:
-        known = ", ".join([*_CHANNELS, *_BAYER])
-        raise DatasetError(f"topic {topic.name}: images are encoded as {encoding!r}; flocc reads {known}")
-    if len(message.data) < message.height * message.step or message.step < message.width * bytes_per_pixel:
-        raise DatasetError(f"topic {topic.name}: an image has {len(message.data)} bytes, too few for its size")
-    rows = message.data[: message.height * message.step].reshape(message.height, message.step)
-    rows = rows[:, : message.width * bytes_per_pixel]
-    if encoding in _BAYER:
-        return cv2.cvtColor(np.ascontiguousarray(rows), getattr(cv2, f"COLOR_Bayer{_BAYER[encoding]}2RGB"))
-    if encoding == "mono16":
-        return rows[:, 0::2] if message.is_bigendian else rows[:, 1::2]
-    if bytes_per_pixel == 1:
-        return rows
-    pixels = rows.reshape(message.height, message.width, bytes_per_pixel)[..., :3]
-    return pixels if encoding.startswith("rgb") else pixels[..., ::-1]
+    try:
+        return raw_pixels(message)
+    except ValueError as error:
+        raise DatasetError(f"topic {topic.name}: {error}") from error
 
 
 def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]:
@@ -123,16 +105,8 @@ def lens_of(message: Any, topic: Topic) -> Lens:
     Raises:
         DatasetError: The camera is not calibrated, or of another model than pinhole with radtan.
     """
-    if message.distortion_model not in PINHOLE_MODELS:
-        raise DatasetError(
-            f"topic {topic.name}: the distortion model is {message.distortion_model!r}; flocc takes plumb_bob"
-        )
-    K, D = (message.k, message.d) if "k" in message.__dataclass_fields__ else (message.K, message.D)
-    k1, k2, p1, p2, k3 = ([*map(float, D), 0.0, 0.0, 0.0, 0.0, 0.0])[:5]
     try:
-        camera = Camera(
-            message.width, message.height, float(K[0]), float(K[4]), float(K[2]), float(K[5]), (k1, k2, p1, p2)
-        )
+        camera, k3 = camera_of(message)
     except ValueError as error:
         raise DatasetError(f"topic {topic.name}: {error}") from error
     return Lens(camera, k3=k3)

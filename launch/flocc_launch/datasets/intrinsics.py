@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import inverse
 from flocc_agent.runtime.recording import read_camera
+from flocc_agent.runtime.ros2.pixels import PINHOLE_MODELS
 from flocc_agent.runtime.trajectory import RecordingError, checked_pose
 from flocc_launch.datasets.source import DatasetError, Lens
 
 Float = NDArray[np.float64]
 
-PINHOLE_MODELS = ("", "pinhole", "radtan", "radial-tangential", "plumb_bob", "none")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 

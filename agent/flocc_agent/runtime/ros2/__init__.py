@@ -4,8 +4,3 @@
 messages, `static_frames` and `synchroniser` put images, odometry and mounting together, `session` is zenoh, `adapter`
 is all of it on one event loop.
 """
-
-from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
-from flocc_agent.runtime.ros2.types import Ros2Error
-
-__all__ = ["Host", "Ros2Adapter", "Ros2Error"]

@@ -9,7 +9,8 @@ from flocc_agent.core.interfaces import Camera
 
 Pixels = NDArray[np.uint8]
 
-PINHOLE_MODELS = ("", "plumb_bob", "pinhole", "radtan", "none")
+PINHOLE_MODELS = ("", "pinhole", "radtan", "radial-tangential", "plumb_bob", "none")
+"""Names of the camera model that flocc takes: pinhole, with radial-tangential distortion."""
 
 _BYTES = {"mono8": 1, "8UC1": 1, "mono16": 2, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
 _BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
@@ -24,10 +25,12 @@ def raw_pixels(message: Any) -> Pixels:
     import cv2
 
     encoding = str(message.encoding)
-    width_bytes = message.width * (1 if encoding in _BAYER else _BYTES.get(encoding, 0))
-    if width_bytes == 0:
-        known = ", ".join([*_BYTES, *_BAYER])
-        raise ValueError(f"images are encoded as {encoding!r}, {message.width} wide; flocc reads {known}")
+    pixel_bytes = 1 if encoding in _BAYER else _BYTES.get(encoding)
+    if pixel_bytes is None:
+        raise ValueError(f"images are encoded as {encoding!r}; flocc reads {', '.join([*_BYTES, *_BAYER])}")
+    if message.width * message.height == 0:
+        raise ValueError("an image has no pixels")
+    width_bytes = message.width * pixel_bytes
     if len(message.data) < message.height * message.step or message.step < width_bytes:
         raise ValueError(f"an image has {len(message.data)} bytes, too few for its size")
     rows = np.asarray(message.data[: message.height * message.step]).reshape(message.height, message.step)
@@ -37,7 +40,7 @@ def raw_pixels(message: Any) -> Pixels:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), code), dtype=np.uint8)
     if encoding == "mono16":
         return rows[:, 0::2] if message.is_bigendian else rows[:, 1::2]
-    if width_bytes == message.width:
+    if pixel_bytes == 1:
         return rows
     pixels = rows.reshape(message.height, message.width, -1)[..., :3]
     return pixels if encoding.startswith("rgb") else pixels[..., ::-1]

@@ -17,7 +17,7 @@ from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
 from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.ros2 import Host, Ros2Adapter
+from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 from flocc_protocol.ids import LogId, Term
 
 EPOCH_S = 1_700_000_000

@@ -72,7 +72,7 @@ def test_a_colour_filter_is_interpolated() -> None:
 @pytest.mark.parametrize(
     ("encoding", "said"),
     [
-        ("16UC1", "images are encoded as '16UC1', 8 wide; flocc reads mono8, 8UC1, mono16, rgb8, bgr8"),
+        ("16UC1", "images are encoded as '16UC1'; flocc reads mono8, 8UC1, mono16, rgb8, bgr8"),
         ("yuv422", "encoded as 'yuv422'"),
         ("32FC1", "encoded as '32FC1'"),
         ("", "encoded as ''"),
@@ -90,6 +90,13 @@ def test_an_image_with_fewer_bytes_than_its_size_is_refused() -> None:
     short_step = cdr_by_hand.image(STAMP, "cam", (HEIGHT, WIDTH), "rgb8", bytes(3 * WIDTH * HEIGHT), WIDTH)
     with pytest.raises(BadMessage, match="too few"):
         image_of(TYPES.read(short_step, IMAGE), LENS)
+
+
+def test_an_image_without_pixels_is_refused() -> None:
+    for encoding in ("mono8", "bayer_rggb8"):
+        payload = cdr_by_hand.image(STAMP, "cam", (0, WIDTH), encoding, b"", WIDTH)
+        with pytest.raises(BadMessage, match="an image has no pixels"):
+            image_of(TYPES.read(payload, IMAGE), LENS)
 
 
 def test_an_image_of_another_size_than_the_intrinsics_is_refused() -> None:
