@@ -112,7 +112,9 @@ def test_the_verdict_does_not_hide_a_correction_that_did_not_help(tmp_path: Path
 def test_the_verdict_claims_nothing_for_a_single_robot(tmp_path: Path) -> None:
     whole = html_of(tmp_path)[1]
     report = whole.model_copy(update={"robots": ["r1"], "robot_details": whole.robot_details[:1]})
-    assert verdict(report) == "One robot ran, alone: nothing corrects its odometry. Its error is 0.134 m after alignment."
+    assert (
+        verdict(report) == "One robot ran, alone: nothing corrects its odometry. Its error is 0.134 m after alignment."
+    )
     unknown = report.model_copy(update={"ate_joint_m": None})
     assert verdict(unknown) == "One robot ran, alone: nothing corrects its odometry."
 
