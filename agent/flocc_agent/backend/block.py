@@ -17,6 +17,7 @@ from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
 from flocc_agent.backend.rbcd import Block, Links
+from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.backend.solvers import gnc_finished, gnc_weights, initial_control
 from flocc_agent.config import BackendConfig, Solver
 from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep, decides
@@ -55,7 +56,7 @@ class Measured:
         kappa: (E,) rotation weight.
         tau: (E,) translation weight.
         fixed: (E, 4, r) the other robot's pose, zero where there is none.
-        known: (E,) both ends have a pose in this frame.
+        known: (E,) both ends have a pose in this frame, and the covariance is one.
         own: (E,) its robust weight is this robot's to decide.
     """
 
@@ -86,6 +87,9 @@ def iterate_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | O
     Returns:
         Where the block stands now, or why it could not be moved.
     """
+    broken = first_not_rigid(np.asarray(problem.trajectory.T_odom_keyframe))
+    if broken is not None:
+        return OptimisationFailed(f"robot {problem.log}: odometry of keyframe {broken} is not rigid")
     try:
         return _iterated(config, problem)
     except (np.linalg.LinAlgError, RuntimeError, FloatingPointError) as error:
@@ -205,11 +209,11 @@ def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measur
     T = np.array([c.T_query_match_unscaled for c in closures], dtype=float).reshape(E, 4, 4)
     T[:, :3, 3] *= scale[:, None]
     kappa, tau = isotropic_weights(closure_covariances(closures, scale, config).reshape(E, 6, 6))
-    fixed, known = np.zeros((E, 4, rank)), np.ones(E, dtype=bool)
+    fixed, known = np.zeros((E, 4, rank)), np.isfinite(kappa) & np.isfinite(tau) & (kappa > 0) & (tau > 0)
     for k, closure in enumerate(closures):
         for end in (closure.query, closure.match):
             if end.log != log:
-                known[k] = _usable(problem.others, end, rank)
+                known[k] &= _usable(problem.others, end, rank)
                 fixed[k] = problem.others[end] if known[k] else 0.0
     i = np.array([c.query.index if c.query.log == log else -1 for c in closures], dtype=np.int64)
     j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
