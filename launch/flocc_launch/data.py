@@ -66,11 +66,17 @@ def _recording(path: Path, progress: Progress | None, seed: int = 0) -> Path:
     from flocc_launch.datasets.bag_reader import is_bag
     from flocc_launch.datasets.commands import convert, needed_drift
     from flocc_launch.datasets.detect import read_source
+    from flocc_launch.datasets.source import DatasetError
 
     if all((path / name).exists() for name in RECORDING_FILES):
         return path
-    drift = None if is_bag(path) else needed_drift(read_source(path))
-    return convert(path, _dataset_folder(path.resolve(), f"whole {seed}"), drift=drift, seed=seed, progress=progress)
+    out = _dataset_folder(path.resolve(), f"whole {seed}")
+    if not is_bag(path):
+        return convert(path, out, drift=needed_drift(read_source(path)), seed=seed, progress=progress)
+    try:
+        return convert(path, out, progress=progress)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; make a recording with 'flocc dataset convert', and run that") from error
 
 
 def _dataset_folder(source: Path, how: str) -> Path:
