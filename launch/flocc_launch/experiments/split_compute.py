@@ -251,7 +251,7 @@ def _bars(panel: "Axes", table: Sequence[Row], once: str, per_candidate: str) ->
     panel.set_xticks(range(len(table)), labels)
     panel.set_xlabel("similarity that makes a candidate")
     panel.grid(visible=False, axis="x")
-    panel.legend()
+    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncol=2, frameon=False)
 
 
 SPLIT_COMPUTE = Experiment(
