@@ -613,7 +613,7 @@ class Ros2Config(Section):
     """Where the name of the swarm's map frame is published, std_msgs/String; when it changes, every pose jumps."""
     tf_period_s: float = Field(0.05, gt=0)
     """Least time between two transforms, and between two poses."""
-    tf_tolerance_s: float = Field(0.1, ge=0)
+    tf_tolerance_s: float = Field(0.1, ge=0, le=60)
     """The transform is dated so far ahead, so that it can be looked up until the next one."""
     path_period_s: float = Field(1.0, gt=0)
     """Least time between two paths."""

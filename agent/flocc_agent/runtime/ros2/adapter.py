@@ -52,7 +52,7 @@ PROBLEMS_MAX = 64
 WATCH_PERIOD_S = 1.0
 PATIENCE_S = 5.0
 PATH_PAUSE_RATIO = 9.0
-BACK_IN_TIME = "time goes backwards; such messages are left out. After a reset of the clock, restart the agent"
+BACK_IN_TIME = "time goes backwards; such messages are left out (docs/ros2.md says what to do after a reset)"
 
 SENSOR = Qos(5, best_effort=True)
 RELIABLE = Qos(10)
@@ -186,9 +186,7 @@ class Ros2Adapter:
         config = self._config
         sample = odometry_of(self._types.read(payload, ODOMETRY), config.odom_frame, config.base_frame)
         if not self._synchroniser.add_odometry(*sample):
-            self._complain(
-                "odometry", "time goes backwards; such odometry is left out. Restart the agent after a reset"
-            )
+            self._complain("odometry", BACK_IN_TIME)
             return
         self._posed.set()
         self._place(*sample)

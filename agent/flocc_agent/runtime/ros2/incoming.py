@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.runtime.ros2.pixels import camera_of, compressed_pixels, raw_pixels, rectified_camera_of
 from flocc_agent.runtime.ros2.static_frames import pose_of_numbers
-from flocc_agent.runtime.ros2.types import COMPRESSED_IMAGE, BadMessage
+from flocc_agent.runtime.ros2.types import COMPRESSED_IMAGE, BadMessage, checked_stamp_ns
 
 Float = NDArray[np.float64]
 
@@ -76,4 +76,5 @@ def odometry_of(message: Any, odom_frame: str, base_frame: str) -> tuple[int, Fl
         )
     p, q = message.pose.pose.position, message.pose.pose.orientation
     stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec), pose_of_numbers((p.x, p.y, p.z, q.x, q.y, q.z, q.w), "odometry")
+    T_odom_body = pose_of_numbers((p.x, p.y, p.z, q.x, q.y, q.z, q.w), "odometry")
+    return checked_stamp_ns(stamp.sec, stamp.nanosec), T_odom_body

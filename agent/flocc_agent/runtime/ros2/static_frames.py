@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
+from flocc_protocol.codec import COORDINATE_MAX
 
 Float = NDArray[np.float64]
 
 FRAMES_MAX = 4096
 DEPTH_MAX = 64
+POSITION_MAX_M = COORDINATE_MAX / 4
+"""So that a camera on such a body is still within what may be sent."""
 
 
 class StaticFrames:
@@ -64,10 +67,14 @@ def pose_of_numbers(numbers: tuple[float, ...], where: str) -> Float:
     """Pose of `x y z qx qy qz qw`, as ROS writes it.
 
     Raises:
-        BadMessage: A number is not finite, or the quaternion is not of unit length.
+        BadMessage: A number is not finite or too large to be sent, or the quaternion is not of unit length.
     """
     x, y, z, qx, qy, qz, qw = (float(number) for number in numbers)
     norm = math.hypot(qx, qy, qz, qw)
-    if not math.isfinite(norm) or abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE or not np.all(np.isfinite([x, y, z])):
+    if (
+        not math.isfinite(norm)
+        or abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE
+        or not max(abs(x), abs(y), abs(z)) < POSITION_MAX_M
+    ):
         raise BadMessage(f"{where}: position ({x:g}, {y:g}, {z:g}) with a quaternion of length {norm:.3g} is no pose")
     return pose_from_tq(np.array([x, y, z, qw, qx, qy, qz]))

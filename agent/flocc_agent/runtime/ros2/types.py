@@ -17,6 +17,9 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ODOMETRY = "nav_msgs/msg/Odometry"
 
+SEC_MAX = 2**31 - 3600
+"""ROS counts seconds in 32 bits; an hour is left for what is dated ahead."""
+
 _HEADER = {b"\x00\x01": "<", b"\x00\x00": ">"}
 _FRAME_AT = 16
 
@@ -71,7 +74,7 @@ def header_of(payload: bytes) -> tuple[int, str]:
     """Time (nanoseconds) and frame of a serialised message whose first field is a header; the rest is not read.
 
     Raises:
-        BadMessage: It is too short, or begins with no CDR header.
+        BadMessage: It is too short, begins with no CDR header, or its stamp is no time.
     """
     order = _HEADER.get(bytes(payload[:2]))
     if order is None or len(payload) < _FRAME_AT:
@@ -80,7 +83,18 @@ def header_of(payload: bytes) -> tuple[int, str]:
     frame = bytes(payload[_FRAME_AT : _FRAME_AT + length])
     if len(frame) != length or not frame.endswith(b"\0"):
         raise BadMessage(f"{len(payload)} bytes are no message with a header")
-    return int(sec) * 10**9 + int(nanosec), frame[:-1].decode(errors="replace")
+    return checked_stamp_ns(sec, nanosec), frame[:-1].decode(errors="replace")
+
+
+def checked_stamp_ns(sec: int, nanosec: int) -> int:
+    """Time of a stamp, nanoseconds.
+
+    Raises:
+        BadMessage: It is before 1970, or so late that no later one could be written.
+    """
+    if not 0 <= sec < SEC_MAX or nanosec >= 10**9:
+        raise BadMessage(f"the stamp {sec} s and {nanosec} ns is no time")
+    return int(sec) * 10**9 + int(nanosec)
 
 
 def gid_of(token: str) -> bytes:

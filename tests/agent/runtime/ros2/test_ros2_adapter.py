@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,10 @@ from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
 from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
+from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
+from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_protocol.ids import LogId, Term
 
 EPOCH_S = 1_700_000_000
@@ -311,3 +313,33 @@ def test_the_type_of_images_follows_from_the_topics_name_unless_it_is_said() -> 
     assert not Ros2Config().is_compressed()
     assert Ros2Config(image_topic="camera/image_raw/compressed").is_compressed()
     assert Ros2Config(image_type="compressed").is_compressed()
+
+
+def mutated(payload: bytes, rng: np.random.Generator) -> bytes:
+    """A payload with a few other bytes, or cut, or with junk behind."""
+    broken = bytearray(payload)
+    for _ in range(int(rng.integers(1, 4))):
+        broken[int(rng.integers(0, min(len(broken), 250)))] = int(rng.integers(0, 256))
+    return bytes(broken[: int(rng.integers(0, len(broken) + 1))]) if rng.random() < 0.3 else bytes(broken)
+
+
+async def test_no_payload_of_any_kind_stops_the_adapter() -> None:
+    rng, agent = np.random.default_rng(11), Agent()
+    selector = KeyframeSelector(KeyframeConfig(distance_m=0.0))
+    adapter = Ros2Adapter(Ros2Config(camera_mounting=MOUNTING), "r1", selector, agent.host())
+    adapter._mount(T_BODY_CAMERA)
+    K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
+    info = cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.1, 0.0, 0.0, 0.0, 0.1], P)
+    placed = cdr_by_hand.transforms([Stamped((0, 0), "base_link", "optical", MOUNTING[:3], MOUNTING[3:])])
+    for t_ms in range(0, 60_000, 20):
+        sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        picture = cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "bgr8", bytes(72), 18)
+        sent = {"odometry": cdr_by_hand.odometry(sample), "image": picture, "camera_info": info, "tf_static": placed}
+        for kind, payload in sent.items():
+            adapter._arrived(Incoming("", kind, mutated(payload, rng)))
+        while (posed := adapter._synchroniser.next()) is not None:
+            with suppress(BadMessage):
+                await adapter._consider(posed)
+    assert len(agent.problems()) <= 64
+    assert sum(adapter.counters().values()) > 1000
+    assert all(np.all(np.isfinite(T)) for _, T, _ in agent.keyframes)

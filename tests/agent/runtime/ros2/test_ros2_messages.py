@@ -110,8 +110,8 @@ def test_the_covariance_is_in_the_order_of_ros() -> None:
 
 def odometry(**changes: Any) -> bytes:
     position, quaternion = numbers_of(T_ODOM_BODY)
-    sample = {"frame": "odom", "child": "base_link", "position": position, "quaternion": quaternion} | changes
-    return cdr_by_hand.odometry(Stamped(STAMP, **sample))
+    sample = {"stamp": STAMP, "frame": "odom", "child": "base_link", "position": position, "quaternion": quaternion}
+    return cdr_by_hand.odometry(Stamped(**(sample | changes)))
 
 
 def test_odometry_is_read() -> None:
@@ -128,6 +128,10 @@ def test_odometry_is_read() -> None:
         ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "quaternion of length 0 is no pose"),
         ({"quaternion": (0.0, 0.0, 0.0, float("nan"))}, "is no pose"),
         ({"position": (1e400, 0.0, 0.0)}, "is no pose"),
+        ({"position": (0.0, 0.0, -1e7)}, "is no pose"),
+        ({"stamp": (-1, 0)}, "the stamp -1 s and 0 ns is no time"),
+        ({"stamp": (2**31 - 1, 0)}, "is no time"),
+        ({"stamp": (1, 10**9)}, "is no time"),
     ],
 )
 def test_odometry_that_cannot_be_used_says_why(changes: dict[str, Any], said: str) -> None:
