@@ -329,8 +329,9 @@ class Agent:
         log = self._store.identity.log
         boot = int.from_bytes(os.urandom(6))
         distributed = config.backend.mode is BackendMode.DISTRIBUTED
+        core_parameters = config.core.under(config.bandwidth_bytes_s)
         core = Robot(
-            log, config.compute_class, boot, config.core, self._clock_s(), restored, _sealer(config), distributed
+            log, config.compute_class, boot, core_parameters, self._clock_s(), restored, _sealer(config), distributed
         )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s

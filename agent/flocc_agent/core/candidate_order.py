@@ -11,8 +11,10 @@ joined, so that a pair that joins two of them simply gains most.
 Odometry chains are contracted to the keyframes that have closures or candidates (a chain of n edges is one edge of
 weight 1 / n), each with the mass of the keyframes around it, and neighbours are merged until `NODES_MAX` remain.
 
-Robots choose without talking: both owners of a pair know it, so each counts on the other to register what comes first
-and is the other's, and chooses its own beside that.
+Only what is chosen is fetched and registered, also where latents are at hand: a pair that adds little costs the solver
+as much as one that adds much. All others have their turn when nothing better is left. Robots choose without talking:
+both owners of a pair know it, so each counts on the other to register what comes first and is the other's, and chooses
+its own beside that.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

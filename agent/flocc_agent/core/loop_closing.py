@@ -274,7 +274,7 @@ class LoopClosing:
         return [*self._work.using(keyframe), *self._offers.using(keyframe)]
 
     def _choice(self) -> list[CandidatePair]:
-        """The few pairs that come first because they strengthen the pose graph most."""
+        """The few pairs that are due because they strengthen the pose graph most; all others wait for their turn."""
         if self._spectral is None or not len(self._work):
             return []
         if self._chosen is None:
@@ -293,7 +293,7 @@ class LoopClosing:
     def _fetchable(self) -> list[KeyframeId]:
         """Latents that can be had and that a pair lacks, the first pair's first."""
         chosen = [keyframe for pair in self._choice() if (work := self._work.get(pair)) for keyframe in work.lacking]
-        return [*chosen, *self._fetchable_by_similarity()]
+        return chosen or self._fetchable_by_similarity()
 
     def _fetchable_by_similarity(self) -> list[KeyframeId]:
         lacking = self._work.lacking

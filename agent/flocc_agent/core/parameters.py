@@ -3,7 +3,7 @@
 They are plain dataclasses so that the core stays free of frameworks; `config.py` checks them with pydantic.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 _FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
@@ -91,13 +91,20 @@ class PlaceRecognitionParameters:
     """Candidates per keyframe and other robot; the paper takes the nearest neighbour only."""
     own_gap_keyframes: int = 0
     """A robot also looks for its own keyframes that are at least so many apart; 0: only for other robots'."""
-    candidate_order: Literal["similarity", "spectral"] = "similarity"
-    """Which candidates are registered first: the most similar, or those that strengthen the pose graph most."""
+    candidate_order: Literal["auto", "similarity", "spectral"] = "auto"
+    """Which candidates are registered first: the most similar, or those that strengthen the pose graph most; auto: the
+    latter where the robot has a bandwidth budget."""
 
     def __post_init__(self) -> None:
         _require(-1 <= self.similarity_threshold <= 1, "similarity_threshold must be in [-1, 1]")
         _require(1 <= self.best_matches <= 16, "best_matches must be in [1, 16]")
         _require(self.own_gap_keyframes >= 0, "own_gap_keyframes must not be negative")
+
+    def under(self, bandwidth_bytes_s: float | None) -> "PlaceRecognitionParameters":
+        """With the order that a budget, or none, calls for."""
+        if self.candidate_order != "auto":
+            return self
+        return replace(self, candidate_order="similarity" if bandwidth_bytes_s is None else "spectral")
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,3 +214,7 @@ class CoreParameters:
     loop_closing: LoopClosingParameters = field(default_factory=LoopClosingParameters)
     rounds: RoundParameters = field(default_factory=RoundParameters)
     distributed: DistributedParameters = field(default_factory=DistributedParameters)
+
+    def under(self, bandwidth_bytes_s: float | None) -> "CoreParameters":
+        """With the order of candidates that a budget, or none, calls for."""
+        return replace(self, place_recognition=self.place_recognition.under(bandwidth_bytes_s))

@@ -7,7 +7,7 @@ thousands that wait for latents out of reach.
 import heapq
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from flocc_agent.core.place_recognition import Candidate
@@ -170,10 +170,10 @@ class WorkTable:
         """Registrations under way."""
         return len(self._registering)
 
-    def start_next(self, until_s: float, first: Iterable[CandidatePair] = ()) -> Work | None:
-        """Start a pair that is ready, if one is: of the given ones the first, else the most similar."""
-        work = next((work for pair in first if (work := self._by_pair.get(pair)) and work.is_ready), None)
-        while work is None and self._ready:
+    def start_next(self, until_s: float, chosen: Sequence[CandidatePair] = ()) -> Work | None:
+        """Start a pair that is ready, if one is: the first of those chosen, or where none is the most similar."""
+        work = next((work for pair in chosen if (work := self._by_pair.get(pair)) and work.is_ready), None)
+        while work is None and self._ready and not chosen:
             found = self._by_pair.get(heapq.heappop(self._ready)[1])
             work = found if found is not None and found.is_ready else None
         if work is not None:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from flocc_launch.experiments.bandwidth import BANDWIDTH
+from flocc_launch.experiments.candidate_order import CANDIDATE_ORDER
 from flocc_launch.experiments.distributed import DISTRIBUTED
 from flocc_launch.experiments.experiment import Experiment, ExperimentError
 from flocc_launch.experiments.faults import FAULTS
@@ -20,6 +21,7 @@ ALL: tuple[Experiment[Any], ...] = (
     SPARSE_KEYFRAMES,
     FAULTS,
     BANDWIDTH,
+    CANDIDATE_ORDER,
     DISTRIBUTED,
 )
 

@@ -80,7 +80,8 @@ class Swarm:
         """Switch a robot on."""
         station = self.stations[name]
         boot = int(np.random.default_rng([self._seed, BOOTS, *name.encode(), station.life]).integers(2**52))
-        station.start(boot, self.scenario.core, self.scenario.backend.mode is BackendMode.DISTRIBUTED)
+        core = self.scenario.core.under(self.scenario.bandwidth_bytes_s)
+        station.start(boot, core, self.scenario.backend.mode is BackendMode.DISTRIBUTED)
 
     def kill(self, name: str) -> None:
         """A robot dies; its disk stays."""
