@@ -111,7 +111,10 @@ def test_the_verdict_does_not_hide_a_correction_that_did_not_help(tmp_path: Path
 
 def test_the_verdict_claims_nothing_for_a_single_robot(tmp_path: Path) -> None:
     whole = html_of(tmp_path)[1]
-    report = whole.model_copy(update={"robots": ["r1"], "robot_details": whole.robot_details[:1]})
+    lone = {"robots": ["r1"], "robot_details": whole.robot_details[:1]}
+    assert verdict(whole.model_copy(update=lone)).startswith("One robot ran, alone, and closed ")
+    none = whole.closures.model_copy(update={"accepted": 0})
+    report = whole.model_copy(update={**lone, "closures": none})
     assert (
         verdict(report) == "One robot ran, alone: nothing corrects its odometry. Its error is 0.134 m after alignment."
     )

@@ -14,7 +14,12 @@ def verdict(report: Report) -> str:
 
 
 def alone(report: Report) -> str:
-    """What there is to say of a single robot: loops are closed between robots only."""
+    """What there is to say of a single robot, which closes loops with itself where it was asked to."""
+    loops = report.closures.accepted
+    if loops:
+        return (
+            f"One robot ran, alone, and closed {word(loops)} loop{'s' * (loops != 1)}. {error_sentence(report)}".strip()
+        )
     error = "" if report.ate_joint_m is None else f" Its error is {number(report.ate_joint_m, 'm')} after alignment."
     return f"One robot ran, alone: nothing corrects its odometry.{error}"
 
