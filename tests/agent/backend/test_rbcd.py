@@ -103,8 +103,8 @@ def iterated(problem: BlockProblem, solver: Solver, iterations: int) -> BlockSte
     for _ in range(iterations):
         step = iterate_block(config(solver), problem)
         assert isinstance(step, BlockStep)
-        problem = replace(problem, state=step.state, origin=step.origin)
-    return step
+        found, problem = step, replace(problem, state=step.state, origin=step.origin)
+    return found
 
 
 def test_a_robot_alone_comes_to_rest_at_its_own_optimum_in_its_own_frame() -> None:

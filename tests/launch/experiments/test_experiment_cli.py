@@ -131,7 +131,9 @@ def test_a_checkpoint_of_another_model_is_refused(
     assert not (out / "rows.jsonl").exists()
 
 
-@pytest.mark.parametrize("name", ["registration", "split-compute", "sparse-keyframes", "faults", "bandwidth"])
+@pytest.mark.parametrize(
+    "name", ["full-system", "registration", "scale", "split-compute", "sparse-keyframes", "faults", "bandwidth"]
+)
 def test_the_smallest_version_of_each_experiment_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

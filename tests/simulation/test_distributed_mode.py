@@ -1,0 +1,59 @@
+"""`backend.mode = "distributed"` in whole agents on virtual time: one map without a leader's rounds."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flocc_agent.config import BackendConfig
+from flocc_launch.scenario import Scenario
+from flocc_launch.simulation.simulate import simulate
+
+
+def scenario(**changes: Any) -> Scenario:
+    """Three robots whose walks overlap; their registrations are metric."""
+    exact = {"scale_sigma_ratio": 0.0, "scale_drift_sigma_ratio": 0.0}
+    fields: dict[str, Any] = {
+        "name": "together",
+        "tracks": {"robots": 3, "seed": 3, "area_m": 12.0, "length_m": 20.0},
+        "keyframes": {"distance_m": 1.0},
+        "perception": {"method": "synthetic", "synthetic": exact},
+        "backend": {"mode": "distributed", "formulation": "base"},
+        "radio": {"loss_ratio": 0.3, "latency_s": 0.05, "jitter_s": 0.05},
+    }
+    return Scenario.model_validate({**fields, **changes})
+
+
+def test_robots_that_lose_messages_agree_on_one_map_that_no_leader_made(tmp_path: Path) -> None:
+    report = simulate(scenario(), tmp_path / "run", 1)
+    assert report.map_frames == ["map/r1"]
+    assert report.ate_joint_m is not None
+    assert report.bytes["separators"] > 0
+    lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    assert "optimised" not in {line["event"] for line in lines}
+    givers = {(line["robot"], line["leader"]) for line in lines if line["event"] == "correction"}
+    assert givers == {("r1", "r1"), ("r2", "r2"), ("r3", "r3")}
+    central = simulate(scenario(backend={"formulation": "base"}), tmp_path / "central", 1)
+    assert central.ate_joint_m is not None
+    assert report.ate_joint_m < 1.2 * central.ate_joint_m + 0.02
+
+
+def test_a_robot_that_was_killed_comes_back_above_its_last_iteration(tmp_path: Path) -> None:
+    faults = [
+        {"at_s": 18.0, "kind": "kill", "robots": ["r2"]},
+        {"at_s": 22.0, "kind": "restart", "robots": ["r2"]},
+    ]
+    report = simulate(scenario(faults=faults), tmp_path / "run", 1)
+    assert report.map_frames == ["map/r1"]
+    lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    rounds = [line["round"] for line in lines if line["event"] == "correction" and line["robot"] == "r2"]
+    assert rounds == sorted(set(rounds))
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"), [({"formulation": "smoothed"}, "formulation = 'base'"), ({"solver": "huber"}, "'lm' and")]
+)
+def test_what_distributed_mode_cannot_do_is_refused_with_a_sentence(fields: dict[str, str], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        BackendConfig.model_validate({"mode": "distributed", "formulation": "base", **fields})
