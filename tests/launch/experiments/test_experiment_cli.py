@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,13 +103,16 @@ def test_robots_that_never_come_near_each_other_are_refused(
     assert "no two views of different robots are within 10 m of each other" in sentence(capsys)
 
 
-def test_a_robot_whose_way_stays_apart_is_named_before_anything_is_simulated() -> None:
+def test_a_robot_without_truth_or_whose_way_stays_apart_is_named_before_anything_is_simulated() -> None:
     routes = {"r1": [[0, 0], [10, 0]], "r2": [[10, 0], [20, 0]], "r3": [[500, 0], [510, 0]]}
     tracks = TracksScenario.model_validate({"robots": 3, "routes_m": routes})
     playbacks = playbacks_of(Scenario(tracks=tracks), {})
     require_overlap({name: playbacks[name] for name in ("r1", "r2")}, 5.0, "scenario s")
     with pytest.raises(ExperimentError, match=r"scenario s: the way of robot r3 stays more than 5 m from the others'"):
         require_overlap(playbacks, 5.0, "scenario s")
+    blind = {**playbacks, "r2": replace(playbacks["r2"], truth=None)}
+    with pytest.raises(ExperimentError, match="scenario s: robot r2 has no ground truth"):
+        require_overlap(blind, 5.0, "scenario s")
 
 
 def test_a_checkpoint_of_another_model_is_refused(
