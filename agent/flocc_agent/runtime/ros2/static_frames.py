@@ -71,10 +71,7 @@ def pose_of_numbers(numbers: tuple[float, ...], where: str) -> Float:
     """
     x, y, z, qx, qy, qz, qw = (float(number) for number in numbers)
     norm = math.hypot(qx, qy, qz, qw)
-    if (
-        not math.isfinite(norm)
-        or abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE
-        or not max(abs(x), abs(y), abs(z)) < POSITION_MAX_M
-    ):
+    is_unit = abs(norm - 1.0) <= QUATERNION_NORM_TOLERANCE
+    if not (is_unit and all(abs(each) < POSITION_MAX_M for each in (x, y, z))):
         raise BadMessage(f"{where}: position ({x:g}, {y:g}, {z:g}) with a quaternion of length {norm:.3g} is no pose")
     return pose_from_tq(np.array([x, y, z, qw, qx, qy, qz]))

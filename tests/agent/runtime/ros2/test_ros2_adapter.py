@@ -331,7 +331,7 @@ async def test_no_payload_of_any_kind_stops_the_adapter() -> None:
     K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
     info = cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.1, 0.0, 0.0, 0.0, 0.1], P)
     placed = cdr_by_hand.transforms([Stamped((0, 0), "base_link", "optical", MOUNTING[:3], MOUNTING[3:])])
-    for t_ms in range(0, 60_000, 20):
+    for t_ms in range(0, 20_000, 20):
         sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         picture = cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "bgr8", bytes(72), 18)
         sent = {"odometry": cdr_by_hand.odometry(sample), "image": picture, "camera_info": info, "tf_static": placed}
@@ -341,5 +341,5 @@ async def test_no_payload_of_any_kind_stops_the_adapter() -> None:
             with suppress(BadMessage):
                 await adapter._consider(posed)
     assert len(agent.problems()) <= 64
-    assert sum(adapter.counters().values()) > 1000
+    assert sum(adapter.counters().values()) > 300
     assert all(np.all(np.isfinite(T)) for _, T, _ in agent.keyframes)

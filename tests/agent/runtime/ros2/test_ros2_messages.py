@@ -129,6 +129,7 @@ def test_odometry_is_read() -> None:
         ({"quaternion": (0.0, 0.0, 0.0, float("nan"))}, "is no pose"),
         ({"position": (1e400, 0.0, 0.0)}, "is no pose"),
         ({"position": (0.0, 0.0, -1e7)}, "is no pose"),
+        ({"position": (0.0, float("nan"), 0.0)}, "is no pose"),
         ({"stamp": (-1, 0)}, "the stamp -1 s and 0 ns is no time"),
         ({"stamp": (2**31 - 1, 0)}, "is no time"),
         ({"stamp": (1, 10**9)}, "is no time"),
