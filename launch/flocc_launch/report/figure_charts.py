@@ -52,7 +52,7 @@ def stacked(x: Axis, y: Axis, edges: Float, rejected: int, accepted: int, k: int
             said = title(f"{count} {word}, ratio {edges[k]:.2f} to {edges[k + 1]:.2f}")
             bars.append(element("rect", said, x=left, y=top, width=width, height=bottom - top, class_=f"bar {name}"))
     if rejected + accepted > y.high:
-        bars.append(element("text", f"↑ {rejected + accepted}", x=left + width + 4, y=y.to_px + 10, font_size=12))
+        bars.append(element("text", f"↑ {rejected + accepted}", x=left, y=y.to_px - 5, font_size=12))
     return bars
 
 
@@ -62,7 +62,7 @@ def threshold(x: Axis, y: Axis, limit: float) -> str:
     if not x.from_px <= at <= x.to_px:
         return ""
     line = element("line", x1=at, x2=at, y1=y.to_px, y2=y.from_px, class_="mark")
-    return line + element("text", f"R_thr {limit:g}", x=at + 5, y=TOP_PX + 4, font_size=12)
+    return line + element("text", f"R_thr {limit:g}", x=at + 5, y=TOP_PX + 12, font_size=12)
 
 
 def error_figure(loaded: LoadedRun) -> str | None:
