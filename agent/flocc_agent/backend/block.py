@@ -8,6 +8,7 @@ by graduated non-convexity (Yang 2020), each by the lower of its two robots. Sca
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep, decides
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import inverse
-from flocc_protocol.ids import KeyframeId
+from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 Float = NDArray[np.float64]
@@ -40,6 +41,8 @@ INNER_STEPS = 20
 TOGETHER_RATIO = 0.5
 MOMENTUM_MAX = 0.995
 TILT = 1e-3
+CLOSURES_MAX = 32
+"""Blocks whose closures are kept as arrays."""
 LEAVE_RATIO = 1.2
 """A used closure is dropped only this far beyond its bound, so that weights come to rest."""
 
@@ -204,22 +207,30 @@ def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopC
 def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measured:
     """The block's closures as arrays, with the poses of others as last heard."""
     closures, log = problem.closures, problem.log
-    E = len(closures)
-    scale = np.array([initial_scale(c, config) for c in closures])
-    T = np.array([c.T_query_match_unscaled for c in closures], dtype=float).reshape(E, 4, 4)
-    T[:, :3, 3] *= scale[:, None]
-    kappa, tau = isotropic_weights(closure_covariances(closures, scale, config).reshape(E, 6, 6))
-    fixed, known = np.zeros((E, 4, rank)), np.isfinite(kappa) & np.isfinite(tau) & (kappa > 0) & (tau > 0)
+    alone = _without_others(config, closures, log)
+    fixed, known = np.zeros((len(closures), 4, rank)), alone.known.copy()
     for k, closure in enumerate(closures):
         for end in (closure.query, closure.match):
             if end.log != log:
                 known[k] &= _usable(problem.others, end, rank)
                 fixed[k] = problem.others[end] if known[k] else 0.0
+    return replace(alone, fixed=fixed, known=known)
+
+
+@lru_cache(maxsize=CLOSURES_MAX)
+def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], log: LogId) -> Measured:
+    """What does not change from one iteration to the next; `known` says only whether the covariance is one."""
+    E = len(closures)
+    scale = np.array([initial_scale(c, config) for c in closures])
+    T = np.array([c.T_query_match_unscaled for c in closures], dtype=float).reshape(E, 4, 4)
+    T[:, :3, 3] *= scale[:, None]
+    kappa, tau = isotropic_weights(closure_covariances(closures, scale, config).reshape(E, 6, 6))
+    known = np.isfinite(kappa) & np.isfinite(tau) & (kappa > 0) & (tau > 0)
     i = np.array([c.query.index if c.query.log == log else -1 for c in closures], dtype=np.int64)
     j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
     own = np.array([decides(c) == log for c in closures], dtype=bool)
     pairs = tuple(CandidatePair.of(c.query, c.match) for c in closures)
-    return Measured(pairs, i, j, T, kappa, tau, fixed, known, own)
+    return Measured(pairs, i, j, T, kappa, tau, np.zeros((E, 4, config.rank)), known, own)
 
 
 def _usable(others: Mapping[KeyframeId, Float], keyframe: KeyframeId, rank: int) -> bool:

@@ -6,7 +6,6 @@ that double. Every robot starts in its own frame and moves into that of a neighb
 frame survives: the lowest robot's. A robot gives corrections to itself only, with its iteration as the round.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -93,6 +92,8 @@ class DistributedOptimisation:
         self._trajectory = Trajectory(np.zeros((0, 4, 4)))
         self._closures: tuple[LoopClosure, ...] = ()
         self._separators: tuple[int, ...] = ()
+        self._far_ends: tuple[KeyframeId, ...] = ()
+        self._joined: tuple[LogId, ...] = ()
         self._state: BlockState | None = None
         self._step: BlockStep | None = None
         self._has_news = False
@@ -232,20 +233,23 @@ class DistributedOptimisation:
             return
         self._trajectory = graph.trajectories[self._own]
         self._closures = tuple(c for c in graph.closures if self._own in (c.query.log, c.match.log))
-        self._separators = tuple(sorted({self._ends(c)[0].index for c in self._closures if _joins_robots(c)}))
+        ends = [self._ends(c) for c in self._closures if c.query.log != c.match.log]
+        self._separators = tuple(sorted({own.index for own, _ in ends}))
+        self._far_ends = tuple(sorted({other for _, other in ends}))
+        self._joined = tuple(sorted({other.log for _, other in ends}))
         self._has_news = True
 
     def _ends(self, closure: LoopClosure) -> tuple[KeyframeId, KeyframeId]:
         """The own and the other end of a closure between two robots."""
         return (closure.query, closure.match) if closure.query.log == self._own else (closure.match, closure.query)
 
-    def _far_ends(self) -> Iterator[KeyframeId]:
-        return (self._ends(closure)[1] for closure in self._closures if _joins_robots(closure))
+    def _heard_of(self) -> list[_Neighbour]:
+        """Neighbours that closures join to this robot and that said something."""
+        return [self._neighbours[log] for log in self._joined if log in self._neighbours]
 
     def _sharing(self) -> list[_Neighbour]:
-        """Neighbours in this robot's frame that closures join to it."""
-        joined = {end.log for end in self._far_ends()}
-        return [n for log, n in sorted(self._neighbours.items()) if log in joined and n.anchor == self.anchor]
+        """Those of them that are in this robot's frame."""
+        return [neighbour for neighbour in self._heard_of() if neighbour.anchor == self.anchor]
 
     def _take_poses(self, held: _Neighbour, message: Separators) -> bool:
         """Whether a pose moved enough to begin anew."""
@@ -301,14 +305,13 @@ class DistributedOptimisation:
 
     def _in_lower_frame(self) -> _Neighbour | None:
         """A neighbour with closures in the lowest frame that is lower than this robot's; the freshest of several."""
-        joined = {end.log for end in self._far_ends()}
-        lower = [n for log, n in sorted(self._neighbours.items()) if log in joined and n.anchor < self.anchor]
+        lower = [neighbour for neighbour in self._heard_of() if neighbour.anchor < self.anchor]
         return min(lower, key=lambda n: (n.anchor, -n.origin_iteration), default=None)
 
     def _poses_in(self, anchor: LogId) -> dict[KeyframeId, Float]:
         """Poses of the far ends of closures, of robots in a frame, as far as they said them."""
         found = {}
-        for end in self._far_ends():
+        for end in self._far_ends:
             neighbour = self._neighbours.get(end.log)
             if neighbour is not None and neighbour.anchor == anchor and end.index in neighbour.poses:
                 found[end] = neighbour.poses[end.index]
@@ -339,7 +342,3 @@ class DistributedOptimisation:
                 )
             )
         return messages
-
-
-def _joins_robots(closure: LoopClosure) -> bool:
-    return closure.query.log != closure.match.log
