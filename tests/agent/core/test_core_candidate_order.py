@@ -1,6 +1,7 @@
 """Claims on the spectral order of candidates."""
 
 import time
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,6 +18,11 @@ from flocc_agent.core.candidate_order import (
     step_for,
     uncertainty_removed,
 )
+from flocc_agent.core.effects import Effect, FetchLatent, Register
+from flocc_agent.core.latents import Peer
+from flocc_agent.core.loop_closing import LoopClosing, registrar_of
+from flocc_agent.core.parameters import CoreParameters, LoopClosingParameters, PlaceRecognitionParameters
+from flocc_agent.core.place_recognition import Candidate
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
@@ -208,3 +214,70 @@ def test_a_gain_is_what_the_sum_of_inverse_eigenvalues_loses() -> None:
 
 def test_an_edge_between_equal_values_removes_nothing() -> None:
     assert uncertainty_removed(np.zeros((1, 3)), np.ones(3), 1.0) == pytest.approx([0.0])
+
+
+def closing_of(count: int) -> tuple[LoopClosing, list[CandidatePair]]:
+    """Robot r1, in range of r2, with so many pairs of its own to register, one latent to fetch for each."""
+    own = [one for one in side_by_side() if registrar_of(one) == R1 and one.low.index > 0][:count]
+    machine = LoopClosing(
+        R1,
+        0,
+        lambda keyframe: (KeyframeId(keyframe.log, keyframe.index - 1), (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),
+        LoopClosingParameters(fetches_max=1),
+        order_of(R1, R2),
+    )
+    machine.on_peer("r2", Peer(0))
+    for index in range(LENGTH):
+        machine.on_held(KeyframeId(R1, index))
+    machine.on_candidates([Candidate(one, 0.9) for one in own], 0.0)
+    return machine, own
+
+
+def started(effects: list[Effect]) -> list[CandidatePair]:
+    return [effect.pair for effect in effects if isinstance(effect, Register)]
+
+
+def fetched(effects: list[Effect]) -> list[KeyframeId]:
+    return [effect.keyframe for effect in effects if isinstance(effect, FetchLatent)]
+
+
+def test_only_chosen_pairs_are_fetched_and_registered_also_where_latents_are_at_hand() -> None:
+    machine, own = closing_of(12)
+    (wanted,) = fetched(machine.tick(0.0))
+    chosen = machine._choice()
+    assert wanted == chosen[0].high
+    idle = next(one for one in own if one not in chosen)
+    machine.on_held(idle.high)
+    assert started(machine.tick(1.0)) == []
+    machine.on_held(wanted)
+    assert started(machine.tick(2.0)) == [chosen[0]]
+
+
+def test_every_pair_has_its_turn() -> None:
+    machine, own = closing_of(12)
+    done: list[CandidatePair] = []
+    for step in range(200):
+        for effect in machine.tick(float(step)):
+            match effect:
+                case FetchLatent(keyframe):
+                    machine.on_held(keyframe)
+                case Register(one):
+                    done.append(one)
+                    machine.on_closure(one)
+    assert sorted(done) == sorted(own)
+
+
+@pytest.mark.parametrize(
+    ("order", "bandwidth", "expected"),
+    [
+        ("auto", None, "similarity"),
+        ("auto", 1e5, "spectral"),
+        ("similarity", 1e5, "similarity"),
+        ("spectral", None, "spectral"),
+    ],
+)
+def test_a_budget_calls_for_the_spectral_order_unless_another_is_asked_for(
+    order: Literal["auto", "similarity", "spectral"], bandwidth: float | None, expected: str
+) -> None:
+    given = CoreParameters(place_recognition=PlaceRecognitionParameters(candidate_order=order))
+    assert given.under(bandwidth).place_recognition.candidate_order == expected
