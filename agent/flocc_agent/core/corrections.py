@@ -47,6 +47,7 @@ class Corrections:
         self._rounds = rounds
         self._sealer = sealer
         self._newest: dict[LogId, LogCorrection] = {}
+        self._frame_unknown = False
         self._asked_until_s: dict[LogId, float] = {}
         self._agreed: dict[LogId, CorrectionVersion] = {}
         self._announcer: Announcer[CorrectionVersion] = Announcer()
@@ -68,9 +69,10 @@ class Corrections:
             "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
         }
 
-    def restore(self, message: LogCorrection) -> None:
-        """Put back the correction that was applied before a restart."""
+    def restore(self, message: LogCorrection, frame_changed: bool) -> None:
+        """Put back the correction that was applied before a restart; consumers may not know its frame yet."""
         self._keep(message)
+        self._frame_unknown = frame_changed
 
     def announced(self) -> tuple[CorrectionVersion, ...]:
         """What one heartbeat says of the corrections that this robot holds."""
@@ -182,7 +184,9 @@ class Corrections:
         return bool(shift.max() > self._rounds.translation_tolerance_m)
 
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
-        correction = delivered(message, frame_changed=held is not None and held.anchor != message.anchor)
+        changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
+        self._frame_unknown = False
+        correction = delivered(message, changed)
         facts = {
             "term": message.term.counter,
             "leader": message.term.leader.robot,
@@ -191,7 +195,7 @@ class Corrections:
             "frame_changed": correction.frame_changed,
             "T_map_odom": [float(x) for x in message.T_map_odom],
         }
-        return [PersistCorrection(message), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
+        return [PersistCorrection(message, changed), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:

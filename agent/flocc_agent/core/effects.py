@@ -137,9 +137,15 @@ class PersistTerm:
 
 @dataclass(frozen=True, slots=True)
 class PersistCorrection:
-    """Remember the correction that this robot applied."""
+    """Remember the correction that this robot applied.
+
+    Attributes:
+        correction: It.
+        frame_changed: Consumers may not have heard of its map frame yet: the power may go before they do.
+    """
 
     correction: LogCorrection
+    frame_changed: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,12 +85,14 @@ class Restored:
         latents: Keyframes whose latents are stored.
         term_counter: Highest term counter the robot claimed.
         correction: The correction it applied last.
+        frame_changed: That correction changed the map frame, and nobody knows whether consumers heard of it.
     """
 
     records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
     latents: tuple[KeyframeId, ...] = ()
     term_counter: int = 0
     correction: LogCorrection | None = None
+    frame_changed: bool = False
 
     def counter_max(self) -> int:
         """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
@@ -390,7 +392,7 @@ class Robot:
         for keyframe in restored.latents:
             self.closing.on_held(keyframe)
         if restored.correction is not None:
-            self.corrections.restore(restored.correction)
+            self.corrections.restore(restored.correction, restored.frame_changed)
 
     # Time
 

@@ -10,6 +10,9 @@ from flocc_protocol.messages import CorrectionBatch, Envelope, LogCorrection, Un
 
 Persist = PersistRecord | PersistTerm | PersistCorrection
 
+FRAME_CHANGED = "frame_changed"
+"""Fact: the kept correction, or one that was about to be kept, changed the map frame."""
+
 
 def write(store: Store, effects: Iterable[Persist]) -> None:
     """Bring a batch onto the disk; own records are safe when this returns."""
@@ -21,9 +24,13 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
         match effect:
             case PersistTerm(counter):
                 store.put_term_counter(counter)
-            case PersistCorrection(correction):
+            case PersistCorrection(correction, frame_changed):
+                if frame_changed:
+                    store.put_fact(FRAME_CHANGED, b"1")
                 envelope = Envelope(store.identity.log, CorrectionBatch((correction,)))
                 store.put_correction(correction.log.robot, encode(envelope))
+                if not frame_changed and store.fact(FRAME_CHANGED) == b"1":
+                    store.put_fact(FRAME_CHANGED, b"0")
             case PersistRecord():
                 pass
 
@@ -36,6 +43,7 @@ def restore(store: Store) -> Restored:
         latents=tuple(store.latent_keyframes()),
         term_counter=store.term_counter(),
         correction=_correction(store, own),
+        frame_changed=store.fact(FRAME_CHANGED) == b"1",
     )
 
 

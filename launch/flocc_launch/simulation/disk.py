@@ -20,6 +20,7 @@ class Disk:
     latents: dict[KeyframeId, bytes] = field(default_factory=dict)
     term_counter: int = 0
     correction: LogCorrection | None = None
+    frame_changed: bool = False
     latent_bytes: int = 0
 
     def put_record(self, log: LogId, number: int, data: bytes) -> None:
@@ -39,4 +40,4 @@ class Disk:
     def restored(self) -> Restored:
         """What a robot finds when it starts again."""
         records = tuple((log, tuple(data)) for log, data in sorted(self.records.items()))
-        return Restored(records, tuple(sorted(self.latents)), self.term_counter, self.correction)
+        return Restored(records, tuple(sorted(self.latents)), self.term_counter, self.correction, self.frame_changed)

@@ -240,7 +240,7 @@ class Station:
                 self.later(self.workers.iterated_at_s(now_s), lambda: self.workers.iterate(effect))
             case PersistTerm(counter):
                 self.disk.term_counter = max(self.disk.term_counter, counter)
-            case PersistCorrection(correction):
-                self.disk.correction = correction
+            case PersistCorrection(correction, frame_changed):
+                self.disk.correction, self.disk.frame_changed = correction, frame_changed
             case Deliver() | Report():
                 pass

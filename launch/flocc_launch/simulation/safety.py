@@ -52,23 +52,26 @@ def all_invariants(separated: bool) -> list[Invariant]:
 class Fencing:
     """No robot applies a correction older than one it applied, and a consumer is told when the frame changes."""
 
-    _last: dict[LogId, Correction] = field(default_factory=dict)
+    _last: dict[LogId, tuple[Correction, int]] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
         """Deliveries whose (term, round) does not grow, or whose jump is not told."""
         for effect in step.effects:
             if isinstance(effect, Deliver):
-                yield from self._delivered(step.station.log, effect.correction)
+                yield from self._delivered(step.station, effect.correction)
 
-    def _delivered(self, log: LogId, correction: Correction) -> Iterator[str]:
-        last = self._last.get(log)
-        self._last[log] = correction
+    def _delivered(self, station: Station, correction: Correction) -> Iterator[str]:
+        """A robot that died in the middle of a jump may tell of it once more when it is back."""
+        last, life = self._last.get(station.log, (None, 0))
+        self._last[station.log] = (correction, station.life)
         if last is None:
             return
+        name, told = station.log, correction.frame_changed
         if (correction.term, correction.round) <= (last.term, last.round):
-            yield f"{log} applied {correction.term}/{correction.round} after {last.term}/{last.round}"
-        if correction.frame_changed != (correction.map_frame != last.map_frame):
-            yield f"{log} went from {last.map_frame} to {correction.map_frame}, told {correction.frame_changed}"
+            yield f"{name} applied {correction.term}/{correction.round} after {last.term}/{last.round}"
+        jumps = correction.map_frame != last.map_frame
+        if told != jumps and not (told and station.life != life):
+            yield f"{name} went from {last.map_frame} to {correction.map_frame}, told {told}"
 
 
 @dataclass(slots=True)

@@ -70,7 +70,7 @@ def test_a_jump_of_the_frame_is_told() -> None:
 
 def test_what_was_applied_before_a_restart_still_fences() -> None:
     machine = corrections()
-    machine.restore(correction(Term(4, R2), 3))
+    machine.restore(correction(Term(4, R2), 3), frame_changed=False)
     assert machine.on_message("r2", correction(Term(4, R2), 2)) == []
     assert delivered(machine.on_message("r2", correction(Term(4, R2), 4, anchor=R2))) == [(4, 4, True)]
 
@@ -136,6 +136,17 @@ class Seals:
     def check_correction(self, leader: LogId, correction: bytes, signature: bytes) -> None:
         if signature.rstrip(b".") != leader.robot.encode():
             raise DecodeError("forged")
+
+
+def test_a_jump_in_whose_middle_the_robot_died_is_told_after_the_restart() -> None:
+    machine = corrections()
+    machine.on_message("r2", correction(Term(1, R2), 1, anchor=R2))
+    (kept,) = [e for e in machine.on_message("r2", correction(Term(1, R2), 2)) if isinstance(e, PersistCorrection)]
+    assert kept.frame_changed
+    again = corrections()
+    again.restore(kept.correction, kept.frame_changed)
+    assert delivered(again.on_message("r2", correction(Term(1, R2), 3))) == [(1, 3, True)]
+    assert delivered(again.on_message("r2", correction(Term(1, R2), 4))) == [(1, 4, False)]
 
 
 def test_a_relay_cannot_forge_a_correction() -> None:
