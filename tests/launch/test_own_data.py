@@ -89,9 +89,7 @@ def test_a_folder_of_bags_is_a_robot_each(tmp_path: Path) -> None:
 
 def test_a_bag_that_needs_more_said_is_to_be_converted_first(own: Path, tmp_path: Path) -> None:
     scenario = read_scenario(str(walking(True, odometry=None).write(tmp_path / "run.bag")), {})
-    with pytest.raises(
-        DatasetError, match=r"has no odometry topic; .* recording with 'flocc dataset convert', and"
-    ):
+    with pytest.raises(DatasetError, match=r"has no odometry topic; .* recording with 'flocc dataset convert', and"):
         recordings(scenario)
 
 
