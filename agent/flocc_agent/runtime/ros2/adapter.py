@@ -24,6 +24,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Lens, image_of, lens_of, odometry_of
 from flocc_agent.runtime.ros2.names import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.outgoing import Outgoing
+from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.session import Publisher, Ros2Session
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
 from flocc_agent.runtime.ros2.synchroniser import PosedImage, Synchroniser
@@ -48,7 +49,6 @@ Float = NDArray[np.float64]
 
 INBOX_MESSAGES_MAX = 512
 INBOX_BYTES_MAX = 64 * 1024 * 1024
-PROBLEMS_MAX = 64
 WATCH_PERIOD_S = 1.0
 PATIENCE_S = 5.0
 PATH_PAUSE_RATIO = 9.0
@@ -96,8 +96,7 @@ class Ros2Adapter:
         self._synchroniser = Synchroniser(config.images_max, config.odometry_gap_max_s)
         self._static = StaticFrames()
         self._counter = TrafficCounter()
-        self._refused = Counter[str]()
-        self._problems: set[str] = set()
+        self._problems = Problems(host.report)
         self._heard = Counter[str]()
         self._lens: Lens | None = None
         self._T_body_camera: Float | None = None
@@ -113,7 +112,7 @@ class Ros2Adapter:
         """What was dropped or refused, by reason."""
         dropped = {f"ros2 {reason}": n for reason, n in self._synchroniser.dropped.items()}
         waiting = {f"ros2 {reason}": n for reason, n in self._counter.snapshot().dropped.items()}
-        return {**dropped, **waiting, **{f"ros2 {reason}": n for reason, n in self._refused.items()}}
+        return {**dropped, **waiting, **{f"ros2 {reason}": n for reason, n in self._problems.counts.items()}}
 
     async def run(self, corrections: "asyncio.Queue[Correction | None]") -> None:
         """Open the session, live until the corrections end, close it.
@@ -226,12 +225,12 @@ class Ros2Adapter:
             return
         lens = self._lens
         if lens is None:
-            self._refused["image without intrinsics"] += 1
+            self._problems.counts["image without intrinsics"] += 1
             return
         message = self._types.read(posed.payload, COMPRESSED_IMAGE if self._config.is_compressed() else IMAGE)
         T_body_camera = self._mounting(message.header.frame_id.lstrip("/"))
         if T_body_camera is None:
-            self._refused["image without mounting"] += 1
+            self._problems.counts["image without mounting"] += 1
             return
         image = await asyncio.to_thread(image_of, message, lens)
         self._selector.took(posed.T_odom_body)
@@ -332,22 +331,17 @@ class Ros2Adapter:
         for kind, topic in self._subscribed.items():
             if not self._heard[kind]:
                 self._complain(kind, f"no {topic.type} has come yet")
-        if self._heard["image"] and self._refused["image without mounting"] and self._T_body_camera is None:
+        if self._heard["image"] and self._problems.counts["image without mounting"] and self._T_body_camera is None:
             self._complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
 
     def _refuse(self, kind: str, sentence: str) -> None:
-        self._refused[f"{kind} refused"] += 1
-        self._complain(kind, sentence)
+        self._problems.refuse(kind, self._name(kind), sentence)
 
     def _complain(self, kind: str, sentence: str) -> None:
-        """Say something once."""
-        where = self._subscribed[kind].name if kind in self._subscribed else "ROS 2"
-        told = f"{where}: {sentence}"
-        if told in self._problems or len(self._problems) >= PROBLEMS_MAX:
-            return
-        self._problems.add(told)
-        logger.warning("%s", told)
-        self._host.report("ros2_problem", {"sentence": told})
+        self._problems.say(self._name(kind), sentence)
+
+    def _name(self, kind: str) -> str:
+        return self._subscribed[kind].name if kind in self._subscribed else "ROS 2"
 
 
 def _enqueue(inbox: Inbox, kind: str, payload: bytes) -> None:
