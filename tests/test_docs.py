@@ -5,17 +5,23 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel, ValidationError
 from tests.doc_commands import ROOT, SHELL, blocks, command_lines, complaint, parsed_commands, runnable, script
 from tests.doc_props import write_bag, write_own_data
 
+from flocc_agent.config import AgentConfig
 from flocc_launch.config_reference import reference
+from flocc_launch.scenario import Scenario
 
 PARTS = ("protocol", "agent", "docker")
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / part / "README.md" for part in PARTS)])
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
+TABLES = "core|keyframes|perception|backend|radio|store|transport|source|ros2|metrics"
+KEY = re.compile(rf"`((?:{TABLES})\.[a-z_0-9.]*[a-z0-9](?<!\.py))(?: = [^`]*)?`")
 LIVE = re.compile(r"^flocc (launch|demo|agent|experiment)\b|^python examples/", re.M)
 
 
@@ -81,6 +87,34 @@ def test_every_block_is_run_or_says_why_not(page: Path) -> None:
     shell = [block for block in blocks(page) if block.language in SHELL and block.why_not is None]
     foreign = [line for block in shell for line in command_lines(block.text) if not runnable(line)]
     assert foreign == [], "mark the block: <!-- not run: why --> on the line above its fence"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_keys_that_a_page_names_exist(page: Path) -> None:
+    named = set(KEY.findall(page.read_text(encoding="utf-8")))
+    known = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
+    assert [key for key in sorted(named) if f"`{key}`" not in known and f"[{key}]" not in known] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_configurations_on_a_page_have_no_key_that_is_unknown(page: Path) -> None:
+    tables = [tomllib.loads(block.text) for block in blocks(page) if block.language == "toml"]
+    assert [table for table in tables if unknown_keys(AgentConfig, table) and unknown_keys(Scenario, table)] == []
+
+
+def unknown_keys(model: type[BaseModel], table: dict[str, object]) -> list[str]:
+    """Keys of a fragment that a model does not have; what a fragment lacks does not matter."""
+    try:
+        model.model_validate(table, context={"folder": None})
+    except ValidationError as error:
+        return [".".join(map(str, e["loc"])) for e in error.errors() if e["type"] == "extra_forbidden"]
+    return []
+
+
+def test_an_unknown_key_is_noticed() -> None:
+    table: dict[str, object] = {"keyframes": {"distanse_m": 0.1}}
+    assert unknown_keys(AgentConfig, table) == unknown_keys(Scenario, table) == ["keyframes.distanse_m"]
+    assert KEY.findall("`core.gossip.request_timeout_s = 2` and `core/gossip.py`") == ["core.gossip.request_timeout_s"]
 
 
 @pytest.mark.timeout(300)
