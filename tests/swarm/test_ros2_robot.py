@@ -68,6 +68,11 @@ async def robot(port: int) -> AsyncIterator[Robot]:
         await reading
 
 
+def has_seen_enough(heard: dict[str, Any]) -> bool:
+    """Whether a path of some length came, and transforms for a while."""
+    return len(heard.get("path", ())) >= 8 and heard["transforms"] > 20
+
+
 async def test_a_robot_without_flocc_code_gets_transform_pose_and_path(tmp_path: Path) -> None:
     (port,) = free_ports(1)
     config = tmp_path / "r1.toml"
@@ -77,7 +82,7 @@ async def test_a_robot_without_flocc_code_gets_transform_pose_and_path(tmp_path:
         agent = subprocess.Popen(command, stderr=log)
         try:
             async with robot(port) as driving:
-                await until(lambda: len(driving.heard.get("path", ())) >= 8, 60.0)
+                await until(lambda: has_seen_enough(driving.heard), 60.0)
                 heard = driving.heard
         finally:
             agent.send_signal(signal.SIGTERM)
@@ -95,7 +100,6 @@ async def test_a_robot_without_flocc_code_gets_transform_pose_and_path(tmp_path:
     assert all(0.2 < step_m < 0.45 for step_m in steps_m), heard["path"]
     aside_m = [abs(value) for _, y, z in heard["path"] for value in (y, z)]
     assert max(aside_m) < 1e-5
-    assert heard["transforms"] > 10
     assert len(heard["map_frames"]) >= 1
     assert heard["map_frames"][0].startswith("map/r1")
     events = [json.loads(line) for line in (tmp_path / "r1" / "events.jsonl").read_text().splitlines()]
