@@ -79,6 +79,22 @@ def team(
 
 
 @dataset.command()
+def graph(
+    file: Annotated[Path, typer.Argument(help="Pose graph of several robots with ground truth (.jrl).")],
+    out: Annotated[Path, typer.Option(help="Folder of the recordings and of scenario.toml.")],
+    rate: Annotated[float, typer.Option(min=0.01, help="Playback speed.")] = 20.0,
+    metric: Annotated[bool, typer.Option("--metric", help="Closures keep their scale.")] = False,
+) -> None:
+    """Turn a pose graph into recordings and a scenario: recorded odometry, closures to be looked up."""
+    from flocc_launch.graph_files import read_graph_file
+    from flocc_launch.graph_recording import write_recordings, write_scenario
+
+    read = read_graph_file(file)
+    write_recordings(read, out, file.stem)
+    typer.echo(f"scenario: {write_scenario(read, out, rate, metric)}")
+
+
+@dataset.command()
 def split(
     source: Source,
     out: Annotated[Path, typer.Option(help="Folder of the recordings.")],

@@ -20,6 +20,32 @@ from flocc_launch.datasets.writer import RecordingWriter
 from flocc_launch.graph_files.graph_file import GraphFile, GraphFileError
 
 REGISTRATIONS = "registrations.json"
+OWN_GAP_KEYFRAMES = 10
+SCENARIO = """name = "graph"
+rate = {rate}
+
+{robots}
+[keyframes]
+distance_m = 0.01
+
+[perception]
+method = "recorded"
+
+[perception.recorded]
+file = "{registrations}"
+scale = "{scale}"
+
+[core.place_recognition]
+similarity_threshold = 0.01
+best_matches = 16
+own_gap_keyframes = {gap}
+
+[backend]
+formulation = "{formulation}"
+weight_by_probability = false
+odometry_rotation_sigma_rad = {rotation_rad}
+odometry_translation_sigma_m = {translation_m}
+"""
 STEP_S = 1.0
 """Time between keyframes where the file has no times."""
 
@@ -58,6 +84,34 @@ def write_recordings(file: GraphFile, out: Path, source: str) -> GraphRecordings
     entries = {"format": FORMAT, "keyframes": names, "pairs": [_entry(c) for c in _once(file.graph.closures)]}
     registrations.write_text(json.dumps(entries), encoding="utf-8")
     return GraphRecordings(robots, registrations)
+
+
+def odometry_sigmas(file: GraphFile) -> tuple[float, float]:
+    """The file's odometry noise as a configuration has it, rad and metres: medians of the isotropic deviations."""
+    covariances = [t.edge_covariances for t in file.graph.trajectories.values() if t.edge_covariances is not None]
+    S = np.concatenate(covariances)
+    rotation = np.sqrt(np.trace(S[:, :3, :3], axis1=1, axis2=2) / 3.0)
+    translation = np.sqrt(np.trace(S[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
+    return float(np.median(rotation)), float(np.median(translation))
+
+
+def write_scenario(file: GraphFile, out: Path, rate: float, keeps_scale: bool) -> Path:
+    """Write `scenario.toml` beside the recordings, for `flocc launch` and `flocc simulate`."""
+    rotation_rad, translation_m = odometry_sigmas(file)
+    robots = [f'[robots.{log.robot}]\nrecording = "{log.robot}"\n' for log in sorted(file.graph.trajectories)]
+    text = SCENARIO.format(
+        rate=rate,
+        robots="\n".join(robots),
+        registrations=REGISTRATIONS,
+        scale="kept" if keeps_scale else "removed",
+        formulation="base" if keeps_scale else "independent",
+        gap=OWN_GAP_KEYFRAMES,
+        rotation_rad=rotation_rad,
+        translation_m=translation_m,
+    )
+    path = out / "scenario.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def _write_robot(file: GraphFile, robot: str, path: Path, source: str) -> Path:

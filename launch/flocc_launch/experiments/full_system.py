@@ -12,7 +12,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 from pydantic import Field
 
 from flocc_agent.config import (
@@ -50,7 +49,7 @@ from flocc_launch.experiments.experiment import (
 from flocc_launch.experiments.plots import COLOURS
 from flocc_launch.experiments.statistics import grouped, middle, with_spread
 from flocc_launch.graph_files import read_graph_file
-from flocc_launch.graph_recording import GraphRecordings, write_recordings
+from flocc_launch.graph_recording import OWN_GAP_KEYFRAMES, GraphRecordings, odometry_sigmas, write_recordings
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
 from flocc_launch.run_folder import RunFolder
@@ -63,7 +62,6 @@ if TYPE_CHECKING:
 COSMO = {"cosmo-wifi": "wifi", "cosmo-proradio": "proradio"}
 TARGET_ATE_M = 2.5
 DEFAULT = "flocc independent gnc-tls"
-OWN_GAP_KEYFRAMES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +208,7 @@ def scenario_of(settings: FullSystemSettings, source: str, method: Method, seed:
     places: dict[str, Any] = {"candidate_order": method.order}
     if source in COSMO:
         made = _cosmo(settings, source)
-        sigmas = _odometry_sigmas(settings, source)
+        sigmas = odometry_sigmas(read_graph_file(_file(settings, source)))
         places |= {"similarity_threshold": 0.01, "best_matches": 16, "own_gap_keyframes": OWN_GAP_KEYFRAMES}
         pause_s = settings.iteration_period_s
         return Scenario(
@@ -280,15 +278,6 @@ def _cosmo(settings: FullSystemSettings, source: str) -> GraphRecordings:
     made = write_recordings(read_graph_file(path).shortened(settings.keyframes_max), out, path.stem)
     marker.touch()
     return made
-
-
-def _odometry_sigmas(settings: FullSystemSettings, source: str) -> tuple[float, float]:
-    """The file's own odometry noise as the two numbers of a configuration: medians of the isotropic deviations."""
-    trajectories = read_graph_file(_file(settings, source)).graph.trajectories.values()
-    S = np.concatenate([np.asarray(t.edge_covariances) for t in trajectories])
-    rotation = np.sqrt(np.trace(S[:, :3, :3], axis1=1, axis2=2) / 3.0)
-    translation = np.sqrt(np.trace(S[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
-    return float(np.median(rotation)), float(np.median(translation))
 
 
 # Summary
