@@ -25,7 +25,7 @@ from flocc_protocol.errors import FloccError
 ROOT = Path(__file__).parents[1]
 USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]  # of typer's own click, whose place changes
 FENCE = re.compile(r"(?:^<!-- not run: (?P<why>[^>]*?) -->\n)?^```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S)
-SPAN = re.compile(r"`((?:flocc|python -m|make) [^`]+)`")
+SPAN = re.compile(r"`((?:[A-Z_]+=\S+ )*(?:flocc|python -m|make|pytest) [^`]+)`")
 FILE_NAME = re.compile(r"# (?:[^\s]*/)?([\w.-]+\.(?:toml|yaml))\b")
 SHELL = ("sh", "bash")
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|^[A-Z]$|<|\.\.\.")
@@ -115,6 +115,8 @@ def complaint(command: str) -> str | None:
     program = Path(words[0]).name if words else ""
     if program == "flocc":
         return _flocc_complaint(words[1:])
+    if program == "pytest" or words[1:3] == ["-m", "pytest"]:
+        return _paths_complaint(words[1:])
     if program == "make":
         return _make_complaint(words[1:])
     if program in ("python", "python3") and len(words) > 2 and words[1] == "-m":
@@ -164,6 +166,11 @@ def _strictly(command: Any, name: str, words: list[str]) -> str | None:
     return None
 
 
+def _paths_complaint(words: list[str]) -> str | None:
+    paths = [word.split("::")[0] for word in words if word.startswith("tests/")]
+    return next((f"{path} is not there" for path in paths if not (ROOT / path).exists()), None)
+
+
 def _make_complaint(words: list[str]) -> str | None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
     unknown = [word for word in words if "=" not in word and word not in targets]
@@ -171,7 +178,7 @@ def _make_complaint(words: list[str]) -> str | None:
 
 
 def _module_complaint(module: str, words: list[str]) -> str | None:
-    if module in ("pip", "venv", "pytest"):
+    if module in ("pip", "venv"):
         return None
     if importlib.util.find_spec(module) is None:
         return f"there is no module {module}"

@@ -138,6 +138,7 @@ def test_the_commands_of_a_page_run(page: Path, props: Path, tmp_path: Path) -> 
         ("python -m flocc_launch.nothing", "there is no module"),
         ("python -m flocc_launch.reliability idle --runz 3", "no option --runz"),
         ("make tset", "no target tset"),
+        ("FLOCC_SHARED=/data pytest -s tests/no_test.py -k some", "tests/no_test.py is not there"),
         ("rosrun flocc", "not a program"),
     ],
 )
