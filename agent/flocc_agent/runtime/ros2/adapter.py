@@ -6,7 +6,6 @@ and counted; the agent goes on.
 
 import asyncio
 import logging
-import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -23,19 +22,16 @@ from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Lens, image_of, lens_of, odometry_of
 from flocc_agent.runtime.ros2.names import Offer, Qos, Topic
-from flocc_agent.runtime.ros2.outgoing import Outgoing
 from flocc_agent.runtime.ros2.problems import Problems
-from flocc_agent.runtime.ros2.session import Publisher, Ros2Session
+from flocc_agent.runtime.ros2.session import Ros2Session
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
 from flocc_agent.runtime.ros2.synchroniser import PosedImage, Synchroniser
+from flocc_agent.runtime.ros2.telling import Teller
 from flocc_agent.runtime.ros2.types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
     ODOMETRY,
-    PATH,
-    POSE,
-    TEXT,
     TF,
     BadMessage,
     MessageTypes,
@@ -51,13 +47,9 @@ INBOX_MESSAGES_MAX = 512
 INBOX_BYTES_MAX = 64 * 1024 * 1024
 WATCH_PERIOD_S = 1.0
 PATIENCE_S = 5.0
-PATH_PAUSE_RATIO = 9.0
 BACK_IN_TIME = "time goes backwards; such messages are left out (docs/ros2.md says what to do after a reset)"
 
 SENSOR = Qos(5, best_effort=True)
-RELIABLE = Qos(10)
-TF_QOS = Qos(100)
-LATCHED = Qos(1, transient_local=True)
 TF_STATIC = Qos(100, transient_local=True)
 
 
@@ -92,7 +84,6 @@ class Ros2Adapter:
         self._selector = selector
         self._host = host
         self._types = MessageTypes()
-        self._outgoing = Outgoing(self._types, config.map_frame, config.odom_frame)
         self._synchroniser = Synchroniser(config.images_max, config.odometry_gap_max_s)
         self._static = StaticFrames()
         self._counter = TrafficCounter()
@@ -100,12 +91,9 @@ class Ros2Adapter:
         self._heard = Counter[str]()
         self._lens: Lens | None = None
         self._T_body_camera: Float | None = None
-        self._correction: Correction | None = None
-        self._tf_last_ns: int | None = None
-        self._path_changed = False
+        self._teller: Teller | None = None
         self._posed = asyncio.Event()
         self._session: Ros2Session | None = None
-        self._publishers: dict[str, Publisher] = {}
         self._subscribed: dict[str, Topic] = {}
 
     def counters(self) -> dict[str, int]:
@@ -125,10 +113,11 @@ class Ros2Adapter:
             self._mount(pose_of_numbers(self._config.camera_mounting, "camera_mounting"))
         inbox = Inbox(loop, self._arrived, self._counter, INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
         try:
-            await asyncio.to_thread(self._open, inbox, loop)
+            teller = self._teller = await asyncio.to_thread(self._open, inbox, loop)
             async with asyncio.TaskGroup() as tasks:
-                others = [tasks.create_task(work) for work in (self._feed(), self._draw(), self._watch(), self._beat())]
-                await self._tell(corrections)
+                works = (self._feed(), self._watch(), teller.draw(), teller.beat())
+                others = [tasks.create_task(work) for work in works]
+                await teller.listen(corrections)
                 for other in others:
                     other.cancel()
         finally:
@@ -137,19 +126,15 @@ class Ros2Adapter:
 
     # Opening
 
-    def _open(self, inbox: Inbox, loop: asyncio.AbstractEventLoop) -> None:
+    def _open(self, inbox: Inbox, loop: asyncio.AbstractEventLoop) -> Teller:
         config = self._config
         node = "flocc_" + self._robot.replace("-", "_")
         session = self._session = Ros2Session(config.router, config.domain_id, config.namespace, node, self._types)
-        self._publishers = {
-            "tf": session.publisher(config.tf_topic, TF, TF_QOS),
-            "path": session.publisher(config.path_topic, PATH, LATCHED),
-            "pose": session.publisher(config.pose_topic, POSE, RELIABLE),
-            "map_frame": session.publisher(config.map_frame_topic, TEXT, LATCHED),
-        }
+        teller = Teller(config, self._types, session, self._bodies)
         for kind, (name, type_name, qos) in self._wanted().items():
             self._subscribed[kind] = session.subscribe(name, type_name, qos, partial(_enqueue, inbox, kind))
         session.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))
+        return teller
 
     def _wanted(self) -> dict[str, tuple[str, str, Qos]]:
         """Topic, type and quality of service of each subscription."""
@@ -188,7 +173,8 @@ class Ros2Adapter:
             self._complain("odometry", BACK_IN_TIME)
             return
         self._posed.set()
-        self._place(*sample)
+        if self._teller is not None:
+            self._teller.place(*sample)
 
     def _take_image(self, payload: bytes) -> None:
         stamp_ns, frame = header_of(payload)
@@ -235,7 +221,8 @@ class Ros2Adapter:
         image = await asyncio.to_thread(image_of, message, lens)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
-        self._path_changed = True
+        if self._teller is not None:
+            self._teller.path_changed = True
 
     def _mounting(self, camera_frame: str) -> Float | None:
         """`T_body_camera`, found once; None while /tf_static does not connect the two."""
@@ -249,65 +236,9 @@ class Ros2Adapter:
         self._T_body_camera = T_body_camera
         self._host.mount_camera(T_body_camera)
 
-    # What goes
-
-    async def _tell(self, corrections: "asyncio.Queue[Correction | None]") -> None:
-        """Publish what a correction changes; ends with the corrections."""
-        while (correction := await corrections.get()) is not None:
-            self._correction = correction
-            self._put("map_frame", self._outgoing.text(correction.map_frame))
-            self._path_changed = True
-
-    async def _draw(self) -> None:
-        """Publish the path when it changed, for at most a tenth of the time: it grows with the run."""
-        pause_s = self._config.path_period_s
-        while True:
-            await asyncio.sleep(pause_s)
-            if not self._path_changed:
-                continue
-            self._path_changed = False
-            began_s = time.monotonic()
-            message = await asyncio.to_thread(self._path)
-            if message is not None:
-                await asyncio.to_thread(self._put, "path", message)
-            pause_s = max(self._config.path_period_s, PATH_PAUSE_RATIO * (time.monotonic() - began_s))
-
-    def _path(self) -> Any:
-        """The corrected path, of at most `path_poses_max` keyframes and the last; None where it is not known yet."""
-        if self._config.image_topic and self._T_body_camera is None:
-            return None
-        stamps_s, T_map_body = self._host.trajectory()
-        if not stamps_s:
-            return None
-        step = -(-len(stamps_s) // self._config.path_poses_max)
-        chosen = sorted({*range(0, len(stamps_s), step), len(stamps_s) - 1})
-        stamps_ns = [round(stamps_s[i] * 1e6) * 1000 for i in chosen]  # a double holds today's seconds to 0.2 us
-        return self._outgoing.path(T_map_body[chosen], stamps_ns, stamps_ns[-1])
-
-    def _place(self, stamp_ns: int, T_odom_body: Float) -> None:
-        """Publish map to odom, and the pose, as often as configured; the time is that of the odometry."""
-        config, correction = self._config, self._correction
-        if correction is None:
-            return
-        if self._tf_last_ns is not None and stamp_ns - self._tf_last_ns < config.tf_period_s * 1e9:
-            return
-        self._tf_last_ns = stamp_ns
-        self._put_transform(correction, stamp_ns)
-        self._put("pose", self._outgoing.pose(correction.T_map_odom, correction.covariance, T_odom_body, stamp_ns))
-
-    def _put_transform(self, correction: Correction, stamp_ns: int) -> None:
-        ahead_ns = round(self._config.tf_tolerance_s * 1e9)
-        self._put("tf", self._outgoing.transform(correction.T_map_odom, stamp_ns + ahead_ns))
-
-    async def _beat(self) -> None:
-        """Publish map to odom by the clock where no odometry comes by ROS."""
-        while not self._config.odometry_topic:
-            await asyncio.sleep(self._config.tf_period_s)
-            if self._correction is not None:
-                self._put_transform(self._correction, time.time_ns())
-
-    def _put(self, name: str, message: Any) -> None:
-        self._publishers[name].put(message)
+    def _bodies(self) -> tuple[list[float], Float] | None:
+        """The corrected path; None while it is not known where the camera sits on the body."""
+        return None if self._config.image_topic and self._T_body_camera is None else self._host.trajectory()
 
     # What is wrong
 
