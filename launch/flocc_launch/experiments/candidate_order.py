@@ -24,7 +24,7 @@ from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed, PoseGra
 from flocc_launch.evaluation import ate_m
 from flocc_launch.experiments.experiment import Cell, Experiment, Finding, Row, Settings, Summary, grid, judged
 from flocc_launch.experiments.plots import COLOURS, from_zero
-from flocc_launch.experiments.statistics import grouped, middle
+from flocc_launch.experiments.statistics import grouped, middle, values
 from flocc_launch.scenario import Scenario, SimulationScenario, TracksScenario
 from flocc_launch.simulation.playback import Playback
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
@@ -68,6 +68,11 @@ class CandidateOrderSettings(Settings):
     runs: int = Field(7, ge=1, le=100)
     """Repetitions with other walks, drift and perception."""
 
+    @property
+    def apart_s(self) -> float:
+        """How long the robots explore on their own."""
+        return self.length_m / TracksScenario().speed_m_s
+
 
 def cells(settings: CandidateOrderSettings) -> list[Cell]:
     """Both orders of each run."""
@@ -81,7 +86,7 @@ def measure(settings: CandidateOrderSettings, cell: Cell, seed: int) -> Row:
     swarm = swarm_of(given, playbacks, seed)
     assert given.duration_s is not None
     swarm.run_until(given.duration_s)
-    graph, closures = registered(swarm)
+    graph, closures, times_s = registered(swarm)
     counts = sorted({*(n for n in settings.closures if n < len(closures)), len(closures)})
     rejected = {(line["query"], line["match"]) for line in swarm.lines if line["event"] == "closure_rejected"}
     received = [swarm.network.traffic[name].received["latent"] for name in sorted(playbacks)]
@@ -91,6 +96,7 @@ def measure(settings: CandidateOrderSettings, cell: Cell, seed: int) -> Row:
         "candidates": sum(line["event"] == "candidate" for line in swarm.lines),
         "latent_bytes_received": sum(received),
         "curve": [[n, ate_of(PoseGraph(graph.trajectories, closures[:n]), playbacks)] for n in counts],
+        "after_s": [[n, round(times_s[n - 1] - settings.apart_s, 1)] for n in counts if n],
         "odometry_m": ate_of(PoseGraph(graph.trajectories), playbacks, joined=False),
     }
 
@@ -98,18 +104,17 @@ def measure(settings: CandidateOrderSettings, cell: Cell, seed: int) -> Row:
 def scenario(settings: CandidateOrderSettings, order: Order, seed: int) -> Scenario:
     """Explore apart, then meet."""
     tracks = TracksScenario(robots=settings.robots, seed=seed, area_m=settings.area_m, length_m=settings.length_m)
-    apart_s = settings.length_m / tracks.speed_m_s
     alone = tuple((f"r{k + 1}",) for k in range(settings.robots))
     radio: dict[str, Any] = {
         "latency_s": LATENCY_S,
         "bandwidth_bytes_s": settings.bandwidth_bytes_s,
-        "partitions": ({"groups": alone, "to_s": apart_s},),
+        "partitions": ({"groups": alone, "to_s": settings.apart_s},),
     }
     slow_s = 4 * settings.latent_bytes / settings.bandwidth_bytes_s
     return Scenario(
         name="candidate-order",
         seed=seed,
-        duration_s=apart_s + settings.meeting_s,
+        duration_s=settings.apart_s + settings.meeting_s,
         tracks=tracks,
         keyframes=KeyframeConfig(distance_m=settings.keyframe_distance_m, rotation_rad=1.0),
         radio=RadioConfig.model_validate(radio),
@@ -126,8 +131,8 @@ def scenario(settings: CandidateOrderSettings, order: Order, seed: int) -> Scena
     )
 
 
-def registered(swarm: Swarm) -> tuple[PoseGraph, list[LoopClosure]]:
-    """The graph of whoever knows most, and its closures in the order in which they were registered."""
+def registered(swarm: Swarm) -> tuple[PoseGraph, list[LoopClosure], list[float]]:
+    """The graph of whoever knows most, its closures in the order in which they were registered, and when they were."""
     cores = [station.core for station in swarm.running() if station.core is not None]
     knows = max(cores, key=lambda core: core.assembly.closures)
     graph = knows.assembly.graph()
@@ -137,7 +142,8 @@ def registered(swarm: Swarm) -> tuple[PoseGraph, list[LoopClosure]]:
             first.setdefault((line["query"], line["match"]), line["t"])
     by_pair = {CandidatePair.of(c.query, c.match): c for c in graph.closures}
     times = {pair: first[str(c.query), str(c.match)] for pair, c in by_pair.items()}
-    return graph, [by_pair[pair] for pair in sorted(by_pair, key=lambda pair: (times[pair], pair))]
+    ordered = sorted(by_pair, key=lambda pair: (times[pair], pair))
+    return graph, [by_pair[pair] for pair in ordered], [times[pair] for pair in ordered]
 
 
 def ate_of(graph: PoseGraph, playbacks: dict[str, Playback], joined: bool = True) -> float | None:
@@ -182,14 +188,14 @@ def levels(rows: Sequence[Row]) -> list[int]:
 
 
 def _level(order: str, n: int, rows: Sequence[Row]) -> Row:
-    known = [{"ate_m": dict(row["curve"]).get(n)} for row in rows]
-    errors = [row for row in known if row["ate_m"] is not None]
+    known = [{"ate_m": dict(row["curve"]).get(n), "after_s": dict(row["after_s"]).get(n)} for row in rows]
     return {
         "order": order,
         "closures": n,
-        "runs": len(rows),
-        "in_one_map": len(errors),
-        "ate_m": middle(errors, "ate_m"),
+        "after_s": middle(known, "after_s"),
+        "runs": len(values(known, "after_s")),
+        "in_one_map": len(values(known, "ate_m")),
+        "ate_m": middle(known, "ate_m"),
     }
 
 
@@ -256,25 +262,29 @@ def _spread(shares: Sequence[float]) -> str:
 
 
 def draw(figure: "Figure", _settings: CandidateOrderSettings, rows: Sequence[Row]) -> None:
-    """Error over closures: runs thin, medians thick."""
-    panel = figure.subplots()
-    shown = []
+    """Error over closures and over time: runs thin, medians thick; runs that never end in one map are not drawn."""
+    left, right = figure.subplots(1, 2, sharey=True)
+    shown: list[float] = []
     for k, order in enumerate(ORDERS):
         mine = [row for row in rows if row["order"] == order]
         for row in mine:
-            known = [(n, error) for n, error in row["curve"] if error is not None]
+            after_s = dict(row["after_s"])
+            known = [(n, after_s[n], error) for n, error in row["curve"] if error is not None]
             if known:
-                panel.plot(*zip(*known, strict=True), color=COLOURS[k], alpha=0.25, linewidth=0.8)
-        medians = [(n, _level(order, n, mine)["ate_m"]) for n in levels(rows)]
-        line = [(n, value) for n, value in medians if value is not None]
-        if line:
-            panel.plot(*zip(*line, strict=True), color=COLOURS[k], marker="o", markersize=4, label=f"{order} order")
-            shown += [value for _, value in line]
-    panel.set_xscale("log", base=2)
-    panel.set_xlabel("closures registered")
-    panel.set_ylabel("joint ATE, m")
-    from_zero(panel, shown)
-    panel.legend()
+                counts, times_s, errors = zip(*known, strict=True)
+                left.plot(counts, errors, color=COLOURS[k], alpha=0.25, linewidth=0.8)
+                right.plot(times_s, errors, color=COLOURS[k], alpha=0.25, linewidth=0.8)
+        medians = [level for n in levels(rows) if (level := _level(order, n, mine))["ate_m"] is not None]
+        middles = [level["ate_m"] for level in medians]
+        thick = {"color": COLOURS[k], "marker": "o", "markersize": 4, "label": f"{order} order"}
+        left.plot([level["closures"] for level in medians], middles, **thick)
+        right.plot([level["after_s"] for level in medians], middles, **thick)
+        shown += middles
+    left.set_xlabel("closures registered")
+    left.set_ylabel("joint ATE, m")
+    right.set_xlabel("time since the robots met, s")
+    from_zero(left, shown)
+    left.legend()
 
 
 CANDIDATE_ORDER = Experiment(
