@@ -68,9 +68,7 @@ def optimise(
     results = {k: excluded(graph.closures[k], reason) for k, reason in screened.excluded.items()}
     for outcome in outcomes:
         results.update(outcome.closures)
-    timings_s = {"screening": after_screening - began}
-    for name in sorted({name for outcome in outcomes for name in outcome.timings_s}):
-        timings_s[name] = sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes)
+    timings_s = {"screening": after_screening - began, **summed_timings(outcomes)}
     return GraphSolution(
         components=tuple(sorted((c for outcome in outcomes for c in outcome.components), key=lambda c: c.anchor)),
         closures=tuple(results[k] for k in range(len(graph.closures))),
@@ -113,24 +111,48 @@ def _solve_and_split(
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
 ) -> Outcome:
-    """Solve; where rejections leave several components, solve each of them with the closures that it has left."""
+    """Solve; where too few closures join maps, or are left to, solve each component with the closures that it has."""
     began = time.perf_counter()
     dropped = inconsistent(trajectories, closures, config) if config.pairwise_consistency else {}
-    kept = {k: c for k, c in closures.items() if k not in dropped}
-    outcome = _solve_connected(trajectories, kept, fixes, config, initial, wanted)
     turned_away = {k: rejected(closures[k], reason) for k, reason in dropped.items()}
-    turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
-    left = {k: c for k, c in kept.items() if k not in turned_away}
-    for k in too_few(list(trajectories), left, config.closures_to_join_min):
-        turned_away[k] = rejected(left.pop(k), f"fewer than {config.closures_to_join_min} closures join these maps")
-    groups = components_of(list(trajectories), list(left.values()))
+    turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
+    outcome = Outcome((), {})
+    groups = _groups(trajectories, closures, turned_away)
+    if len(groups) == 1:
+        kept = {k: c for k, c in closures.items() if k not in turned_away}
+        outcome = _solve_connected(trajectories, kept, fixes, config, initial, wanted)
+        turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
+        turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
+        groups = _groups(trajectories, closures, turned_away)
     if len(groups) == 1:
         timings_s = {"consistency": time.perf_counter() - began - sum(outcome.timings_s.values()), **outcome.timings_s}
         return replace(outcome, closures={**outcome.closures, **turned_away}, timings_s=timings_s)
+    left = {k: c for k, c in closures.items() if k not in turned_away}
     screened = Screened(dict(trajectories), {}, tuple(fixes), ())
     plain = config.model_copy(update={"pairwise_consistency": False})
     parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in groups]
     return _joined(parts, turned_away, outcome)
+
+
+def _joining_too_few(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    turned_away: Mapping[int, ClosureResult],
+    config: BackendConfig,
+) -> dict[int, ClosureResult]:
+    """Those of the remaining closures that are too few to join maps."""
+    left = {k: c for k, c in closures.items() if k not in turned_away}
+    reason = f"fewer than {config.closures_to_join_min} closures join these maps"
+    return {k: rejected(left[k], reason) for k in too_few(list(trajectories), left, config.closures_to_join_min)}
+
+
+def _groups(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    turned_away: Mapping[int, ClosureResult],
+) -> tuple[tuple[LogId, ...], ...]:
+    """The logs that the remaining closures connect."""
+    return components_of(list(trajectories), [c for k, c in closures.items() if k not in turned_away])
 
 
 def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], before: Outcome) -> Outcome:
@@ -142,8 +164,14 @@ def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], 
         closures,
         tuple(w for part in parts for w in part.warnings),
         before.iterations + sum(part.iterations for part in parts),
-        before.timings_s,
+        summed_timings([before, *parts]),
     )
+
+
+def summed_timings(outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """Seconds of each stage, of all outcomes together."""
+    names = sorted({name for outcome in outcomes for name in outcome.timings_s})
+    return {name: sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes) for name in names}
 
 
 def _solve_connected(
