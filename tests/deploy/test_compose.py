@@ -1,6 +1,7 @@
 """compose.yaml: valid by the specification's schema, and its containers' command starts agents that hear each other."""
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -126,28 +127,41 @@ def test_the_secure_variant_gives_each_container_its_own_keys_and_nothing_else(t
 
 @pytest.mark.swarm
 @pytest.mark.slow
-def test_the_containers_commands_start_agents_that_find_each_other(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_secure", [False, True], ids=["plain", "secure"])
+def test_the_containers_commands_start_agents_that_hear_each_other(tmp_path: Path, is_secure: bool) -> None:
     scenario = Scenario.model_validate({"name": "c", "tracks": {"robots": 2, "length_m": 20.0, "area_m": 8.0}})
     (tmp_path / "recordings").mkdir()
     for name, made in zip(ROBOTS, recordings(scenario).values(), strict=False):
         (tmp_path / "recordings" / name).symlink_to(made)
-    options = "--set transport.interface=lo --set perception.method=synthetic --set source.rate=4"
-    places = {"/data": tmp_path / "data", "/recordings": tmp_path / "recordings", "/etc/flocc": ROOT / "docker"}
-    running = []
-    for name in ROBOTS[:2]:
-        words = arguments(name, {"OPTIONS": options, "LATENCY": "0.01"})
-        for inside, outside in places.items():
-            words = [word.replace(inside, str(outside)) for word in words]
-        running.append(subprocess.Popen([sys.executable, "-m", "flocc_launch.cli", *words], stderr=subprocess.PIPE))
+    if is_secure:
+        make_keys(tmp_path / "keys", "compose", ROBOTS)
+    running = [started(name, tmp_path, is_secure) for name in ROBOTS[:2]]
     events = [tmp_path / "data" / name / "events.jsonl" for name in ROBOTS[:2]]
     ends_s = time.monotonic() + 60.0
     while time.monotonic() < ends_s and not all(_hears(path) for path in events):
         time.sleep(0.2)
     for process in running:
         process.terminate()
-    said = [process.communicate(timeout=30)[1].decode() for process in running]
+    said = [process.communicate(timeout=30)[1] for process in running]
     assert [process.returncode for process in running] == [0, 0], said
     assert all(_hears(path) for path in events), said
+
+
+def started(name: str, folder: Path, is_secure: bool) -> "subprocess.Popen[str]":
+    """What a container runs, on loopback, with the container's folders below `folder`."""
+    options = "--set transport.interface=lo --set perception.method=synthetic --set source.rate=4"
+    if is_secure:
+        options += " " + compose_schema.read(SECURE)["services"][name]["environment"]["OPTIONS"]
+    places = {
+        "/etc/flocc/keys": folder / "keys" / name,
+        "/etc/flocc": ROOT / "docker",
+        "/data": folder / "data",
+        "/recordings": folder / "recordings",
+    }
+    words = arguments(name, {"OPTIONS": options, "LATENCY": "0.01"})
+    for inside, outside in places.items():
+        words = [re.sub(f"(^|=){inside}", rf"\g<1>{outside}", word) for word in words]
+    return subprocess.Popen([sys.executable, "-m", "flocc_launch.cli", *words], stderr=subprocess.PIPE, text=True)
 
 
 def _hears(path: Path) -> bool:
