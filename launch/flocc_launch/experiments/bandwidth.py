@@ -22,7 +22,7 @@ from flocc_launch.experiments.bandwidth_parts import (
 )
 from flocc_launch.experiments.experiment import Cell, Experiment, ExperimentError, Progress, Row, Settings, Summary
 from flocc_launch.experiments.plots import COLOURS, MARKERS
-from flocc_launch.experiments.registration_data import RegistrationData, RegistrationSettings, data_of
+from flocc_launch.experiments.registration_data import RegistrationSettings, data_of, prepare_data
 from flocc_launch.experiments.statistics import grouped, middle
 
 if TYPE_CHECKING:
@@ -61,12 +61,10 @@ class BandwidthSettings(Settings):
     """Repetitions of the simulated swarms."""
 
 
-def scenes_of(settings: BandwidthSettings) -> RegistrationData:
-    """The images; each scene has several robots with many views."""
-    return data_of(
-        RegistrationSettings(
-            data=settings.data, worlds=settings.worlds, walks=settings.walks, perception=settings.perception
-        )
+def images(settings: BandwidthSettings) -> RegistrationSettings:
+    """The images, as the registration experiment names them."""
+    return RegistrationSettings(
+        data=settings.data, worlds=settings.worlds, walks=settings.walks, perception=settings.perception
     )
 
 
@@ -76,18 +74,17 @@ def prepare(settings: BandwidthSettings, progress: Progress) -> None:
     Raises:
         FloccError: The data cannot be used, or the size of a method's latents is not known.
     """
-    del progress
     unknown = sorted(set(settings.latents) - set(LATENT_SIZES))
     if unknown:
         raise ExperimentError(f"the size of {unknown[0]!r} latents is not known; there are {', '.join(LATENT_SIZES)}")
     if {"descriptors", "keypoints"} & set(settings.parts):
-        scenes_of(settings)
+        prepare_data(images(settings), progress)
 
 
 def cells(settings: BandwidthSettings) -> list[Cell]:
     """All parts."""
     needs_scenes = {"descriptors", "keypoints"} & set(settings.parts)
-    names = [name for name, scene in scenes_of(settings).scenes.items() if usable(scene)] if needs_scenes else []
+    names = [name for name, scene in data_of(images(settings)).scenes.items() if usable(scene)] if needs_scenes else []
     by_part = {
         "bytes": [
             Cell({"part": "bytes", "on": name}, run) for name in settings.latents for run in range(settings.runs)
@@ -106,9 +103,9 @@ def measure(settings: BandwidthSettings, cell: Cell, seed: int) -> Row:
         case "bytes":
             return {"forms": bytes_by_kind(LATENT_SIZES[name], settings.length_m, seed)}
         case "descriptors":
-            return {"forms": descriptor_forms(scenes_of(settings), name)}
+            return {"forms": descriptor_forms(data_of(images(settings)), name)}
         case "keypoints":
-            return {"forms": keypoint_accuracy(scenes_of(settings), name, settings.pairs, seed)}
+            return {"forms": keypoint_accuracy(data_of(images(settings)), name, settings.pairs, seed)}
         case _:
             return {"forms": latent_accuracy(settings.network, settings.pictures)}
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from flocc_launch.evaluate_registration import Outcome, registered
-from flocc_launch.experiments.experiment import Cell, Experiment, Progress, Row, Summary
+from flocc_launch.experiments.experiment import Cell, Experiment, Row, Summary
 from flocc_launch.experiments.logistic import LogisticFit, fit_logistic
 from flocc_launch.experiments.plots import COLOURS
 from flocc_launch.experiments.precision_recall import Curve, curve
@@ -21,6 +21,7 @@ from flocc_launch.experiments.registration_data import (
     drawn_pairs,
     error_max_m,
     near_pairs,
+    prepare_data,
 )
 from flocc_launch.experiments.registration_findings import POOLED, findings, halved
 
@@ -34,12 +35,6 @@ METRICS = {
     "correspondences": "correspondences",
     "ratio": "correspondence ratio, Eq. (1)",
 }
-
-
-def prepare(settings: RegistrationSettings, progress: Progress) -> None:
-    """Make the scenes and load the back-end once, so that bad data and checkpoints are told at once."""
-    del progress  # generating a town tells its own
-    data_of(settings)
 
 
 def cells(settings: RegistrationSettings) -> list[Cell]:
@@ -224,5 +219,5 @@ REGISTRATION = Experiment(
     measure=measure,
     summarise=summarise,
     draw=draw,
-    prepare=prepare,
+    prepare=prepare_data,
 )

@@ -59,13 +59,29 @@ class RegistrationSettings(Settings):
     """Pairs in one step of the experiment."""
 
 
-def make_scenes(settings: RegistrationSettings, progress: Progress) -> dict[str, Scene]:
+def prepare_data(settings: RegistrationSettings, progress: Progress) -> None:
+    """Generate the towns that are not there yet, and load everything once, so that bad data is told at once.
+
+    Raises:
+        FloccError: Data or a checkpoint cannot be used; see `make_scenes`.
+    """
+    for seed in settings.worlds:
+        recordings(town(settings, seed), progress)
+    data_of(settings)
+
+
+def town(settings: RegistrationSettings, seed: int) -> Scenario:
+    """A generated town with its robots."""
+    return Scenario(world=WorldScenario(robots=settings.robots, seed=seed))
+
+
+def make_scenes(settings: RegistrationSettings) -> dict[str, Scene]:
     """All scenes of the settings, by name; checks that each can be judged.
 
     Raises:
         FloccError: Data is damaged, has no ground truth, or its robots never come near each other.
     """
-    found = {name: scene for name, scene in _all_scenes(settings, progress).items() if scene is not None}
+    found = _all_scenes(settings)
     if not found:
         raise ExperimentError("there is nothing to register: give --data, --datasets, --recordings or --worlds")
     for name, scene in found.items():
@@ -77,7 +93,7 @@ def make_scenes(settings: RegistrationSettings, progress: Progress) -> dict[str,
     return found
 
 
-def _all_scenes(settings: RegistrationSettings, progress: Progress) -> dict[str, Scene]:
+def _all_scenes(settings: RegistrationSettings) -> dict[str, Scene]:
     keyframes = KeyframeConfig(distance_m=settings.keyframe_distance_m)
     scenes: dict[str, Scene] = {}
     if settings.data is not None:
@@ -91,8 +107,7 @@ def _all_scenes(settings: RegistrationSettings, progress: Progress) -> dict[str,
     if settings.recordings:
         scenes["recordings"] = _of_recordings(settings.recordings, keyframes)
     for seed in settings.worlds:
-        world = Scenario(world=WorldScenario(robots=settings.robots, seed=seed))
-        scenes[f"town-{seed}"] = _of_recordings(list(recordings(world, progress).values()), keyframes)
+        scenes[f"town-{seed}"] = _of_recordings(list(recordings(town(settings, seed)).values()), keyframes)
     for seed in settings.walks:
         tracks = TracksScenario(robots=settings.robots, seed=seed, area_m=WALKS_AREA_M, length_m=WALKS_LENGTH_M)
         scenes[f"walks-{seed}"] = _of_recordings(list(recordings(Scenario(tracks=tracks)).values()), keyframes)
@@ -176,13 +191,13 @@ class Encoded(Sequence[bytes]):
 class RegistrationData:
     """Scenes and perception of one experiment in this process."""
 
-    def __init__(self, settings: RegistrationSettings, progress: Progress) -> None:
+    def __init__(self, settings: RegistrationSettings) -> None:
         self.skills = build_perception(settings.perception)
-        self.scenes = make_scenes(settings, progress)
+        self.scenes = make_scenes(settings)
         self.encoded = {name: Encoded(scene, self.skills) for name, scene in self.scenes.items()}
 
 
 @lru_cache(maxsize=1)
 def data_of(settings: RegistrationSettings) -> RegistrationData:
     """Data of the settings, made once in each process."""
-    return RegistrationData(settings, lambda _done, _all: None)
+    return RegistrationData(settings)
