@@ -4,7 +4,6 @@ Campaigns and large swarms ask who corrects whom and when, not how well; this an
 """
 
 from collections.abc import Mapping
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +22,32 @@ from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 
-CLOSURES_KEPT_MAX = 16_384
+
+class Alignment:
+    """The optimiser of one swarm; remembers of each closure what is the same in every round."""
+
+    def __init__(self) -> None:
+        self._known: dict[LoopClosure, tuple[tuple[LogId, LogId], ClosureResult]] = {}
+
+    def __call__(self, graph: PoseGraph, _initial: GraphSolution | None = None) -> GraphSolution:
+        """Place every log in its component's map frame; trusts the closures it comes across first."""
+        known = [self._known.get(closure) or self._look_at(closure) for closure in graph.closures]
+        bridges = {logs: closure for (logs, _), closure in zip(reversed(known), reversed(graph.closures), strict=True)}
+        groups = components_of(list(graph.trajectories), list(bridges.values()))
+        components = tuple(_component(logs, graph, bridges) for logs in groups)
+        return GraphSolution(components, tuple([used for _, used in known]))
+
+    def _look_at(self, closure: LoopClosure) -> tuple[tuple[LogId, LogId], ClosureResult]:
+        """Which logs a closure joins, and that it is used."""
+        low, high = sorted((closure.query.log, closure.match.log))
+        used = ClosureResult(closure.query, closure.match, ClosureState.USED, 1.0, closure.scale_initial, 0.0)
+        known = self._known[closure] = (low, high), used
+        return known
 
 
-def align(graph: PoseGraph, _initial: GraphSolution | None = None) -> GraphSolution:
-    """Place every log in its component's map frame; trusts the closures it comes across first."""
-    known = [_known(closure) for closure in graph.closures]
-    bridges = {logs: closure for (logs, _), closure in zip(reversed(known), reversed(graph.closures), strict=True)}
-    groups = components_of(list(graph.trajectories), list(bridges.values()))
-    return GraphSolution(tuple(_component(logs, graph, bridges) for logs in groups), tuple([used for _, used in known]))
-
-
-@lru_cache(maxsize=CLOSURES_KEPT_MAX)
-def _known(closure: LoopClosure) -> tuple[tuple[LogId, LogId], ClosureResult]:
-    """What is the same in every round: the logs that a closure joins, and that it is used."""
-    low, high = sorted((closure.query.log, closure.match.log))
-    used = ClosureResult(closure.query, closure.match, ClosureState.USED, 1.0, closure.scale_initial, 0.0)
-    return (low, high), used
+def align(graph: PoseGraph) -> GraphSolution:
+    """One alignment alone."""
+    return Alignment()(graph)
 
 
 def _component(

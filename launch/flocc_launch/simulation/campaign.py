@@ -15,7 +15,7 @@ from flocc_agent.composition import build_perception
 from flocc_agent.config import KeyframeConfig
 from flocc_launch.run_folder import write_json
 from flocc_launch.scenario import FaultKind, Scenario, TracksScenario
-from flocc_launch.simulation.alignment import align
+from flocc_launch.simulation.alignment import Alignment
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.faults import schedule
 from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
@@ -116,7 +116,7 @@ def invariants_of(scenario: Scenario) -> list[Invariant]:
 def prepared(scenario: Scenario) -> Swarm:
     """A swarm with quick stand-ins for perception and back end, and its faults to come."""
     eyes = ImageEyes(build_perception(scenario.perception, scenario.seed), scenario.perception, None)
-    swarm = Swarm(scenario, _playbacks(scenario), Equipment(eyes, align), scenario.seed)
+    swarm = Swarm(scenario, _playbacks(scenario), Equipment(eyes, Alignment()), scenario.seed)
     schedule(swarm, scenario.faults)
     return swarm
 

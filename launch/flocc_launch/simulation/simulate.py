@@ -13,7 +13,7 @@ from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
 from flocc_launch.run_folder import RobotResult, Run, RunFolder
 from flocc_launch.scenario import Scenario
-from flocc_launch.simulation.alignment import align
+from flocc_launch.simulation.alignment import Alignment
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.faults import schedule
 from flocc_launch.simulation.playback import Playback, nothing, of_recording, of_walk
@@ -62,7 +62,7 @@ def swarm_of(scenario: Scenario, playbacks: Mapping[str, Playback], seed: int, c
     """Put the robots of a scenario on virtual time, with their faults to come."""
     eyes = ImageEyes(build_perception(scenario.perception, seed), scenario.perception, cache)
     given = scenario.simulation
-    optimiser = align if given.optimiser == "quick" else build_optimiser(scenario.backend)
+    optimiser = Alignment() if given.optimiser == "quick" else build_optimiser(scenario.backend)
     times = WorkTimes(given.encode_s, given.register_s, given.optimise_s)
     swarm = Swarm(scenario, playbacks, Equipment(eyes, optimiser, times), seed)
     schedule(swarm, scenario.faults)

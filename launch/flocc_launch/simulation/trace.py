@@ -37,7 +37,7 @@ from flocc_agent.core.registration import Registration
 from flocc_agent.geometry import pose
 from flocc_agent.radio import LinkOverride, LinkParameters, Partition, RadioParameters
 from flocc_launch.scenario import RobotScenario, Scenario, TracksScenario
-from flocc_launch.simulation.alignment import align
+from flocc_launch.simulation.alignment import Alignment
 from flocc_launch.simulation.playback import Capture, Playback
 from flocc_launch.simulation.robot import Station
 from flocc_launch.simulation.swarm import Equipment, Swarm
@@ -223,7 +223,7 @@ def _scenario(classes: dict[str, int]) -> Scenario:
 
 
 def _equipment() -> Equipment:
-    return Equipment(PlaceEyes(), align)
+    return Equipment(PlaceEyes(), Alignment())
 
 
 def _places() -> Playback:
