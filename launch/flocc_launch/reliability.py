@@ -260,7 +260,7 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
 
 
 def crowd(robots: int, duration_s: float) -> Scenario:
-    """Many robots in one town, all in range of each other, two keyframes per second each: 1 m/s, one every half metre."""
+    """Many robots in one town, all in range of each other: 1 m/s, two keyframes per second each."""
     return Scenario(
         name="crowd",
         tracks=TracksScenario(
