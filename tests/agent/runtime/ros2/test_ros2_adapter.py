@@ -1,6 +1,8 @@
 """The adapter against a raw zenoh node that speaks the documented form: keyframes in, corrections out, faults said."""
 
 import asyncio
+import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import Any
@@ -19,7 +21,7 @@ from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
 from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
-from flocc_agent.runtime.ros2.types import BadMessage
+from flocc_agent.runtime.ros2.types import BadMessage, Ros2Error
 from flocc_protocol.ids import LogId, Term
 
 EPOCH_S = 1_700_000_000
@@ -75,12 +77,13 @@ class Agent:
         self.mounted: list[Float] = []
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
+        self.poses = [(EPOCH_S + 0.25, np.eye(4)), (EPOCH_S + 1.0, T_MAP_ODOM)]
 
     async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
         self.keyframes.append((image, T_odom_camera, stamp_s))
 
     def trajectory(self) -> tuple[list[float], Float]:
-        return [EPOCH_S + 0.25, EPOCH_S + 1.0], np.stack([np.eye(4), T_MAP_ODOM])
+        return [stamp_s for stamp_s, _ in self.poses], np.stack([T for _, T in self.poses])
 
     def host(self) -> Host:
         return Host(self.add_keyframe, self.mounted.append, self.trajectory, lambda *event: self.events.append(event))
@@ -184,6 +187,24 @@ async def test_a_correction_goes_out_as_transform_pose_path_and_frame() -> None:
     attached = [cdr_by_hand.read_attachment(each.attachment or b"") for each in node.received["/tf"]]
     assert [number for number, *_ in attached] == list(range(attached[0][0], attached[0][0] + len(attached)))
     assert {identifier for *_, identifier in attached} == {gid(token)}
+
+
+async def test_a_program_that_feeds_the_agent_gets_transforms_by_the_clock_and_a_thinned_path() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        robot.node.subscribe("/tf", TF)
+        robot.node.subscribe("/r1/flocc/path", PATH, latched=True)
+        options = {"image_topic": "", "odometry_topic": "", "path_poses_max": 2, "tf_period_s": 0.02}
+        async with adapted(port, **options) as (agent, _):
+            agent.poses = [(EPOCH_S + float(k), pose(np.eye(3), np.array([k, 0.0, 0.0]))) for k in range(7)]
+            before_s = time.time()
+            agent.corrections.put_nowait(correction())
+            await until(lambda: len(robot.node.received["/tf"]) >= 5 and bool(robot.node.received["/r1/flocc/path"]))
+            assert not any("/MS/" in token for token in robot.node.tokens if "flocc_r_1" in token)
+    times_s = [cdr_by_hand.read_transforms(each.payload)[0].stamp[0] for each in robot.node.received["/tf"]]
+    assert all(before_s - 1.0 <= each_s <= time.time() + 1.0 for each_s in times_s)
+    *_, path = cdr_by_hand.read_path(robot.node.received["/r1/flocc/path"][-1].payload)
+    assert [(p.stamp[0] - EPOCH_S, p.position[0]) for p in path] == [(0, 0.0), (4, 4.0), (6, 6.0)]
 
 
 async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
@@ -307,6 +328,13 @@ async def test_what_an_image_waits_for_is_said() -> None:
 def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         Ros2Config(**options)
+
+
+@pytest.mark.parametrize("package", ["rosbags.typesys", "xxhash"])
+def test_a_missing_extra_is_said(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(Ros2Error, match=r"needs rosbags and xxhash: pip install 'flocc\[ros2\]'"):
+        Ros2Adapter(Ros2Config(), "r1", KeyframeSelector(KeyframeConfig()), Agent().host())
 
 
 def test_the_type_of_images_follows_from_the_topics_name_unless_it_is_said() -> None:
