@@ -31,7 +31,7 @@ Float = NDArray[np.float64]
 Indices = NDArray[np.int_]
 
 NODES_MAX = 128
-PICKS = 4
+PICKS = 2
 """Candidates that are chosen ahead; a chosen one stays in front, so that no half fetched latent is left behind."""
 POOL_MAX = 256
 """Own candidates that are compared, and as many of others; the most similar ones."""
