@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from flocc_agent.config import MetricsConfig
+from flocc_agent.config import ConfigError, MetricsConfig
 from flocc_agent.runtime.metrics import Look, MetricsError, MetricsServer, metrics_of
 from flocc_agent.runtime.transport import TrafficCounter
 from flocc_agent.stages import BOUNDS_S, StageTimes
@@ -132,3 +132,20 @@ def test_the_page_lists_every_metric() -> None:
     names = {f"{name}_info" if name == "flocc_agent" else name for name in names} | {f"flocc_{name}" for name in GAUGES}
     listed = set(re.findall(r"^\| `(flocc_[a-z_]+)", PAGE.read_text(), re.MULTILINE))
     assert listed == names
+
+
+def test_an_address_is_a_port_or_a_host_and_a_port_and_robots_take_one_after_the_other() -> None:
+    assert MetricsConfig.at("9100", 2) == (MetricsConfig(port=9100), MetricsConfig(port=9101))
+    assert MetricsConfig.at("0.0.0.0:9100") == (MetricsConfig(port=9100, host="0.0.0.0"),)
+    assert MetricsConfig.at("[::]:9100") == (MetricsConfig(port=9100, host="::"),)
+
+
+@pytest.mark.parametrize("text", ["", "here", "0", "65536", "host:", "host:x", "-1"])
+def test_what_is_no_address_is_one_clear_sentence(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"^metrics: '.*' is not \[HOST:\]PORT, such as 9100 or 0\.0\.0\.0:9100$"):
+        MetricsConfig.at(text)
+
+
+def test_ports_that_do_not_suffice_are_refused() -> None:
+    with pytest.raises(ConfigError, match="^metrics: from port 65535 there are no ports for 2 robots$"):
+        MetricsConfig.at("65535", 2)
