@@ -147,5 +147,5 @@ def test_what_is_no_address_is_one_clear_sentence(text: str) -> None:
 
 
 def test_ports_that_do_not_suffice_are_refused() -> None:
-    with pytest.raises(ConfigError, match="^metrics: from port 65535 there are no ports for 2 robots$"):
+    with pytest.raises(ConfigError, match=r"^metrics: from port 65535 there are no ports for 2 robots$"):
         MetricsConfig.at("65535", 2)
