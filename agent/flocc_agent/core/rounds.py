@@ -9,6 +9,8 @@ from flocc_protocol.ids import Term
 FAILURES_MAX = 6
 HURRIED_PERIOD_S = 0.5
 """Least pause between rounds while groups meet."""
+HURRY_MAX_S = 2.0
+"""A meeting hurries rounds for one period, but no longer than this: a long period is somebody's wish to save work."""
 
 
 class Rounds:
@@ -40,8 +42,8 @@ class Rounds:
             self._started = None
 
     def hurry(self, now: float) -> None:
-        """Groups meet, and news are to be expected: for one period rounds may follow each other quickly."""
-        self._hurried_until_s = now + self._parameters.period_s
+        """Groups meet, and news are to be expected: for one short period rounds may follow each other quickly."""
+        self._hurried_until_s = now + min(self._parameters.period_s, HURRY_MAX_S)
         self._next_s = min(self._next_s, now + HURRIED_PERIOD_S)
 
     def on_solution(self, term: Term, round_number: int, solution: GraphSolution) -> bool:
