@@ -1,6 +1,6 @@
 # make demo    three robots in a generated world, one report: creates .venv and installs what that needs
 # make test    installs what tests need and runs all of them: ruff, mypy, import contracts, pytest
-# make swarm-test   shipped scenarios over real zenoh, a worse variant of each that must fail, observers: five minutes
+# make swarm-test   shipped scenarios over real zenoh, a worse variant of each that must fail, observers: six minutes
 # make check   the same without installing anything
 # make clean   removes .venv and everything that was generated
 
