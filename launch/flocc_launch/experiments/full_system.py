@@ -62,6 +62,8 @@ if TYPE_CHECKING:
 COSMO = {"cosmo-wifi": "wifi", "cosmo-proradio": "proradio"}
 TARGET_ATE_M = 2.5
 DEFAULT = "flocc independent gnc-tls"
+SETTLE_S = 20.0
+"""A run on cosmo_bench is quiet when nothing happened for a round's period and this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ class FullSystemSettings(Settings):
     """Repetitions with other seeds: links, workers, walks."""
     loss_ratio: float = Field(0.1, ge=0, lt=1)
     """Share of messages lost on every link."""
-    round_period_s: float = Field(200.0, gt=0)
+    round_period_s: float = Field(100.0, gt=0, le=200)
     """Time between rounds on cosmo_bench, whose robots drive for a quarter of an hour; elsewhere the default."""
     iteration_period_s: float = Field(2.0, gt=0)
     """Time between iterations of rbcd on cosmo_bench; elsewhere the default."""
@@ -230,7 +232,7 @@ def scenario_of(settings: FullSystemSettings, source: str, method: Method, seed:
                 odometry_rotation_sigma_rad=sigmas[0],
                 odometry_translation_sigma_m=sigmas[1],
             ),
-            settle_s=60.0,
+            settle_s=settings.round_period_s + SETTLE_S,
         )
     core = CoreParameters(place_recognition=PlaceRecognitionParameters(**places))
     if source == "tracks":
