@@ -183,8 +183,9 @@ def summarise(_settings: CandidateOrderSettings, rows: Sequence[Row]) -> Summary
 
 
 def levels(rows: Sequence[Row]) -> list[int]:
-    """Numbers of closures that every run reached or that all settled on."""
-    return sorted({n for row in rows for n, _ in row["curve"][:-1]})
+    """Numbers of closures that every run reached, so that all medians are over the same runs."""
+    reached_by = [{n for n, _ in row["curve"][:-1]} for row in rows]
+    return sorted(set.intersection(*reached_by)) if reached_by else []
 
 
 def _level(order: str, n: int, rows: Sequence[Row]) -> Row:
