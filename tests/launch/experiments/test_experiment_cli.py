@@ -50,7 +50,7 @@ def test_the_list_names_every_experiment(monkeypatch: pytest.MonkeyPatch, capsys
 
 def test_an_unknown_experiment_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, "nonsense") == 2
-    assert "there is no experiment 'nonsense'; there are registration" in sentence(capsys)
+    assert "there is no experiment 'nonsense'; there are full-system" in sentence(capsys)
 
 
 @pytest.mark.parametrize(
