@@ -20,7 +20,7 @@ from flocc_launch.datasets.writer import RecordingWriter
 from flocc_launch.graph_files.graph_file import GraphFile, GraphFileError
 
 REGISTRATIONS = "registrations.json"
-OWN_GAP_KEYFRAMES = 10
+OWN_GAP_KEYFRAMES = 2
 SCENARIO = """name = "graph"
 rate = {rate}
 

@@ -68,13 +68,21 @@ def _graph_file(data: Mapping[str, Any], path: Path) -> GraphFile:
 
 
 def _stamps(measurements: Mapping[str, Any], graph: PoseGraph) -> dict[LogId, Float]:
-    """Times of each robot's entries, seconds from the first of all; only where every entry is one keyframe's."""
+    """Times of each robot's keyframes, seconds from the first: of the first entry that has each as its newest."""
     stamps: dict[LogId, list[int]] = {}
     for robot, entries in measurements.items():
-        log = log_of(_number(robot) << INDEX_BITS)
-        found = [int(entry["stamp"]) for entry in entries if "stamp" in entry]
-        if len(found) == len(graph.trajectories.get(log, ())):
-            stamps[log] = found
+        number = _number(robot)
+        seen: dict[int, int] = {}
+        for entry in entries:
+            keys = [
+                int(item[name]) for item in entry["measurements"] for name in ("key", "key1", "key2") if name in item
+            ]
+            own = [key for key in keys if key >> INDEX_BITS == number]
+            if own and "stamp" in entry:
+                seen.setdefault(max(own), int(entry["stamp"]))
+        log = log_of(number << INDEX_BITS)
+        if seen and len(seen) == len(graph.trajectories.get(log, ())):
+            stamps[log] = [seen[key] for key in sorted(seen)]
     first = min((own[0] for own in stamps.values()), default=0)
     return {log: np.array([(stamp - first) * 1e-9 for stamp in own]) for log, own in stamps.items()}
 
