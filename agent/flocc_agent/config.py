@@ -116,8 +116,8 @@ class BackendConfig(Section):
     scale_link_unknown_sigma_ratio: float = Field(3.0, gt=0)
     """The same where no initial scale makes the closures' network units comparable."""
     scale_prior_sigma_ratio: float = Field(0.5, gt=0)
-    """Prior on a scale that Eq. (6) initialises: standard deviation relative to its initial value. Robots that met at one
-    place only are placed by it; much smaller rejects closures whose scale is far from its initial value."""
+    """Prior on a scale that Eq. (6) initialises: standard deviation relative to its initial value. Robots that met at
+    one place only are placed by it; much smaller rejects closures whose scale is far from its initial value."""
     scale_prior_unknown_sigma_ratio: float = Field(20.0, gt=0)
     """The same for closures without an initial scale, around one metre per network unit."""
     weight_by_probability: bool = True
