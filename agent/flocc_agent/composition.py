@@ -21,7 +21,15 @@ from flocc_agent.backend import iterate_own_block, optimise_graph
 from flocc_agent.config import AgentConfig, BackendConfig, BackendMode, PerceptionConfig, RadioConfig, Ros2Config
 from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.effects import Correction
-from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, OdometryPair, Registrar
+from flocc_agent.core.interfaces import (
+    Camera,
+    Describer,
+    Encoder,
+    Image,
+    OdometryPair,
+    PictureEncoder,
+    Registrar,
+)
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.robot import Robot
@@ -80,6 +88,14 @@ class Perception:
             descriptor = Array.int8(self.describer.describe(image))
         with stage("encode"):
             return EncodedImage(descriptor, self.encoder.encode(image))
+
+    def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
+        """Give what is sent of a stored latent; see `PictureEncoder.part`."""
+        return self.encoder.part(latent, encode_bytes) if isinstance(self.encoder, PictureEncoder) else latent
+
+    def encode_s(self) -> float | None:
+        """Tell how long encoding a received picture takes, seconds; None where pictures are not wanted."""
+        return self.encoder.encode_s if isinstance(self.encoder, PictureEncoder) else None
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's."""
@@ -349,8 +365,8 @@ class Agent:
                 perception.register,
                 build_optimiser(config.backend),
                 build_iterator(config.backend),
-                perception.encoder.part,
-                lambda: perception.encoder.encode_s,
+                perception.part,
+                perception.encode_s,
             ),
             Reporter(config.name, self._T_body_camera, config.backend.steepness),
             self._on_line,

@@ -5,7 +5,7 @@ arrays. Only the back-end that wrote a latent reads it, and it refuses another m
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,13 +88,18 @@ class Encoder(Protocol):
         """Identity of the method and its weights; latents of one identity can be registered with each other."""
         ...
 
+    def encode(self, image: Image) -> bytes:
+        """Compute the latent of an image."""
+        ...
+
+
+@runtime_checkable
+class PictureEncoder(Encoder, Protocol):
+    """An encoder whose latents may hold the picture as well, which the receiver can encode by itself."""
+
     @property
     def encode_s(self) -> float | None:
         """Smoothed time to encode one picture, seconds; None where a latent is always fetched rather than encoded."""
-        ...
-
-    def encode(self, image: Image) -> bytes:
-        """Compute the latent of an image."""
         ...
 
     def part(self, latent: bytes, encode_bytes: int | None, /) -> bytes:

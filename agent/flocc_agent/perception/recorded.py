@@ -90,15 +90,6 @@ class RecordedPerception:
         """Identity of the method."""
         return MODEL
 
-    @property
-    def encode_s(self) -> float | None:
-        """None: a latent is smaller than its picture and always fetched."""
-        return None
-
-    def part(self, latent: bytes, _: int | None) -> bytes:
-        """The whole latent; see `Encoder.part`."""
-        return latent
-
     def describe(self, image: Image) -> NDArray[np.float32]:
         """Unit vector (D,) with an entry for each recorded pair of the keyframe."""
         name = name_of(image.pixels.tobytes())

@@ -59,15 +59,6 @@ class SyntheticPerception:
         """Describe the pose and key that an image of `pose_image` holds."""
         return self.describe_pose(*_unpacked(image.pixels.tobytes()))
 
-    @property
-    def encode_s(self) -> float | None:
-        """None: a latent is smaller than its picture and always fetched."""
-        return None
-
-    def part(self, latent: bytes, _: int | None) -> bytes:
-        """The whole latent; see `Encoder.part`."""
-        return latent
-
     def encode(self, image: Image) -> bytes:
         """Encode the pose and key that an image of `pose_image` holds."""
         return self.encode_pose(*_unpacked(image.pixels.tobytes()))

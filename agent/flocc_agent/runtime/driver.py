@@ -106,8 +106,8 @@ class Skills:
         register: (query latent, match latent, odometry pair) to a relative pose up to scale.
         optimise: Pose graph and last solution to a solution; must be importable by a worker process.
         iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
-        part: (latent, what the link carries while the asker encodes a picture) to what is sent; see `Encoder.part`.
-        encode_s: See `Encoder.encode_s`.
+        part: (latent, what the link carries while the asker encodes) to what is sent; see `PictureEncoder.part`.
+        encode_s: See `PictureEncoder.encode_s`.
     """
 
     encode: Callable[[Image], Encoded]

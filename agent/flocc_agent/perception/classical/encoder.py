@@ -27,15 +27,6 @@ class ClassicalEncoder:
         """Identity of the features; latents of one identity can be registered with each other."""
         return MODEL
 
-    @property
-    def encode_s(self) -> float | None:
-        """None: a latent is smaller than its picture and always fetched."""
-        return None
-
-    def part(self, latent: bytes, _: int | None) -> bytes:
-        """The whole latent; see `Encoder.part`."""
-        return latent
-
     def encode(self, image: Image) -> bytes:
         """Compute the latent of an image."""
         camera = image.camera
