@@ -127,7 +127,7 @@ def symmetric(pattern: Pattern, blocks: Float) -> sparse.bsr_matrix:
 
 def _border(pattern: Pattern, A_i: Float, A_j: Float, a_scale: Float, cluster: Int, clusters: int) -> sparse.csr_matrix:
     """Products (6 N, C) of the nodes' Jacobians with those by the scales."""
-    scaled = np.flatnonzero(cluster >= 0) if clusters else np.zeros(0, dtype=np.int64)
+    scaled = np.flatnonzero(cluster >= 0)
     values = np.concatenate([np.einsum("eki,ek->ei", A[scaled], a_scale[scaled]) for A in (A_i, A_j)])
     nodes = np.concatenate([pattern.i[scaled], pattern.j[scaled]])
     rows = (6 * nodes[:, None] + np.arange(6)).ravel()
