@@ -339,7 +339,7 @@ class Driver:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await asyncio.to_thread(write, self._store, self._copied)
+        await self._flush()
         self._count_bytes(last=True)
         await self._transport.close()
         await self._workers.close()
@@ -428,10 +428,9 @@ class Driver:
     async def _write(self, written: list[Persist]) -> None:
         """Bring what is to be kept onto the disk before anything is sent that depends on it."""
         if written:
-            batch = [*self._copied, *written]
+            self._copied += written
             written.clear()
-            self._copied.clear()
-            await asyncio.to_thread(write, self._store, batch)
+            await self._flush()
 
     async def _write_copies(self) -> None:
         """Bring copies of others' records onto the disk, many at a time: what a crash loses of them comes again."""
@@ -440,9 +439,12 @@ class Driver:
             return
         self._copies_due_s = now + COPIES_PERIOD_S
         if self._copied:
-            batch = self._copied.copy()
-            self._copied.clear()
-            await asyncio.to_thread(write, self._store, batch)
+            await self._flush()
+
+    async def _flush(self) -> None:
+        """Write whatever waits for the disk."""
+        batch, self._copied = self._copied, []
+        await asyncio.to_thread(write, self._store, batch)
 
     def _do(self, effect: Effect) -> None:
         match effect:
