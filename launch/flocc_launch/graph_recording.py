@@ -72,18 +72,25 @@ def write_recordings(file: GraphFile, out: Path, source: str) -> GraphRecordings
         source: What the recordings are of, one line.
 
     Raises:
-        GraphFileError: The file has no whole ground truth of some robot.
+        GraphFileError: The file has no whole ground truth of some robot, or times that do not increase.
     """
-    robots = {}
-    for log in sorted(file.graph.trajectories):
-        if log not in file.T_truth:
-            raise GraphFileError(f"{source}: has no ground truth of robot {log}")
-        robots[log.robot] = _write_robot(file, log.robot, out / log.robot, source)
+    _require_playable(file, source)
+    robots = {
+        log.robot: _write_robot(file, log.robot, out / log.robot, source) for log in sorted(file.graph.trajectories)
+    }
     names = [f"{log.robot}/{k}" for log, t in sorted(file.graph.trajectories.items()) for k in range(len(t))]
     registrations = out / REGISTRATIONS
     entries = {"format": FORMAT, "keyframes": names, "pairs": [_entry(c) for c in _once(file.graph.closures)]}
     registrations.write_text(json.dumps(entries), encoding="utf-8")
     return GraphRecordings(robots, registrations)
+
+
+def _require_playable(file: GraphFile, source: str) -> None:
+    for log in sorted(file.graph.trajectories):
+        if log not in file.T_truth:
+            raise GraphFileError(f"{source}: has no ground truth of robot {log}")
+        if log in file.stamps_s and np.any(np.diff(file.stamps_s[log]) <= 0):
+            raise GraphFileError(f"{source}: the times of robot {log} do not increase")
 
 
 def odometry_sigmas(file: GraphFile) -> tuple[float, float]:

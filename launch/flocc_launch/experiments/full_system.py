@@ -5,6 +5,7 @@ the end. On cosmo_bench the closures are the recorded ones, offered when both ke
 flocc's methods get them without scale, the baselines, which stand for systems with metric sensors, with it.
 """
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,6 +47,7 @@ from flocc_launch.experiments.experiment import (
     Summary,
     judged,
 )
+from flocc_launch.experiments.overlap import require_overlap
 from flocc_launch.experiments.plots import COLOURS
 from flocc_launch.experiments.statistics import grouped, middle, with_spread
 from flocc_launch.graph_files import read_graph_file
@@ -61,6 +63,8 @@ if TYPE_CHECKING:
 
 COSMO = {"cosmo-wifi": "wifi", "cosmo-proradio": "proradio"}
 TARGET_ATE_M = 2.5
+NEAR_M = 10.0
+"""Robots whose true ways never come this near show nothing."""
 DEFAULT = "flocc independent gnc-tls"
 SETTLE_S = 20.0
 """A run on cosmo_bench is quiet when nothing happened for a round's period and this."""
@@ -137,15 +141,19 @@ def _runs_on(source: str, method: str) -> bool:
 
 
 def prepare(settings: FullSystemSettings, progress: Progress) -> None:
-    """Check names, and make the recordings that all cells share."""
+    """Check names, and make the recordings that all cells share.
+
+    Raises:
+        FloccError: There is no such method or source, or its data is missing, has no ground truth or no overlap.
+    """
     for method in settings.methods:
         if method not in METHODS:
             raise ExperimentError(f"there is no method {method!r}; there are {', '.join(METHODS)}")
     for number, source in enumerate(settings.sources):
-        if source in COSMO:
-            _cosmo(settings, source)
-        elif source not in ("tracks", "world", "sevenscenes"):
+        if source not in (*COSMO, "tracks", "world", "sevenscenes"):
             raise ExperimentError(f"there is no source {source!r}; see --help")
+        given = scenario_of(settings, source, METHODS[DEFAULT], seed=1)
+        require_overlap(playbacks_of(given, _recordings(settings, source, given)), NEAR_M, source)
         progress(number + 1, len(settings.sources))
 
 
@@ -270,9 +278,10 @@ def _file(settings: FullSystemSettings, source: str) -> Path:
 
 
 def _cosmo(settings: FullSystemSettings, source: str) -> GraphRecordings:
-    """Recordings of a file, made once."""
+    """Recordings of a file, made once for its content."""
     path = _file(settings, source)
-    out = cache_folder() / "graphs" / f"{path.stem}-{settings.keyframes_max}"
+    content = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    out = cache_folder() / "graphs" / f"{path.stem}-{content}-{settings.keyframes_max}"
     marker = out / "whole"
     if marker.exists():
         robots = {folder.name: folder for folder in sorted(out.iterdir()) if folder.is_dir()}

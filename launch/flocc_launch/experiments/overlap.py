@@ -1,7 +1,8 @@
 """Whether robots' true ways come near each other at all: an experiment on robots that never do shows nothing."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +10,10 @@ from scipy.spatial import cKDTree
 
 from flocc_launch.experiments.experiment import ExperimentError
 from flocc_launch.simulation.playback import Playback
+from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
+T = TypeVar("T", str, LogId)
 
 
 def require_overlap(playbacks: Mapping[str, Playback], near_m: float, what: str) -> None:
@@ -29,19 +32,23 @@ def require_overlap(playbacks: Mapping[str, Playback], near_m: float, what: str)
     if blind:
         raise ExperimentError(f"{what}: robot {blind[0]} has no ground truth, so no error can be measured")
     ways_m = {name: p.truth.T_fixed_body[:, :3, 3] for name, p in seeing.items() if p.truth is not None}
-    group = _grown(ways_m, near_m)
-    apart = sorted(set(ways_m) - group)
+    apart = sorted(set(ways_m) - joined(ways_m, _near(ways_m, near_m)))
     if apart:
         raise ExperimentError(
             f"{what}: the way of robot {apart[0]} stays more than {near_m:g} m from the others': no overlap, no map"
         )
 
 
-def _grown(ways_m: Mapping[str, Float], near_m: float) -> set[str]:
-    """The robots that hang together with the first one."""
+def _near(ways_m: Mapping[str, Float], near_m: float) -> list[tuple[str, str]]:
+    """Pairs of robots whose ways come near each other."""
     trees = {name: cKDTree(way) for name, way in ways_m.items()}
-    near = {(a, b) for a, b in combinations(sorted(trees), 2) if trees[a].count_neighbors(trees[b], near_m)}
-    group = set(sorted(ways_m)[:1])
-    while grown := {b for a, b in near | {(b, a) for a, b in near} if a in group} - group:
+    return [(a, b) for a, b in combinations(sorted(trees), 2) if trees[a].count_neighbors(trees[b], near_m)]
+
+
+def joined(names: Collection[T], pairs: Iterable[tuple[T, T]]) -> set[T]:
+    """Those of the names that hang together with the first one, directly or through others."""
+    both_ways = {ordered for a, b in pairs for ordered in ((a, b), (b, a))}
+    group = set(sorted(names)[:1])
+    while grown := {b for a, b in both_ways if a in group} - group:
         group |= grown
     return group

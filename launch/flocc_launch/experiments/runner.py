@@ -83,9 +83,8 @@ def run_experiment(
         experiment.prepare(settings, on_prepare)
         cells = experiment.cells(settings)
         rows = folder.rows()
-        folder.write_state(len(cells), *_counts(rows, cells))
         missing = [cell for cell in cells if rows.get(cell.key, {"error": "missing"})["error"] is not None]
-        _measure_all(experiment, settings, seed, missing, processes, folder, len(cells), on_row)
+        _measure_all(experiment, settings, seed, cells, missing, processes, folder, on_row)
     except KeyboardInterrupt:
         raise _interrupted(experiment, settings, folder) from None
     result = finish(experiment, settings, folder, cells)
@@ -125,19 +124,23 @@ def _measure_all(
     experiment: Experiment[S],
     settings: S,
     seed: int,
+    cells: Sequence[Cell],
     missing: Sequence[Cell],
     processes: int,
     folder: ExperimentFolder,
-    cells: int,
     on_row: OnRow,
 ) -> None:
-    """Measure cells and keep each row."""
+    """Measure cells and keep each row, so that the folder says how far it is even after a kill."""
     one_by_one = processes == 1 or len(missing) < 2
     jobs = [(experiment.measure, settings, cell, seed) for cell in missing]
     rows = (measured(*job) for job in jobs) if one_by_one else _in_processes(jobs, processes)
-    for done, row in enumerate(rows, start=cells - len(missing) + 1):
+    known = folder.rows()
+    folder.write_state(len(cells), *_counts(known, cells))
+    for done, row in enumerate(rows, start=len(cells) - len(missing) + 1):
         folder.append(row)
-        on_row(row, done, cells)
+        known[row["cell"]] = row
+        folder.write_state(len(cells), *_counts(known, cells))
+        on_row(row, done, len(cells))
 
 
 def measured(measure: Callable[[S, Cell, int], Row], settings: S, cell: Cell, seed: int) -> Row:

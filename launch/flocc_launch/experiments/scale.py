@@ -29,11 +29,12 @@ from flocc_launch.experiments.experiment import (
     grid,
     judged,
 )
+from flocc_launch.experiments.overlap import joined
 from flocc_launch.experiments.plots import COLOURS
 from flocc_launch.experiments.statistics import grouped, middle, with_spread
 from flocc_launch.generated_graph import Noise, generate
 from flocc_launch.graph_files import read_graph_file
-from flocc_launch.graph_files.graph_file import ate_m
+from flocc_launch.graph_files.graph_file import GraphFile, ate_m
 from flocc_launch.optimise import positions
 from flocc_protocol.ids import LogId
 
@@ -87,10 +88,25 @@ def cells(settings: ScaleSettings) -> list[Cell]:
 
 
 def prepare(settings: ScaleSettings, _progress: Progress) -> None:
-    """Refuse sources that are not there."""
+    """Refuse sources that are not there, or of which no joint error can be measured.
+
+    Raises:
+        FloccError: A file is missing or damaged, has no ground truth, or its robots have no closures with each other.
+    """
     for source in settings.sources:
         if source != "generated":
-            _file(settings, source)
+            path = _file(settings, source)
+            _require_measurable(read_graph_file(path), path)
+
+
+def _require_measurable(file: GraphFile, path: Path) -> None:
+    blind = sorted(set(file.graph.trajectories) - set(file.truth_m))
+    if blind:
+        raise ExperimentError(f"{path}: has no ground truth of robot {blind[0]}, so no error can be measured")
+    pairs = {(c.query.log, c.match.log) for c in file.graph.closures}
+    apart = sorted(set(file.graph.trajectories) - joined(file.graph.trajectories, pairs))
+    if apart:
+        raise ExperimentError(f"{path}: no closures join robot {apart[0]} to the others: no overlap, no map")
 
 
 def measure(settings: ScaleSettings, cell: Cell, seed: int) -> Row:

@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from flocc_launch.experiments.experiment import ExperimentError
 from flocc_launch.experiments.overlap import require_overlap
 from flocc_launch.experiments.registry import ALL, find
 from flocc_launch.experiments.runner import run_experiment
+from flocc_launch.graph_files.graph_file import INDEX_BITS
+from flocc_launch.graph_files.jrl import BETWEEN
 from flocc_launch.scenario import Scenario, TracksScenario
 from flocc_launch.simulation.simulate import playbacks_of
 
@@ -113,6 +116,64 @@ def test_a_robot_without_truth_or_whose_way_stays_apart_is_named_before_anything
     blind = {**playbacks, "r2": replace(playbacks["r2"], truth=None)}
     with pytest.raises(ExperimentError, match="scenario s: robot r2 has no ground truth"):
         require_overlap(blind, 5.0, "scenario s")
+
+
+def two_robots() -> dict[str, Any]:
+    """A JRL file of two robots that meet at their first keyframes, three keyframes each."""
+    still = {"rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0, 0.0, 0.0]}
+    step = {**still, "translation": [1.0, 0.0, 0.0]}
+    keys = {robot: [(ord(robot) << INDEX_BITS) + k for k in range(3)] for robot in "ab"}
+
+    def between(stamp: int, first: int, second: int, value: dict[str, Any]) -> dict[str, Any]:
+        factor = {"type": BETWEEN, "key1": first, "key2": second, "measurement": value}
+        return {"stamp": stamp, "measurements": [{**factor, "covariance": np.eye(6).ravel().tolist()}]}
+
+    odometry = {robot: [between(k + 1, own[k], own[k + 1], step) for k in range(2)] for robot, own in keys.items()}
+    truth = {robot: [{"key": key, **still} for key in own] for robot, own in keys.items()}
+    odometry["a"].append(between(0, keys["a"][0], keys["b"][0], still))
+    return {"measurements": odometry, "groundtruth": truth}
+
+
+@pytest.mark.parametrize(
+    ("experiment", "left_out", "said"),
+    [
+        ("scale", "truth", "has no ground truth of robot b"),
+        ("scale", "closures", "no closures join robot b to the others"),
+        ("full-system", "truth", "has no ground truth of robot b"),
+        ("full-system", "times", "the times of robot a do not increase"),
+    ],
+)
+def test_a_benchmark_without_truth_or_overlap_is_refused_before_any_cell(
+    experiment: str,
+    left_out: str,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    graph = two_robots()
+    if left_out == "truth":
+        del graph["groundtruth"]["b"]
+    elif left_out == "closures":
+        del graph["measurements"]["a"][-1]
+    else:
+        graph["measurements"]["a"][0]["stamp"] = 5
+    (tmp_path / "cosmo_bench" / "wifi").mkdir(parents=True)
+    (tmp_path / "cosmo_bench" / "wifi" / "small.jrl").write_text(json.dumps(graph), encoding="utf-8")
+    out = tmp_path / "out"
+    given = ["--data", str(tmp_path), "--sources", "cosmo-wifi", "--out", str(out)]
+    assert run(monkeypatch, experiment, *given) == 2
+    assert said in sentence(capsys)
+    assert not (out / "rows.jsonl").exists()
+
+
+def test_pictures_that_are_missing_are_told_before_any_cell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["--data", str(tmp_path), "--sources", "sevenscenes", "--out", str(tmp_path / "out")]
+    assert run(monkeypatch, "full-system", *given) == 2
+    assert sentence(capsys).endswith("sevenscenes: does not exist")
 
 
 def test_a_checkpoint_of_another_model_is_refused(

@@ -80,6 +80,16 @@ def test_an_interrupted_experiment_keeps_its_rows_marked_partial_and_goes_on(tmp
     assert rows(tmp_path) == before
 
 
+def test_the_folder_says_after_every_cell_how_far_it_is(tmp_path: Path) -> None:
+    said = []
+    run_experiment(TOY, ToySettings(), 5, tmp_path, on_row=lambda *_: said.append(config(tmp_path)))
+    assert [(state["state"], state["done"], state["cells"]) for state in said] == [
+        ("partial", 1, 3),
+        ("partial", 2, 3),
+        ("finished", 3, 3),
+    ]
+
+
 def test_a_finished_cell_is_not_measured_again(tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
         run(tmp_path, interrupted_at=2)
