@@ -134,12 +134,12 @@ def rays_of(
     path_m: Mapping[LogId, Float],
     steepness: float,
 ) -> Rays:
-    """Bring closures of one pair of logs into the order (lower log, higher log)."""
+    """Bring closures of one pair of logs into the order (lower log, higher log), within a log (earlier, later)."""
     T_i, T_j, T_hat, known, exact, weight, path = [], [], [], [], [], [], []
     for k in ids:
         c = closures[k]
         T = np.asarray(c.T_query_match_unscaled, dtype=float)
-        low, high = (c.query, c.match) if c.query.log <= c.match.log else (c.match, c.query)
+        low, high = sorted((c.query, c.match))
         T_hat.append(T if low == c.query else inverse(T))
         T_i.append(trajectories[low.log].T_odom_keyframe[low.index])
         T_j.append(trajectories[high.log].T_odom_keyframe[high.index])

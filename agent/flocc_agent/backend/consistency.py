@@ -1,10 +1,10 @@
 """Pairwise consistency maximisation (Mangelson 2018) for closures whose scale may be unknown.
 
-Two closures k, l of one pair of robots and the odometry between them form a loop: `T_k B = A T_l`, with A and B the
-odometry of both robots from k to l. The rotations must agree. Translations must agree for some positive lengths s_k,
-s_l of the two measured directions: `s_k t_k + R_k t_B - t_A - s_l R_A t_l = 0`, of which the part across both
-directions is left as a test. Variances grow along the odometry. The greatest set of closures that agree two by two is
-kept; it is found greedily from the best connected closures on.
+Two closures k, l of one pair of robots, or within one robot, and the odometry between them form a loop:
+`T_k B = A T_l`, with A and B the odometry of both ends from k to l. The rotations must agree. Translations must agree
+for some positive lengths s_k, s_l of the two measured directions: `s_k t_k + R_k t_B - t_A - s_l R_A t_l = 0`, of which
+the part across both directions is left as a test. Variances grow along the odometry. The greatest set of closures that
+agree two by two is kept; it is found greedily from the best connected closures on.
 
 What it needs is an odometry whose covariances tell the truth: with optimistic ones, right closures far apart in time
 disagree and are lost. Hence it is off by default; GNC needs it less.
@@ -28,7 +28,7 @@ CLOSURES_MAX = 1500
 SEEDS_MAX = 50
 FREEDOM = 4
 PARALLEL_MIN = 1e-9
-REASON = "is not consistent with most closures of this pair of robots"
+REASON = "is not consistent with most closures of this pair of robots, or within this robot"
 
 
 def inconsistent(
@@ -38,8 +38,7 @@ def inconsistent(
     pairs: dict[tuple[LogId, LogId], list[int]] = {}
     for k in sorted(closures):
         a, b = sorted((closures[k].query.log, closures[k].match.log))
-        if a != b:
-            pairs.setdefault((a, b), []).append(k)
+        pairs.setdefault((a, b), []).append(k)
     path_m = {log: travelled_m(trajectory) for log, trajectory in trajectories.items()}
     dropped: dict[int, str] = {}
     for ids in (ids for ids in pairs.values() if 2 < len(ids) <= CLOSURES_MAX):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import (
@@ -281,3 +282,18 @@ def test_pairwise_consistency_clears_the_way_for_least_squares() -> None:
     wrong = [state for state, right in zip(states, dirty.is_right, strict=True) if not right]
     assert wrong.count(ClosureState.REJECTED) >= 0.95 * len(wrong)
     assert [s for s, right in zip(states, dirty.is_right, strict=True) if right].count(ClosureState.REJECTED) <= 3
+
+
+def test_pairwise_consistency_judges_closures_within_a_robot() -> None:
+    log, lap, turns_rad = LogId("r00"), 20, np.arange(60) * 2.0 * np.pi / 20
+    T = np.array(
+        [pose(so3_exp(np.array([0.0, 0.0, a])), 5.0 * np.array([np.cos(a), np.sin(a), 0.1])) for a in turns_rad]
+    )
+    ends = [(k, k + lap) if k % 2 else (k + lap, k) for k in range(lap)]
+    right = {
+        n: LoopClosure(KeyframeId(log, i), KeyframeId(log, j), between(T[i], T[j]), metric=True)
+        for n, (i, j) in enumerate(ends)
+    }
+    away = pose(np.eye(3), np.array([0.0, 4.0, 0.0]))
+    wrong = {n: replace(right[n], T_query_match_unscaled=away @ right[n].T_query_match_unscaled) for n in (3, 8, 15)}
+    assert set(inconsistent({log: Trajectory(T)}, {**right, **wrong}, BackendConfig())) == set(wrong)
