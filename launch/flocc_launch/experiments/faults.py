@@ -156,12 +156,16 @@ def draw(figure: "Figure", _settings: FaultsSettings, rows: Sequence[Row]) -> No
         levels = levels_of(rows, axis)
         for line, (measure_name, label) in enumerate(MEASURES.items()):
             panel = panels[line][column]
-            spread_line(panel, levels, measure_name)
+            spread_line(panel, levels, measure_name, label="flocc")
+            if measure_name == "ate_m":
+                spread_line(panel, levels, "ate_odometry_m", 1, "odometry alone")
             if column == 0:
                 panel.set_ylabel(label)
         panels[-1][column].set_xlabel(LABELS[axis])
+    panels[0][0].legend(fontsize=8, frameon=False)
     for line, measure_name in zip(panels, MEASURES, strict=True):
-        from_zero(line[0], drawn_values(rows, measure_name))
+        extra = drawn_values(rows, "ate_odometry_m") if measure_name == "ate_m" else []
+        from_zero(line[0], [*drawn_values(rows, measure_name), *extra])
 
 
 FAULTS = Experiment(
