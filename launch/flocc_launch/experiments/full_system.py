@@ -48,8 +48,8 @@ from flocc_launch.experiments.experiment import (
     judged,
 )
 from flocc_launch.experiments.overlap import require_overlap
-from flocc_launch.experiments.plots import COLOURS
-from flocc_launch.experiments.statistics import grouped, middle, with_spread
+from flocc_launch.experiments.plots import COLOURS, MARKERS
+from flocc_launch.experiments.statistics import grouped, middle, values, with_spread
 from flocc_launch.graph_files import read_graph_file
 from flocc_launch.graph_recording import OWN_GAP_KEYFRAMES, GraphRecordings, odometry_sigmas, write_recordings
 from flocc_launch.report.finish import finish
@@ -59,6 +59,7 @@ from flocc_launch.scenario import DatasetScenario, RobotScenario, Scenario, Trac
 from flocc_launch.simulation.simulate import playbacks_of, run, swarm_of, write
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COSMO = {"cosmo-wifi": "wifi", "cosmo-proradio": "proradio"}
@@ -321,51 +322,79 @@ def summarise(_settings: FullSystemSettings, rows: Sequence[Row]) -> Summary:
 
 def findings(rows: Sequence[Row]) -> list[Finding]:
     """The paper's claims on whole systems."""
-    ate = {key: middle(group, "ate_m") for key, group in grouped(rows, "source", "method").items()}
-    took = {key: middle(group, "solve_cpu_s") for key, group in grouped(rows, "source", "method").items()}
-    sources = list(dict.fromkeys(row["source"] for row in rows))
-    return [f for source in sources for f in _of_source(source, ate, took)]
+    return [f for (source,), of_source in grouped(rows, "source").items() for f in _of_source(source, of_source)]
 
 
-def _of_source(
-    source: str, ate: dict[tuple[Any, ...], float | None], took: dict[tuple[Any, ...], float | None]
-) -> list[Finding]:
+def _of_source(source: str, rows: Sequence[Row]) -> list[Finding]:
+    of = {method: group for (method,), group in grouped(rows, "method").items()}
+    ate = {method: value for method, group in of.items() if (value := middle(group, "ate_m")) is not None}
     found = []
-    if source in COSMO and (default := ate.get((source, DEFAULT))) is not None:
+    if source in COSMO and DEFAULT in ate:
         claim = f"flocc's default ends at most {TARGET_ATE_M} m off on {source}"
-        found.append(judged(claim, "issue 8", default <= TARGET_ATE_M, f"{default:.2f} m."))
-    smoothed = ate.get((source, "flocc smoothed lm"))
-    robust = ate.get((source, "flocc smoothed gnc-tls"))
-    if smoothed is not None and robust is not None:
-        seconds = took[source, "flocc smoothed lm"], took[source, "flocc smoothed gnc-tls"]
-        numbers = f"LM {smoothed:.2f} m in {seconds[0]:.2f} s, GNC {robust:.2f} m in {seconds[1]:.2f} s of CPU."
+        found.append(judged(claim, "issue 8", ate[DEFAULT] <= TARGET_ATE_M, f"{ate[DEFAULT]:.2f} m."))
+    if "flocc smoothed lm" in ate and "flocc smoothed gnc-tls" in ate:
+        plain_m, robust_m = ate["flocc smoothed lm"], ate["flocc smoothed gnc-tls"]
+        plain_s, robust_s = (middle(of[f"flocc smoothed {name}"], "solve_cpu_s") or 0.0 for name in ("lm", "gnc-tls"))
+        numbers = f"LM {plain_m:.3g} m in {plain_s:.2g} s, GNC {robust_m:.3g} m in {robust_s:.2g} s of CPU."
         claim = f"GNC adds little to smoothed scales and costs far more ({source})"
-        little = smoothed <= 1.1 * robust and (seconds[1] or 0.0) > 2.0 * (seconds[0] or 0.0)
-        found.append(judged(claim, "Sec. IV-C", little, numbers))
-    best = {name: ate.get((source, f"flocc {name} lm")) for name in ("base", "independent", "smoothed")}
-    if all(value is not None for value in best.values()):
-        numbers = ", ".join(f"{name} {value:.2f} m" for name, value in best.items()) + " with LM."
-        holds = max(best["independent"] or 0.0, best["smoothed"] or 0.0) <= (best["base"] or 0.0)
-        found.append(judged(f"Independent and smoothed scales beat base ({source})", "Sec. IV-A", holds, numbers))
+        holds = plain_m <= 1.1 * robust_m and robust_s > 2.0 * plain_s
+        found.append(judged(claim, "Sec. IV-C", holds, numbers))
+    return [*found, *_formulations(source, ate, middle(rows, "ate_odometry_m"))]
+
+
+def _formulations(source: str, ate: dict[str, float], odometry_m: float | None) -> list[Finding]:
+    """Whether free scales beat fixed ones, with each solver; nothing is shown where all are lost."""
+    found = []
+    for solver in (Solver.LM.value, Solver.GNC_TLS.value):
+        methods = [f"flocc {name} {solver}" for name in ("base", "independent", "smoothed")]
+        if not set(methods) <= set(ate):
+            continue
+        base_m, independent_m, smoothed_m = (ate[method] for method in methods)
+        lost = odometry_m is not None and min(base_m, independent_m, smoothed_m) > odometry_m
+        numbers = f"base {base_m:.3g} m, independent {independent_m:.3g} m, smoothed {smoothed_m:.3g} m"
+        numbers += f"; all are worse than odometry alone, {odometry_m:.3g} m." if lost else "."
+        claim = f"Independent and smoothed scales beat base with {solver} ({source})"
+        holds = None if lost else max(independent_m, smoothed_m) <= base_m
+        found.append(judged(claim, "Sec. IV-A", holds, numbers))
     return found
 
 
 def draw(figure: "Figure", _settings: FullSystemSettings, rows: Sequence[Row]) -> None:
-    """A panel per source, a bar per method."""
-    sources = list(dict.fromkeys(row["source"] for row in rows))
-    figure.set_size_inches(2.0 + 3.2 * len(sources), 5.0)
-    panels = figure.subplots(1, len(sources), sharey=True, squeeze=False)[0]
+    """A panel per source, a line per method: its error as a mark with its value, runs as small dots."""
+    by_source = {source: of_source for (source,), of_source in grouped(rows, "source").items()}
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    for panel, source in zip(panels, sources, strict=True):
-        of_source = grouped([row for row in rows if row["source"] == source], "method")
-        values = [middle(of_source.get((method,), []), "ate_m") or 0.0 for method in methods]
-        colours = [COLOURS[1] if METHODS[method].metric else COLOURS[0] for method in methods]
-        panel.barh(range(len(methods)), values, color=colours)
-        panel.set_xscale("log")
-        panel.set_xlabel("joint ATE, m")
+    figure.set_size_inches(2.6 + 3.2 * len(by_source), 1.6 + 0.34 * len(methods))
+    panels = figure.subplots(1, len(by_source), sharey=True, squeeze=False)[0]
+    for panel, (source, of_source) in zip(panels, by_source.items(), strict=True):
+        _draw_source(panel, methods, of_source)
         panel.set_title(source)
     panels[0].set_yticks(range(len(methods)), methods)
     panels[0].invert_yaxis()
+    panels[0].grid(visible=False, axis="y")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+
+
+def _draw_source(panel: "Axes", methods: Sequence[str], rows: Sequence[Row]) -> None:
+    of = {method: group for (method,), group in grouped(rows, "method").items()}
+    kinds = {False: "closures without scale", True: "metric closures"}
+    for metric, label in kinds.items():
+        drawn = [(n, of[name]) for n, name in enumerate(methods) if name in of and METHODS[name].metric == metric]
+        known = [(value, n) for n, group in drawn if (value := middle(group, "ate_m")) is not None]
+        if known:
+            panel.plot(*zip(*known, strict=True), MARKERS[metric], color=COLOURS[metric], label=label)
+        for n, group in drawn:
+            panel.plot(
+                values(group, "ate_m"), [n] * len(values(group, "ate_m")), ".", color=COLOURS[metric], alpha=0.45
+            )
+        for value, n in known:
+            panel.annotate(f"{value:.3g}", (value, n), (7, 0), textcoords="offset points", fontsize=7, va="center")
+    if (odometry_m := middle(rows, "ate_odometry_m")) is not None:
+        panel.axvline(odometry_m, color="#555555", linestyle=":", label="odometry alone")
+    panel.set_xscale("log")
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.margins(x=0.2)
+    panel.set_xlabel("joint ATE, m")
 
 
 FULL_SYSTEM: Experiment[FullSystemSettings] = Experiment(
