@@ -4,7 +4,7 @@ Every robot takes in every record, and only a leader asks for the graph: records
 matrices when somebody wants them.
 """
 
-from bisect import insort
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,11 +112,13 @@ class GraphAssembly:
 
     def _build(self) -> None:
         """Build the closures that are new since the last graph, and those whose keyframes came meanwhile."""
-        for pair in sorted(pair for pair in self._unbuilt if self._known(pair.low) and self._known(pair.high)):
-            if pair not in self._built:
-                insort(self._order, pair)
-            self._built[pair] = _loop_closure(self._closures[pair][2])
-            self._unbuilt.remove(pair)
+        ready = sorted(pair for pair in self._unbuilt if self._known(pair.low) and self._known(pair.high))
+        if not ready:
+            return
+        self._order += [pair for pair in ready if pair not in self._built]
+        self._order.sort()
+        self._built.update(zip(ready, _loop_closures([self._closures[pair][2] for pair in ready]), strict=True))
+        self._unbuilt.difference_update(ready)
 
     def _known(self, keyframe: KeyframeId) -> bool:
         odometry = self._odometry.get(keyframe.log)
@@ -146,12 +148,16 @@ class GraphAssembly:
                     self._early[keyframe] = self._early.get(keyframe, 0) + 1
 
 
-def _loop_closure(record: ClosureRecord) -> LoopClosure:
-    return LoopClosure(
-        query=record.query,
-        match=record.match,
-        T_query_match_unscaled=pose_from_tq(np.array(record.T_query_match_unscaled)),
-        match_ratio=record.match_ratio,
-        scale_initial=record.scale_initial,
-        covariance=None if record.covariance is None else symmetric(record.covariance.numpy()),
-    )
+def _loop_closures(records: Sequence[ClosureRecord]) -> list[LoopClosure]:
+    poses = poses_from_tq(np.array([record.T_query_match_unscaled for record in records]))
+    return [
+        LoopClosure(
+            query=record.query,
+            match=record.match,
+            T_query_match_unscaled=T_query_match_unscaled,
+            match_ratio=record.match_ratio,
+            scale_initial=record.scale_initial,
+            covariance=None if record.covariance is None else symmetric(record.covariance.numpy()),
+        )
+        for record, T_query_match_unscaled in zip(records, poses, strict=True)
+    ]

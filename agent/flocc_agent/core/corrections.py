@@ -234,9 +234,10 @@ def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
 
 def symmetric(upper: Float) -> Float:
     """Covariance (6, 6) of its upper triangle (21)."""
-    out = np.zeros((6, 6))
+    out = np.empty((6, 6))
     out[_UPPER] = upper
-    return out + np.triu(out, 1).T
+    out.T[_UPPER] = upper
+    return out
 
 
 def upper_triangle(covariance: Float) -> Array:

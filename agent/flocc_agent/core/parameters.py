@@ -157,6 +157,9 @@ class RoundParameters:
 
     period_s: float = 2.0
     """Shortest time between two rounds."""
+    period_per_keyframe_s: float = 1e-3
+    """Shortest time between two rounds for each keyframe of the swarm, where that is longer: a large correction costs
+    everybody something."""
     timeout_s: float = 60.0
     """A round without a result by then is given up and the next one may start."""
     keyframes_per_round: int = 20
@@ -170,6 +173,7 @@ class RoundParameters:
 
     def __post_init__(self) -> None:
         _require(self.period_s > 0 and self.timeout_s > 0, "round times must be positive")
+        _require(self.period_per_keyframe_s >= 0, "period_per_keyframe_s must not be negative")
         _require(2 <= self.correction_keyframes_max <= 1500, "correction_keyframes_max must be in [2, 1500]")
 
 

@@ -1,5 +1,6 @@
 """Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A)."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -10,6 +11,8 @@ from flocc_agent.core.parameters import PlaceRecognitionParameters
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
+
+Descriptor = NDArray[np.float32]
 
 CAPACITY_FIRST = 64
 DIRECTIONS_MAX = 1024
@@ -23,6 +26,10 @@ class Candidate:
     similarity: float
 
 
+Found = tuple[KeyframeId, Candidate]
+"""A new keyframe and a candidate that it gave."""
+
+
 class _Descriptors:
     """The descriptors of one log, as the rows of one growing matrix."""
 
@@ -32,10 +39,10 @@ class _Descriptors:
         self.indices: list[int] = []
 
     @property
-    def matrix(self) -> NDArray[np.float32]:
+    def matrix(self) -> Descriptor:
         return self._rows[: len(self.indices)]
 
-    def append(self, index: int, descriptor: NDArray[np.float32]) -> None:
+    def append(self, index: int, descriptor: Descriptor) -> None:
         count = len(self.indices)
         if count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
@@ -61,59 +68,91 @@ class PlaceRecognition:
         self.refused = 0
         self.best_similarities: dict[str, float] = {}
 
-    def on_keyframe(self, keyframe: KeyframeId, place: Array) -> list[Candidate]:
-        """Add a keyframe's descriptor and find its candidates, best first."""
-        descriptor = direction(place)
-        if descriptor is None or not self._fits(keyframe.log, descriptor):
-            self.refused += 1
-            return []
+    def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
+        """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
+        found: list[Found] = []
+        others: list[tuple[KeyframeId, Descriptor]] = []
+        for keyframe, place in keyframes:
+            descriptor = direction(place)
+            if descriptor is None or not self._add(keyframe, descriptor):
+                self.refused += 1
+            elif keyframe.log.robot != self._own.robot:
+                others.append((keyframe, descriptor))
+            elif keyframe.log == self._own:
+                found += self._among_own(others)
+                found += self._among_all(keyframe, descriptor)
+                others = []
+        return found + self._among_own(others)
+
+    def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
+        """Keep a descriptor; one log has descriptors of one length, another length is another method."""
         known = self._by_log.get(keyframe.log)
         if known is None:
             known = self._by_log[keyframe.log] = _Descriptors(len(descriptor))
+        elif known.dimension != len(descriptor):
+            return False
         known.append(keyframe.index, descriptor)
-        found = [c for log in self._partners(keyframe.log) for c in self._best(keyframe, descriptor, log)]
-        if len(found) > 1:
-            found.sort(key=lambda candidate: (-candidate.similarity, candidate.pair))
+        return True
+
+    def _among_all(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
+        """Candidates of one of this robot's keyframes, with each other robot's and, if wanted, with its own."""
+        found = self._within(keyframe, descriptor) if self._parameters.own_gap_keyframes > 0 else []
+        for log in sorted(self._by_log):
+            others = self._by_log[log]
+            if log.robot != self._own.robot and others.dimension == len(descriptor):
+                similarities = others.matrix @ descriptor
+                found += self._best(keyframe, log, others.indices, similarities, log.robot)
+        return _sorted(found)
+
+    def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
+        """Candidates of other robots' keyframes with this robot's."""
+        own = self._by_log.get(self._own)
+        if own is None:
+            return []
+        found: list[Found] = []
+        fitting = [(keyframe, descriptor) for keyframe, descriptor in keyframes if own.dimension == len(descriptor)]
+        if fitting:
+            similarities = np.array([descriptor for _, descriptor in fitting]) @ own.matrix.T
+            for (keyframe, _), row in zip(fitting, similarities, strict=True):
+                found += _sorted(self._best(keyframe, self._own, own.indices, row, keyframe.log.robot))
         return found
 
-    def _fits(self, log: LogId, descriptor: NDArray[np.float32]) -> bool:
-        """One log has descriptors of one length; another length is another method."""
-        known = self._by_log.get(log)
-        return known is None or known.dimension == len(descriptor)
+    def _within(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
+        """Candidates among this robot's own keyframes that are far enough apart."""
+        own = self._by_log[self._own]
+        apart = keyframe.index - np.array(own.indices)
+        similarities = np.where(apart >= self._parameters.own_gap_keyframes, own.matrix @ descriptor, -2.0)
+        return self._best(keyframe, self._own, own.indices, similarities, None)
 
-    def _partners(self, log: LogId) -> list[LogId]:
-        if log == self._own:
-            within = [log] if self._parameters.own_gap_keyframes > 0 else []
-            return [*within, *(other for other in sorted(self._by_log) if other.robot != log.robot)]
-        return [self._own] if self._own in self._by_log and log.robot != self._own.robot else []
-
-    def _best(self, keyframe: KeyframeId, descriptor: NDArray[np.float32], log: LogId) -> list[Candidate]:
-        others = self._by_log[log]
-        if others.dimension != len(descriptor):
+    def _best(
+        self, keyframe: KeyframeId, log: LogId, indices: list[int], similarities: Descriptor, robot: str | None
+    ) -> list[Found]:
+        """The most similar keyframes of one log, those above the threshold; what was best is noted for a robot."""
+        first = int(similarities.argmax())
+        highest = float(similarities[first])
+        if robot is not None and highest > self.best_similarities.get(robot, -1.0):
+            self.best_similarities[robot] = highest
+        if highest < self._parameters.similarity_threshold:
             return []
-        similarities = others.matrix @ descriptor
-        if log == keyframe.log:
-            apart = keyframe.index - np.array(others.indices)
-            similarities = np.where(apart >= self._parameters.own_gap_keyframes, similarities, -2.0)
-        if self._parameters.best_matches == 1:
-            best = [int(similarities.argmax())]
-        else:
+        best = [first]
+        if self._parameters.best_matches > 1:
             best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
-        if log != keyframe.log:
-            self._note(log.robot if keyframe.log == self._own else keyframe.log.robot, float(similarities[best[0]]))
         return [
-            Candidate(CandidatePair.of(keyframe, KeyframeId(log, others.indices[k])), float(similarities[k]))
+            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, indices[k])), float(similarities[k])))
             for k in best
             if similarities[k] >= self._parameters.similarity_threshold
         ]
 
-    def _note(self, robot: str, similarity: float) -> None:
-        """Remember the best similarity with each other robot, for those who ask why nothing was found."""
-        self.best_similarities[robot] = max(similarity, self.best_similarities.get(robot, -1.0))
+
+def _sorted(found: list[Found]) -> list[Found]:
+    """The most similar first."""
+    if len(found) > 1:
+        found.sort(key=lambda one: (-one[1].similarity, one[1].pair))
+    return found
 
 
 @lru_cache(maxsize=DIRECTIONS_MAX)
-def direction(place: Array) -> NDArray[np.float32] | None:
+def direction(place: Array) -> Descriptor | None:
     """Descriptor (D,) of unit length, or None where it has no direction; found once for all robots of a process."""
     values = place.numpy()
     norm = float(np.linalg.norm(values))

@@ -349,28 +349,29 @@ class Robot:
         return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
 
     def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
-        """Let everything that is derived from the logs know of new records."""
-        effects: list[Effect] = []
+        """Let everything that is derived from the logs know of new records; places are recognised at the end."""
+        described: list[tuple[KeyframeId, Array]] = []
         for new in new_records:
             self.assembly.add(new)
             match new.record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
                     if descriptor is not None:
-                        effects += self._recognise(KeyframeId(new.log, index), descriptor, now)
+                        described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match))
                 case RejectionRecord(query, match):
                     self.closing.on_resolved(CandidatePair.of(query, match))
                 case _:
                     pass
-        return effects
+        return self._recognise(described, now) if described else []
 
-    def _recognise(self, keyframe: KeyframeId, descriptor: Array, now: float) -> list[Effect]:
-        """Look for a keyframe's candidates; after a restart not in logs where it had a partner before."""
-        found = self.recognition.on_keyframe(keyframe, descriptor)
-        candidates = [c for c in found if (keyframe, c.pair.other(keyframe).log) not in self._partnered]
-        return self.closing.on_candidates(candidates, now)
+    def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
+        """Look for keyframes' candidates; after a restart not between a keyframe and a log where it had a partner."""
+        found = self.recognition.on_keyframes(keyframes)
+        if self._partnered:
+            found = [(k, c) for k, c in found if (k, c.pair.other(k).log) not in self._partnered]
+        return self.closing.on_candidates([candidate for _, candidate in found], now) if found else []
 
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""

@@ -81,15 +81,18 @@ class Rounds:
     def _start(self, term: Term, now: float) -> Effect:
         self._round += 1
         self._running_until_s = now + self._parameters.timeout_s
-        self._next_s = now + (HURRIED_PERIOD_S if now < self._hurried_until_s else self._parameters.period_s)
+        self._next_s = now + (HURRIED_PERIOD_S if now < self._hurried_until_s else self._period_s())
         self._started = (self._assembly.revision, self._assembly.keyframes)
         return Optimise(term, self._round, self._assembly.graph(), self._solution)
+
+    def _period_s(self) -> float:
+        return max(self._parameters.period_s, self._parameters.period_per_keyframe_s * self._assembly.keyframes)
 
     def _try_again(self, now: float) -> None:
         self._running_until_s = None
         self._started = None
         self._failures = min(self._failures + 1, FAILURES_MAX)
-        self._next_s = max(self._next_s, now + self._parameters.period_s * 2**self._failures)
+        self._next_s = max(self._next_s, now + self._period_s() * 2**self._failures)
 
     def _stale(self) -> bool:
         """Whether the last started round of this term missed a log, a closure, a fix or many keyframes."""

@@ -1,7 +1,9 @@
 """Virtual time: what is to happen, in order of time; what was entered first comes first."""
 
+import gc
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import count
 
 Action = Callable[[], None]
@@ -25,7 +27,19 @@ class Agenda:
 
     def run_until(self, end_s: float) -> None:
         """Let everything happen that is due by then."""
-        while self._entries and self._entries[0][0] <= end_s:
-            self.now_s, _, action = heapq.heappop(self._entries)
-            action()
+        with _rare_collections():
+            while self._entries and self._entries[0][0] <= end_s:
+                self.now_s, _, action = heapq.heappop(self._entries)
+                action()
         self.now_s = max(self.now_s, end_s)
+
+
+@contextmanager
+def _rare_collections() -> Iterator[None]:
+    """Look for garbage rarely: a swarm keeps millions of small objects and makes hardly any cycles."""
+    usual = gc.get_threshold()
+    gc.set_threshold(20_000, 50, 1000)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*usual)

@@ -70,6 +70,14 @@ def test_a_new_closure_calls_for_a_round_after_the_period() -> None:
     assert started(rounds.tick(PARAMETERS.period_s)) == [2]
 
 
+def test_rounds_of_a_large_swarm_follow_each_other_more_slowly() -> None:
+    rounds, assembly = leading(keyframes=10_000)
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, SOLUTION)
+    add_keyframes(assembly, R2, 0, 1)
+    assert rounds.deadline() == 10_000 * PARAMETERS.period_per_keyframe_s > PARAMETERS.period_s
+
+
 def test_many_new_keyframes_call_for_a_round() -> None:
     rounds, assembly = leading()
     rounds.tick(0.0)
