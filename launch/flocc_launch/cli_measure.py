@@ -32,6 +32,9 @@ def optimise(
     formulation: Annotated[str | None, typer.Option(help="base, independent, smoothed or shared scales.")] = None,
     solver: Annotated[str | None, typer.Option(help="lm, gnc-tls, gnc-gm, huber or cauchy.")] = None,
     scale_initial: Annotated[str | None, typer.Option(help="Start of scales: raw, odometry or ground-truth.")] = None,
+    consistency: Annotated[
+        bool, typer.Option("--pairwise-consistency", help="Filter closures by pairwise consistency first.")
+    ] = False,
     unit_scale: Annotated[bool, typer.Option("--unit-scale", help="Free the scale of inter-robot closures.")] = False,
     drop_outliers: Annotated[
         bool, typer.Option("--drop-labelled-outliers", help="Leave out what the file labels as wrong.")
@@ -51,6 +54,7 @@ def optimise(
         formulation=_chosen(Formulation, formulation, "--formulation"),
         solver=_chosen(Solver, solver, "--solver"),
         scale_initial=_chosen(ScaleInitial, scale_initial, "--scale-initial"),
+        pairwise_consistency=consistency,
         unit_scale=unit_scale,
         drop_labelled_outliers=drop_outliers,
         from_file_initialisation=from_file,

@@ -45,6 +45,7 @@ def optimise_file(
     formulation: Formulation | None = None,
     solver: Solver | None = None,
     scale_initial: ScaleInitial | None = None,
+    pairwise_consistency: bool = False,
     unit_scale: bool = False,
     drop_labelled_outliers: bool = False,
     from_file_initialisation: bool = False,
@@ -58,6 +59,7 @@ def optimise_file(
         formulation: Scales of closures; the default is the agent's.
         solver: The default is the agent's.
         scale_initial: Where free scales start; `ground-truth` takes them from the file's own translations.
+        pairwise_consistency: Filter closures by pairwise consistency first.
         unit_scale: Reduce translations of inter-robot closures to length one and free their scale.
         drop_labelled_outliers: Leave out closures that the file labels as wrong.
         from_file_initialisation: Start from the file's own initialisation.
@@ -71,7 +73,7 @@ def optimise_file(
         OptimiseError: There is no solution, or the folder cannot be written.
     """
     file = prepared(read_graph_file(path), path, unit_scale, drop_labelled_outliers, scale_initial)
-    config = file_config(formulation, solver, scale_initial)
+    config = file_config(formulation, solver, scale_initial, pairwise_consistency)
     initial = initialisation(file, path) if from_file_initialisation else None
     from flocc_agent.backend.optimiser import optimise
 
@@ -112,12 +114,16 @@ def prepared(
 
 
 def file_config(
-    formulation: Formulation | None, solver: Solver | None, scale_initial: ScaleInitial | None
+    formulation: Formulation | None,
+    solver: Solver | None,
+    scale_initial: ScaleInitial | None,
+    pairwise_consistency: bool = False,
 ) -> BackendConfig:
     """The agent's configuration with what was asked for; a file's covariances are trusted, Eq. (2) is off."""
     asked = {"formulation": formulation, "solver": solver, "scale_initial": scale_initial}
     return BackendConfig(
         **{key: value for key, value in asked.items() if value is not None},
+        pairwise_consistency=pairwise_consistency,
         weight_by_probability=False,
         relative_tolerance=CONVERGED_RATIO,
     )
