@@ -129,7 +129,7 @@ class RadioParameters:
     @property
     def is_perfect(self) -> bool:
         """Whether every message arrives at once, so that nobody has to be asked."""
-        return self == RadioParameters()
+        return self == PERFECT
 
     def of(self, sender: str, receiver: str) -> LinkParameters:
         """The quality of the directed link between two robots."""
@@ -145,6 +145,9 @@ class RadioParameters:
     def healed(self) -> "RadioParameters":
         """The same links without any partition or blackout, present or to come."""
         return replace(self, partitions=(), blackouts=())
+
+
+PERFECT = RadioParameters()
 
 
 @dataclass(slots=True)

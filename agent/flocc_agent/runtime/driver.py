@@ -302,7 +302,6 @@ class Driver:
         try:
             await self._transport.open()
             self._opened.set()
-            self._start(self._warm_up())
             await self._live()
             await self._carry_out(self.robot.handle(Leaving(), self._clock_s()))
         finally:
@@ -330,10 +329,11 @@ class Driver:
         self._wake.clear()
         copies_due_s = self._copies_due_s if self._copied else float("inf")
         pause_s = min(self.robot.deadline(), self._bytes_due_s, copies_due_s) - self._clock_s()
+        alarm = asyncio.get_running_loop().call_later(max(pause_s, 0.0), self._wake.set)
         try:
-            await asyncio.wait_for(self._wake.wait(), max(pause_s, 0.0))
-        except TimeoutError:
-            return
+            await self._wake.wait()
+        finally:
+            alarm.cancel()
 
     async def _close(self) -> None:
         for task in list(self._tasks):
@@ -505,28 +505,19 @@ class Driver:
         self.put(LatentFetched(keyframe, holder))
 
     async def _register(self, effect: Register) -> None:
-        latents: dict[KeyframeId, bytes] = {}
-        for keyframe in (effect.query, effect.match, effect.neighbour):
-            latent = await asyncio.to_thread(self._store.latent, keyframe)
-            if latent is None:
-                self.put(LatentMissing(effect.pair, keyframe))
-                return
-            latents[keyframe] = latent
-        pair = OdometryPair(
-            latents[effect.neighbour],
-            pose_from_tq(np.array(effect.T_neighbour_query)),
-            f"{effect.neighbour} {effect.query}",
-        )
-        arguments = (latents[effect.query], latents[effect.match], pair)
-        result = await self._workers.run("register", self._skills.register, *arguments)
+        keyframes = (effect.query, effect.match, effect.neighbour)
+        query, match, neighbour = await asyncio.to_thread(lambda: [self._store.latent(k) for k in keyframes])
+        if query is None or match is None or neighbour is None:
+            missing = keyframes[[query, match, neighbour].index(None)]
+            self.put(LatentMissing(effect.pair, missing))
+            return
+        T_neighbour_query = pose_from_tq(np.array(effect.T_neighbour_query))
+        pair = OdometryPair(neighbour, T_neighbour_query, f"{effect.neighbour} {effect.query}")
+        result = await self._workers.run("register", self._skills.register, query, match, pair)
         if isinstance(result, WorkFailed):
             self.put(PairRegistered(effect.pair, RegistrationFailed(RegistrationFailure.CRASHED, result.reason)))
             return
         self.put(PairRegistered(effect.pair, result.value))
-
-    async def _warm_up(self) -> None:
-        """Start the optimiser's process now, so that the first round does not wait for it."""
-        await self._workers.run("optimise", self._skills.optimise, PoseGraph({}), None, counted=False)
 
     async def _optimise(self, effect: Optimise) -> None:
         result = await self._workers.run("optimise", self._skills.optimise, effect.graph, effect.initial)
@@ -549,7 +540,8 @@ class Driver:
 
     def _report(self, report: Report) -> None:
         line = self._reporter.line(report, self._clock_s())
-        logger.log(_level(report), "%s: %s %s", self.robot.log, report.event, _brief(report.fields))
+        if logger.isEnabledFor(level := _level(report)):
+            logger.log(level, "%s: %s %s", self.robot.log, report.event, _brief(report.fields))
         self._on_line(line)
 
     def _count_bytes(self, last: bool = False) -> None:

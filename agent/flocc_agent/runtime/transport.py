@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from flocc_protocol.errors import FloccError
 
@@ -57,8 +57,7 @@ class Fetched:
     latent: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Traffic:
+class Traffic(NamedTuple):
     """Messages and their payload bytes. A broadcast counts once at the sender and once at each receiver."""
 
     messages: int = 0

@@ -84,16 +84,13 @@ class Workers:
         self._pending_max = pending_max
         self._is_closed = False
 
-    async def run(
-        self, kind: str, function: Callable[..., T], *arguments: object, counted: bool = True
-    ) -> Ok[T] | WorkFailed:
+    async def run(self, kind: str, function: Callable[..., T], *arguments: object) -> Ok[T] | WorkFailed:
         """Run a function off the loop; whatever it raises is logged and returned as a failure.
 
         Args:
             kind: Which workers.
             function: What to run.
             arguments: With what.
-            counted: Whether its times count among `stages`.
 
         Raises:
             KeyError: There are no workers of this kind.
@@ -112,8 +109,7 @@ class Workers:
             self._pending[kind] -= 1
         if isinstance(result, WorkFailed):
             return result
-        if counted:
-            self._count(kind, result.value, time.monotonic() - began_s)
+        self._count(kind, result.value, time.monotonic() - began_s)
         return Ok(result.value.value)
 
     async def _run(

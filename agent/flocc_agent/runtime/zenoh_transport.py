@@ -305,7 +305,7 @@ class ZenohTransport:
 
     def _arrived(self, message: Incoming) -> None:
         """Put a message to the emulated radio, if there is one, and deliver it when it says."""
-        if self._radio is None:
+        if self._radio is None or self._radio.parameters.is_perfect:
             return self._deliver(message)
         if message.attachment is not None and len(message.attachment) == POSITION.size:
             self._radio.update_position(message.sender, POSITION.unpack(message.attachment))
