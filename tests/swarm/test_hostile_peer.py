@@ -124,4 +124,4 @@ async def test_mutated_bytes_change_nothing(caplog: pytest.LogCaptureFixture) ->
     errors = [record for record in caplog.records if record.levelno >= logging.ERROR or record.exc_info]
     assert errors == []
     warnings = [record for record in caplog.records if record.levelno == logging.WARNING]
-    assert len(warnings) < 600, "a peer's faults are logged once per peer and reason"
+    assert len(warnings) < 60, "a peer's faults are logged once per peer and reason"
