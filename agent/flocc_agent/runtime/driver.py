@@ -248,7 +248,7 @@ class Driver:
             "queues": self._queues(),
             "links": {table: totals(peers) for table, peers in counters.links().items()},
             "stages": brief_of(self._workers.stages.snapshot()),
-            "refused": self.counters(),
+            "refused": {**counters.dropped, **self._refusals()},
             "busy": self.busy(),
         }
 
@@ -361,7 +361,7 @@ class Driver:
         try:
             envelope = decode(payload)
         except UnknownVersion as error:
-            self._refuse(sender, str(error))
+            self._refuse(sender, "another protocol version", str(error))
             return
         except DecodeError:
             self._refuse(sender, "malformed message")
@@ -374,13 +374,13 @@ class Driver:
             return
         self.put(MessageReceived(envelope))
 
-    def _refuse(self, peer: str, reason: str) -> None:
+    def _refuse(self, peer: str, reason: str, detail: str = "") -> None:
+        """Count what is refused of a peer by reason; the first is told, with what is special about it."""
         if len(self._refused) >= REFUSED_MAX and (peer, reason) not in self._refused:
             peer, reason = "others", "for more reasons than are kept"
         self._refused[peer, reason] += 1
         if self._refused[peer, reason] == 1:
-            logger.warning("%s: refused %s: %s", self.robot.log, peer, reason)
-            self._report(Report("peer_refused", {"peer": peer, "reason": reason}))
+            self._report(Report("peer_refused", {"peer": peer, "reason": detail or reason}))
 
     def _send(self, message: Message, to: str | None) -> None:
         payload = encode(Envelope(self.robot.log, message))
