@@ -15,6 +15,8 @@ ARRAY_BYTES_MAX = 48 * 1024
 DIMENSIONS_MAX = 3
 SCALE_MAX = 1e30
 _NUMPY = {"f8": "<f8", "f4": "<f4", "f2": "<f2", "i1": "|i1", "u1": "|u1"}
+_ITEM_BYTES = {dtype: np.dtype(name).itemsize for dtype, name in _NUMPY.items()}
+_ALWAYS_FINITE = frozenset({"i1", "u1"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +33,12 @@ class Array:
             raise ValueError(f"array dtype {self.dtype[:8]!r} is not one of {', '.join(_NUMPY)}")
         if len(self.shape) > DIMENSIONS_MAX or not all(0 <= size <= ARRAY_BYTES_MAX for size in self.shape):
             raise ValueError(f"an array has at most {DIMENSIONS_MAX} dimensions of 0 to {ARRAY_BYTES_MAX}")
-        expected = math.prod(self.shape) * np.dtype(_NUMPY[self.dtype]).itemsize
+        expected = math.prod(self.shape) * _ITEM_BYTES[self.dtype]
         if len(self.data) != expected or expected > ARRAY_BYTES_MAX:
             raise ValueError(f"array {self.dtype}{list(self.shape)} cannot have {len(self.data)} bytes")
         if not 0.0 < self.scale <= SCALE_MAX or (self.dtype != "i1" and self.scale != 1.0):
             raise ValueError(f"array {self.dtype} cannot have the scale {self.scale}")
-        if not np.isfinite(self._stored()).all():
+        if self.dtype not in _ALWAYS_FINITE and not np.isfinite(self._stored()).all():
             raise ValueError("an array must be finite")
 
     @classmethod

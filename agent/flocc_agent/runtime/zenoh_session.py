@@ -2,10 +2,12 @@
 
 Each choice is measured in facts/zenoh.md: two sessions per agent (control, bulk) because bulk on a shared link
 delays heartbeats; one link per pair (max_links 1, the higher name dials); short open_timeout because attempts that
-hang keep pairs apart under loss; shared memory off because it bypasses emulated links.
+hang keep pairs apart under loss; shared memory off because it bypasses emulated links. What RUNTIME and
+BULK_LEASE_FACTOR save is in docs/reliability.md.
 """
 
 import json
+import os
 import re
 from enum import Enum
 from typing import Any
@@ -17,6 +19,11 @@ from flocc_agent.runtime.security import secure_settings
 from flocc_agent.runtime.transport import TransportError
 
 RX_MESSAGE_MARGIN_BYTES = 64 * 1024
+BULK_LEASE_FACTOR = 4
+"""Bulk links are idle most of the time, and each sends four signs of life per lease: with 30 robots that is as many
+messages as their heartbeats. Control links are never idle."""
+RUNTIME = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
+"""One thread for all that zenoh does on links: waking six for small messages costs a quarter more."""
 
 
 class Plane(Enum):
@@ -62,7 +69,7 @@ def session_settings(
         "transport/unicast/max_links": 1,
         "transport/unicast/open_timeout": round(config.open_timeout_s * 1000),
         "transport/unicast/accept_timeout": round(config.open_timeout_s * 1000),
-        "transport/link/tx/lease": round(config.lease_s * 1000),
+        "transport/link/tx/lease": round(config.lease_s * 1000) * (1 if control else BULK_LEASE_FACTOR),
         "transport/link/rx/max_message_size": message_bytes_max + RX_MESSAGE_MARGIN_BYTES,
     }
     if not control:
@@ -78,6 +85,7 @@ def open_session(settings: dict[str, Any], whose: str) -> zenoh.Session:
     Raises:
         TransportError: A setting that zenoh refuses, a port in use, an address that is not this machine's.
     """
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)  # read when the process opens its first session
     zenoh.init_log_from_env_or("off")
     zenoh_config = zenoh.Config()
     for path, value in settings.items():
