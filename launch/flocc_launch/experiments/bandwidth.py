@@ -188,14 +188,17 @@ def draw(figure: "Figure", _settings: BandwidthSettings, rows: Sequence[Row]) ->
 
 def _draw_bytes(panel: "Axes", forms: Sequence[Row]) -> None:
     """Bytes per closure by kind on a logarithmic scale; all kinds but the latents are the same for every method."""
+    from matplotlib.ticker import EngFormatter
+
     names = [name for (name,) in grouped(forms, "on")]
     bars = [(f"latent\n{name}", _per_closure(forms, name, "latent")) for name in names]
     bars += [(kind, _per_closure(forms, names[0], kind)) for kind in (*KINDS[1:], "others")]
     labels, sizes = zip(*sorted(bars, key=lambda bar: bar[1]), strict=True)
     drawn = panel.barh(labels, sizes, color=[COLOURS[label.startswith("latent")] for label in labels])
-    panel.bar_label(drawn, fmt="{:.3g}", fontsize=7, padding=2)
+    panel.bar_label(drawn, fmt=EngFormatter("B", places=1), fontsize=7, padding=2)
     panel.set_xscale("log")
-    panel.set_xlim(right=8.0 * max(sizes))
+    panel.xaxis.set_major_formatter(EngFormatter("B"))
+    panel.set_xlim(1.0, 15.0 * max(sizes))
     panel.tick_params(axis="y", labelsize=7)
     panel.set_xlabel("bytes sent per closure gained")
     panel.grid(visible=False, axis="y")

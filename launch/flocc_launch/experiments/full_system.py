@@ -48,7 +48,7 @@ from flocc_launch.experiments.experiment import (
     judged,
 )
 from flocc_launch.experiments.overlap import require_overlap
-from flocc_launch.experiments.plots import COLOURS, MARKERS
+from flocc_launch.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_launch.experiments.statistics import grouped, middle, values, with_spread
 from flocc_launch.graph_files import read_graph_file
 from flocc_launch.graph_recording import OWN_GAP_KEYFRAMES, GraphRecordings, odometry_sigmas, write_recordings
@@ -370,7 +370,6 @@ def draw(figure: "Figure", _settings: FullSystemSettings, rows: Sequence[Row]) -
         panel.set_title(source)
     panels[0].set_yticks(range(len(methods)), methods)
     panels[0].invert_yaxis()
-    panels[0].grid(visible=False, axis="y")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
 
@@ -392,9 +391,10 @@ def _draw_source(panel: "Axes", methods: Sequence[str], rows: Sequence[Row]) -> 
     if (odometry_m := middle(rows, "ate_odometry_m")) is not None:
         panel.axvline(odometry_m, color="#555555", linestyle=":", label="odometry alone")
     panel.set_xscale("log")
-    panel.xaxis.set_major_formatter("{x:g}")
+    label_logarithmic(panel.xaxis)
     panel.margins(x=0.2)
     panel.set_xlabel("joint ATE, m")
+    panel.grid(visible=False, axis="y")
 
 
 FULL_SYSTEM: Experiment[FullSystemSettings] = Experiment(

@@ -9,6 +9,7 @@ from flocc_launch.experiments.statistics import values
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
 COLOURS = ("#1f6f8b", "#d1495b", "#66a182", "#edae49", "#5f4b8b", "#8d6a4f")
 """Told apart by people who see few colours, and in print."""
@@ -38,3 +39,14 @@ def drawn_values(rows: Sequence[Row], column: str) -> list[float]:
 def from_zero(panel: "Axes", known: Sequence[float]) -> None:
     """Let the upright axis begin at zero and end above every value."""
     panel.set_ylim(0.0, 1.08 * max(known, default=1.0) or 1.0)
+
+
+def label_logarithmic(axis: "Axis") -> None:
+    """Plain numbers at powers of ten and at 2, 3 and 5 times these, so that a narrow range has labels too."""
+
+    def labelled(value: float, _place: float) -> str:
+        return f"{value:g}" if f"{value:e}"[0] in "1235" else ""
+
+    axis.set_major_formatter(labelled)
+    axis.set_minor_formatter(labelled)
+    axis.set_tick_params(which="both", labelsize=7)

@@ -30,7 +30,7 @@ from flocc_launch.experiments.experiment import (
     judged,
 )
 from flocc_launch.experiments.overlap import joined
-from flocc_launch.experiments.plots import COLOURS
+from flocc_launch.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_launch.experiments.statistics import grouped, middle, with_spread
 from flocc_launch.generated_graph import Noise, generate
 from flocc_launch.graph_files import read_graph_file
@@ -39,6 +39,7 @@ from flocc_launch.optimise import positions
 from flocc_protocol.ids import LogId
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Float = NDArray[np.float64]
@@ -273,27 +274,35 @@ def _of(source: str, odometry: str, rows: Sequence[Row]) -> list[Finding]:
 
 
 def draw(figure: "Figure", _settings: ScaleSettings, rows: Sequence[Row]) -> None:
-    """A panel per source and odometry: ATE by formulation, a bar per initialisation; LM plain, GNC hatched."""
+    """A panel per source and odometry: ATE by formulation, a mark per initialisation; LM full, GNC hollow."""
     groups = grouped(rows, "source", "odometry")
     columns = len({source for source, _ in groups})
     figure.set_size_inches(2.0 + 3.4 * columns, 6.5)
     panels = figure.subplots(2, columns, sharex=True, squeeze=False)
     places = {key: panels[k % 2][k // 2] for k, key in enumerate(groups)}
     for key, of in groups.items():
-        panel = places[key]
-        bars = list(grouped(of, "initial", "solver").items())
-        width = 0.8 / len(bars)
-        for k, ((initial, solver), group) in enumerate(bars):
-            by_formulation = grouped(group, "formulation")
-            values = [middle(by_formulation.get((name,), []), "ate_m") or 0.0 for name in FORMULATIONS]
-            at = [n + (k - (len(bars) - 1) / 2) * width for n in range(len(FORMULATIONS))]
-            hatch = "" if solver == Solver.LM.value else "//"
-            panel.bar(at, values, width, color=COLOURS[k // 2], hatch=hatch, label=f"{initial}, {solver}")
-        panel.set_yscale("log")
-        panel.set_title(f"{key[0]}, {key[1]} odometry", fontsize=9)
-        panel.set_xticks(range(len(FORMULATIONS)), FORMULATIONS, fontsize=8)
-    panels[0][0].set_ylabel("joint ATE, m")
-    panels[0][0].legend(frameon=False, fontsize=7)
+        _draw_panel(places[key], of)
+        places[key].set_title(f"{key[0]}, {key[1]} odometry", fontsize=9)
+    for line in panels:
+        line[0].set_ylabel("joint ATE, m")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+
+
+def _draw_panel(panel: "Axes", rows: Sequence[Row]) -> None:
+    marks = list(grouped(rows, "initial", "solver").items())
+    for k, ((initial, solver), group) in enumerate(marks):
+        by_formulation = grouped(group, "formulation")
+        known = [(n, middle(by_formulation.get((name,), []), "ate_m")) for n, name in enumerate(FORMULATIONS)]
+        at = [(n + (k - (len(marks) - 1) / 2) * 0.11, value) for n, value in known if value is not None]
+        colour, fill = COLOURS[k // 2], "full" if solver == Solver.LM.value else "none"
+        if at:
+            style: Any = {"linestyle": "", "marker": MARKERS[k // 2], "fillstyle": fill, "markersize": 6}
+            panel.plot(*zip(*at, strict=True), color=colour, label=f"{initial}, {solver}", **style)
+    panel.set_yscale("log")
+    label_logarithmic(panel.yaxis)
+    panel.set_xticks(range(len(FORMULATIONS)), FORMULATIONS, fontsize=8)
+    panel.set_xlim(-0.5, len(FORMULATIONS) - 0.5)
 
 
 SCALE: Experiment[ScaleSettings] = Experiment(
