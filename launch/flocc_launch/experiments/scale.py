@@ -66,6 +66,8 @@ class ScaleSettings(Settings):
     """Closures of a generated graph, at most."""
     outlier_ratio: float = Field(0.05, ge=0, lt=1)
     """Share of wrong closures of a generated graph; cosmo_bench has its own."""
+    labelled_outliers: bool = True
+    """Whether closures that cosmo_bench labels as wrong stay in."""
     unit_sigma_ratio: float = Field(0.3, ge=0)
     """Spread of metres per network unit on cosmo_bench (log-normal)."""
     initial_sigma_ratio: float = Field(0.1, ge=0)
@@ -175,6 +177,7 @@ def _generated(settings: ScaleSettings, poor: bool, rng: np.random.Generator) ->
 def _cosmo(settings: ScaleSettings, source: str, rng: np.random.Generator) -> DrawnGraph:
     """The file's graph; closures between robots in network units of their own."""
     file = read_graph_file(_file(settings, source))
+    file = file if settings.labelled_outliers else file.without_outliers()
     units = np.exp(settings.unit_sigma_ratio * rng.normal(size=len(file.graph.closures)))
     errors = np.exp(settings.initial_sigma_ratio * rng.normal(size=len(units)))
     closures = [
