@@ -43,8 +43,8 @@ MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
 WANTS_MAX = 16
 OFFERS_MAX = 64
-SEPARATORS_MAX = 150
-STIFFNESS_TOLERANCE = 1e-5
+SEPARATORS_MAX = 128
+STIFFNESS_TOLERANCE = 1e-9
 RANK_MIN, RANK_MAX = 3, 5
 RECORDS_BATCH_MAX = 64
 BATCHES_MAX = 64
@@ -361,7 +361,7 @@ class Separators:
         transforms: (N, 4, 4) float64: what the sender's own measurements between each keyframe and the one before it
             in the list come to: they pull `X_k` to `transform @ X_(k-1)`, condensed odometry in the sense of
             Grisetti 2012. The first row says nothing.
-        stiffness: (N, 4, 4) float32: how strongly, a symmetric weight of that difference's rows; zero in the first.
+        stiffness: (N, 4, 4) float64: how strongly, a symmetric weight of that difference's rows; zero in the first.
         pairs: Closures between two robots whose robust weight is the sender's to decide.
         weights: (M,) float32 in [0, 1], one per pair.
     """
@@ -436,8 +436,8 @@ def _check_lifted(poses: NDArray[np.float64]) -> None:
 def _check_condensed(separators: Separators) -> None:
     """Refuse transforms that leave the map and stiffness that pushes away."""
     transforms, stiffness, shape = separators.transforms, separators.stiffness, (len(separators.keyframes), 4, 4)
-    if (transforms.dtype, transforms.shape) != ("f8", shape) or (stiffness.dtype, stiffness.shape) != ("f4", shape):
-        raise ValueError("separators have (N, 4, 4) float64 transforms and (N, 4, 4) float32 stiffness, one per keyframe")
+    if (transforms.dtype, transforms.shape) != ("f8", shape) or (stiffness.dtype, stiffness.shape) != ("f8", shape):
+        raise ValueError("separators have (N, 4, 4) float64 transforms and stiffness, one per keyframe")
     if np.any(np.abs(transforms.numpy()) > COORDINATE_MAX):
         raise ValueError("transforms between separators stay within the map")
     weights = stiffness.numpy()

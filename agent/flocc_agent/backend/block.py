@@ -16,6 +16,7 @@ from scipy.special import chdtri
 
 from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
+from flocc_agent.backend.condensed import Surroundings, condensed, holds, surroundings
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
 from flocc_agent.backend.rbcd import Block, Links
 from flocc_agent.backend.screening import first_not_rigid
@@ -38,7 +39,14 @@ REST_ITERATIONS = 20
 FIRST_STEPS = 30
 STEPS = 2
 INNER_STEPS = 20
-TOGETHER_RATIO = 0.5
+TOGETHER_RATIO = 1.0
+HOLD_START = 1.0
+HOLD_RISE = 4.0
+HOLD_FALL = 0.5
+HOLD_GOOD = 0.5
+HOLD_MAX = 100.0
+HOLD_MIN = 1e-6
+OWN_HOLD = 1.0
 MOMENTUM_MAX = 0.995
 TILT = 1e-3
 CLOSURES_MAX = 32
@@ -53,31 +61,15 @@ class Measured:
 
     Attributes:
         pairs: The pair of keyframes of each closure.
-        i: (E,) index of its query in the block, -1 where it is another robot's.
-        j: (E,) the same of its match.
-        T: (E, 4, 4) metric measurement.
-        kappa: (E,) rotation weight.
-        tau: (E,) translation weight.
-        fixed: (E, 4, r) the other robot's pose, zero where there is none.
-        known: (E,) both ends have a pose in this frame, and the covariance is one.
+        links: Query, match and measurement of each, without robust weights.
+        known: (E,) both ends have a pose in this frame, one of them moves, and the covariance is one.
         own: (E,) its robust weight is this robot's to decide.
     """
 
     pairs: tuple[CandidatePair, ...]
-    i: Int
-    j: Int
-    T: Float
-    kappa: Float
-    tau: Float
-    fixed: Float
+    links: Links
     known: NDArray[np.bool_]
     own: NDArray[np.bool_]
-
-    def residuals(self, X: Float) -> Float:
-        """Squared residuals (E,) without robust weights."""
-        X_i = np.where((self.i >= 0)[:, None, None], X[np.maximum(self.i, 0)], self.fixed)
-        X_j = np.where((self.j >= 0)[:, None, None], X[np.maximum(self.j, 0)], self.fixed)
-        return rbcd.squared_residuals(X_i, X_j, self.T, self.kappa, self.tau)
 
 
 def iterate_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | OptimisationFailed:
@@ -107,24 +99,39 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
         moved = _aligned(config, problem, state)
         if moved is not None:
             state, aligned = moved, True
-            problem = replace(problem, others=problem.align_to, anchored=False, align_to={})
-    measured = _measured(config, problem, state.X.shape[2])
-    state = _weighed(config, problem, measured, state)
+            problem = replace(problem, others=problem.align_to, around=(), anchored=False, align_to={})
+    n = len(state.X)
+    near = surroundings(n, _movable(problem, config.rank), problem.condensed, config.rank)
+    X_all = np.concatenate([state.X, near.X])
+    measured = _measured(config, problem, near.index)
+    state = _weighed(config, problem, measured, state, X_all)
     weights = _weights_of(config, problem, measured, state)
-    links = _links(config, problem, measured, weights)
-    block = Block(len(state.X), links)
-    descended = rbcd.descend(block, state.X, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
-    together = bool(np.any((weights > 0) & ((measured.i < 0) | (measured.j < 0))))
-    X = descended.X
+    closures, odometry = _weighted(measured, weights), _odometry(config, problem)
+    separators = _separators(problem, n)
+    typical = _typical(odometry)
+    state = replace(state, holds=_holds(state, near, typical))
+    held = _held(state, near, separators, X_all, typical)
+    together = bool(np.any((weights > 0) & measured.links.touching(n) & ~measured.links.within(n)))
+    parts = [closures, odometry, near.links, *([held] if together else [])]
+    block = Block(len(X_all), rbcd.joined(parts))
+    descended = rbcd.descend(block, X_all, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
+    X = descended.X[:n]
     if together:
-        X = rbcd.retracted(state.X, TOGETHER_RATIO * (descended.X - state.X))
-    moved_most = float(np.abs(X - state.X_before).max())
-    decided = sum(weight == 0.0 for weight in state.weights.values())
-    next_state = _extrapolated(state, X, together)
-    finished = state.control is None and not state.has_unjudged
-    origin = _origin(problem, next_state.X, aligned)
-    T_map_keyframe = rbcd.rounded(X, _origin(problem, X, aligned))
-    return BlockStep(next_state, T_map_keyframe, origin, moved_most, descended.cost, aligned, finished, decided)
+        X = rbcd.retracted(state.X, TOGETHER_RATIO * (X - state.X))
+    next_state = replace(_extrapolated(state, X, together), foreseen=near.foreseen(descended.X[n:]))
+    inner = rbcd.joined([closures.chosen(closures.within(n)), odometry])
+    return BlockStep(
+        state=next_state,
+        T_map_keyframe=rbcd.rounded(X, _origin(problem, X, aligned)),
+        origin=_origin(problem, next_state.X, aligned),
+        moved=float(np.abs(X - state.X_before).max()),
+        cost=_cost(rbcd.joined([closures.chosen(closures.touching(n)), odometry]), np.concatenate([X, near.X])),
+        aligned=aligned,
+        finished=state.control is None and not state.has_unjudged,
+        rejected=sum(weight == 0.0 for weight in state.weights.values()),
+        separators=tuple(separators.tolist()),
+        condensed=condensed(problem.log, separators.tolist(), odometry, inner, next_state.X),
+    )
 
 
 def _origin(problem: BlockProblem, X: Float, aligned: bool) -> Float:
@@ -141,10 +148,9 @@ def _first_state(config: BackendConfig, problem: BlockProblem) -> BlockState:
     state = BlockState(X, X)
     if not own:
         return state
-    alone = replace(problem, closures=own, others={}, align_to={})
-    measured = _measured(config, alone, config.rank)
-    weights = np.ones(len(own)) if config.solver is Solver.LM else np.zeros(len(own))
-    block = Block(len(X), _links(config, alone, measured, weights))
+    measured = _measured(config, replace(problem, closures=own, around=()), {})
+    weights = measured.known.astype(float) if config.solver is Solver.LM else np.zeros(len(own))
+    block = Block(len(X), rbcd.joined([_weighted(measured, weights), _odometry(config, problem)]))
     X = rbcd.descend(block, X, FIRST_STEPS, INNER_STEPS, config.relative_tolerance).X
     return BlockState(X, X)
 
@@ -204,17 +210,21 @@ def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopC
     )  # fmt: skip
 
 
-def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measured:
-    """The block's closures as arrays, with the poses of others as last heard."""
-    closures, log = problem.closures, problem.log
+def _measured(config: BackendConfig, problem: BlockProblem, movable: Mapping[KeyframeId, int]) -> Measured:
+    """Closures as arrays, with the poses of others as last heard; some of those move with the block."""
+    closures, log = (*problem.closures, *problem.around), problem.log
     alone = _without_others(config, closures, log)
-    fixed, known = np.zeros((len(closures), 4, rank)), alone.known.copy()
+    i, j, known = alone.links.i.copy(), alone.links.j.copy(), alone.known.copy()
+    fixed = alone.links.fixed.copy()
     for k, closure in enumerate(closures):
-        for end in (closure.query, closure.match):
+        for end, index in ((closure.query, i), (closure.match, j)):
             if end.log != log:
-                known[k] &= _usable(problem.others, end, rank)
-                fixed[k] = problem.others[end] if known[k] else 0.0
-    return replace(alone, fixed=fixed, known=known)
+                index[k] = movable.get(end, -1)
+                known[k] &= _usable(problem.others, end, config.rank)
+                if index[k] < 0 and known[k]:
+                    fixed[k] = problem.others[end]
+    known &= (i >= 0) | (j >= 0)
+    return replace(alone, links=replace(alone.links, i=i, j=j, fixed=fixed), known=known)
 
 
 @lru_cache(maxsize=CLOSURES_MAX)
@@ -230,7 +240,8 @@ def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], lo
     j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
     own = np.array([decides(c) == log for c in closures], dtype=bool)
     pairs = tuple(CandidatePair.of(c.query, c.match) for c in closures)
-    return Measured(pairs, i, j, T, kappa, tau, np.zeros((E, 4, config.rank)), known, own)
+    links = Links(i, j, T, rbcd.diagonal_weights(kappa, tau), np.zeros((E, 4, config.rank)))
+    return Measured(pairs, links, known, own)
 
 
 def _usable(others: Mapping[KeyframeId, Float], keyframe: KeyframeId, rank: int) -> bool:
@@ -252,7 +263,9 @@ def isotropic_weights(covariances: Float) -> tuple[Float, Float]:
     return 1.5 / np.trace(rotation, axis1=1, axis2=2), 3.0 / np.trace(translation, axis1=1, axis2=2)
 
 
-def _weighed(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> BlockState:
+def _weighed(
+    config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState, X: Float
+) -> BlockState:
     """Decide robust weights that are this robot's: at once for new closures, the others once per stage.
 
     A new closure that does not agree waits until the weights have been final for a while; then all robots of the
@@ -262,7 +275,7 @@ def _weighed(config: BackendConfig, problem: BlockProblem, measured: Measured, s
         return state
     usable = np.flatnonzero(measured.own & measured.known)
     bound = np.full(len(usable), float(chdtri(6.0, 1.0 - config.inlier_probability)))
-    squared = measured.residuals(state.X)[usable]
+    squared = measured.links.residuals(X)[usable]
     pairs = [measured.pairs[k] for k in usable]
     state = _with_new(state, pairs, squared <= bound)
     waited = state.control is None and state.in_stage >= REST_ITERATIONS
@@ -310,25 +323,80 @@ def _weights_of(config: BackendConfig, problem: BlockProblem, measured: Measured
     return np.where(measured.known, weights, 0.0)
 
 
-def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, weights: Float) -> Links:
-    """Closures with weight, then odometry, then what holds the anchor's first keyframe."""
+def _weighted(measured: Measured, weights: Float) -> Links:
+    """Closures with their robust weights, of those that have one."""
+    links = replace(measured.links, weight=weights[:, None, None] * measured.links.weight)
+    return links.chosen(weights > 0)
+
+
+def _odometry(config: BackendConfig, problem: BlockProblem) -> Links:
+    """Odometry, an edge per keyframe but the first."""
     T_odom = np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)
-    n, rank = len(T_odom), measured.fixed.shape[2]
-    used = weights > 0
+    n = len(T_odom)
     covariances = problem.trajectory.edge_covariances
     if covariances is None:
         one = diagonal_covariance(config.odometry_rotation_sigma_rad, config.odometry_translation_sigma_m)
         covariances = np.broadcast_to(one, (n - 1, 6, 6))
-    kappa, tau = isotropic_weights(np.asarray(covariances, dtype=float))
+    weight = rbcd.diagonal_weights(*isotropic_weights(np.asarray(covariances, dtype=float)))
     before = np.arange(n - 1)
-    i, j, T = (
-        [measured.i[used], before],
-        [measured.j[used], before + 1],
-        [measured.T[used], inverse(T_odom[:-1]) @ T_odom[1:]],
-    )
-    kappas, taus = [(weights * measured.kappa)[used], kappa], [(weights * measured.tau)[used], tau]
-    fixed = [measured.fixed[used], np.zeros((n - 1, 4, rank))]
-    return Links(*(np.concatenate(part) for part in (i, j, T, kappas, taus, fixed)))
+    fixed = np.zeros((n - 1, 4, config.rank))
+    return Links(before, before + 1, inverse(T_odom[:-1]) @ T_odom[1:], weight, fixed)
+
+
+def _typical(links: Links) -> Float:
+    """A weight (4, 4) like those of most edges."""
+    return np.median(links.weight, axis=0) if len(links.i) else np.eye(4)
+
+
+def _holds(state: BlockState, near: Surroundings, typical: Float) -> dict[LogId, float]:
+    """How strongly to hold each robot's separators: more where they went elsewhere than foreseen, less where there."""
+    found = {}
+    for log, (indices, keyframes) in near.of_robots().items():
+        hold = state.holds.get(log, HOLD_START)
+        known = [(k, *state.foreseen[kf]) for k, kf in zip(indices, keyframes, strict=True) if kf in state.foreseen]
+        if known:
+            now = near.X[[k for k, _, _ in known]]
+            was, expected = np.array([w for _, w, _ in known]), np.array([e for _, _, e in known])
+            moved, missed = _squared(now - was, typical), _squared(now - expected, typical)
+            if moved > 0 and missed > moved:
+                hold = min(hold * HOLD_RISE, HOLD_MAX)
+            elif missed < HOLD_GOOD * moved:
+                hold = max(hold * HOLD_FALL, HOLD_MIN)
+        found[log] = hold
+    return found
+
+
+def _squared(V: Float, typical: Float) -> float:
+    return float(np.sum(V * (typical @ V)))
+
+
+def _held(state: BlockState, near: Surroundings, separators: Int, X: Float, typical: Float) -> Links:
+    n = len(X) - len(near.X)
+    parts = [
+        holds(np.array(indices) + n, X, state.holds[log] * typical) for log, (indices, _) in near.of_robots().items()
+    ]
+    return rbcd.joined([holds(separators, X, OWN_HOLD * max(state.holds.values(), default=0.0) * typical), *parts])
+
+
+def _cost(links: Links, X: Float) -> float:
+    """Half the sum of squared residuals."""
+    return 0.5 * float(np.sum(links.residuals(X)))
+
+
+def _separators(problem: BlockProblem, poses: int) -> Int:
+    """Indices of own keyframes at the ends of closures with other robots."""
+    ends = [end for c in problem.closures if c.query.log != c.match.log for end in (c.query, c.match)]
+    found = {end.index for end in ends if end.log == problem.log and end.index < poses}
+    return np.array(sorted(found), dtype=np.int64)
+
+
+def _movable(problem: BlockProblem, rank: int) -> dict[KeyframeId, Float]:
+    """Heard separators of robots that share closures with this one, where all that pulls at these is known."""
+    heard = {keyframe: X for keyframe, X in problem.others.items() if X.shape == (4, rank)}
+    joined = {end.log for c in problem.closures for end in (c.query, c.match)} - {problem.log}
+    ends = [(near, far) for c in problem.around for near, far in ((c.query, c.match), (c.match, c.query))]
+    blind = {near.log for near, far in ends if near not in heard or far not in heard}
+    return {keyframe: X for keyframe, X in heard.items() if keyframe.log in joined - blind}
 
 
 def _extrapolated(state: BlockState, X: Float, together: bool) -> BlockState:

@@ -17,6 +17,21 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CondensedOdometry:
+    """What a block's own measurements between two of its separators, neighbours in its log, come to.
+
+    Attributes:
+        before: The earlier keyframe.
+        transform: (4, 4): it pulls the later lifted pose X to `transform @ X_before`.
+        stiffness: (4, 4) symmetric weight of that difference.
+    """
+
+    before: KeyframeId
+    transform: Float
+    stiffness: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BlockState:
     """Where a robot's block stands between two iterations; only its worker looks inside.
 
@@ -29,6 +44,8 @@ class BlockState:
         in_stage: Iterations since the weights were last decided.
         epoch: Number of the graduation that the weights come from.
         has_unjudged: A closure came since that did not agree; it waits, without weight, for the next graduation.
+        holds: How strongly the separators of another robot are held where they were heard, relative to odometry.
+        foreseen: Where other robots' separators were heard, and where this robot expected them next.
     """
 
     X: Float
@@ -39,6 +56,8 @@ class BlockState:
     in_stage: int = 0
     epoch: int = 0
     has_unjudged: bool = False
+    holds: Mapping[LogId, float] = field(default_factory=dict)
+    foreseen: Mapping[KeyframeId, tuple[Float, Float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +68,9 @@ class BlockProblem:
         log: Whose block.
         trajectory: Its odometry.
         closures: Closures with at least one end in it.
-        others: (4, r) pose of other robots' keyframes at the far ends of closures, as last heard, in this frame.
+        around: Closures between other robots, at least one of which shares a closure with this one.
+        others: (4, r) pose of other robots' separators, as last heard, in this frame.
+        condensed: What holds those to the separator before them.
         heard: Robust weights that other robots decided.
         epoch: Latest graduation that another robot began.
         anchored: The block is the anchor's: its first keyframe's odometry says where the map frame lies.
@@ -61,7 +82,9 @@ class BlockProblem:
     log: LogId
     trajectory: Trajectory
     closures: tuple[LoopClosure, ...]
+    around: tuple[LoopClosure, ...]
     others: Mapping[KeyframeId, Float]
+    condensed: Mapping[KeyframeId, CondensedOdometry]
     heard: Mapping[CandidatePair, float]
     epoch: int
     anchored: bool
@@ -83,6 +106,8 @@ class BlockStep:
         aligned: The block moved into the frame it was asked to move into.
         finished: Robust weights are final.
         rejected: Closures of this robot's decision with weight zero.
+        separators: Indices of the keyframes at the ends of closures with other robots, in order.
+        condensed: One per separator but the first: what holds it to the one before.
     """
 
     state: BlockState
@@ -93,6 +118,8 @@ class BlockStep:
     aligned: bool
     finished: bool
     rejected: int
+    separators: tuple[int, ...] = ()
+    condensed: tuple[CondensedOdometry, ...] = ()
 
 
 def decides(closure: LoopClosure) -> LogId:
