@@ -30,6 +30,14 @@ from flocc_protocol.errors import FloccError
 
 START_S = 60.0
 CROWD_START_S = 120.0
+CROWD_START_PER_AGENT_S = 1.5
+"""Robots of a crowd begin to move when all have started, which takes two cores about a second each."""
+SETTLE_S = 10.0
+LOAD_LOOK_S = 1.0
+RESIDENT_PERIOD_S = 60.0
+KEYFRAMES_PER_S = 2.0
+CROWD_AREA_M = 1000.0
+"""Streets are a quarter of this apart: some 1.5 other robots have passed any place by the end of 20 minutes."""
 LOOK_S = 0.1
 CLOCK_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -43,9 +51,9 @@ class NotReached(FloccError):
 class Swarm:
     """Agent processes on one folder, with one clock."""
 
-    def __init__(self, scenario: Scenario, folder: Path, with_recordings: bool = True) -> None:
-        self.epoch_s = time.monotonic()
+    def __init__(self, scenario: Scenario, folder: Path, with_recordings: bool = True, start_s: float = 0.0) -> None:
         paths = recordings(scenario) if with_recordings else {}
+        self.epoch_s = time.monotonic()
         names = [f"r{i + 1}" for i in range(scenario.tracks.robots)] if scenario.tracks else scenario.names()
         transports = loopback_transports(names)
         self.agents = [
@@ -53,7 +61,9 @@ class Swarm:
                 agent_config(
                     scenario,
                     name,
-                    source=SourceConfig(recording=paths[name].resolve() if name in paths else None, rate=scenario.rate),
+                    source=SourceConfig(
+                        recording=paths[name].resolve() if name in paths else None, rate=scenario.rate, start_s=start_s
+                    ),
                     transport=transports[name],
                     folder=(folder / name).resolve(),
                 ),
@@ -231,32 +241,89 @@ async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
 
 
 async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
-    """Many agents with two keyframes per second each: CPU, memory over time, late heartbeats, messages dropped."""
-    swarm = Swarm(crowd(agents, duration_s), folder)
+    """Many agents with two keyframes per second each, once all have started: CPU, memory, queues, late heartbeats."""
+    start_s = CROWD_START_PER_AGENT_S * agents
+    swarm = Swarm(crowd(agents, duration_s), folder, start_s=start_s)
     await swarm.start()
-    resident: list[float] = []
+    watched = Watched()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1"), CROWD_START_S, "r1 leads")
-        began_s, used_s, before = swarm.now_s(), sum(map(cpu_s, swarm.agents)), _keyframes(swarm.agents)
+        await asyncio.sleep(max(start_s + SETTLE_S - swarm.now_s(), 0.0))
+        began_s, used_s, before = swarm.now_s(), sum(map(cpu_s, swarm.agents)), _sums(swarm.agents)
         while swarm.now_s() - began_s < duration_s:
-            await asyncio.sleep(min(10.0, duration_s))
-            resident.append(statistics.median(resident_bytes(agent) / MEBIBYTE for agent in swarm.agents))
+            await asyncio.sleep(LOAD_LOOK_S)
+            watched.look(swarm.agents, swarm.now_s() - began_s)
         lasted_s, used_s = swarm.now_s() - began_s, sum(map(cpu_s, swarm.agents)) - used_s
         lost = sum(len(events(agent, "neighbour_down", began_s)) for agent in swarm.agents)
-        keyframes = _keyframes(swarm.agents)
-        rates = [(keyframes[name] - before[name]) / lasted_s for name in before]
-        refused = _refused(swarm.agents)
+        after, refused = _sums(swarm.agents), _refused(swarm.agents)
+        behind = _records_behind(swarm.agents)
     finally:
         await swarm.stop()
     return {
         "agents": agents,
         "duration_s": round(lasted_s, 1),
-        "keyframes_per_s": spread(rates),
+        "keyframes": after["keyframes"] - before["keyframes"],
+        "keyframes_intended": round(KEYFRAMES_PER_S * lasted_s * agents),
+        "closures": after["closures"] - before["closures"],
         "cores_used": round(used_s / lasted_s, 2),
-        "rss_mib_over_time": [round(value, 1) for value in resident],
+        "heartbeat_gap_s": watched.gaps_s,
         "neighbours_lost": lost,
+        "fullest_queues": watched.fullest(),
+        "records_behind": behind,
         "refused_or_dropped": refused,
+        "rss_mib_over_time": watched.resident,
     }
+
+
+class Watched:
+    """What was seen of a crowd over time.
+
+    Attributes:
+        gaps_s: The longest time between two heartbeats, as sent and as heard by another robot.
+        resident: Seconds since the beginning, and MiB: the median agent, the largest, the leader, all workers.
+    """
+
+    def __init__(self) -> None:
+        self.gaps_s = {"sent": 0.0, "heard": 0.0}
+        self.resident: list[dict[str, float]] = []
+        self._sizes: dict[str, tuple[int, int]] = {}
+
+    def look(self, agents: Sequence[AgentProcess], at_s: float) -> None:
+        """Take in everybody's state, and once in `RESIDENT_PERIOD_S` the memory."""
+        for agent in agents:
+            for which, gap_s in agent.status.get("heartbeat_gap_s", {}).items():
+                self.gaps_s[which] = max(self.gaps_s[which], gap_s)
+            for queue, (size, size_max) in agent.status.get("sizes", {}).items():
+                self._sizes[queue] = max(self._sizes.get(queue, (0, size_max)), (size, size_max))
+        if at_s >= len(self.resident) * RESIDENT_PERIOD_S:
+            self.resident.append({"at_s": round(at_s), **_resident(agents)})
+
+    def fullest(self) -> dict[str, list[int]]:
+        """The largest size of each queue and table of any robot, with its maximum, the fullest first."""
+        fullest = sorted(self._sizes.items(), key=lambda item: -item[1][0] / item[1][1])
+        return {queue: list(size) for queue, size in fullest if size[0] > 0}
+
+
+def _resident(agents: Sequence[AgentProcess]) -> dict[str, float]:
+    """Memory of the processes now, MiB."""
+    families = [[_resident_bytes(pid) / MEBIBYTE for pid in _family(agent)] for agent in agents]
+    own = [family[0] for family in families]
+    return {
+        "median": round(statistics.median(own), 1),
+        "max": round(max(own), 1),
+        "leader": round(own[0], 1),
+        "workers": round(sum(sum(family[1:]) for family in families), 1),
+    }
+
+
+def _records_behind(agents: Sequence[AgentProcess]) -> int:
+    """How many records of one log the robot that is furthest behind lacks, as of everybody's last state."""
+    longest: dict[str, int] = {}
+    for agent in agents:
+        for log, (count, _) in agent.status["logs"].items():
+            longest[log] = max(longest.get(log, 0), count)
+    held = [agent.status["logs"] for agent in agents]
+    return max(count - int(logs.get(log, [0])[0]) for logs in held for log, count in longest.items())
 
 
 def crowd(robots: int, duration_s: float) -> Scenario:
@@ -264,7 +331,7 @@ def crowd(robots: int, duration_s: float) -> Scenario:
     return Scenario(
         name="crowd",
         tracks=TracksScenario(
-            robots=robots, seed=3, area_m=60.0, speed_m_s=1.0, length_m=CROWD_START_S + duration_s + 30.0
+            robots=robots, seed=3, area_m=CROWD_AREA_M, speed_m_s=1.0, length_m=duration_s + SETTLE_S + 30.0
         ),
         keyframes=KeyframeConfig(distance_m=0.45, rotation_rad=math.pi),
         perception=PerceptionConfig(method="synthetic"),
@@ -272,8 +339,13 @@ def crowd(robots: int, duration_s: float) -> Scenario:
     )
 
 
-def _keyframes(agents: Iterable[AgentProcess]) -> dict[str, int]:
-    return {agent.name: agent.status.get("keyframes", 0) for agent in agents}
+def _sums(agents: Iterable[AgentProcess]) -> dict[str, int]:
+    """Keyframes of all together, and closures as far as everybody knows them."""
+    states = [agent.status for agent in agents]
+    return {
+        "keyframes": sum(state.get("keyframes", 0) for state in states),
+        "closures": min(state.get("closures", 0) for state in states),
+    }
 
 
 def _refused(agents: Iterable[AgentProcess]) -> dict[str, int]:

@@ -57,6 +57,7 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import Persist, write
+from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, Transport, TransportCounters
@@ -65,7 +66,17 @@ from flocc_agent.stages import brief_of, fields_of
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import KeyframeId
-from flocc_protocol.messages import Envelope, Message, UnknownVersion, decode, encode, kind_of
+from flocc_protocol.keys import Kind
+from flocc_protocol.messages import (
+    BATCHES_MAX,
+    RECORDS_BATCH_MAX,
+    Envelope,
+    Message,
+    UnknownVersion,
+    decode,
+    encode,
+    kind_of,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -74,11 +85,12 @@ Float = NDArray[np.float64]
 INBOX_MAX = 8192
 COPIES_MAX = 256
 COPIES_PERIOD_S = 0.5
-"""Copies of others' records are written so many or so long at a time."""
+"""Copies of others' records are written so many, and what one message adds, or so long at a time."""
 REFUSED_MAX = 512
 """Refusals that are counted apart, by peer and reason."""
 IMAGES_MAX = 8
 CORRECTIONS_MAX = 16
+HEARTBEAT = Kind.HEARTBEAT.value
 BYTES_PERIOD_S = 1.0
 ACCOUNT_PERIOD_S = 10.0
 
@@ -168,6 +180,7 @@ class Driver:
         self._copied: list[Persist] = []
         self._copies_due_s = self._began_s
         self._account_due_s = self._began_s + ACCOUNT_PERIOD_S
+        self._gaps = {"sent": LongestGap(), "heard": LongestGap()}
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
 
@@ -246,6 +259,8 @@ class Driver:
             "received_bytes": sum(traffic.payload_bytes for traffic in counters.received.values()),
             "loss": self._losses(),
             "queues": self._queues(),
+            "sizes": {name: list(size) for name, size in self._sizes().items()},
+            "heartbeat_gap_s": {which: round(gap.longest_s(self._clock_s()), 3) for which, gap in self._gaps.items()},
             "links": {table: totals(peers) for table, peers in counters.links().items()},
             "stages": brief_of(self._workers.stages.snapshot()),
             "refused": {**counters.dropped, **self._refusals()},
@@ -270,7 +285,7 @@ class Driver:
                 "term": 0 if term is None else term.counter,
                 "round": 0 if applied is None else applied.round,
             },
-            queues={"inbox": (len(self._inbox), INBOX_MAX), "images": (len(self._images), IMAGES_MAX), **robot.sizes()},
+            queues=self._sizes(),
             info={"robot": robot.log.robot, "log": str(robot.log)},
         )
 
@@ -372,6 +387,8 @@ class Driver:
         if len(self._inbox) >= INBOX_MAX:
             self._refuse(sender, "too many messages wait")
             return
+        if kind == HEARTBEAT:
+            self._gaps["heard"].mark(sender, self._clock_s())
         self.put(MessageReceived(envelope))
 
     def _refuse(self, peer: str, reason: str, detail: str = "") -> None:
@@ -383,11 +400,13 @@ class Driver:
             self._report(Report("peer_refused", {"peer": peer, "reason": detail or reason}))
 
     def _send(self, message: Message, to: str | None) -> None:
-        payload = encode(Envelope(self.robot.log, message))
+        payload, kind = encode(Envelope(self.robot.log, message)), kind_of(message)
+        if kind == HEARTBEAT:
+            self._gaps["sent"].mark(HEARTBEAT, self._clock_s())
         if to is None:
-            self._transport.broadcast(kind_of(message), payload)
+            self._transport.broadcast(kind, payload)
         else:
-            self._transport.unicast(to, kind_of(message), payload)
+            self._transport.unicast(to, kind, payload)
 
     # Effects
 
@@ -409,11 +428,15 @@ class Driver:
                     self._report(effect)
                     continue
                 case Report():
+                    if effect.event == "neighbour_down":
+                        self._gaps["heard"].forget(str(effect.fields["peer"]))
                     self._report(effect)
                     continue
             await self._write(written)
             self._do(effect)
         await self._write(written)
+        if len(self._copied) >= COPIES_MAX:
+            await self._flush()
 
     def _end_log(self, peer: str) -> None:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
@@ -435,7 +458,7 @@ class Driver:
     async def _write_copies(self) -> None:
         """Bring copies of others' records onto the disk, many at a time: what a crash loses of them comes again."""
         now = self._clock_s()
-        if now < self._copies_due_s and len(self._copied) < COPIES_MAX:
+        if now < self._copies_due_s:
             return
         self._copies_due_s = now + COPIES_PERIOD_S
         if self._copied:
@@ -565,6 +588,16 @@ class Driver:
     def _queues(self) -> dict[str, int]:
         """What waits: events for the core, images for the encoder, candidates for their registration."""
         return {"inbox": len(self._inbox), "images": len(self._images), "candidates": self.robot.closing.load}
+
+    def _sizes(self) -> dict[str, tuple[int, int]]:
+        """Every queue, table and cache: how much is in it, and its maximum."""
+        return {
+            "inbox": (len(self._inbox), INBOX_MAX),
+            "images": (len(self._images), IMAGES_MAX),
+            "disk": (len(self._copied), COPIES_MAX + BATCHES_MAX * RECORDS_BATCH_MAX),
+            **self._transport.sizes(),
+            **self.robot.sizes(),
+        }
 
     def _account(self, counters: TransportCounters, now: float) -> dict[str, Any]:
         """Bytes by link and kind, and time by stage, since this start of the agent."""

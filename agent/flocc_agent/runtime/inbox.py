@@ -65,6 +65,11 @@ class Inbox:
         if wake:
             self._wake()
 
+    def size(self) -> tuple[int, int]:
+        """Messages of the kind of which most wait, and how many may."""
+        with self._lock:
+            return max(map(len, self._queues.values())), self._messages_max
+
     def _append(self, message: Incoming) -> None:
         queue = self._queues.setdefault(message.kind, deque())
         waiting_bytes = self._waiting_bytes.get(message.kind, 0) + len(message.payload)

@@ -162,6 +162,10 @@ class Transport(Protocol):
         """What went through so far."""
         ...
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Every queue: how much is in it, and its maximum."""
+        ...
+
 
 LATENT = "latent"
 """The kind under which pieces of latents are counted."""

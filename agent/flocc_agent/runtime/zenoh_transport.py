@@ -143,6 +143,11 @@ class ZenohTransport:
             counters.dropped.update({f"radio-{reason}": n for reason, n in sorted(self._radio.dropped.items())})
         return counters
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Messages that wait for the robot (of the kind with most), and those that the emulated radio delays."""
+        network = (0, self._config.inbox_messages_max) if self._inbox is None else self._inbox.size()
+        return {"network": network, "delayed": (len(self._delayed), DELAYED_MAX)}
+
     # --- opening and closing
 
     async def open(self) -> None:
