@@ -47,6 +47,7 @@ from flocc_launch.experiments.experiment import (
     Summary,
     judged,
 )
+from flocc_launch.experiments.formulation_claims import Measured, formulation_findings
 from flocc_launch.experiments.overlap import require_overlap
 from flocc_launch.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_launch.experiments.statistics import grouped, middle, values, with_spread
@@ -332,31 +333,12 @@ def _of_source(source: str, rows: Sequence[Row]) -> list[Finding]:
     if source in COSMO and DEFAULT in ate:
         claim = f"flocc's default ends at most {TARGET_ATE_M} m off on {source}"
         found.append(judged(claim, "issue 8", ate[DEFAULT] <= TARGET_ATE_M, f"{ate[DEFAULT]:.2f} m."))
-    if "flocc smoothed lm" in ate and "flocc smoothed gnc-tls" in ate:
-        plain_m, robust_m = ate["flocc smoothed lm"], ate["flocc smoothed gnc-tls"]
-        plain_s, robust_s = (middle(of[f"flocc smoothed {name}"], "solve_cpu_s") or 0.0 for name in ("lm", "gnc-tls"))
-        numbers = f"LM {plain_m:.3g} m in {plain_s:.2g} s, GNC {robust_m:.3g} m in {robust_s:.2g} s of CPU."
-        claim = f"GNC adds little to smoothed scales and costs far more ({source})"
-        holds = plain_m <= 1.1 * robust_m and robust_s > 2.0 * plain_s
-        found.append(judged(claim, "Sec. IV-C", holds, numbers))
-    return [*found, *_formulations(source, ate, middle(rows, "ate_odometry_m"))]
-
-
-def _formulations(source: str, ate: dict[str, float], odometry_m: float | None) -> list[Finding]:
-    """Whether free scales beat fixed ones, with each solver; nothing is shown where all are lost."""
-    found = []
-    for solver in (Solver.LM.value, Solver.GNC_TLS.value):
-        methods = [f"flocc {name} {solver}" for name in ("base", "independent", "smoothed")]
-        if not set(methods) <= set(ate):
-            continue
-        base_m, independent_m, smoothed_m = (ate[method] for method in methods)
-        lost = odometry_m is not None and min(base_m, independent_m, smoothed_m) > odometry_m
-        numbers = f"base {base_m:.3g} m, independent {independent_m:.3g} m, smoothed {smoothed_m:.3g} m"
-        numbers += f"; all are worse than odometry alone, {odometry_m:.3g} m." if lost else "."
-        claim = f"Independent and smoothed scales beat base with {solver} ({source})"
-        holds = None if lost else max(independent_m, smoothed_m) <= base_m
-        found.append(judged(claim, "Sec. IV-A", holds, numbers))
-    return found
+    measured = {
+        (method.formulation.value, method.solver.value): Measured(ate[name], middle(of[name], "solve_cpu_s") or 0.0)
+        for name, method in METHODS.items()
+        if name in ate and not method.metric
+    }
+    return [*found, *formulation_findings(source, measured, middle(rows, "ate_odometry_m"))]
 
 
 def draw(figure: "Figure", _settings: FullSystemSettings, rows: Sequence[Row]) -> None:

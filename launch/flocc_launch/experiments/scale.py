@@ -27,8 +27,8 @@ from flocc_launch.experiments.experiment import (
     Settings,
     Summary,
     grid,
-    judged,
 )
+from flocc_launch.experiments.formulation_claims import Measured, formulation_findings
 from flocc_launch.experiments.overlap import joined
 from flocc_launch.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_launch.experiments.statistics import grouped, middle, with_spread
@@ -253,27 +253,13 @@ def findings(rows: Sequence[Row]) -> list[Finding]:
 
 
 def _of(source: str, odometry: str, rows: Sequence[Row]) -> list[Finding]:
-    of = {
-        key: (middle(group, "ate_m"), middle(group, "solve_cpu_s"))
-        for key, group in grouped(rows, "initial", "formulation", "solver").items()
+    started = [row for row in rows if row["initial"] == ScaleInitial.ODOMETRY.value]
+    measured = {
+        (key[0], key[1]): Measured(ate_m, middle(group, "solve_cpu_s") or 0.0)
+        for key, group in grouped(started, "formulation", "solver").items()
+        if (ate_m := middle(group, "ate_m")) is not None
     }
-    ate: Any = {key: value[0] for key, value in of.items()}
-    where = f"{source}, {odometry} odometry"
-    found = []
-    for solver in SOLVERS:
-        values = {name: ate.get(("odometry", name, solver)) for name in ("base", "independent", "smoothed")}
-        if all(value is not None for value in values.values()):
-            numbers = ", ".join(f"{name} {value:.3g} m" for name, value in values.items()) + "."
-            holds = max(values["independent"], values["smoothed"]) < values["base"]
-            claim = f"Independent and smoothed beat base with odometry's scale and {solver} ({where})"
-            found.append(judged(claim, "Sec. IV-C, Tabs. II, III", holds, numbers))
-    plain, robust = (of.get(("odometry", "smoothed", solver)) for solver in SOLVERS)
-    if plain is not None and robust is not None and None not in (*plain, *robust):
-        (a, a_s), (b, b_s) = plain, robust
-        numbers = f"LM {a:.3g} m in {a_s:.2g} s, GNC {b:.3g} m in {b_s:.2g} s of CPU."
-        holds = a <= 1.1 * b and b_s > 2.0 * a_s  # type: ignore[operator]
-        found.append(judged(f"GNC adds little to smoothed and costs far more ({where})", "Sec. IV-C", holds, numbers))
-    return found
+    return formulation_findings(f"{source}, {odometry} odometry, scales from it", measured)
 
 
 def draw(figure: "Figure", _settings: ScaleSettings, rows: Sequence[Row]) -> None:

@@ -11,6 +11,7 @@ from flocc_agent.config import ConfigError
 from flocc_agent.core.registration import closure_probability
 from flocc_launch.experiments.experiment import ExperimentError, Verdict
 from flocc_launch.experiments.folder import ExperimentFolder, configuration_of
+from flocc_launch.experiments.formulation_claims import Measured, formulation_findings
 from flocc_launch.experiments.logistic import fit_logistic
 from flocc_launch.experiments.precision_recall import curve
 from flocc_launch.experiments.registration import REGISTRATION, summarise
@@ -178,3 +179,23 @@ def test_no_steepness_is_learned_from_a_partial_experiment_or_where_none_fits(tm
     other.write_state(1, 1, 0)
     with pytest.raises(ExperimentError, match="is no registration experiment"):
         learned(tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("plain_m", "robust_m", "verdicts"),
+    [
+        ((3.0, 1.0, 1.0), (3.0, 1.0, 1.0), [Verdict.CONFIRMED, Verdict.CONFIRMED, Verdict.CONFIRMED]),
+        ((1.0, 1.02, 0.99), (1.0, 3.0, 0.5), [Verdict.NOT_SHOWN, Verdict.CONTRADICTED, Verdict.CONTRADICTED]),
+        ((90.0, 50.0, 40.0), (9.0, 1.0, 1.0), [Verdict.NOT_SHOWN, Verdict.CONFIRMED, Verdict.CONTRADICTED]),
+        ((90.0, 50.0, 40.0), (90.0, 50.0, 40.0), [Verdict.NOT_SHOWN, Verdict.NOT_SHOWN, Verdict.NOT_SHOWN]),
+    ],
+)
+def test_nothing_is_claimed_of_errors_that_are_the_same_or_worse_than_odometry(
+    plain_m: tuple[float, ...], robust_m: tuple[float, ...], verdicts: list[Verdict]
+) -> None:
+    of = {
+        (name, solver): Measured(ate_m, seconds)
+        for solver, errors_m, seconds in (("lm", plain_m, 1.0), ("gnc-tls", robust_m, 3.0))
+        for name, ate_m in zip(("base", "independent", "smoothed"), errors_m, strict=True)
+    }
+    assert [f.verdict for f in formulation_findings("here", of, odometry_m=10.0)] == [*verdicts, Verdict.CONFIRMED]
