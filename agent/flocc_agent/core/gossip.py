@@ -6,7 +6,7 @@ neighbour about what was sent, so a lost, doubled, late or reordered message can
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple, Protocol
 
@@ -62,7 +62,7 @@ class Sealer(Protocol):
 
 @dataclass(slots=True)
 class LogCopy:
-    """A prefix of one robot's log: records, their bytes, and the chained checksum before each."""
+    """A prefix of one robot's log: records without descriptors, their bytes, and the chained checksum before each."""
 
     records: list[Record] = field(default_factory=list)
     encoded: list[bytes] = field(default_factory=list)
@@ -140,7 +140,7 @@ class Gossip:
         """Put back a record that was read from disk, in order."""
         copy = self.logs.setdefault(log, LogCopy())
         record = decode_record(self._opened(log, len(copy), data))
-        copy.append(record, data)
+        copy.append(kept(record), data)
         self._announce(log, copy)
         return NewRecord(log, len(copy) - 1, record)
 
@@ -152,7 +152,7 @@ class Gossip:
         if self._sealer is not None:
             data = self._sealer.seal(self._own, number, data)
         assert copy.accepts(record), "own keyframes are numbered without gaps"
-        copy.append(record, data)
+        copy.append(kept(record), data)
         self._announce(self._own, copy)
         batch = RecordBatch(self._own, number, before, (data,))
         return NewRecord(self._own, number, record), [PersistRecord(self._own, number, data)], batch
@@ -256,13 +256,13 @@ class Gossip:
         effects: list[Effect] = []
         for data in batch.records[len(copy) - batch.first :]:
             try:
-                record = decoded(self._opened(batch.log, len(copy), data))
+                record, record_kept = decoded(self._opened(batch.log, len(copy), data))
             except DecodeError as error:
                 return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
             if not copy.accepts(record) or len(copy) >= self._parameters.records_max:
                 return new, [*effects, *self._refused(peer, f"record of {batch.log} out of place")]
             number = len(copy)
-            copy.append(record, data)
+            copy.append(record_kept, data)
             new.append(NewRecord(batch.log, number, record))
             effects.append(PersistRecord(batch.log, number, data))
         return new, effects
@@ -308,6 +308,12 @@ def _is_full(message: Records) -> bool:
 
 
 @lru_cache(maxsize=DECODED_MAX)
-def decoded(data: bytes) -> Record:
-    """A record, decoded once where several copies of a log live in one process."""
-    return decode_record(data)
+def decoded(data: bytes) -> tuple[Record, Record]:
+    """A record, and what is kept of it, decoded once where several copies of a log live in one process."""
+    record = decode_record(data)
+    return record, kept(record)
+
+
+def kept(record: Record) -> Record:
+    """A record without its descriptor: place recognition has that, and the record's bytes."""
+    return replace(record, descriptor=None) if isinstance(record, KeyframeRecord) else record

@@ -1,5 +1,6 @@
 """Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A)."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -45,7 +46,9 @@ class _Descriptors:
     def append(self, index: int, descriptor: Descriptor) -> None:
         count = len(self.indices)
         if count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+            rows = np.empty((count + max(CAPACITY_FIRST, count // 4), self.dimension), dtype=np.float32)
+            rows[:count] = self._rows
+            self._rows = rows
         self._rows[count] = descriptor
         self.indices.append(index)
 
@@ -155,8 +158,8 @@ def _sorted(found: list[Found]) -> list[Found]:
 def direction(place: Array) -> Descriptor | None:
     """Descriptor (D,) of unit length, or None where it has no direction; found once for all robots of a process."""
     values = place.numpy()
-    norm = float(np.linalg.norm(values))
-    if not np.isfinite(norm) or norm < 1e-12:
+    norm = math.sqrt(float(values.dot(values)))
+    if not math.isfinite(norm) or norm < 1e-12:
         return None
     unit = np.asarray(values / norm, dtype=np.float32)
     unit.flags.writeable = False
