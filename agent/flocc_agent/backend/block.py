@@ -16,7 +16,7 @@ from scipy.special import chdtri
 
 from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
-from flocc_agent.backend.condensed import Surroundings, condensed, holds, surroundings
+from flocc_agent.backend.condensed import condensed, holds, surroundings
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
 from flocc_agent.backend.rbcd import Block, Links
 from flocc_agent.backend.screening import first_not_rigid
@@ -40,13 +40,11 @@ FIRST_STEPS = 30
 STEPS = 2
 INNER_STEPS = 20
 TOGETHER_RATIO = 1.0
-HOLD_START = 1.0
+HOLD_FALL = 0.7
 HOLD_RISE = 4.0
-HOLD_FALL = 0.5
-HOLD_GOOD = 0.5
-HOLD_MAX = 100.0
-HOLD_MIN = 1e-6
-OWN_HOLD = 1.0
+HOLD_TOLERANCE = 0.01
+HOLD_MIN = 1e-5
+HOLD_MAX = 10.0
 MOMENTUM_MAX = 0.995
 TILT = 1e-3
 CLOSURES_MAX = 32
@@ -108,9 +106,9 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     weights = _weights_of(config, problem, measured, state)
     closures, odometry = _weighted(measured, weights), _odometry(config, problem)
     separators = _separators(problem, n)
-    typical = _typical(odometry)
-    state = replace(state, holds=_holds(state, near, typical))
-    held = _held(state, near, separators, X_all, typical)
+    concerned = rbcd.joined([closures.chosen(closures.touching(n)), odometry])
+    state = _with_hold(state, _cost(concerned, X_all))
+    held = holds(np.concatenate([separators, np.arange(n, len(X_all))]), X_all, state.hold * _typical(odometry))
     together = bool(np.any((weights > 0) & measured.links.touching(n) & ~measured.links.within(n)))
     parts = [closures, odometry, near.links, *([held] if together else [])]
     block = Block(len(X_all), rbcd.joined(parts))
@@ -118,14 +116,14 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     X = descended.X[:n]
     if together:
         X = rbcd.retracted(state.X, TOGETHER_RATIO * (X - state.X))
-    next_state = replace(_extrapolated(state, X, together), foreseen=near.foreseen(descended.X[n:]))
+    next_state = _extrapolated(state, X, together)
     inner = rbcd.joined([closures.chosen(closures.within(n)), odometry])
     return BlockStep(
         state=next_state,
         T_map_keyframe=rbcd.rounded(X, _origin(problem, X, aligned)),
         origin=_origin(problem, next_state.X, aligned),
         moved=float(np.abs(X - state.X_before).max()),
-        cost=_cost(rbcd.joined([closures.chosen(closures.touching(n)), odometry]), np.concatenate([X, near.X])),
+        cost=_cost(concerned, np.concatenate([X, near.X])),
         aligned=aligned,
         finished=state.control is None and not state.has_unjudged,
         rejected=sum(weight == 0.0 for weight in state.weights.values()),
@@ -348,34 +346,10 @@ def _typical(links: Links) -> Float:
     return np.median(links.weight, axis=0) if len(links.i) else np.eye(4)
 
 
-def _holds(state: BlockState, near: Surroundings, typical: Float) -> dict[LogId, float]:
-    """How strongly to hold each robot's separators: more where they went elsewhere than foreseen, less where there."""
-    found = {}
-    for log, (indices, keyframes) in near.of_robots().items():
-        hold = state.holds.get(log, HOLD_START)
-        known = [(k, *state.foreseen[kf]) for k, kf in zip(indices, keyframes, strict=True) if kf in state.foreseen]
-        if known:
-            now = near.X[[k for k, _, _ in known]]
-            was, expected = np.array([w for _, w, _ in known]), np.array([e for _, _, e in known])
-            moved, missed = _squared(now - was, typical), _squared(now - expected, typical)
-            if moved > 0 and missed > moved:
-                hold = min(hold * HOLD_RISE, HOLD_MAX)
-            elif missed < HOLD_GOOD * moved:
-                hold = max(hold * HOLD_FALL, HOLD_MIN)
-        found[log] = hold
-    return found
-
-
-def _squared(V: Float, typical: Float) -> float:
-    return float(np.sum(V * (typical @ V)))
-
-
-def _held(state: BlockState, near: Surroundings, separators: Int, X: Float, typical: Float) -> Links:
-    n = len(X) - len(near.X)
-    parts = [
-        holds(np.array(indices) + n, X, state.holds[log] * typical) for log, (indices, _) in near.of_robots().items()
-    ]
-    return rbcd.joined([holds(separators, X, OWN_HOLD * max(state.holds.values(), default=0.0) * typical), *parts])
+def _with_hold(state: BlockState, cost: float) -> BlockState:
+    """Hold separators less while that lowers the cost of what concerns the block, more as soon as it rose."""
+    hold = state.hold * (HOLD_RISE if cost > (1.0 + HOLD_TOLERANCE) * state.cost else HOLD_FALL)
+    return replace(state, hold=min(max(hold, HOLD_MIN), HOLD_MAX), cost=cost)
 
 
 def _cost(links: Links, X: Float) -> float:

@@ -102,19 +102,6 @@ class Surroundings:
     X: Float
     links: Links
 
-    def of_robots(self) -> dict[LogId, tuple[list[int], list[KeyframeId]]]:
-        """Numbers and keyframes by robot."""
-        found: dict[LogId, tuple[list[int], list[KeyframeId]]] = {}
-        for k, keyframe in enumerate(self.index):
-            numbers, keyframes = found.setdefault(keyframe.log, ([], []))
-            numbers.append(k)
-            keyframes.append(keyframe)
-        return found
-
-    def foreseen(self, X: Float) -> dict[KeyframeId, tuple[Float, Float]]:
-        """Where each was heard, and where the block expects it (m, 4, r)."""
-        return {keyframe: (self.X[k], X[k]) for k, keyframe in enumerate(self.index)}
-
 
 def surroundings(
     poses: int, heard: Mapping[KeyframeId, Float], condensed_odometry: Mapping[KeyframeId, CondensedOdometry], rank: int

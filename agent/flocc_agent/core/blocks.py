@@ -44,8 +44,8 @@ class BlockState:
         in_stage: Iterations since the weights were last decided.
         epoch: Number of the graduation that the weights come from.
         has_unjudged: A closure came since that did not agree; it waits, without weight, for the next graduation.
-        holds: How strongly the separators of another robot are held where they were heard, relative to odometry.
-        foreseen: Where other robots' separators were heard, and where this robot expected them next.
+        hold: How strongly separators are held where they were said, relative to odometry.
+        cost: Of the measurements that concern the block, before the last iteration.
     """
 
     X: Float
@@ -56,8 +56,8 @@ class BlockState:
     in_stage: int = 0
     epoch: int = 0
     has_unjudged: bool = False
-    holds: Mapping[LogId, float] = field(default_factory=dict)
-    foreseen: Mapping[KeyframeId, tuple[Float, Float]] = field(default_factory=dict)
+    hold: float = 1.0
+    cost: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
