@@ -5,6 +5,7 @@ Poor odometry is that of a VIO whose scale is some per cent off, differently on 
 """
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +50,10 @@ FORMULATIONS = tuple(
     f.value for f in (Formulation.BASE, Formulation.INDEPENDENT, Formulation.SMOOTHED, Formulation.SHARED)
 )
 SOLVERS = (Solver.LM.value, Solver.GNC_TLS.value)
+
+DRAWS_MAX = 100
+JOINING_MIN = 10
+"""Closures of a pair of robots that surely join it, wrong ones among them."""
 
 
 class ScaleSettings(Settings):
@@ -167,11 +172,29 @@ def draw_graph(settings: ScaleSettings, source: str, poor: bool, seed: int) -> D
 
 
 def _generated(settings: ScaleSettings, poor: bool, rng: np.random.Generator) -> DrawnGraph:
+    """A generated graph whose closures join all robots; walks that never meet are drawn again.
+
+    Raises:
+        ExperimentError: So many robots hardly ever meet.
+    """
     noise = Noise(odometry=(0.006, 0.05) if poor else (0.003, 0.02), scale_initial_ratio=0.0)
-    made = generate(rng, settings.robots, settings.keyframes, settings.closures, settings.outlier_ratio, noise=noise)
+    given = settings.robots, settings.keyframes, settings.closures, settings.outlier_ratio
+    drawn = (generate(rng, *given, noise=noise) for _ in range(DRAWS_MAX))
+    made = next((each for each in drawn if _hangs_together(each.graph)), None)
+    if made is None:
+        raise ExperimentError(
+            f"{settings.robots} robots of {settings.keyframes} keyframes do not all meet in {DRAWS_MAX} draws"
+        )
     true_scale = [c.scale_initial or 1.0 for c in made.graph.closures]
     errors = np.exp(settings.initial_sigma_ratio * rng.normal(size=len(true_scale)))
     return DrawnGraph(made.graph, true_scale, (np.array(true_scale) * errors).tolist(), made.truth_m())
+
+
+def _hangs_together(graph: PoseGraph) -> bool:
+    """Whether pairs of robots with enough closures join all robots."""
+    counts = Counter((c.query.log, c.match.log) for c in graph.closures)
+    pairs = {pair for pair, count in counts.items() if count >= JOINING_MIN}
+    return joined(graph.trajectories, pairs) == set(graph.trajectories)
 
 
 def _cosmo(settings: ScaleSettings, source: str, rng: np.random.Generator) -> DrawnGraph:

@@ -13,9 +13,11 @@ from flocc_launch.experiments.experiment import ExperimentError, Verdict
 from flocc_launch.experiments.folder import ExperimentFolder, configuration_of
 from flocc_launch.experiments.formulation_claims import Measured, formulation_findings
 from flocc_launch.experiments.logistic import fit_logistic
+from flocc_launch.experiments.overlap import joined
 from flocc_launch.experiments.precision_recall import curve
 from flocc_launch.experiments.registration import REGISTRATION, summarise
 from flocc_launch.experiments.registration_data import RegistrationSettings
+from flocc_launch.experiments.scale import ScaleSettings, draw_graph
 from flocc_launch.experiments.steepness import learned, with_steepness, write_steepness
 
 
@@ -199,3 +201,12 @@ def test_nothing_is_claimed_of_errors_that_are_the_same_or_worse_than_odometry(
         for name, ate_m in zip(("base", "independent", "smoothed"), errors_m, strict=True)
     }
     assert [f.verdict for f in formulation_findings("here", of, odometry_m=10.0)] == [*verdicts, Verdict.CONFIRMED]
+
+
+def test_generated_graphs_join_all_robots_and_robots_that_cannot_meet_are_said() -> None:
+    for seed in range(3):
+        graph = draw_graph(ScaleSettings(keyframes=60), "generated", False, seed).graph
+        pairs = {(c.query.log, c.match.log) for c in graph.closures}
+        assert joined(graph.trajectories, pairs) == set(graph.trajectories)
+    with pytest.raises(ExperimentError, match="2 robots of 20 keyframes do not all meet in 100 draws"):
+        draw_graph(ScaleSettings(robots=2, keyframes=20, closures=4), "generated", False, 1)
