@@ -40,9 +40,10 @@ FIRST_STEPS = 30
 STEPS = 2
 INNER_STEPS = 20
 TOGETHER_RATIO = 1.0
-HOLD_FALL = 0.7
-HOLD_RISE = 4.0
-HOLD_TOLERANCE = 0.01
+HOLD_FALL = 0.8
+HOLD_RISE = 2.0
+HOLD_TOLERANCE = 2.0
+HOLD_PATIENCE = 1.1
 HOLD_MIN = 1e-5
 HOLD_MAX = 10.0
 MOMENTUM_MAX = 0.995
@@ -107,12 +108,13 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     closures, odometry = _weighted(measured, weights), _odometry(config, problem)
     separators = _separators(problem, n)
     concerned = rbcd.joined([closures.chosen(closures.touching(n)), odometry])
-    state = _with_hold(state, _cost(concerned, X_all))
     held = holds(np.concatenate([separators, np.arange(n, len(X_all))]), X_all, state.hold * _typical(odometry))
     together = bool(np.any((weights > 0) & measured.links.touching(n) & ~measured.links.within(n)))
     parts = [closures, odometry, near.links, *([held] if together else [])]
     block = Block(len(X_all), rbcd.joined(parts))
     descended = rbcd.descend(block, X_all, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
+    if together:
+        state = _with_hold(state, block.cost(X_all) - descended.cost)
     X = descended.X[:n]
     if together:
         X = rbcd.retracted(state.X, TOGETHER_RATIO * (X - state.X))
@@ -346,10 +348,11 @@ def _typical(links: Links) -> Float:
     return np.median(links.weight, axis=0) if len(links.i) else np.eye(4)
 
 
-def _with_hold(state: BlockState, cost: float) -> BlockState:
-    """Hold separators less while that lowers the cost of what concerns the block, more as soon as it rose."""
-    hold = state.hold * (HOLD_RISE if cost > (1.0 + HOLD_TOLERANCE) * state.cost else HOLD_FALL)
-    return replace(state, hold=min(max(hold, HOLD_MIN), HOLD_MAX), cost=cost)
+def _with_hold(state: BlockState, decrease: float) -> BlockState:
+    """Hold separators less while iterations find less and less to lower, more as soon as they find more."""
+    reference = min(HOLD_PATIENCE * state.decrease, decrease)
+    hold = state.hold * (HOLD_RISE if decrease > HOLD_TOLERANCE * reference else HOLD_FALL)
+    return replace(state, hold=min(max(hold, HOLD_MIN), HOLD_MAX), decrease=reference)
 
 
 def _cost(links: Links, X: Float) -> float:

@@ -23,6 +23,10 @@ from flocc_protocol.ids import KeyframeId, LogId
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+BEND_MAX = 0.5
+"""Entries of a rotation by which a force may bend condensed odometry; it is said to be stiffer where it would more."""
+STRETCH_MAX_M = 1e5
+
 
 def condensed(
     log: LogId, separators: Sequence[int], odometry: Links, own: Links, X: Float
@@ -43,7 +47,10 @@ def condensed(
         before, at = separators[k - 1], separators[k]
         stiffness = _stiffness(odometry, before, at)
         force = rbcd.projected(X[at][None], (forces[k] + pull)[None])[0]
-        transform = _carrying(X[before], X[at] - np.linalg.solve(stiffness, force))
+        bend = np.linalg.solve(stiffness, force)
+        excess = max(1.0, float(np.abs(bend[:3]).max()) / BEND_MAX, float(np.abs(bend[3]).max()) / STRETCH_MAX_M)
+        stiffness = excess * stiffness
+        transform = _carrying(X[before], X[at] - bend / excess)
         pull = transform.T @ stiffness @ (X[at] - transform @ X[before])
         found.append(CondensedOdometry(KeyframeId(log, before), transform, stiffness))
     return tuple(reversed(found))

@@ -45,7 +45,7 @@ class BlockState:
         epoch: Number of the graduation that the weights come from.
         has_unjudged: A closure came since that did not agree; it waits, without weight, for the next graduation.
         hold: How strongly separators are held where they were said, relative to odometry.
-        cost: Of the measurements that concern the block, before the last iteration.
+        decrease: By how much the last iterations found that the cost could be lowered; it rises where they diverge.
     """
 
     X: Float
@@ -57,7 +57,7 @@ class BlockState:
     epoch: int = 0
     has_unjudged: bool = False
     hold: float = 1.0
-    cost: float = float("inf")
+    decrease: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
