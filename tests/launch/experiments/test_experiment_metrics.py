@@ -17,7 +17,7 @@ from flocc_launch.experiments.overlap import joined
 from flocc_launch.experiments.precision_recall import curve
 from flocc_launch.experiments.registration import REGISTRATION, summarise
 from flocc_launch.experiments.registration_data import RegistrationSettings
-from flocc_launch.experiments.scale import ScaleSettings, draw_graph
+from flocc_launch.experiments.scale_graphs import ScaleSettings, draw_graph
 from flocc_launch.experiments.steepness import learned, with_steepness, write_steepness
 
 
