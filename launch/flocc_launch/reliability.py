@@ -36,8 +36,9 @@ SETTLE_S = 10.0
 LOAD_LOOK_S = 1.0
 RESIDENT_PERIOD_S = 60.0
 KEYFRAMES_PER_S = 2.0
-CROWD_AREA_M = 1000.0
-"""Streets are a quarter of this apart: some 1.5 other robots have passed any place by the end of 20 minutes."""
+CROWD_AREA_M = 2000.0
+"""Every keyframe is compared with every other robot's: in so large a town one in six has a partner after 5 minutes, two
+in three after 20; in one of 60 m each has three all the time, which makes four records of each keyframe."""
 LOOK_S = 0.1
 CLOCK_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")

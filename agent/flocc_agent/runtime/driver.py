@@ -56,6 +56,7 @@ from flocc_agent.core.registration import Registration, RegistrationFailed, Regi
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.metrics import Look
+from flocc_agent.runtime.outbox import Outbox
 from flocc_agent.runtime.persistence import Persist, write
 from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
@@ -72,6 +73,8 @@ from flocc_protocol.messages import (
     RECORDS_BATCH_MAX,
     Envelope,
     Message,
+    RecordBatch,
+    Records,
     UnknownVersion,
     decode,
     encode,
@@ -180,6 +183,7 @@ class Driver:
         self._copied: list[Persist] = []
         self._copies_due_s = self._began_s
         self._account_due_s = self._began_s + ACCOUNT_PERIOD_S
+        self._outbox = Outbox()
         self._gaps = {"sent": LongestGap(), "heard": LongestGap()}
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
@@ -318,6 +322,7 @@ class Driver:
             await self._transport.open()
             self._opened.set()
             await self._live()
+            self._send_records()
             await self._carry_out(self.robot.handle(Leaving(), self._clock_s()))
         finally:
             await self._close()
@@ -332,6 +337,7 @@ class Driver:
                 now = self._clock_s()
                 self._workers.stages.observe("inbox_wait", now - put_s)
                 await self._carry_out(self.robot.handle(event, now))
+            self._send_due_records()
             self._count_bytes()
             await self._write_copies()
             await self._sleep()
@@ -343,7 +349,8 @@ class Driver:
             return
         self._wake.clear()
         copies_due_s = self._copies_due_s if self._copied else float("inf")
-        pause_s = min(self.robot.deadline(), self._bytes_due_s, copies_due_s) - self._clock_s()
+        due_s = min(self.robot.deadline(), self._bytes_due_s, copies_due_s, self._outbox.due_s())
+        pause_s = due_s - self._clock_s()
         alarm = asyncio.get_running_loop().call_later(max(pause_s, 0.0), self._wake.set)
         try:
             await self._wake.wait()
@@ -408,6 +415,23 @@ class Driver:
         else:
             self._transport.unicast(to, kind, payload)
 
+    def _send_later(self, batch: RecordBatch) -> None:
+        """Broadcast own records, now or with those that follow."""
+        too_long = self._outbox.add(batch)
+        if too_long is not None:
+            self._send(too_long, None)
+        self._send_due_records()
+
+    def _send_due_records(self) -> None:
+        if self._outbox.due_s() <= self._clock_s():
+            self._send_records()
+
+    def _send_records(self) -> None:
+        """Broadcast own records that wait."""
+        waiting = self._outbox.take(len(self.robot.neighbours.names()), self._clock_s())
+        if waiting is not None:
+            self._send(waiting, None)
+
     # Effects
 
     async def _carry_out(self, effects: list[Effect]) -> None:
@@ -471,7 +495,10 @@ class Driver:
 
     def _do(self, effect: Effect) -> None:
         match effect:
+            case Broadcast(Records(batches=(batch,))) if batch.log == self.robot.log:
+                self._send_later(batch)
             case Broadcast(message):
+                self._send_records()
                 self._send(message, None)
             case Unicast(to, message):
                 self._send(message, to)
