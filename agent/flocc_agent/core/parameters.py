@@ -161,7 +161,7 @@ class RoundParameters:
     """Shortest time between two rounds for each keyframe of the swarm, where that is longer: a large correction costs
     everybody something."""
     timeout_s: float = 60.0
-    """A round without a result by then is given up and the next one may start."""
+    """A round without a result by then is given up and the next one may start; each in a row gets twice the time."""
     keyframes_per_round: int = 20
     """New keyframes that call for a round even without a new closure."""
     correction_keyframes_max: int = 400

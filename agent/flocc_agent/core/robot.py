@@ -208,7 +208,7 @@ class Robot:
             case LatentMissing(pair, keyframe):
                 return self._reject_lost(self.closing.on_latent_missing(pair, keyframe), keyframe, now)
             case GraphOptimised():
-                return self._on_optimised(event)
+                return self._on_optimised(event, now)
             case GraphOptimisationFailed(term, round_number, reason):
                 self.rounds.on_failed(term, round_number, now)
                 return [Report("optimisation_failed", {"term": str(term), "round": round_number, "reason": reason})]
@@ -336,8 +336,8 @@ class Robot:
         record = judged(*roles, result, self._parameters.loop_closing)
         return [*self._append(record, now), judgement_report(record, self.log)]
 
-    def _on_optimised(self, event: GraphOptimised) -> list[Effect]:
-        if not self.rounds.on_solution(event.term, event.round, event.solution):
+    def _on_optimised(self, event: GraphOptimised, now: float) -> list[Effect]:
+        if not self.rounds.on_solution(event.term, event.round, event.solution, now):
             return [Report("stale_solution", {"term": str(event.term), "round": event.round})]
         report = solution_report(event.term, event.round, event.solution)
         return [report, *self.corrections.publish(event.term, event.round, event.solution)]

@@ -22,6 +22,7 @@ class Rounds:
         self._term: Term | None = None
         self._round = 0
         self._running_until_s: float | None = None
+        self._started_s = float("-inf")
         self._next_s = float("-inf")
         self._hurried_until_s = float("-inf")
         self._started: tuple[int, int] | None = None
@@ -46,18 +47,23 @@ class Rounds:
         self._hurried_until_s = now + min(self._parameters.period_s, HURRY_MAX_S)
         self._next_s = min(self._next_s, now + HURRIED_PERIOD_S)
 
-    def on_solution(self, term: Term, round_number: int, solution: GraphSolution) -> bool:
-        """Take an answer; False for one of an earlier round or term, which counts for nothing."""
-        if not self._awaits(term, round_number):
+    def on_solution(self, term: Term, round_number: int, solution: GraphSolution, now: float) -> bool:
+        """Take an answer; False for one of an earlier round or term, which counts for nothing.
+
+        A round that was given up counts as long as no other one was started. The next one pauses for as long as this
+        one took, so that a large graph on a slow computer does not take all of it.
+        """
+        if (term, round_number) != (self._term, self._round):
             return False
         self._running_until_s = None
         self._failures = 0
+        self._next_s = max(self._next_s, now + (now - self._started_s))
         self._solution = solution
         return True
 
     def on_failed(self, term: Term, round_number: int, now: float) -> None:
         """A round without a solution: the last one stands; it is tried again, after a growing pause."""
-        if self._awaits(term, round_number):
+        if self._running_until_s is not None and (term, round_number) == (self._term, self._round):
             self._try_again(now)
 
     def tick(self, now: float) -> list[Effect]:
@@ -80,7 +86,8 @@ class Rounds:
 
     def _start(self, term: Term, now: float) -> Effect:
         self._round += 1
-        self._running_until_s = now + self._parameters.timeout_s
+        self._running_until_s = now + self._parameters.timeout_s * 2**self._failures
+        self._started_s = now
         self._next_s = now + (HURRIED_PERIOD_S if now < self._hurried_until_s else self._period_s())
         self._started = (self._assembly.revision, self._assembly.keyframes)
         return Optimise(term, self._round, self._assembly.graph(), self._solution)
@@ -103,9 +110,6 @@ class Rounds:
         revision, keyframes = self._started
         grown = self._assembly.keyframes - keyframes
         return revision != self._assembly.revision or grown >= self._parameters.keyframes_per_round
-
-    def _awaits(self, term: Term, round_number: int) -> bool:
-        return self._running_until_s is not None and (term, round_number) == (self._term, self._round)
 
 
 def solution_report(term: Term, round_number: int, solution: GraphSolution) -> Report:

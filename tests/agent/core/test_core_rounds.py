@@ -56,14 +56,14 @@ def test_nobody_optimises_who_does_not_lead() -> None:
 def test_nothing_new_calls_for_no_round() -> None:
     rounds, _ = leading()
     rounds.tick(0.0)
-    rounds.on_solution(TERM, 1, SOLUTION)
+    rounds.on_solution(TERM, 1, SOLUTION, 0.0)
     assert rounds.tick(100.0) == []
 
 
 def test_a_new_closure_calls_for_a_round_after_the_period() -> None:
     rounds, assembly = leading()
     rounds.tick(0.0)
-    rounds.on_solution(TERM, 1, SOLUTION)
+    rounds.on_solution(TERM, 1, SOLUTION, 0.0)
     add_keyframes(assembly, R2, 0, 1)
     assembly.add(NewRecord(R1, 1, closure("r1/0", "r2/0")))
     assert rounds.deadline() == PARAMETERS.period_s
@@ -73,7 +73,7 @@ def test_a_new_closure_calls_for_a_round_after_the_period() -> None:
 def test_rounds_of_a_large_swarm_follow_each_other_more_slowly() -> None:
     rounds, assembly = leading(keyframes=10_000)
     rounds.tick(0.0)
-    rounds.on_solution(TERM, 1, SOLUTION)
+    rounds.on_solution(TERM, 1, SOLUTION, 0.0)
     add_keyframes(assembly, R2, 0, 1)
     assert rounds.deadline() == 10_000 * PARAMETERS.period_per_keyframe_s > PARAMETERS.period_s
 
@@ -81,19 +81,44 @@ def test_rounds_of_a_large_swarm_follow_each_other_more_slowly() -> None:
 def test_many_new_keyframes_call_for_a_round() -> None:
     rounds, assembly = leading()
     rounds.tick(0.0)
-    rounds.on_solution(TERM, 1, SOLUTION)
+    rounds.on_solution(TERM, 1, SOLUTION, 0.0)
     add_keyframes(assembly, R1, 1, PARAMETERS.keyframes_per_round)
     assert rounds.tick(10.0) == []
     add_keyframes(assembly, R1, PARAMETERS.keyframes_per_round, PARAMETERS.keyframes_per_round + 1)
     assert started(rounds.tick(10.0)) == [2]
 
 
-def test_a_late_solution_counts_for_nothing() -> None:
+def test_a_solution_of_another_term_or_of_an_earlier_round_counts_for_nothing() -> None:
     rounds, _ = leading()
     rounds.tick(0.0)
-    assert not rounds.on_solution(Term(9, R2), 1, SOLUTION)
+    assert not rounds.on_solution(Term(9, R2), 1, SOLUTION, 0.0)
     rounds.tick(PARAMETERS.timeout_s)
-    assert not rounds.on_solution(TERM, 1, SOLUTION)
+    assert started(rounds.tick(rounds.deadline())) == [2]
+    assert not rounds.on_solution(TERM, 1, SOLUTION, PARAMETERS.timeout_s)
+
+
+def test_a_solution_that_comes_after_its_round_was_given_up_counts_until_the_next_starts() -> None:
+    rounds, _ = leading()
+    rounds.tick(0.0)
+    rounds.tick(PARAMETERS.timeout_s)
+    assert rounds.on_solution(TERM, 1, SOLUTION, PARAMETERS.timeout_s + 0.1)
+
+
+def test_a_round_that_is_given_up_is_followed_by_one_with_twice_the_time() -> None:
+    rounds, _ = leading()
+    rounds.tick(0.0)
+    rounds.tick(rounds.deadline())
+    again_s = rounds.deadline()
+    assert started(rounds.tick(again_s)) == [2]
+    assert rounds.deadline() == again_s + 2 * PARAMETERS.timeout_s
+
+
+def test_the_next_round_pauses_as_long_as_the_last_one_took() -> None:
+    rounds, assembly = leading()
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, SOLUTION, 20.0)
+    add_keyframes(assembly, R2, 0, 1)
+    assert rounds.deadline() == 40.0
 
 
 def test_a_round_that_gives_no_answer_is_given_up_and_tried_again() -> None:
