@@ -16,6 +16,8 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 POINT_BYTES, HALF_POINT_BYTES = 8, 4
+RANK_RATIO = 1e-6
+"""Directions in which samples spread less than this part of their greatest spread are rounding, not data."""
 RootSift = NDArray[np.uint8]
 
 
@@ -25,7 +27,7 @@ class Basis:
 
     Attributes:
         mean: (D,) of the training data.
-        directions: (D, D) rows of unit length, by falling variance.
+        directions: (K, D) rows of unit length, by falling variance; N samples have at most N - 1.
     """
 
     mean: Float
@@ -36,8 +38,8 @@ class Basis:
         """Learn from (N, D) samples."""
         data = np.asarray(samples, dtype=np.float64)
         mean = data.mean(axis=0)
-        _, vectors = np.linalg.eigh(np.cov(data, rowvar=False))
-        return cls(mean, np.asarray(vectors.T[::-1]))
+        _, spread, directions = np.linalg.svd(data - mean, full_matrices=False)
+        return cls(mean, np.asarray(directions[spread > RANK_RATIO * spread[0]]))
 
     def reduce(self, values: NDArray[np.generic], size: int) -> Float:
         """Coordinates (N, size) of (N, D) values."""
@@ -60,9 +62,12 @@ def unit(values: NDArray[np.generic]) -> Float:
 
 
 def reduced_descriptors(descriptors: Float32, basis: Basis) -> dict[str, tuple[int, Float]]:
-    """Forms of descriptors (N, D) of unit length: name -> bytes of one, and (N, D or fewer) to compare by cosine."""
+    """Forms of descriptors (N, D) of unit length: name -> bytes of one, and (N, D or fewer) to compare by cosine.
+
+    A form is left out where the basis was learned on too few samples to have so many directions.
+    """
     dimension = descriptors.shape[1]
-    sizes = [size for size in (256, 128, 64, 32) if size < dimension]
+    sizes = [size for size in (256, 128, 64, 32) if size < dimension and size <= len(basis.directions)]
     return {
         "fp32": (4 * dimension, unit(descriptors)),
         "fp16": (2 * dimension, unit(descriptors.astype(np.float16))),

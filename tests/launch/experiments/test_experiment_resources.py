@@ -24,8 +24,15 @@ def test_a_basis_restores_what_lies_in_its_first_directions() -> None:
     assert not np.allclose(basis.restore(basis.reduce(data, 4)), data, atol=0.1)
 
 
+def test_a_basis_has_no_more_directions_than_its_samples_tell() -> None:
+    descriptors = unit(flat_data(count=50, dimension=128, rank=90)).astype(np.float32)
+    basis = Basis.of(descriptors.astype(np.float64))
+    assert len(basis.directions) == 49
+    assert [name for name in reduced_descriptors(descriptors, basis) if name.startswith("pca")] == ["pca-32 int8"]
+
+
 def test_reduced_descriptors_say_how_many_bytes_travel_and_keep_unit_length() -> None:
-    descriptors = unit(flat_data(dimension=128)).astype(np.float32)
+    descriptors = unit(flat_data(count=100, dimension=128, rank=90)).astype(np.float32)
     forms = reduced_descriptors(descriptors, Basis.of(descriptors))
     assert {name: size for name, (size, _) in forms.items()} == {
         "fp32": 512, "fp16": 256, "int8": 128, "pca-64 int8": 64, "pca-32 int8": 32,
