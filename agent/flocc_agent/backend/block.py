@@ -1,9 +1,9 @@
-"""One iteration of a robot's block in a distributed optimisation: extend, align, weigh, descend, extrapolate.
+"""One iteration of a robot's block in a distributed optimisation: extend, align, weigh, descend.
 
-All robots may iterate at the same time: a step goes half of the way to the block's minimum, because the whole
-quadratic form is at most twice the sum of the blocks' own ones (`|a - b|^2 <= 2 |a|^2 + 2 |b|^2` on every edge).
-Nesterov's extrapolation makes up for it and starts anew where it points uphill. Closures' robust weights are decided
-by graduated non-convexity (Yang 2020), each by the lower of its two robots. Scales are constants: those of Eq. (6).
+All robots may iterate at the same time. The separators of robots that share closures move with the block, as these
+said that they hang together (`condensed.py`), and are held where they were heard, in cycles, from little to much.
+Closures' robust weights are decided by graduated non-convexity (Yang 2020), each by
+the lower of its two robots. Scales are constants: those of Eq. (6).
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,14 +39,11 @@ REST_ITERATIONS = 20
 FIRST_STEPS = 30
 STEPS = 2
 INNER_STEPS = 20
-TOGETHER_RATIO = 1.0
-HOLD_FALL = 0.8
-HOLD_RISE = 2.0
-HOLD_TOLERANCE = 2.0
-HOLD_PATIENCE = 1.1
+HOLD_STEP = 10.0
+"""Between two iterations of a cycle that ends with separators held, where they were said, as much as odometry holds."""
+HOLD_FALL = 2.0
 HOLD_MIN = 1e-5
-HOLD_MAX = 10.0
-MOMENTUM_MAX = 0.995
+"""The least, relative to odometry, with which a cycle begins."""
 TILT = 1e-3
 CLOSURES_MAX = 32
 """Blocks whose closures are kept as arrays."""
@@ -101,37 +98,50 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
             problem = replace(problem, others=problem.align_to, around=(), anchored=False, align_to={})
     n = len(state.X)
     near = surroundings(n, _movable(problem, config.rank), problem.condensed, config.rank)
-    X_all = np.concatenate([state.X, near.X])
+    X_heard = np.concatenate([state.X, near.X])
     measured = _measured(config, problem, near.index)
-    state = _weighed(config, problem, measured, state, X_all)
+    state = _weighed(config, problem, measured, state, X_heard)
     weights = _weights_of(config, problem, measured, state)
     closures, odometry = _weighted(measured, weights), _odometry(config, problem)
-    separators = _separators(problem, n)
     concerned = rbcd.joined([closures.chosen(closures.touching(n)), odometry])
-    held = holds(np.concatenate([separators, np.arange(n, len(X_all))]), X_all, state.hold * _typical(odometry))
-    together = bool(np.any((weights > 0) & measured.links.touching(n) & ~measured.links.within(n)))
-    parts = [closures, odometry, near.links, *([held] if together else [])]
-    block = Block(len(X_all), rbcd.joined(parts))
-    descended = rbcd.descend(block, X_all, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
+    within = rbcd.joined([closures.chosen(closures.within(n)), odometry])
+    separators, parts = _separators(problem, n), [closures, odometry, near.links]
+    together = len(concerned.i) > len(within.i)
+    hold = min(state.hold * HOLD_STEP**state.age, 1.0)
     if together:
-        state = _with_hold(state, block.cost(X_all) - descended.cost)
+        held = np.concatenate([separators, np.arange(n, len(X_heard))])
+        parts.append(holds(held, X_heard, hold * _typical(odometry)))
+    block = Block(len(X_heard), rbcd.joined(parts))
+    descended = rbcd.descend(block, X_heard, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
     X = descended.X[:n]
+    since = state.X if state.age == 0 else state.X_before
     if together:
-        X = rbcd.retracted(state.X, TOGETHER_RATIO * (X - state.X))
-    next_state = _extrapolated(state, X, together)
-    inner = rbcd.joined([closures.chosen(closures.within(n)), odometry])
+        state = _with_hold(state, hold, block.cost(X_heard) - descended.cost)
     return BlockStep(
-        state=next_state,
+        state=replace(state, X=X, X_before=since, in_stage=state.in_stage + 1),
         T_map_keyframe=rbcd.rounded(X, _origin(problem, X, aligned)),
-        origin=_origin(problem, next_state.X, aligned),
-        moved=float(np.abs(X - state.X_before).max()),
-        cost=_cost(concerned, np.concatenate([X, near.X])),
+        origin=_origin(problem, X, aligned),
+        moved=float(np.abs(X - since).max()),
+        cost=0.5 * float(np.sum(concerned.residuals(np.concatenate([X, near.X])))),
         aligned=aligned,
         finished=state.control is None and not state.has_unjudged,
         rejected=sum(weight == 0.0 for weight in state.weights.values()),
         separators=tuple(separators.tolist()),
-        condensed=condensed(problem.log, separators.tolist(), odometry, inner, next_state.X),
+        condensed=condensed(problem.log, separators.tolist(), odometry, within, X),
     )
+
+
+def _with_hold(state: BlockState, hold: float, decrease: float) -> BlockState:
+    """Hold more; after the most, begin again with less than the last time, or more where there was more to lower.
+
+    Held little, long bends of several robots go in one iteration, and what is short may be shaken; held more, that is
+    damped: the levels of a multigrid cycle.
+    """
+    if hold < 1.0:
+        return replace(state, age=state.age + 1)
+    has_diverged = decrease > state.decrease
+    least = min(state.hold * HOLD_STEP, 1.0) if has_diverged else max(state.hold / HOLD_FALL, HOLD_MIN)
+    return replace(state, age=0, hold=least, decrease=decrease)
 
 
 def _origin(problem: BlockProblem, X: Float, aligned: bool) -> Float:
@@ -286,7 +296,7 @@ def _weighed(
         control = initial_control(Solver.GNC_TLS, squared, bound, config.gnc_start_ratio)
         begun = _decided(state, pairs, gnc_weights(Solver.GNC_TLS, squared, bound, control), control)
         return replace(begun, epoch=epoch, has_unjudged=False)
-    if state.in_stage < STAGE_ITERATIONS or len(usable) == 0:
+    if state.in_stage < STAGE_ITERATIONS or state.age > 0 or len(usable) == 0:
         return state
     if state.control is None:
         before = np.array([state.weights[pair] for pair in pairs])
@@ -348,18 +358,6 @@ def _typical(links: Links) -> Float:
     return np.median(links.weight, axis=0) if len(links.i) else np.eye(4)
 
 
-def _with_hold(state: BlockState, decrease: float) -> BlockState:
-    """Hold separators less while iterations find less and less to lower, more as soon as they find more."""
-    reference = min(HOLD_PATIENCE * state.decrease, decrease)
-    hold = state.hold * (HOLD_RISE if decrease > HOLD_TOLERANCE * reference else HOLD_FALL)
-    return replace(state, hold=min(max(hold, HOLD_MIN), HOLD_MAX), decrease=reference)
-
-
-def _cost(links: Links, X: Float) -> float:
-    """Half the sum of squared residuals."""
-    return 0.5 * float(np.sum(links.residuals(X)))
-
-
 def _separators(problem: BlockProblem, poses: int) -> Int:
     """Indices of own keyframes at the ends of closures with other robots."""
     ends = [end for c in problem.closures if c.query.log != c.match.log for end in (c.query, c.match)]
@@ -374,11 +372,3 @@ def _movable(problem: BlockProblem, rank: int) -> dict[KeyframeId, Float]:
     ends = [(near, far) for c in problem.around for near, far in ((c.query, c.match), (c.match, c.query))]
     blind = {near.log for near, far in ends if near not in heard or far not in heard}
     return {keyframe: X for keyframe, X in heard.items() if keyframe.log in joined - blind}
-
-
-def _extrapolated(state: BlockState, X: Float, together: bool) -> BlockState:
-    """Nesterov's extrapolation; where it points back (O'Donoghue 2015), and alone, it starts anew."""
-    step = X - state.X_before
-    age = 0 if not together or np.sum((state.X - X) * step) > 0 else state.age
-    momentum = min(age / (age + 3.0), MOMENTUM_MAX)
-    return replace(state, X=rbcd.retracted(X, momentum * step), X_before=X, age=age + 1, in_stage=state.in_stage + 1)
