@@ -2,12 +2,13 @@
 
 Threads run what releases the interpreter lock or is plain Python (OpenCV, torch); a process of its own runs what holds
 the lock for long (GTSAM). The process is started at its first task, ends when it has been idle for a while, when it is
-no longer needed, and when its parent dies in whatever way, because its input then ends. Every queue is bounded.
+no longer needed, and when its parent dies in whatever way. Every queue is bounded.
 
 This is the only module that catches `Exception`: the failure of a task is logged with its traceback and returned.
 """
 
 import asyncio
+import ctypes
 import logging
 import os
 import pickle
@@ -32,6 +33,8 @@ PROCESS_KINDS = frozenset({"optimise"})
 LENGTH = struct.Struct(">Q")
 NICENESS = 5
 STOP_TIMEOUT_S = 2.0
+PR_SET_PDEATHSIG = 1
+"""prctl(2): the signal that this process gets when its parent dies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,6 +261,7 @@ def _failed(kind: str, error: Exception) -> WorkFailed:
 def serve() -> None:
     """Be a worker process: tasks on standard input, results on what was standard output, until the input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_the_agent()
     os.nice(NICENESS)
     requests = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
@@ -272,6 +276,12 @@ def serve() -> None:
             answers.flush()
         except BrokenPipeError:
             os._exit(0)
+
+
+def _end_with_the_agent() -> None:
+    """Where the kernel can, end in the middle of a task when the agent was killed: an optimisation takes minutes."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _frame(requests: BinaryIO) -> bytes | None:

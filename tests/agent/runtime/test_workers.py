@@ -150,14 +150,19 @@ from flocc_agent.runtime.workers import Workers
 from tests.agent.runtime import work
 async def main():
     workers = Workers()
-    print((await workers.run("optimise", work.process_id)).value, flush=True)
+    process_id = (await workers.run("optimise", work.process_id)).value
+    task = asyncio.create_task(workers.run("optimise", work.BUSY_OR_IDLE))
+    await asyncio.sleep(0.1)
+    print(process_id, flush=True)
     await asyncio.sleep(60)
 asyncio.run(main())
 """
 
 
-async def test_the_process_of_a_killed_agent_ends_too() -> None:
-    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
+@pytest.mark.parametrize("task", ["process_id", "wait_for_ever"])
+async def test_the_process_of_a_killed_agent_ends_too(task: str) -> None:
+    program = PARENT.replace("BUSY_OR_IDLE", task)
+    parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     os.kill(parent.pid, signal.SIGKILL)
