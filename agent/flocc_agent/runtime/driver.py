@@ -237,8 +237,9 @@ class Driver:
         return corrected_bodies(self.robot, self._reporter.T_body_camera)
 
     def busy(self) -> bool:
-        """Whether images, fetches, registrations or rounds are under way."""
-        return bool(self._inbox or self._images or self._tasks or self.robot.closing.load)
+        """Whether images, fetches, registrations or rounds are under way, or a leader still owes a round."""
+        owes_round = self.robot.rounds.deadline() < float("inf")
+        return bool(self._inbox or self._images or self._tasks or self.robot.closing.load or owes_round)
 
     def status(self) -> dict[str, Any]:
         """What this robot does now: leader, neighbours, sizes, map frame, bytes, refusals."""
