@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.block import isotropic_weights, iterate_block
-from flocc_agent.backend.rbcd import diagonal_weights, lifted, squared_residuals
+from flocc_agent.backend.rbcd import lifted, squared_residuals
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.blocks import BlockStep
 from flocc_agent.core.distributed_optimisation import DistributedOptimisation
@@ -235,4 +235,4 @@ def graph_cost(graph: PoseGraph, T_map_keyframe: Mapping[LogId, Float]) -> float
 
 
 def _cost(T_i: Float, T_j: Float, T: Float, kappa: Float, tau: Float) -> float:
-    return float(np.sum(squared_residuals(lifted(T_i, 3), lifted(T_j, 3), T, diagonal_weights(kappa, tau))))
+    return float(np.sum(squared_residuals(lifted(T_i, 3), lifted(T_j, 3), T, kappa, tau)))

@@ -43,8 +43,7 @@ MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
 WANTS_MAX = 16
 OFFERS_MAX = 64
-SEPARATORS_MAX = 128
-STIFFNESS_TOLERANCE = 1e-9
+SEPARATORS_MAX = 200
 RANK_MIN, RANK_MAX = 3, 5
 RECORDS_BATCH_MAX = 64
 BATCHES_MAX = 64
@@ -358,10 +357,6 @@ class Separators:
         keyframes: Numbers of the keyframes in the sender's log.
         poses: (N, 4, r) float64: three rows of a 3-frame in r dimensions (a relaxed rotation, transposed), then the
             position, metres.
-        transforms: (N, 4, 4) float64: what the sender's own measurements between each keyframe and the one before it
-            in the list come to: they pull `X_k` to `transform @ X_(k-1)`, condensed odometry in the sense of
-            Grisetti 2012. The first row says nothing.
-        stiffness: (N, 4, 4) float64: how strongly, a symmetric weight of that difference's rows; zero in the first.
         pairs: Closures between two robots whose robust weight is the sender's to decide.
         weights: (M,) float32 in [0, 1], one per pair.
     """
@@ -373,8 +368,6 @@ class Separators:
     origin_iteration: int
     keyframes: tuple[int, ...]
     poses: Array
-    transforms: Array
-    stiffness: Array
     pairs: tuple[CandidatePair, ...]
     weights: Array
 
@@ -390,7 +383,6 @@ class Separators:
             raise ValueError(f"separators have one float32 weight per pair, at most {OFFERS_MAX}")
         _check_lifted(self.poses.numpy())
         _check_lifted(self.origin.numpy()[None])
-        _check_condensed(self)
         if np.any((self.weights.numpy() < 0.0) | (self.weights.numpy() > 1.0)):
             raise ValueError("a robust weight lies in [0, 1]")
 
@@ -431,21 +423,6 @@ def _check_lifted(poses: NDArray[np.float64]) -> None:
     gram = frames @ np.swapaxes(frames, 1, 2)
     if np.any(np.abs(gram - np.eye(3)) > QUATERNION_NORM_TOLERANCE) or np.any(np.abs(poses[:, 3]) > COORDINATE_MAX):
         raise ValueError("separators lie within the map and have orthonormal frames")
-
-
-def _check_condensed(separators: Separators) -> None:
-    """Refuse transforms that leave the map and stiffness that pushes away."""
-    transforms, stiffness, shape = separators.transforms, separators.stiffness, (len(separators.keyframes), 4, 4)
-    if (transforms.dtype, transforms.shape) != ("f8", shape) or (stiffness.dtype, stiffness.shape) != ("f8", shape):
-        raise ValueError("separators have (N, 4, 4) float64 transforms and stiffness, one per keyframe")
-    if np.any(np.abs(transforms.numpy()) > COORDINATE_MAX):
-        raise ValueError("transforms between separators stay within the map")
-    weights = stiffness.numpy()
-    largest = np.abs(weights).max(axis=(1, 2), initial=0.0)
-    if np.any(weights != np.swapaxes(weights, 1, 2)) or np.any(
-        np.linalg.eigvalsh(weights).min(axis=1, initial=0.0) < -STIFFNESS_TOLERANCE * largest
-    ):
-        raise ValueError("stiffness between separators is symmetric and not negative")
 
 
 _BEAT = integer(0, COUNTER_MAX)
@@ -603,8 +580,6 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
             origin_iteration=COUNT,
             keyframes=sequence(COUNT, SEPARATORS_MAX),
             poses=ARRAY,
-            transforms=ARRAY,
-            stiffness=ARRAY,
             pairs=sequence(_PAIR, OFFERS_MAX),
             weights=ARRAY,
         ),

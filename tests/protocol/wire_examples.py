@@ -72,13 +72,6 @@ def lifted_array(count: int, rank: int = 3) -> Array:
     return Array.of(poses, "f8")
 
 
-def condensed_arrays(count: int) -> tuple[Array, Array]:
-    """(count, 4, 4) float64 transforms and stiffness; exact in binary."""
-    stiffness = np.repeat(np.diag([4.0, 4.0, 4.0, 2.0])[None], count, axis=0)
-    stiffness[:1] = 0.0
-    return Array.of(np.repeat(np.eye(4)[None], count, axis=0), "f8"), Array.of(stiffness, "f8")
-
-
 def lifted_origin(rank: int = 3) -> Array:
     """(4, rank) float64: the identity."""
     return Array.of(np.eye(4, rank), "f8")
@@ -145,7 +138,6 @@ MESSAGES: tuple[Message, ...] = (
         16,
         (3, 8),
         lifted_array(2),
-        *condensed_arrays(2),
         (CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),),
         Array.of(np.array([0.25])),
     ),
@@ -222,7 +214,6 @@ def largest_messages() -> list[Message]:
             INDEX_MAX,
             (INDEX_MAX,) * SEPARATORS_MAX,
             lifted_array(SEPARATORS_MAX, RANK_MAX),
-            *condensed_arrays(SEPARATORS_MAX),
             (CandidatePair(keyframe, other),) * OFFERS_MAX,
             Array.of(np.ones(OFFERS_MAX)),
         ),
@@ -356,7 +347,6 @@ messages: st.SearchStrategy[Message] = st.one_of(
             n,
             tuple(range(n)),
             lifted_array(n, rank),
-            *condensed_arrays(n),
             (),
             Array.of(np.zeros(0)),
         ),

@@ -1,9 +1,9 @@
-"""One iteration of a robot's block in a distributed optimisation: extend, align, weigh, descend.
+"""One iteration of a robot's block in a distributed optimisation: extend, align, weigh, descend, extrapolate.
 
-All robots may iterate at the same time. The separators of robots that share closures move with the block, as these
-said that they hang together (`condensed.py`), and are held where they were heard, in cycles, from little to much.
-Closures' robust weights are decided by graduated non-convexity (Yang 2020), each by
-the lower of its two robots. Scales are constants: those of Eq. (6).
+All robots may iterate at the same time: a step goes half of the way to the block's minimum, because the whole
+quadratic form is at most twice the sum of the blocks' own ones (`|a - b|^2 <= 2 |a|^2 + 2 |b|^2` on every edge).
+Nesterov's extrapolation makes up for it and starts anew where it points uphill. Closures' robust weights are decided
+by graduated non-convexity (Yang 2020), each by the lower of its two robots. Scales are constants: those of Eq. (6).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,6 @@ from scipy.special import chdtri
 
 from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
-from flocc_agent.backend.condensed import condensed, holds, surroundings
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
 from flocc_agent.backend.rbcd import Block, Links
 from flocc_agent.backend.screening import first_not_rigid
@@ -39,11 +38,8 @@ REST_ITERATIONS = 20
 FIRST_STEPS = 30
 STEPS = 2
 INNER_STEPS = 20
-HOLD_STEP = 10.0
-"""Between two iterations of a cycle that ends with separators held, where they were said, as much as odometry holds."""
-HOLD_FALL = 2.0
-HOLD_MIN = 1e-5
-"""The least, relative to odometry, with which a cycle begins."""
+TOGETHER_RATIO = 0.5
+MOMENTUM_MAX = 0.995
 TILT = 1e-3
 CLOSURES_MAX = 32
 """Blocks whose closures are kept as arrays."""
@@ -57,15 +53,31 @@ class Measured:
 
     Attributes:
         pairs: The pair of keyframes of each closure.
-        links: Query, match and measurement of each, without robust weights.
-        known: (E,) both ends have a pose in this frame, one of them moves, and the covariance is one.
+        i: (E,) index of its query in the block, -1 where it is another robot's.
+        j: (E,) the same of its match.
+        T: (E, 4, 4) metric measurement.
+        kappa: (E,) rotation weight.
+        tau: (E,) translation weight.
+        fixed: (E, 4, r) the other robot's pose, zero where there is none.
+        known: (E,) both ends have a pose in this frame, and the covariance is one.
         own: (E,) its robust weight is this robot's to decide.
     """
 
     pairs: tuple[CandidatePair, ...]
-    links: Links
+    i: Int
+    j: Int
+    T: Float
+    kappa: Float
+    tau: Float
+    fixed: Float
     known: NDArray[np.bool_]
     own: NDArray[np.bool_]
+
+    def residuals(self, X: Float) -> Float:
+        """Squared residuals (E,) without robust weights."""
+        X_i = np.where((self.i >= 0)[:, None, None], X[np.maximum(self.i, 0)], self.fixed)
+        X_j = np.where((self.j >= 0)[:, None, None], X[np.maximum(self.j, 0)], self.fixed)
+        return rbcd.squared_residuals(X_i, X_j, self.T, self.kappa, self.tau)
 
 
 def iterate_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | OptimisationFailed:
@@ -95,53 +107,24 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
         moved = _aligned(config, problem, state)
         if moved is not None:
             state, aligned = moved, True
-            problem = replace(problem, others=problem.align_to, around=(), anchored=False, align_to={})
-    n = len(state.X)
-    near = surroundings(n, _movable(problem, config.rank), problem.condensed, config.rank)
-    X_heard = np.concatenate([state.X, near.X])
-    measured = _measured(config, problem, near.index)
-    state = _weighed(config, problem, measured, state, X_heard)
+            problem = replace(problem, others=problem.align_to, anchored=False, align_to={})
+    measured = _measured(config, problem, state.X.shape[2])
+    state = _weighed(config, problem, measured, state)
     weights = _weights_of(config, problem, measured, state)
-    closures, odometry = _weighted(measured, weights), _odometry(config, problem)
-    concerned = rbcd.joined([closures.chosen(closures.touching(n)), odometry])
-    within = rbcd.joined([closures.chosen(closures.within(n)), odometry])
-    separators, parts = _separators(problem, n), [closures, odometry, near.links]
-    together = len(concerned.i) > len(within.i)
-    hold = min(state.hold * HOLD_STEP**state.age, 1.0)
+    links = _links(config, problem, measured, weights)
+    block = Block(len(state.X), links)
+    descended = rbcd.descend(block, state.X, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
+    together = bool(np.any((weights > 0) & ((measured.i < 0) | (measured.j < 0))))
+    X = descended.X
     if together:
-        held = np.concatenate([separators, np.arange(n, len(X_heard))])
-        parts.append(holds(held, X_heard, hold * _typical(odometry)))
-    block = Block(len(X_heard), rbcd.joined(parts))
-    descended = rbcd.descend(block, X_heard, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
-    X = descended.X[:n]
-    since = state.X if state.age == 0 else state.X_before
-    if together:
-        state = _with_hold(state, hold, block.cost(X_heard) - descended.cost)
-    return BlockStep(
-        state=replace(state, X=X, X_before=since, in_stage=state.in_stage + 1),
-        T_map_keyframe=rbcd.rounded(X, _origin(problem, X, aligned)),
-        origin=_origin(problem, X, aligned),
-        moved=float(np.abs(X - since).max()),
-        cost=0.5 * float(np.sum(concerned.residuals(np.concatenate([X, near.X])))),
-        aligned=aligned,
-        finished=state.control is None and not state.has_unjudged,
-        rejected=sum(weight == 0.0 for weight in state.weights.values()),
-        separators=tuple(separators.tolist()),
-        condensed=condensed(problem.log, separators.tolist(), odometry, within, X),
-    )
-
-
-def _with_hold(state: BlockState, hold: float, decrease: float) -> BlockState:
-    """Hold more; after the most, begin again with less than the last time, or more where there was more to lower.
-
-    Held little, long bends of several robots go in one iteration, and what is short may be shaken; held more, that is
-    damped: the levels of a multigrid cycle.
-    """
-    if hold < 1.0:
-        return replace(state, age=state.age + 1)
-    has_diverged = decrease > state.decrease
-    least = min(state.hold * HOLD_STEP, 1.0) if has_diverged else max(state.hold / HOLD_FALL, HOLD_MIN)
-    return replace(state, age=0, hold=least, decrease=decrease)
+        X = rbcd.retracted(state.X, TOGETHER_RATIO * (descended.X - state.X))
+    moved_most = float(np.abs(X - state.X_before).max())
+    decided = sum(weight == 0.0 for weight in state.weights.values())
+    next_state = _extrapolated(state, X, together)
+    finished = state.control is None and not state.has_unjudged
+    origin = _origin(problem, next_state.X, aligned)
+    T_map_keyframe = rbcd.rounded(X, _origin(problem, X, aligned))
+    return BlockStep(next_state, T_map_keyframe, origin, moved_most, descended.cost, aligned, finished, decided)
 
 
 def _origin(problem: BlockProblem, X: Float, aligned: bool) -> Float:
@@ -158,9 +141,10 @@ def _first_state(config: BackendConfig, problem: BlockProblem) -> BlockState:
     state = BlockState(X, X)
     if not own:
         return state
-    measured = _measured(config, replace(problem, closures=own, around=()), {})
-    weights = measured.known.astype(float) if config.solver is Solver.LM else np.zeros(len(own))
-    block = Block(len(X), rbcd.joined([_weighted(measured, weights), _odometry(config, problem)]))
+    alone = replace(problem, closures=own, others={}, align_to={})
+    measured = _measured(config, alone, config.rank)
+    weights = np.ones(len(own)) if config.solver is Solver.LM else np.zeros(len(own))
+    block = Block(len(X), _links(config, alone, measured, weights))
     X = rbcd.descend(block, X, FIRST_STEPS, INNER_STEPS, config.relative_tolerance).X
     return BlockState(X, X)
 
@@ -220,21 +204,17 @@ def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopC
     )  # fmt: skip
 
 
-def _measured(config: BackendConfig, problem: BlockProblem, movable: Mapping[KeyframeId, int]) -> Measured:
-    """Closures as arrays, with the poses of others as last heard; some of those move with the block."""
-    closures, log = (*problem.closures, *problem.around), problem.log
+def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measured:
+    """The block's closures as arrays, with the poses of others as last heard."""
+    closures, log = problem.closures, problem.log
     alone = _without_others(config, closures, log)
-    i, j, known = alone.links.i.copy(), alone.links.j.copy(), alone.known.copy()
-    fixed = alone.links.fixed.copy()
+    fixed, known = np.zeros((len(closures), 4, rank)), alone.known.copy()
     for k, closure in enumerate(closures):
-        for end, index in ((closure.query, i), (closure.match, j)):
+        for end in (closure.query, closure.match):
             if end.log != log:
-                index[k] = movable.get(end, -1)
-                known[k] &= _usable(problem.others, end, config.rank)
-                if index[k] < 0 and known[k]:
-                    fixed[k] = problem.others[end]
-    known &= (i >= 0) | (j >= 0)
-    return replace(alone, links=replace(alone.links, i=i, j=j, fixed=fixed), known=known)
+                known[k] &= _usable(problem.others, end, rank)
+                fixed[k] = problem.others[end] if known[k] else 0.0
+    return replace(alone, fixed=fixed, known=known)
 
 
 @lru_cache(maxsize=CLOSURES_MAX)
@@ -250,8 +230,7 @@ def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], lo
     j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
     own = np.array([decides(c) == log for c in closures], dtype=bool)
     pairs = tuple(CandidatePair.of(c.query, c.match) for c in closures)
-    links = Links(i, j, T, rbcd.diagonal_weights(kappa, tau), np.zeros((E, 4, config.rank)))
-    return Measured(pairs, links, known, own)
+    return Measured(pairs, i, j, T, kappa, tau, np.zeros((E, 4, config.rank)), known, own)
 
 
 def _usable(others: Mapping[KeyframeId, Float], keyframe: KeyframeId, rank: int) -> bool:
@@ -273,9 +252,7 @@ def isotropic_weights(covariances: Float) -> tuple[Float, Float]:
     return 1.5 / np.trace(rotation, axis1=1, axis2=2), 3.0 / np.trace(translation, axis1=1, axis2=2)
 
 
-def _weighed(
-    config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState, X: Float
-) -> BlockState:
+def _weighed(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> BlockState:
     """Decide robust weights that are this robot's: at once for new closures, the others once per stage.
 
     A new closure that does not agree waits until the weights have been final for a while; then all robots of the
@@ -285,7 +262,7 @@ def _weighed(
         return state
     usable = np.flatnonzero(measured.own & measured.known)
     bound = np.full(len(usable), float(chdtri(6.0, 1.0 - config.inlier_probability)))
-    squared = measured.links.residuals(X)[usable]
+    squared = measured.residuals(state.X)[usable]
     pairs = [measured.pairs[k] for k in usable]
     state = _with_new(state, pairs, squared <= bound)
     waited = state.control is None and state.in_stage >= REST_ITERATIONS
@@ -296,7 +273,7 @@ def _weighed(
         control = initial_control(Solver.GNC_TLS, squared, bound, config.gnc_start_ratio)
         begun = _decided(state, pairs, gnc_weights(Solver.GNC_TLS, squared, bound, control), control)
         return replace(begun, epoch=epoch, has_unjudged=False)
-    if state.in_stage < STAGE_ITERATIONS or state.age > 0 or len(usable) == 0:
+    if state.in_stage < STAGE_ITERATIONS or len(usable) == 0:
         return state
     if state.control is None:
         before = np.array([state.weights[pair] for pair in pairs])
@@ -333,42 +310,30 @@ def _weights_of(config: BackendConfig, problem: BlockProblem, measured: Measured
     return np.where(measured.known, weights, 0.0)
 
 
-def _weighted(measured: Measured, weights: Float) -> Links:
-    """Closures with their robust weights, of those that have one."""
-    links = replace(measured.links, weight=weights[:, None, None] * measured.links.weight)
-    return links.chosen(weights > 0)
-
-
-def _odometry(config: BackendConfig, problem: BlockProblem) -> Links:
-    """Odometry, an edge per keyframe but the first."""
+def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, weights: Float) -> Links:
+    """Closures with weight, then odometry, then what holds the anchor's first keyframe."""
     T_odom = np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)
-    n = len(T_odom)
+    n, rank = len(T_odom), measured.fixed.shape[2]
+    used = weights > 0
     covariances = problem.trajectory.edge_covariances
     if covariances is None:
         one = diagonal_covariance(config.odometry_rotation_sigma_rad, config.odometry_translation_sigma_m)
         covariances = np.broadcast_to(one, (n - 1, 6, 6))
-    weight = rbcd.diagonal_weights(*isotropic_weights(np.asarray(covariances, dtype=float)))
+    kappa, tau = isotropic_weights(np.asarray(covariances, dtype=float))
     before = np.arange(n - 1)
-    fixed = np.zeros((n - 1, 4, config.rank))
-    return Links(before, before + 1, inverse(T_odom[:-1]) @ T_odom[1:], weight, fixed)
+    i, j, T = (
+        [measured.i[used], before],
+        [measured.j[used], before + 1],
+        [measured.T[used], inverse(T_odom[:-1]) @ T_odom[1:]],
+    )
+    kappas, taus = [(weights * measured.kappa)[used], kappa], [(weights * measured.tau)[used], tau]
+    fixed = [measured.fixed[used], np.zeros((n - 1, 4, rank))]
+    return Links(*(np.concatenate(part) for part in (i, j, T, kappas, taus, fixed)))
 
 
-def _typical(links: Links) -> Float:
-    """A weight (4, 4) like those of most edges."""
-    return np.median(links.weight, axis=0) if len(links.i) else np.eye(4)
-
-
-def _separators(problem: BlockProblem, poses: int) -> Int:
-    """Indices of own keyframes at the ends of closures with other robots."""
-    ends = [end for c in problem.closures if c.query.log != c.match.log for end in (c.query, c.match)]
-    found = {end.index for end in ends if end.log == problem.log and end.index < poses}
-    return np.array(sorted(found), dtype=np.int64)
-
-
-def _movable(problem: BlockProblem, rank: int) -> dict[KeyframeId, Float]:
-    """Heard separators of robots that share closures with this one, where all that pulls at these is known."""
-    heard = {keyframe: X for keyframe, X in problem.others.items() if X.shape == (4, rank)}
-    joined = {end.log for c in problem.closures for end in (c.query, c.match)} - {problem.log}
-    ends = [(near, far) for c in problem.around for near, far in ((c.query, c.match), (c.match, c.query))]
-    blind = {near.log for near, far in ends if near not in heard or far not in heard}
-    return {keyframe: X for keyframe, X in heard.items() if keyframe.log in joined - blind}
+def _extrapolated(state: BlockState, X: Float, together: bool) -> BlockState:
+    """Nesterov's extrapolation; where it points back (O'Donoghue 2015), and alone, it starts anew."""
+    step = X - state.X_before
+    age = 0 if not together or np.sum((state.X - X) * step) > 0 else state.age
+    momentum = min(age / (age + 3.0), MOMENTUM_MAX)
+    return replace(state, X=rbcd.retracted(X, momentum * step), X_before=X, age=age + 1, in_stage=state.in_stage + 1)

@@ -9,18 +9,19 @@ conjugate gradients, preconditioned with the block's own sparse factorised quadr
 Arrays hold transposed poses, (n, 4, r): three rows of Y^T, then p^T. Scales are constants here: RBCD knows none.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 REGULARISATION_RATIO = 1e-9
+FACTORS_MAX = 32
 RADIUS_FACTOR = 2.0
 GRADIENT_RATIO = 0.05
 ACCEPT_RATIO = 0.1
@@ -29,58 +30,23 @@ REJECTIONS_MAX = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Links:
-    """Measurements between poses of which at least one is in a block.
+    """Measurements that concern a block; each has at least one end in it.
 
     Attributes:
-        i: (E,) index of the first pose in the block, or -1 where it is held fixed.
+        i: (E,) index of the first pose in the block, or -1 where it belongs to another robot.
         j: (E,) the same for the second pose.
-        T: (E, 4, 4) measured pose of the second in the first, metric; the error is `X_j - T^T X_i`.
-        weight: (E, 4, 4) symmetric weight of its four rows.
-        fixed: (E, 4, r) the pose that is held fixed, where there is one.
+        T: (E, 4, 4) measured pose of the second in the first, metric.
+        kappa: (E,) weight of the rotation, weight of the robust loop included.
+        tau: (E,) weight of the translation, likewise.
+        fixed: (E, 4, r) the other robot's pose, where there is one.
     """
 
     i: Int
     j: Int
     T: Float
-    weight: Float
+    kappa: Float
+    tau: Float
     fixed: Float
-
-    def residuals(self, X: Float) -> Float:
-        """Cost (E,) of each measurement where the block is at X."""
-        X_i = np.where((self.i >= 0)[:, None, None], X[np.maximum(self.i, 0)], self.fixed)
-        X_j = np.where((self.j >= 0)[:, None, None], X[np.maximum(self.j, 0)], self.fixed)
-        return squared_residuals(X_i, X_j, self.T, self.weight)
-
-    def within(self, poses: int) -> NDArray[np.bool_]:
-        """Which of them (E,) have both ends among the first poses."""
-        return (self.i >= 0) & (self.i < poses) & (self.j >= 0) & (self.j < poses)
-
-    def touching(self, poses: int) -> NDArray[np.bool_]:
-        """Which of them (E,) have an end among the first poses."""
-        return ((self.i >= 0) & (self.i < poses)) | ((self.j >= 0) & (self.j < poses))
-
-    def chosen(self, mask: NDArray[np.bool_]) -> "Links":
-        """Some of them."""
-        return Links(self.i[mask], self.j[mask], self.T[mask], self.weight[mask], self.fixed[mask])
-
-
-def joined(parts: Sequence[Links]) -> Links:
-    """Several lists of measurements as one."""
-    return Links(
-        np.concatenate([part.i for part in parts]),
-        np.concatenate([part.j for part in parts]),
-        np.concatenate([part.T for part in parts]),
-        np.concatenate([part.weight for part in parts]),
-        np.concatenate([part.fixed for part in parts]),
-    )
-
-
-def diagonal_weights(kappa: Float, tau: Float) -> Float:
-    """Weights (E, 4, 4) of rotation (E,) and translation (E,)."""
-    weight = np.zeros((len(kappa), 4, 4))
-    weight[:, [0, 1, 2], [0, 1, 2]] = kappa[:, None]
-    weight[:, 3, 3] = tau
-    return weight
 
 
 def lifted(T: Float, rank: int) -> Float:
@@ -114,10 +80,18 @@ def orthonormal(Y: Float) -> Float:
     return np.asarray(inverse_root @ Y)
 
 
-def squared_residuals(X_i: Float, X_j: Float, T: Float, weight: Float) -> Float:
+def squared_residuals(X_i: Float, X_j: Float, T: Float, kappa: Float, tau: Float) -> Float:
     """Cost (E,) of edges between lifted poses (E, 4, r): `kappa |Y_j - Y_i R|^2 + tau |p_j - p_i - Y_i t|^2`."""
     e = X_j - np.swapaxes(T, 1, 2) @ X_i
-    return np.asarray(np.sum(e * (weight @ e), axis=(1, 2)))
+    return np.asarray(kappa * np.sum(e[:, :3] ** 2, axis=(1, 2)) + tau * np.sum(e[:, 3] ** 2, axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stiffness:
+    """Quadratic part of a block, with its factorisation; the same as long as measurements and weights are."""
+
+    Q: csc_array
+    factor: SuperLU
 
 
 class Block:
@@ -126,12 +100,9 @@ class Block:
     def __init__(self, poses: int, links: Links) -> None:
         self.poses = poses
         self.rank = links.fixed.shape[2]
-        self._Q = quadratic(poses, links)
-        diagonal = self._Q.diagonal()
-        shift = diags_array(np.full(len(diagonal), REGULARISATION_RATIO * float(diagonal.mean()) or 1.0))
-        stiffness = csc_array(self._Q + shift)
-        symmetric = {"SymmetricMode": True}
-        self._factor = splu(stiffness, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+        values = (links.i, links.j, links.T, links.kappa, links.tau)
+        stiffness = _stiffness(poses, *(np.ascontiguousarray(each).tobytes() for each in values))
+        self._Q, self._factor = stiffness.Q, stiffness.factor
         self._G, self._constant = _linear(poses, links)
 
     def cost(self, X: Float) -> float:
@@ -165,9 +136,30 @@ class Block:
         return 0.5 * (S + np.swapaxes(S, 1, 2))
 
 
-def quadratic(poses: int, links: Links) -> csc_array:
-    """Q (4n, 4n): with `X_j - T^T X_i` as the error, `T Omega T^T`, `Omega` and `-T Omega` are its blocks."""
-    i, j, T, Omega = links.i, links.j, links.T, links.weight
+@lru_cache(maxsize=FACTORS_MAX)
+def _stiffness(poses: int, i: bytes, j: bytes, T: bytes, kappa: bytes, tau: bytes) -> Stiffness:
+    """Q (4n, 4n) and its factors, of arrays as bytes: they are the same in most iterations."""
+    shaped = np.frombuffer(T).reshape(-1, 4, 4)
+    Omega = _weights(np.frombuffer(kappa), np.frombuffer(tau))
+    Q = _quadratic(poses, np.frombuffer(i, dtype=np.int64), np.frombuffer(j, dtype=np.int64), shaped, Omega)
+    diagonal = Q.diagonal()
+    shift = diags_array(np.full(len(diagonal), REGULARISATION_RATIO * float(diagonal.mean()) or 1.0))
+    factor = splu(
+        csc_array(Q + shift), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return Stiffness(Q, factor)
+
+
+def _weights(kappa: Float, tau: Float) -> Float:
+    """Diagonal weights (E, 4, 4) of rotation columns and translation."""
+    Omega = np.zeros((len(kappa), 4, 4))
+    Omega[:, [0, 1, 2], [0, 1, 2]] = kappa[:, None]
+    Omega[:, 3, 3] = tau
+    return Omega
+
+
+def _quadratic(poses: int, i: Int, j: Int, T: Float, Omega: Float) -> csc_array:
+    """Q (4n, 4n): with `X_j - X_i T` as the error, `T Omega T^T`, `Omega` and `-T Omega` are its blocks."""
     first, second = i >= 0, j >= 0
     both = first & second
     coupling = -(T @ Omega)[both]
@@ -185,7 +177,7 @@ def quadratic(poses: int, links: Links) -> csc_array:
 
 def _linear(poses: int, links: Links) -> tuple[Float, float]:
     """G (4n, r) and the constant of a block, from the poses of others."""
-    Omega = links.weight
+    Omega = _weights(links.kappa, links.tau)
     G = np.zeros((poses, 4, links.fixed.shape[2]))
     constant = 0.0
     only_i, only_j = (links.i >= 0) & (links.j < 0), (links.j >= 0) & (links.i < 0)

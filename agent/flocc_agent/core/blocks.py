@@ -17,21 +17,6 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CondensedOdometry:
-    """What a block's own measurements between two of its separators, neighbours in its log, come to.
-
-    Attributes:
-        before: The earlier keyframe.
-        transform: (4, 4): it pulls the later lifted pose X to `transform @ X_before`.
-        stiffness: (4, 4) symmetric weight of that difference.
-    """
-
-    before: KeyframeId
-    transform: Float
-    stiffness: Float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class BlockState:
     """Where a robot's block stands between two iterations; only its worker looks inside.
 
@@ -44,8 +29,6 @@ class BlockState:
         in_stage: Iterations since the weights were last decided.
         epoch: Number of the graduation that the weights come from.
         has_unjudged: A closure came since that did not agree; it waits, without weight, for the next graduation.
-        hold: How strongly separators are held where they were said, relative to odometry.
-        decrease: By how much the last iterations found that the cost could be lowered; it rises where they diverge.
     """
 
     X: Float
@@ -56,8 +39,6 @@ class BlockState:
     in_stage: int = 0
     epoch: int = 0
     has_unjudged: bool = False
-    hold: float = 1.0
-    decrease: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,9 +49,7 @@ class BlockProblem:
         log: Whose block.
         trajectory: Its odometry.
         closures: Closures with at least one end in it.
-        around: Closures between other robots, at least one of which shares a closure with this one.
-        others: (4, r) pose of other robots' separators, as last heard, in this frame.
-        condensed: What holds those to the separator before them.
+        others: (4, r) pose of other robots' keyframes at the far ends of closures, as last heard, in this frame.
         heard: Robust weights that other robots decided.
         epoch: Latest graduation that another robot began.
         anchored: The block is the anchor's: its first keyframe's odometry says where the map frame lies.
@@ -82,9 +61,7 @@ class BlockProblem:
     log: LogId
     trajectory: Trajectory
     closures: tuple[LoopClosure, ...]
-    around: tuple[LoopClosure, ...]
     others: Mapping[KeyframeId, Float]
-    condensed: Mapping[KeyframeId, CondensedOdometry]
     heard: Mapping[CandidatePair, float]
     epoch: int
     anchored: bool
@@ -106,8 +83,6 @@ class BlockStep:
         aligned: The block moved into the frame it was asked to move into.
         finished: Robust weights are final.
         rejected: Closures of this robot's decision with weight zero.
-        separators: Indices of the keyframes at the ends of closures with other robots, in order.
-        condensed: One per separator but the first: what holds it to the one before.
     """
 
     state: BlockState
@@ -118,8 +93,6 @@ class BlockStep:
     aligned: bool
     finished: bool
     rejected: int
-    separators: tuple[int, ...] = ()
-    condensed: tuple[CondensedOdometry, ...] = ()
 
 
 def decides(closure: LoopClosure) -> LogId:

@@ -1,7 +1,6 @@
 """Distributed optimisation: no leader; every robot iterates on its own block with the separators it heard last.
 
-Robots exchange only separators: their own keyframes at the ends of closures between robots, and what their own
-measurements between two of them come to. A robot iterates when it
+Robots exchange only separators: their own keyframes at the ends of closures between robots. A robot iterates when it
 has news of every neighbour that shares its frame, or has waited long enough; what is lost is said again, with pauses
 that double. Every robot starts in its own frame and moves into that of a neighbour whose anchor is lower, so that one
 frame survives: the lowest robot's. A robot gives corrections to itself only, with its iteration as the round.
@@ -13,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockProblem, BlockStep, CondensedOdometry
+from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
 from flocc_agent.core.parameters import DistributedParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
@@ -27,7 +26,6 @@ Float = NDArray[np.float64]
 ITERATIONS_AFTER_RESTART = 1000
 """A restarted robot counts on from its last correction and this: above whatever it said before."""
 NEIGHBOURS_MAX = 128
-HEARD_MAX = 1 << 16
 FAILURES_MAX = 6
 
 
@@ -58,7 +56,6 @@ class _Neighbour:
     origin: Float
     origin_iteration: int
     poses: dict[int, Float] = field(default_factory=dict)
-    condensed: dict[int, CondensedOdometry] = field(default_factory=dict)
     is_news: bool = True
 
 
@@ -94,9 +91,10 @@ class DistributedOptimisation:
         self._seen: tuple[int, int] | None = None
         self._trajectory = Trajectory(np.zeros((0, 4, 4)))
         self._closures: tuple[LoopClosure, ...] = ()
-        self._around: tuple[LoopClosure, ...] = ()
+        self._separators: tuple[int, ...] = ()
         self._far_ends: tuple[KeyframeId, ...] = ()
         self._joined: tuple[LogId, ...] = ()
+        self._state: BlockState | None = None
         self._step: BlockStep | None = None
         self._has_news = False
         self._running_until_s: float | None = None
@@ -132,7 +130,6 @@ class DistributedOptimisation:
         if held.anchor == self.anchor and held.origin_iteration > self._origin_iteration:
             self._origin, self._origin_iteration = held.origin, held.origin_iteration
         self._has_news |= self._take_poses(held, message) | self._take_weights(sender, message)
-        _take_condensed(sender, held, message)
 
     def on_step(self, number: int, step: BlockStep, now: float) -> list[Effect]:
         """An iteration ended: say the separators; an answer that is late or of another iteration counts for nothing."""
@@ -140,7 +137,7 @@ class DistributedOptimisation:
             return []
         self._running_until_s = None
         self._failures = 0
-        self._step = step
+        self._state, self._step = step.state, step
         if step.aligned and self._aligning is not None:
             self.anchor = self._aligning.anchor
             self._origin_iteration = self._aligning.origin_iteration
@@ -201,26 +198,23 @@ class DistributedOptimisation:
 
     def report(self) -> Report:
         """Where this robot's block stands, for people."""
-        step = self._step
+        step, state = self._step, self._state
         facts = {
             "iteration": self.iteration,
             "anchor": str(self.anchor),
             "neighbours": len(self._sharing()),
-            "separators": 0 if step is None else len(step.separators),
+            "separators": len(self._separators),
             "cost": None if step is None else step.cost,
             "moved": None if step is None else step.moved,
             "closures_rejected": 0 if step is None else step.rejected,
             "weights_final": step is not None and step.finished,
-            "keyframes": 0 if step is None else len(step.state.X),
+            "keyframes": 0 if state is None else len(state.X),
         }
         return Report("block", facts)  # type: ignore[arg-type]
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        return {
-            "separators": (len(self._neighbours), NEIGHBOURS_MAX),
-            "robust_weights": (len(self._heard), HEARD_MAX),
-        }
+        return {"separators": (len(self._neighbours), NEIGHBOURS_MAX)}
 
     # What it knows
 
@@ -240,15 +234,9 @@ class DistributedOptimisation:
         self._trajectory = graph.trajectories[self._own]
         self._closures = tuple(c for c in graph.closures if self._own in (c.query.log, c.match.log))
         ends = [self._ends(c) for c in self._closures if c.query.log != c.match.log]
+        self._separators = tuple(sorted({own.index for own, _ in ends}))
         self._far_ends = tuple(sorted({other for _, other in ends}))
         self._joined = tuple(sorted({other.log for _, other in ends}))
-        self._around = tuple(
-            c
-            for c in graph.closures
-            if c.query.log != c.match.log
-            and self._own not in (c.query.log, c.match.log)
-            and (c.query.log in self._joined or c.match.log in self._joined)
-        )
         self._has_news = True
 
     def _ends(self, closure: LoopClosure) -> tuple[KeyframeId, KeyframeId]:
@@ -276,8 +264,7 @@ class DistributedOptimisation:
     def _take_weights(self, sender: LogId, message: Separators) -> bool:
         changed = False
         for pair, weight in zip(message.pairs, message.weights.numpy().tolist(), strict=True):
-            is_room = pair in self._heard or len(self._heard) < HEARD_MAX
-            if is_room and pair.low.log == sender and self._heard.get(pair) != weight:
+            if pair.low.log == sender and pair.high.log == self._own and self._heard.get(pair) != weight:
                 self._heard[pair] = weight
                 changed = True
         return changed
@@ -306,15 +293,13 @@ class DistributedOptimisation:
                 log=self._own,
                 trajectory=self._trajectory,
                 closures=self._closures,
-                around=self._around,
-                others=self._all_poses(),
-                condensed=self._all_condensed(),
+                others=self._poses_in(self.anchor),
                 heard=dict(self._heard),
                 epoch=self._epoch,
                 anchored=self.anchor == self._own,
                 origin=self._origin if self._aligning is None else self._aligning.origin,
                 align_to=align_to,
-                state=None if self._step is None else self._step.state,
+                state=self._state,
             ),
         )
 
@@ -332,61 +317,28 @@ class DistributedOptimisation:
                 found[end] = neighbour.poses[end.index]
         return found
 
-    def _all_poses(self) -> dict[KeyframeId, Float]:
-        """Poses of everybody's separators in this robot's frame, as far as they said them."""
-        return {
-            KeyframeId(log, index): pose
-            for log, neighbour in self._neighbours.items()
-            if neighbour.anchor == self.anchor
-            for index, pose in neighbour.poses.items()
-        }
-
-    def _all_condensed(self) -> dict[KeyframeId, CondensedOdometry]:
-        """What holds the separators of robots that share closures and the frame with this one."""
-        return {
-            KeyframeId(log, index): link
-            for log in self._joined
-            if log in self._neighbours and self._neighbours[log].anchor == self.anchor
-            for index, link in self._neighbours[log].condensed.items()
-        }
-
     def _said(self) -> list[Separators]:
-        """This robot's separators and the weights that are its to decide, in as many messages as they need.
-
-        A message's first separator is the last of the message before, so that each says what holds its others.
-        """
-        step, origin = self._step, self._origin
-        if step is None or origin is None or not step.separators:
+        """This robot's separators and the weights that are its to decide, in as many messages as they need."""
+        state, origin = self._state, self._origin
+        known = [] if state is None else [index for index in self._separators if index < len(state.X)]
+        if state is None or origin is None or not known:
             return []
-        weighed = [(pair, w) for pair, w in sorted(step.state.weights.items()) if pair.low.log != pair.high.log]
-        transforms = np.array([np.eye(4), *(link.transform for link in step.condensed)])
-        stiffness = np.array([np.zeros((4, 4)), *(link.stiffness for link in step.condensed)])
+        weighed = [(pair, w) for pair, w in sorted(state.weights.items()) if pair.low.log != pair.high.log]
         messages = []
-        stride = SEPARATORS_MAX - 1
-        for k in range(max(-(-(len(step.separators) - 1) // stride), -(-len(weighed) // OFFERS_MAX), 1)):
-            some = slice(k * stride, k * stride + SEPARATORS_MAX)
-            keyframes = step.separators[some]
+        for k in range(max(-(-len(known) // SEPARATORS_MAX), -(-len(weighed) // OFFERS_MAX))):
+            keyframes = known[k * SEPARATORS_MAX : (k + 1) * SEPARATORS_MAX]
             part = weighed[k * OFFERS_MAX : (k + 1) * OFFERS_MAX]
             messages.append(
                 Separators(
                     self.anchor,
                     self.iteration,
-                    step.state.epoch,
+                    state.epoch,
                     Array.of(origin, "f8"),
                     max(self._origin_iteration, 0),
-                    keyframes,
-                    Array.of(step.state.X[list(keyframes)], "f8"),
-                    Array.of(transforms[some], "f8"),
-                    Array.of(np.where(np.arange(len(keyframes))[:, None, None] > 0, stiffness[some], 0.0), "f8"),
+                    tuple(keyframes),
+                    Array.of(state.X[keyframes], "f8"),
                     tuple(pair for pair, _ in part),
                     Array.of(np.array([weight for _, weight in part])),
                 )
             )
         return messages
-
-
-def _take_condensed(sender: LogId, held: _Neighbour, message: Separators) -> None:
-    """Keep what holds each separator of a message to the one before it."""
-    rows = zip(message.keyframes, message.transforms.numpy(), message.stiffness.numpy(), strict=True)
-    for before, (index, transform, stiffness) in zip(message.keyframes, list(rows)[1:], strict=False):
-        held.condensed[index] = CondensedOdometry(KeyframeId(sender, before), transform, stiffness)

@@ -130,7 +130,7 @@ class Once:
         for effect in step.effects:
             match effect:
                 case PersistRecord(log, number, data):
-                    self._note_record(log, number, decoded(data))
+                    self._note_record(log, number, decoded(data)[0])
                 case Report("neighbour_up" | "neighbour_down", fields):
                     self._changed_s[step.station.name, str(fields["peer"])] = step.at_s
                 case Register(pair):

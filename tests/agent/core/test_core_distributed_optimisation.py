@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockState, BlockStep, CondensedOdometry
+from flocc_agent.core.blocks import BlockState, BlockStep
 from flocc_agent.core.distributed_optimisation import DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
 from flocc_agent.core.parameters import DistributedParameters, RoundParameters
@@ -52,24 +52,16 @@ def lifted(shift_m: float = 0.0) -> Float:
     return pose
 
 
-def alone() -> tuple[Array, Array]:
-    """What holds one separator to none before it."""
-    return Array.of(np.eye(4)[None], "f8"), Array.of(np.zeros((1, 4, 4)), "f8")
-
-
 def said(anchor: LogId, iteration: int, keyframe: int, shift_m: float = 0.0, epoch: int = 0) -> Separators:
     poses, origin = Array.of(lifted(shift_m)[None], "f8"), Array.of(lifted(), "f8")
-    nothing = Array.of(np.zeros(0))
-    return Separators(anchor, iteration, epoch, origin, iteration, (keyframe,), poses, *alone(), (), nothing)
+    return Separators(anchor, iteration, epoch, origin, iteration, (keyframe,), poses, (), Array.of(np.zeros(0)))
 
 
 def step(moved: float = 0.0, aligned: bool = False, finished: bool = True) -> BlockStep:
     X = np.repeat(np.eye(4, 3)[None], 4, axis=0)
     T = np.repeat(np.eye(4)[None], 4, axis=0)
     weights = {CandidatePair(KeyframeId(B, 3), KeyframeId(C, 0)): 0.25}
-    held = CondensedOdometry(KeyframeId(B, 1), 2.0 * np.eye(4), 3.0 * np.eye(4))
-    state = BlockState(X, X, weights=weights)
-    return BlockStep(state, T, lifted(), moved, 1.0, aligned, finished, 0, (1, 3), (held,))
+    return BlockStep(BlockState(X, X, weights=weights), T, lifted(), moved, 1.0, aligned, finished, 0)
 
 
 def jobs(effects: list[Effect]) -> list[IterateBlock]:
@@ -166,9 +158,9 @@ def test_weights_are_taken_only_from_the_robot_that_decides_them() -> None:
     pair = CandidatePair(KeyframeId(A, 2), KeyframeId(B, 1))
     one = Array.of(np.ones(1))
     poses, origin = Array.of(lifted()[None], "f8"), Array.of(lifted(), "f8")
-    b.on_separators(C, Separators(B, 1, 0, origin, 1, (0,), poses, *alone(), (pair,), one))
+    b.on_separators(C, Separators(B, 1, 0, origin, 1, (0,), poses, (pair,), one))
     assert jobs(b.tick(0.0))[0].problem.heard == {}
-    b.on_separators(A, Separators(A, 1, 0, origin, 1, (2,), poses, *alone(), (pair,), one))
+    b.on_separators(A, Separators(A, 1, 0, origin, 1, (2,), poses, (pair,), one))
     b.on_step(1, step(), 0.1)
     assert jobs(b.tick(0.3))[0].problem.heard == {pair: 1.0}
 
