@@ -9,9 +9,10 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,11 +137,12 @@ def _measure_all(
     rows = (measured(*job) for job in jobs) if one_by_one else _in_processes(jobs, processes)
     known = folder.rows()
     folder.write_state(len(cells), *_counts(known, cells))
-    for done, row in enumerate(rows, start=len(cells) - len(missing) + 1):
-        folder.append(row)
-        known[row["cell"]] = row
-        folder.write_state(len(cells), *_counts(known, cells))
-        on_row(row, done, len(cells))
+    with closing(rows):  # an interrupt while a row is written ends the processes too
+        for done, row in enumerate(rows, start=len(cells) - len(missing) + 1):
+            folder.append(row)
+            known[row["cell"]] = row
+            folder.write_state(len(cells), *_counts(known, cells))
+            on_row(row, done, len(cells))
 
 
 def measured(measure: Callable[[S, Cell, int], Row], settings: S, cell: Cell, seed: int) -> Row:
@@ -172,7 +174,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(number, float) and not math.isfinite(number) else number
 
 
-def _in_processes(jobs: Sequence[tuple[Any, ...]], processes: int) -> Iterator[Row]:
+def _in_processes(jobs: Sequence[tuple[Any, ...]], processes: int) -> Generator[Row, None, None]:
     """Measure cells in several processes, as they finish; never more jobs are handed out than processes."""
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())

@@ -1,6 +1,7 @@
 """Experiments: what is finished is kept, resumed, never mixed, and marked partial until all is there."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -101,6 +102,18 @@ def test_a_finished_cell_is_not_measured_again(tmp_path: Path) -> None:
     assert rows(tmp_path)[:1] == first
     assert len(rows(tmp_path)) == 3
     assert config(tmp_path)["state"] == "finished"
+
+
+def test_ctrl_c_while_a_row_is_told_ends_the_cells_that_run_in_other_processes(tmp_path: Path) -> None:
+    def interrupt(_row: object, _done: int, _all: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as interrupted:
+        run_experiment(TOY, ToySettings(waits_at=2), 5, tmp_path / "out", 2, interrupt)
+    for child in multiprocessing.active_children():
+        child.join(START_S)
+    assert multiprocessing.active_children() == []
+    assert "1 of 3 cells are kept" in str(interrupted.value)  # whose traceback still holds all that was under way
 
 
 def test_ctrl_c_ends_the_cells_that_run_in_other_processes(tmp_path: Path) -> None:
