@@ -46,10 +46,7 @@ def integer(low: int, high: int) -> Codec[int]:
             raise DecodeError(f"expected an integer in [{low}, {high}]")
         return value
 
-    def pack(value: Any) -> int:
-        return value if type(value) is int and low <= value <= high else check(operator.index(value))
-
-    return Codec(pack, check)
+    return Codec(lambda value: check(operator.index(value)), check)
 
 
 def real(low: float = -math.inf, high: float = math.inf) -> Codec[float]:
@@ -107,17 +104,16 @@ def optional(inner: Codec[T]) -> Codec[T | None]:
 def sequence(inner: Codec[T], items_max: int) -> Codec[tuple[T, ...]]:
     """At most `items_max` inner values."""
     assert items_max <= ITEMS_MAX
-    pack_item, unpack_item = inner.pack, inner.unpack
 
     def pack(values: tuple[T, ...]) -> list[Any]:
         if len(values) > items_max:
             raise DecodeError(f"expected a list of at most {items_max}, not {len(values)}")
-        return list(values) if pack_item is _as_it_is else [pack_item(value) for value in values]
+        return [inner.pack(value) for value in values]
 
     def unpack(value: Any) -> tuple[T, ...]:
         if type(value) is not list or len(value) > items_max:
             raise DecodeError(f"expected a list of at most {items_max}")
-        return tuple([unpack_item(item) for item in value])
+        return tuple([inner.unpack(item) for item in value])
 
     return Codec(pack, unpack)
 
@@ -125,12 +121,12 @@ def sequence(inner: Codec[T], items_max: int) -> Codec[tuple[T, ...]]:
 def struct(build: Callable[..., T], **fields: Codec[Any]) -> Codec[T]:
     """A dataclass as a list of its fields, in its own order; `build` raises ValueError for what cannot be."""
     assert tuple(fields) == tuple(inspect.signature(build).parameters)
-    values_of = operator.attrgetter(*fields) if len(fields) > 1 else lambda value: (getattr(value, *fields),)
+    names = tuple(fields)
     packs = tuple(codec.pack for codec in fields.values())
     unpacks = tuple(codec.unpack for codec in fields.values())
 
     def pack(value: T) -> list[Any]:
-        return [pack_field(item) for pack_field, item in zip(packs, values_of(value), strict=True)]
+        return [pack_field(getattr(value, name)) for name, pack_field in zip(names, packs, strict=True)]
 
     def unpack(value: Any) -> T:
         if type(value) is not list or len(value) != len(unpacks):
