@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import BackendConfig, Formulation, ScaleInitial, Solver
-from flocc_agent.core.pose_graph import OptimisationFailed
+from flocc_agent.core.pose_graph import OptimisationFailed, components_of
 from flocc_launch.experiments.benchmarks import cosmo_file
 from flocc_launch.experiments.experiment import (
     Cell,
@@ -23,7 +23,6 @@ from flocc_launch.experiments.experiment import (
     grid,
 )
 from flocc_launch.experiments.formulation_claims import Measured, formulation_findings
-from flocc_launch.experiments.overlap import joined
 from flocc_launch.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_launch.experiments.scale_graphs import ScaleSettings, draw_graph
 from flocc_launch.experiments.statistics import grouped, middle, with_spread
@@ -69,10 +68,9 @@ def _require_measurable(file: GraphFile, path: Path) -> None:
     blind = sorted(set(file.graph.trajectories) - set(file.truth_m))
     if blind:
         raise ExperimentError(f"{path}: has no ground truth of robot {blind[0]}, so no error can be measured")
-    pairs = {(c.query.log, c.match.log) for c in file.graph.closures}
-    apart = sorted(set(file.graph.trajectories) - joined(file.graph.trajectories, pairs))
+    _, *apart = components_of(list(file.graph.trajectories), file.graph.closures)
     if apart:
-        raise ExperimentError(f"{path}: no closures join robot {apart[0]} to the others: no overlap, no map")
+        raise ExperimentError(f"{path}: no closures join robot {apart[0][0]} to the others: no overlap, no map")
 
 
 def measure(settings: ScaleSettings, cell: Cell, seed: int) -> Row:

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, components_of
 from flocc_agent.geometry import inverse
 from flocc_launch.experiments.benchmarks import cosmo_file
 from flocc_launch.experiments.experiment import ExperimentError, Settings
-from flocc_launch.experiments.overlap import joined
 from flocc_launch.generated_graph import Noise, generate
 from flocc_launch.graph_files import read_graph_file
 from flocc_protocol.ids import LogId
@@ -93,8 +92,8 @@ def _generated(settings: ScaleSettings, poor: bool, rng: np.random.Generator) ->
 def _hangs_together(graph: PoseGraph) -> bool:
     """Whether pairs of robots with enough closures join all robots."""
     counts = Counter((c.query.log, c.match.log) for c in graph.closures)
-    pairs = {pair for pair, count in counts.items() if count >= JOINING_MIN}
-    return joined(graph.trajectories, pairs) == set(graph.trajectories)
+    joining = [c for c in graph.closures if counts[c.query.log, c.match.log] >= JOINING_MIN]
+    return len(components_of(list(graph.trajectories), joining)) == 1
 
 
 def _cosmo(settings: ScaleSettings, source: str, rng: np.random.Generator) -> DrawnGraph:
