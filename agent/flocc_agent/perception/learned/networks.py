@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.feature.aliked import ALIKED
+from kornia.feature.aliked.aliked import ALIKED
 from kornia.feature.lightglue import LightGlue
 from kornia.feature.xfeat import XFeat
 from numpy.typing import NDArray
@@ -97,7 +97,8 @@ class Networks:
         matcher = read_state(checked(variant.matcher, folder))
         self._detect = self._extractor(extractor)
         sizes = LIGHTERGLUE if variant.descriptor_length == LIGHTERGLUE["input_dim"] else {"input_dim": 128}
-        self._matcher = loaded(LightGlue(None, **sizes), as_kornia_names(matcher), variant.matcher).to(device)
+        lightglue = LightGlue(None, **sizes)  # type: ignore[arg-type]  # None: its own sizes, and no download
+        self._matcher = loaded(lightglue, as_kornia_names(matcher), variant.matcher).to(device)
 
     def detect(self, picture: NDArray[np.uint8]) -> tuple[Float32, Float32]:
         """Find features of a picture (H, W, 3), the strongest first.

@@ -1,8 +1,9 @@
 """When a registered pair is a loop closure: by what its front end's wrong pairs never have.
 
 A count alone is no evidence: repeated facades give wrong pairs with many correspondences. What separates them is
-whether a third image agrees: the neighbour in the three-view refinement that gives the scale, or, where the count is in doubt,
-the neighbour registered with the match by itself. The numbers are fitted on all scenes together (docs/learned.md).
+whether a third image agrees: the neighbour in the three-view refinement that gives the scale, or, where the count is
+in doubt, the neighbour registered with the match by itself. The numbers are fitted on all scenes together
+(docs/learned.md).
 """
 
 from dataclasses import dataclass, replace
@@ -152,7 +153,7 @@ def agree(T_neighbour_match_unscaled: Float, result: Registration, T_neighbour_q
 def _angle(expected: Float, found: Float) -> bool:
     """Whether two directions agree."""
     lengths = float(np.linalg.norm(expected) * np.linalg.norm(found))
-    return float(expected @ found) >= np.cos(DIRECTION_AGREES_RAD) * lengths
+    return float(expected @ found) >= float(np.cos(DIRECTION_AGREES_RAD)) * lengths
 
 
 def _is_between(found: Float, first: Float, second: Float) -> bool:
