@@ -163,7 +163,6 @@ def chosen_pairs(judged: JudgedScene, pairs_max: int, cache: Path) -> list[tuple
     scene = judged.scene
     classical = build_perception(PerceptionConfig())
     descriptors = cached_descriptors(scene, classical, cache)
-    rng = np.random.default_rng(SEED)
     best: dict[tuple[int, str], tuple[float, int, int]] = {}
     near: dict[int, list[tuple[int, int]]] = {}
     for pair in cross_pairs(scene, descriptors):
@@ -175,18 +174,16 @@ def chosen_pairs(judged: JudgedScene, pairs_max: int, cache: Path) -> list[tuple
             angle_deg = float(np.degrees(np.arccos(np.clip(truth[2, 2], -1.0, 1.0))))
             near.setdefault(int(np.searchsorted(ANGLES_DEG, angle_deg, "right")), []).append((i, j))
     candidates = sorted({(i, j) for _, i, j in best.values()})
-    chosen = dict.fromkeys(drawn(candidates, pairs_max // 2, rng), True)
+    chosen = dict.fromkeys(drawn(candidates, pairs_max // 2), True)
     for group in sorted(near):
         others = [pair for pair in near[group] if pair not in chosen]
-        chosen.update(dict.fromkeys(drawn(others, pairs_max // (2 * len(near)), rng), False))
+        chosen.update(dict.fromkeys(drawn(others, pairs_max // (2 * len(near))), False))
     return [(i, j, chosen[i, j]) for i, j in sorted(chosen)]
 
 
-def drawn(pairs: Sequence[tuple[int, int]], count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """At most so many of the pairs."""
-    if len(pairs) <= count:
-        return list(pairs)
-    return [pairs[int(k)] for k in sorted(rng.choice(len(pairs), count, replace=False))]
+def drawn(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """At most so many of the pairs; fewer are some of more."""
+    return [pairs[int(k)] for k in np.random.default_rng(SEED).permutation(len(pairs))[:count]]
 
 
 def cached_latents(scene: Scene, wanted: Sequence[int], skills: Perception, cache: Path) -> list[bytes]:
