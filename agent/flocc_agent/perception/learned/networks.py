@@ -44,6 +44,7 @@ LIGHTERGLUE = {
 }
 """LighterGlue's sizes, as published with XFeat; LightGlue's are the class's own."""
 HASH_DIGITS = 8
+LENGTH_MIN = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +144,34 @@ class Networks:
         xfeat = XFeat(top_k=FEATURES_MAX)
         loaded(xfeat.net, state, file)
         xfeat.to(self._device).eval()
+        logits: list[Tensor] = []
+        xfeat.net.register_forward_hook(lambda _network, _image, maps: logits.append(maps[1]))
 
         def by_xfeat(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             found = xfeat.detectAndCompute(image)[0]
-            return found["keypoints"], found["scores"], found["descriptors"]
+            pixels = centred(found["keypoints"], logits.pop(), (image.shape[-1], image.shape[-2]))
+            return pixels, found["scores"], found["descriptors"]
 
         return by_xfeat
+
+
+def centred(pixels: Tensor, logits: Tensor, size_px: tuple[int, int]) -> Tensor:
+    """XFeat's whole-pixel positions moved to the centre of mass of the 3 x 3 probabilities around them.
+
+    Args:
+        pixels: (N, 2) x and y in the picture.
+        logits: (1, 65, h, w): for each cell of 8 x 8 pixels of the network's picture, its pixels and "none".
+        size_px: Width and height of the picture.
+    """
+    heat = nn.functional.pixel_shuffle(torch.softmax(logits, 1)[:, :64], 8)[0, 0]
+    factor = torch.tensor([size / of for size, of in zip(size_px, heat.shape[::-1], strict=True)], device=pixels.device)
+    whole = torch.round(pixels / factor).long()
+    padded = nn.functional.pad(heat, (1, 1, 1, 1))
+    steps = torch.arange(3, device=pixels.device)
+    around = padded[whole[:, 1, None, None] + steps[:, None], whole[:, 0, None, None] + steps]
+    weights = around / around.sum((1, 2), keepdim=True).clamp(min=LENGTH_MIN)
+    moved = torch.stack([(weights.sum(axis) * (steps - 1)).sum(1) for axis in (1, 2)], 1)
+    return ((whole + moved) * factor).clamp(min=0.0)
 
 
 def read_state(path: Path) -> dict[str, Tensor]:
