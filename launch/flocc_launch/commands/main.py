@@ -10,7 +10,7 @@ import typer
 from flocc_launch.commands.common import EXIT_BAD_INPUT, progress_bar, show_report
 from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
-from flocc_launch.commands.measure import add_measures, run_campaign
+from flocc_launch.commands.offline import add_offline, run_campaign
 from flocc_launch.commands.tools import add_tools
 from flocc_protocol.errors import FloccError
 
@@ -232,7 +232,7 @@ def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWat
 
 add_tools(app)
 add_data(app)
-add_measures(app)
+add_offline(app)
 add_lab(app)
 
 if __name__ == "__main__":
