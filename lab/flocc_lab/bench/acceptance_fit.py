@@ -17,11 +17,11 @@ from flocc_lab.bench.acceptance_rows import ANGLES_DEG, Row
 
 ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 10_000)
 AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, 10_000)
-CELLS = (0, 4, 6, 8, 10, 12, 15)
+SIGMAS_DEG = (0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.7)
 WRONG_COST = 50
 """Right pairs that one wrong pair outweighs in the fit: at most 2 % wrong among the pairs that a step adds."""
 MARGIN = 1.2
-"""A wrong pair counts with this many times its correspondences: another scene's may have more."""
+"""A wrong pair counts with this many times its correspondences and certainty: another scene's may have more."""
 RATIO_MIN = 0.3
 CORRESPONDENCES_MIN = 20
 """The paper's rule, for comparison."""
@@ -49,13 +49,16 @@ def fitted(rows: Sequence[Row]) -> Acceptance:
 def best_needed(rows: Sequence[Row]) -> Needed:
     """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
     table = Table(rows)
-    scored = [(table.score(needed), needed.alone, needed.agreeing, needed.cells, needed) for needed in choices()]
+    scored = [
+        (table.score(needed), needed.alone, needed.agreeing, -needed.rotation_sigma_max_rad, needed)
+        for needed in choices()
+    ]
     return max(scored, key=lambda entry: entry[:4])[4]
 
 
 def choices() -> Iterator[Needed]:
     """All rules that are tried."""
-    return (Needed(a, g, c) for a in ALONE for g in AGREEING if g <= a for c in CELLS)
+    return (Needed(a, g, float(np.radians(s))) for a in ALONE for g in AGREEING if g <= a for s in SIGMAS_DEG)
 
 
 class Table:
@@ -66,13 +69,13 @@ class Table:
         self._right = np.array([row.is_right for row in rows], bool)
         factor = np.where(self._right, 1.0, MARGIN)
         self._count = np.array([e.correspondences for e in evidence]) * factor
-        self._cells = np.array([e.cells for e in evidence]) * factor
+        self._sigma_rad = np.array([e.rotation_sigma_rad for e in evidence]) / factor
         self._agrees = np.array([e.neighbour is Neighbour.AGREES for e in evidence], bool)
 
     def score(self, needed: Needed) -> int:
         """Right pairs kept, less what the wrong ones cost."""
         least = np.where(self._agrees, needed.agreeing, needed.alone)
-        kept = (self._count >= least) & (self._cells >= needed.cells)
+        kept = (self._count >= least) & (self._sigma_rad <= needed.rotation_sigma_max_rad)
         return int((kept & self._right).sum()) - WRONG_COST * int((kept & ~self._right).sum())
 
 
@@ -156,5 +159,5 @@ def text(name: str, found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _plain(value: Needed | Kept) -> dict[str, int]:
+def _plain(value: Needed | Kept) -> dict[str, Any]:
     return {name: getattr(value, name) for name in value.__slots__}

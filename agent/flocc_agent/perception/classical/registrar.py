@@ -10,7 +10,7 @@ from flocc_agent.perception.multiview.acceptance import Acceptance, Needed
 from flocc_agent.perception.multiview.parameters import Geometry, Matched
 from flocc_agent.perception.multiview.registrar import PairRegistrar
 
-ACCEPTANCE = Acceptance(Needed(20, 15, 5), Needed(60, 30, 8))
+ACCEPTANCE = Acceptance(Needed(40, 20, 0.017), Needed(60, 30, 0.017))
 
 
 def classical_registrar(config: ClassicalConfig) -> PairRegistrar[Features]:

@@ -14,13 +14,10 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import angle_rad, inverse
-from flocc_agent.perception.multiview.parameters import Rays
 from flocc_agent.perception.multiview.two_view import TwoView
 
 Float = NDArray[np.float64]
 
-CELL = 0.15
-"""Side of a cell of the picture, as x/z: 9 degrees, a ninth of a 70 degree wide picture."""
 ROTATION_AGREES_RAD = float(np.radians(5.0))
 """Both pairs' rotations are right within 1 to 3 degrees where they are right at all."""
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
@@ -42,14 +39,14 @@ class Evidence:
     Attributes:
         correspondences: Verified ones of the loop pair.
         has_scale: Whether three views agree on the length.
-        cells: Cells of the picture that hold verified correspondences, in the image where they are fewer.
+        rotation_sigma_rad: How uncertain the rotation is about its worst axis; what few, badly spread points leave.
         neighbour: What the neighbour says.
         neighbour_correspondences: Verified ones of the neighbour with the match.
     """
 
     correspondences: int
     has_scale: bool
-    cells: int
+    rotation_sigma_rad: float
     neighbour: Neighbour = Neighbour.NOT_ASKED
     neighbour_correspondences: int = 0
 
@@ -61,12 +58,12 @@ class Needed:
     Attributes:
         alone: Correspondences that suffice.
         agreeing: Correspondences that suffice where the neighbour agrees.
-        cells: Cells of the picture that they must spread over.
+        rotation_sigma_max_rad: A less certain rotation is none.
     """
 
     alone: int
     agreeing: int
-    cells: int
+    rotation_sigma_max_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,14 +85,15 @@ class Acceptance:
     def needs_neighbour(self, evidence: Evidence) -> bool:
         """Whether the neighbour's word decides."""
         needed = self.needed(evidence)
-        return needed.agreeing <= evidence.correspondences < needed.alone and evidence.cells >= needed.cells
+        in_doubt = needed.agreeing <= evidence.correspondences < needed.alone
+        return in_doubt and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
 
     def accepts(self, evidence: Evidence) -> bool:
         """Whether the evidence suffices."""
         needed = self.needed(evidence)
         agrees = evidence.neighbour is Neighbour.AGREES
         enough = needed.agreeing if agrees else needed.alone
-        return evidence.correspondences >= enough and evidence.cells >= needed.cells
+        return evidence.correspondences >= enough and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
 
     def judged(self, result: Registration, evidence: Evidence) -> Registration | RegistrationFailed:
         """The registration, marked as judged, or why it is not trusted."""
@@ -103,21 +101,20 @@ class Acceptance:
             return replace(result, is_judged=True)
         needed = self.needed(evidence)
         kind = "with" if evidence.has_scale else "without"
+        found_deg, most_deg = np.degrees([evidence.rotation_sigma_rad, needed.rotation_sigma_max_rad])
         detail = (
-            f"{evidence.correspondences} correspondences in {evidence.cells} cells {kind} scale, "
-            f"{needed.alone} in {needed.cells} needed; neighbour {evidence.neighbour.value}"
+            f"{evidence.correspondences} correspondences {kind} scale, rotation known to {found_deg:.1f} degrees; "
+            f"{needed.alone} and {most_deg:.1f} needed; neighbour {evidence.neighbour.value}"
         )
         counts = result.correspondences, result.odometry_correspondences
         return RegistrationFailed(RegistrationFailure.UNCONVINCING, detail, *counts)
 
 
-def cells(query: Rays, pair: TwoView) -> int:
-    """Cells that hold a pair's correspondences, in the image where they are fewer."""
-    return min(_cells(query.points[pair.query_indices]), _cells(pair.view.observed))
-
-
-def _cells(points: NDArray[np.floating]) -> int:
-    return len(np.unique(np.floor(points / CELL).astype(np.int64), axis=0))
+def evidence_of(result: Registration) -> Evidence:
+    """What a registration says for itself."""
+    assert result.covariance is not None
+    variance = float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1])
+    return Evidence(result.correspondences, result.scale_initial is not None, float(np.sqrt(max(variance, 0.0))))
 
 
 def evidence_of_neighbour(
