@@ -19,8 +19,8 @@ from flocc_agent.perception.multiview.registrar import PairRegistrar
 
 Float = NDArray[np.float64]
 
-RULE = Acceptance(Needed(40, 20, 0.02), Needed(80, 30, 0.02))
-SURE = Evidence(50, True, 0.01)
+RULE = Acceptance(Needed(40, 20, 0.02), Needed(80, 30, 0.02), 0.3)
+SURE = Evidence(50, 0.1, True, 0.01)
 NEIGHBOUR, QUERY = camera_at((-0.6, 0.1, 0.0)), camera_at((0, 0, 0))
 MATCH = camera_at((1.0, 0.2, 0.5), (0.0, 0.2, 0.0))
 
@@ -36,6 +36,8 @@ MATCH = camera_at((1.0, 0.2, 0.5), (0.0, 0.2, 0.0))
         (replace(SURE, correspondences=25, neighbour=Neighbour.SEES_NOTHING), True, False),
         (replace(SURE, correspondences=19, neighbour=Neighbour.AGREES), False, False),
         (replace(SURE, rotation_sigma_rad=0.03), False, False),
+        (replace(SURE, rotation_sigma_rad=0.03, match_ratio=0.3), False, True),
+        (replace(SURE, correspondences=19, match_ratio=0.9), False, False),
         (replace(SURE, correspondences=25, rotation_sigma_rad=0.03), False, False),
     ],
 )
@@ -69,7 +71,7 @@ def test_a_pair_in_doubt_is_accepted_when_the_odometry_neighbour_sees_the_same()
     scene, rng = box(np.random.default_rng(1), 200), np.random.default_rng(2)
     neighbour, query, match = (encode_features(seen_from(scene, T, rng), {}) for T in (NEIGHBOUR, QUERY, MATCH))
     odometry = OdometryPair(neighbour, between(NEIGHBOUR, QUERY), "n-q")
-    sceptical = Acceptance(Needed(1000, 20, 0.05), Needed(1000, 20, 0.05))
+    sceptical = Acceptance(Needed(1000, 20, 0.05), Needed(1000, 20, 0.05), 10.0)
 
     result, evidence = registrar(sceptical).examined(query, match, odometry)
 
@@ -87,7 +89,7 @@ def test_odometry_that_says_otherwise_leaves_a_pair_in_doubt_refused() -> None:
     scene, rng = box(np.random.default_rng(1), 200), np.random.default_rng(2)
     neighbour, query, match = (encode_features(seen_from(scene, T, rng), {}) for T in (NEIGHBOUR, QUERY, MATCH))
     turned = between(NEIGHBOUR, QUERY) @ camera_at((0, 0, 0), (0.0, 0.3, 0.0))
-    sceptical = Acceptance(Needed(1000, 20, 0.05), Needed(1000, 20, 0.05))
+    sceptical = Acceptance(Needed(1000, 20, 0.05), Needed(1000, 20, 0.05), 10.0)
 
     result, evidence = registrar(sceptical).examined(query, match, OdometryPair(neighbour, turned, "n-q"))
 

@@ -1,9 +1,10 @@
 """When a registered pair is a loop closure: by what its front end's wrong pairs never have.
 
-A count alone is no evidence: repeated facades give wrong pairs with many correspondences. What separates them is
-whether a third image agrees: the neighbour in the three-view refinement that gives the scale, or, where the count is
-in doubt, the neighbour registered with the match by itself. The numbers are fitted on all scenes together
-(docs/learned.md).
+A good match ratio, Eq. (1), suffices, but where keyframes are dense or views differ right pairs have a poor one, too. A
+count alone is no evidence: repeated facades give wrong pairs with many correspondences. What separates those is how
+certain the rotation is, and whether a third image agrees: the neighbour in the three-view refinement that gives the
+scale, or, where the count is in doubt, the neighbour registered with the match by itself. The numbers are fitted on all
+scenes together (docs/learned.md).
 """
 
 from dataclasses import dataclass, replace
@@ -12,12 +13,14 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure, match_ratio
 from flocc_agent.geometry import angle_rad, inverse
 from flocc_agent.perception.multiview.two_view import TwoView
 
 Float = NDArray[np.float64]
 
+RATIO_CORRESPONDENCES_MIN = 20
+"""A ratio of fewer is chance, as in the core (`LoopClosingParameters.correspondences_min`)."""
 ROTATION_AGREES_RAD = float(np.radians(5.0))
 """Both pairs' rotations are right within 1 to 3 degrees where they are right at all."""
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
@@ -38,6 +41,7 @@ class Evidence:
 
     Attributes:
         correspondences: Verified ones of the loop pair.
+        match_ratio: Eq. (1).
         has_scale: Whether three views agree on the length.
         rotation_sigma_rad: How uncertain the rotation is about its worst axis; what few, badly spread points leave.
         neighbour: What the neighbour says.
@@ -45,6 +49,7 @@ class Evidence:
     """
 
     correspondences: int
+    match_ratio: float
     has_scale: bool
     rotation_sigma_rad: float
     neighbour: Neighbour = Neighbour.NOT_ASKED
@@ -73,10 +78,17 @@ class Acceptance:
     Attributes:
         with_scale: What a pair needs whose length three views agree on.
         without_scale: What another one needs.
+        match_ratio_min: Eq. (1) that suffices for either, from `RATIO_CORRESPONDENCES_MIN` correspondences on.
     """
 
     with_scale: Needed
     without_scale: Needed
+    match_ratio_min: float
+
+    def has_ratio(self, evidence: Evidence) -> bool:
+        """Whether the paper's rule accepts the pair."""
+        enough = evidence.correspondences >= RATIO_CORRESPONDENCES_MIN
+        return enough and evidence.match_ratio >= self.match_ratio_min
 
     def needed(self, evidence: Evidence) -> Needed:
         """What a pair of this kind needs."""
@@ -86,10 +98,14 @@ class Acceptance:
         """Whether the neighbour's word decides."""
         needed = self.needed(evidence)
         in_doubt = needed.agreeing <= evidence.correspondences < needed.alone
-        return in_doubt and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
+        return (
+            in_doubt and not self.has_ratio(evidence) and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
+        )
 
     def accepts(self, evidence: Evidence) -> bool:
         """Whether the evidence suffices."""
+        if self.has_ratio(evidence):
+            return True
         needed = self.needed(evidence)
         agrees = evidence.neighbour is Neighbour.AGREES
         enough = needed.agreeing if agrees else needed.alone
@@ -114,7 +130,8 @@ def evidence_of(result: Registration) -> Evidence:
     """What a registration says for itself."""
     assert result.covariance is not None
     variance = float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1])
-    return Evidence(result.correspondences, result.scale_initial is not None, float(np.sqrt(max(variance, 0.0))))
+    ratio = match_ratio(result.correspondences, result.odometry_correspondences)
+    return Evidence(result.correspondences, ratio, result.scale_initial is not None, float(np.sqrt(max(variance, 0.0))))
 
 
 def evidence_of_neighbour(
