@@ -37,7 +37,7 @@ from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
 from flocc_protocol.records import SEALED_RECORD_BYTES_MAX, SIGNATURE_BYTES, UPPER_TRIANGLE
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 VERSION_MAX = 127
 MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
