@@ -110,10 +110,12 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
     """
     match config.method:
         case "classical":
-            from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, ClassicalRegistrar
+            from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, classical_registrar
 
             classical = config.classical
-            return Perception(ClassicalDescriber(classical), ClassicalEncoder(classical), ClassicalRegistrar(classical))
+            return Perception(
+                ClassicalDescriber(classical), ClassicalEncoder(classical), classical_registrar(classical)
+            )
         case "synthetic":
             from flocc_agent.perception.synthetic import SyntheticPerception
 
@@ -128,6 +130,10 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
             from flocc_agent.perception.mast3r import build
 
             return Perception(*build(config.mast3r))
+        case "learned":
+            from flocc_agent.perception.learned import build as build_learned
+
+            return Perception(*build_learned(config.learned))
 
 
 def build_optimiser(config: BackendConfig) -> Optimiser:
