@@ -124,6 +124,8 @@ def solution_report(term: Term, round_number: int, solution: GraphSolution) -> R
         "closures_used": states.count(ClosureState.USED),
         "closures_rejected": states.count(ClosureState.REJECTED),
         "closures_excluded": states.count(ClosureState.EXCLUDED),
+        "measured_used": sum(result.state is ClosureState.USED for result in solution.measured),
+        "measured_not_used": sum(result.state is not ClosureState.USED for result in solution.measured),
         "cost": sum(component.cost for component in solution.components),
         "solve_s": solution.solve_s,
         "warnings": list(solution.warnings),
