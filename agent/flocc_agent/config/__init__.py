@@ -1,6 +1,6 @@
 """The configuration of an agent, by noun; what other packages use stands here."""
 
-from flocc_agent.config.agent import AgentConfig, KeyframeConfig, SourceConfig, StoreConfig
+from flocc_agent.config.agent import AgentConfig, CoreSection, KeyframeConfig, SourceConfig, StoreConfig
 from flocc_agent.config.backend import BackendConfig, BackendMode, Formulation, ScaleInitial, Solver
 from flocc_agent.config.network import MetricsConfig, PeerEndpoints, TlsConfig, TransportConfig
 from flocc_agent.config.perception import (
@@ -19,6 +19,7 @@ from flocc_agent.config.section import (
     put_value,
     read_json,
     read_toml,
+    refuse_removed,
     validated,
 )
 
@@ -29,6 +30,7 @@ __all__ = [
     "BlackoutConfig",
     "ClassicalConfig",
     "ConfigError",
+    "CoreSection",
     "Formulation",
     "KeyframeConfig",
     "LinkConfig",
@@ -53,5 +55,6 @@ __all__ = [
     "put_value",
     "read_json",
     "read_toml",
+    "refuse_removed",
     "validated",
 ]

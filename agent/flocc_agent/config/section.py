@@ -7,10 +7,11 @@ import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
+from flocc_agent.config.removed import REMOVED
 from flocc_protocol.errors import FloccError
 
 
@@ -31,6 +32,16 @@ class Section(BaseModel):
         return folder / value if folder is not None and isinstance(value, Path) else value
 
 
+def inner(default: Any, **limits: Any) -> Any:
+    """A parameter that a program may give, an experiment above all, but no file: it is no key and is not written.
+
+    Args:
+        default: Its value.
+        limits: As of pydantic's `Field`.
+    """
+    return Field(default, exclude=True, **limits)
+
+
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -46,6 +57,7 @@ def validated(model: type[M], fields: Mapping[str, object], source: str, folder:
     Raises:
         ConfigError: One sentence that names the source and the key.
     """
+    refuse_removed(fields, source)
     try:
         return model.model_validate(fields, context={"folder": folder})
     except (ValidationError, FloccError) as error:
@@ -92,6 +104,26 @@ def read_json(path: Path) -> dict[str, object]:
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: holds no JSON object")
     return content
+
+
+def refuse_removed(fields: Mapping[str, object], source: str) -> None:
+    """Refuse a key of an earlier version.
+
+    Raises:
+        ConfigError: One sentence that names the source, the key and what replaced it.
+    """
+    for key, replacement in REMOVED.items():
+        if _is_given(fields, key.split(".")):
+            raise ConfigError(f"{source}: the key '{key}' is gone: {replacement}")
+
+
+def _is_given(fields: object, path: list[str]) -> bool:
+    """Whether a key stands somewhere in fields; tables of a list are looked through, too."""
+    if isinstance(fields, list | tuple):
+        return any(_is_given(table, path) for table in fields)
+    if not isinstance(fields, Mapping) or path[0] not in fields:
+        return False
+    return len(path) == 1 or _is_given(fields[path[0]], path[1:])
 
 
 def parsed_change(text: str) -> tuple[str, object]:

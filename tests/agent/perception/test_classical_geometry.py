@@ -3,7 +3,6 @@ import pytest
 from numpy.typing import NDArray
 from tests.agent.perception.classical_scenes import FOCAL_PX, box, camera_at, seen_from
 
-from flocc_agent.config import ClassicalConfig
 from flocc_agent.geometry import angle_rad, inverse, pose, se3_log, so3_exp
 from flocc_agent.perception.classical.bundle import (
     View,
@@ -16,7 +15,6 @@ from flocc_agent.perception.classical.matching import mutual_matches
 from flocc_agent.perception.classical.two_view import TwoView, decompose_essential, two_view
 
 Float = NDArray[np.float64]
-CONFIG = ClassicalConfig()
 
 
 def test_matches_are_mutual_nearest_neighbours_that_pass_the_ratio_test() -> None:
@@ -136,7 +134,7 @@ def test_two_views_give_rotation_and_direction(seed: int, wrong_ratio: float) ->
     T = camera_at((0.8, -0.2, 0.4), (0.05, 0.15, -0.1))
     query = seen_from(scene, np.eye(4), rng)
 
-    pair = two_view(query, seen_from(scene, T, rng, wrong_ratio=wrong_ratio), CONFIG)
+    pair = two_view(query, seen_from(scene, T, rng, wrong_ratio=wrong_ratio), count_min=15)
 
     assert isinstance(pair, TwoView)
     T_query_other = inverse(pair.view.T_view_query)

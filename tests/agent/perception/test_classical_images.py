@@ -104,7 +104,7 @@ def test_features_keep_their_place_where_the_image_is_shrunk() -> None:
     full = ClassicalEncoder(ClassicalConfig(pixels_max=10**9)).encode(image)
     shrunk = ClassicalEncoder(ClassicalConfig(pixels_max=150_000)).encode(image)
 
-    result = two_view(decode_features(full), decode_features(shrunk), ClassicalConfig())
+    result = two_view(decode_features(full), decode_features(shrunk), count_min=15)
 
     assert isinstance(result, TwoView)
     moved_px = np.median(decode_features(full).points[result.query_indices] - result.view.observed, axis=0) * 600.0

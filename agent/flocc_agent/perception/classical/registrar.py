@@ -33,6 +33,10 @@ from flocc_agent.perception.classical.two_view import TwoView, two_view
 from flocc_agent.perception.latent import BadLatent
 from flocc_agent.stages import stage
 
+ODOMETRY_ROTATION_SIGMA_RAD = 0.03
+"""How far odometry's rotation between neighbours may be from the images', calibration error included."""
+ODOMETRY_DIRECTION_SIGMA_RAD = 0.2
+"""How far odometry's direction of motion between neighbours may be from the images'."""
 BASELINE_MIN_M = 1e-3
 """An odometry pair that moved less gives no scale."""
 ROTATION_SIGMA_MIN_RAD = 0.005
@@ -61,7 +65,7 @@ class ClassicalRegistrar:
         except BadLatent as error:
             return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
         with stage("match"):
-            loop_pair = two_view(query_features, match_features, self._config)
+            loop_pair = two_view(query_features, match_features, self._config.correspondences_min)
         with stage("pose"):
             return self._judged(query_features, loop_pair, odometry_pair, odometry)
 
@@ -74,12 +78,12 @@ class ClassicalRegistrar:
             detail = f"{loop_pair} verified correspondences, {self._config.correspondences_min} needed"
             return RegistrationFailed(RegistrationFailure.FEW_CORRESPONDENCES, detail, *counts)
         if odometry is not None and isinstance(odometry_pair, TwoView) and odometry_pair.view.prior is not None:
-            scaled = three_view(query, odometry_pair, loop_pair, self._config)
+            scaled = three_view(query, odometry_pair, loop_pair)
             scale = odometry_scale(odometry.T_neighbour_query[:3, 3], odometry_pair.view.T_view_query[:3, 3])
             if scaled is not None and scale is not None:
                 return registration(scaled, 1, counts, scale)
         points = query.points[loop_pair.query_indices].astype(np.float64)
-        reason = degeneracy(points, loop_pair, self._config)
+        reason = degeneracy(points, loop_pair)
         if reason is not None:
             return RegistrationFailed(RegistrationFailure.DEGENERATE, reason, *counts)
         return registration(loop_pair.refined, 0, counts, None)
@@ -95,10 +99,8 @@ class ClassicalRegistrar:
         T = odometry.T_neighbour_query
         prior = None
         if float(np.linalg.norm(T[:3, 3])) > BASELINE_MIN_M:
-            prior = DirectionPrior(
-                T, self._config.odometry_rotation_sigma_rad, self._config.odometry_direction_sigma_rad
-            )
-        pair = two_view(query, decode_features(odometry.latent), self._config, prior)
+            prior = DirectionPrior(T, ODOMETRY_ROTATION_SIGMA_RAD, ODOMETRY_DIRECTION_SIGMA_RAD)
+        pair = two_view(query, decode_features(odometry.latent), self._config.correspondences_min, prior)
         with self._lock:
             self._odometry_pairs[odometry.key] = pair
             while len(self._odometry_pairs) > self._config.odometry_pairs_max:

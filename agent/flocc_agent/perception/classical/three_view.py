@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.config import ClassicalConfig
 from flocc_agent.geometry import pose
 from flocc_agent.perception.classical.bundle import (
     Refined,
@@ -21,19 +20,23 @@ from flocc_agent.perception.classical.bundle import (
     reprojection_errors_px,
 )
 from flocc_agent.perception.classical.features import Features
-from flocc_agent.perception.classical.two_view import TwoView, usac_parameters
+from flocc_agent.perception.classical.two_view import INLIER_THRESHOLD_PX, SIGMA_PX, TwoView, usac_parameters
 
 Float = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
+COMMON_POINTS_MIN = 10
+"""Points seen in the neighbour, the query and the match that fix the closure's scale; with fewer it has none."""
+SCALE_SIGMA_RATIO_MAX = 0.3
+"""A scale more uncertain than this is not given; the back end then does without an initial one."""
 INVERSE_DEPTH_MIN = 1e-3
 """A nearer point than this many baselines has a depth to start from, in baselines^-1."""
 AGREEING_SHARE_MIN = 0.6
 """Share of the points seen by all that must fit, or the pairs contradict each other."""
 
 
-def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView, config: ClassicalConfig) -> Refined | None:
+def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView) -> Refined | None:
     """Refine both views of a query together.
 
     Returns:
@@ -43,7 +46,7 @@ def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView, conf
     indices = np.union1d(loop_pair.query_indices, odometry_pair.query_indices)
     neighbour, match = _spread(odometry_pair, indices), _spread(loop_pair, indices)
     common = neighbour.seen & match.seen
-    if int(common.sum()) < config.common_points_min:
+    if int(common.sum()) < COMMON_POINTS_MIN:
         return None
     points = query.points[indices].astype(np.float64)
     depths = np.zeros(len(indices))
@@ -52,13 +55,13 @@ def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView, conf
     loop_depths[match.seen] = loop_pair.refined.inverse_depths
     guesses = [
         _by_depth_ratio(match, depths, loop_depths, common),
-        _by_known_points(points, match, depths, common, config),
+        _by_known_points(points, match, depths, common),
     ]
-    refined = [_refined(points, depths, neighbour, match, T, config) for T in guesses if T is not None]
+    refined = [_refined(points, depths, neighbour, match, T) for T in guesses if T is not None]
     if not refined:
         return None
     best = min(refined, key=lambda candidate: candidate.cost)
-    return best if _is_certain(best, points, common, config) else None
+    return best if _is_certain(best, points, common) else None
 
 
 def _spread(pair: TwoView, indices: Indices) -> View:
@@ -81,10 +84,10 @@ def _by_depth_ratio(match: View, depths: Float, loop_depths: Float, common: Mask
     return T
 
 
-def _by_known_points(points: Float, match: View, depths: Float, common: Mask, config: ClassicalConfig) -> Float | None:
+def _by_known_points(points: Float, match: View, depths: Float, common: Mask) -> Float | None:
     """Match pose from the points that the odometry pair placed (perspective-n-point)."""
     usable = common & (depths > INVERSE_DEPTH_MIN)
-    if int(usable.sum()) < config.common_points_min:
+    if int(usable.sum()) < COMMON_POINTS_MIN:
         return None
     placed = np.column_stack([points[usable], np.ones(int(usable.sum()))]) / depths[usable, None]
     found, _, rotation, translation, _ = cv2.solvePnPRansac(
@@ -92,34 +95,32 @@ def _by_known_points(points: Float, match: View, depths: Float, common: Mask, co
         match.observed[usable],
         np.eye(3),
         np.zeros(4),
-        params=usac_parameters(config, match.focal_px),
+        params=usac_parameters(match.focal_px),
     )
     if not found or not np.all(np.isfinite(rotation)) or not np.all(np.isfinite(translation)):
         return None
     return pose(np.asarray(cv2.Rodrigues(rotation)[0], np.float64), np.asarray(translation, np.float64).ravel())
 
 
-def _refined(
-    points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float, config: ClassicalConfig
-) -> Refined:
+def _refined(points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float) -> Refined:
     """Refine from one guess of the match's pose."""
     only_match = match.seen & ~neighbour.seen
     started = depths.copy()
     started[only_match] = inverse_depths_from(points[only_match], T_match_query, match.observed[only_match])
     match = replace(match, T_view_query=T_match_query, unit_translation=False, prior=None)
-    return refine(points, started, (neighbour, match), config.sigma_px)
+    return refine(points, started, (neighbour, match), SIGMA_PX)
 
 
-def _is_certain(refined: Refined, points: Float, common: Mask, config: ClassicalConfig) -> bool:
+def _is_certain(refined: Refined, points: Float, common: Mask) -> bool:
     """Whether the points seen by all agree and fix the match's distance."""
     neighbour, match = refined.views
-    limit = config.inlier_threshold_px
+    limit = INLIER_THRESHOLD_PX
     agrees = reprojection_errors_px(points, refined.inverse_depths, match) < limit
     agrees &= reprojection_errors_px(points, refined.inverse_depths, neighbour) < limit
     count = int((agrees & common).sum())
-    if count < config.common_points_min or count < AGREEING_SHARE_MIN * int(common.sum()):
+    if count < COMMON_POINTS_MIN or count < AGREEING_SHARE_MIN * int(common.sum()):
         return False
-    return length_sigma_ratio(refined, 1) < config.scale_sigma_ratio_max
+    return length_sigma_ratio(refined, 1) < SCALE_SIGMA_RATIO_MAX
 
 
 def length_sigma_ratio(refined: Refined, k: int) -> float:
