@@ -9,7 +9,7 @@ from flocc_agent.config.section import Section, inner
 
 
 class ClassicalConfig(Section):
-    """The classical front end: SIFT features, mutual matching, essential matrix, three-view scale."""
+    """The classical front end: SIFT features, mutual matching; two- and three-view geometry."""
 
     features_max: int = Field(1000, ge=50, le=10_000)
     """Features per image; a latent has 136 bytes for each."""
@@ -17,8 +17,21 @@ class ClassicalConfig(Section):
     """Larger images are shrunk to this many pixels before features are sought (480x375); more cost more time."""
     correspondences_min: int = Field(15, ge=8)
     """Fewer verified correspondences are no registration; lower registers more pairs, and more of them wrongly."""
-    odometry_pairs_max: int = inner(256, ge=1)
-    """Odometry-pair results kept in memory."""
+    acceptance: Literal["fitted", "ratio"] = "fitted"
+    """fitted: the front end's own rule for closures; ratio: Eq. (1) against core.loop_closing.match_ratio_threshold."""
+
+
+class LearnedConfig(Section):
+    """The learned front end: free networks find and match features; the geometry is the classical one's."""
+
+    model: Literal["aliked-lightglue", "xfeat-lighterglue"] = "aliked-lightglue"
+    """aliked-lightglue: sees most; xfeat-lighterglue: costs what SIFT costs; the same on all robots of a swarm."""
+    weights: Path | None = None
+    """Folder with the networks' files; none: where `flocc weights get learned` puts them."""
+    device: Literal["auto", "cuda", "mps", "cpu"] = "auto"
+    """Where the networks run; auto takes the best that is there."""
+    acceptance: Literal["fitted", "ratio"] = "fitted"
+    """fitted: the front end's own rule for closures; ratio: Eq. (1) against core.loop_closing.match_ratio_threshold."""
 
 
 class SyntheticConfig(Section):
@@ -97,10 +110,11 @@ class Mast3rConfig(Section):
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
-    method: Literal["classical", "synthetic", "recorded", "mast3r"] = "classical"
-    """classical: OpenCV, no weights; synthetic: ground truth plus noise; recorded: looked up in a file; mast3r:
-    CosPlace and MASt3R checkpoints."""
+    method: Literal["classical", "synthetic", "recorded", "mast3r", "learned"] = "classical"
+    """classical: OpenCV, no weights; learned: ALIKED or XFeat with LightGlue; mast3r: CosPlace and MASt3R checkpoints;
+    synthetic: ground truth plus noise; recorded: looked up in a file."""
     classical: ClassicalConfig = ClassicalConfig()
+    learned: LearnedConfig = LearnedConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     recorded: RecordedConfig = RecordedConfig()
     mast3r: Mast3rConfig = Mast3rConfig()

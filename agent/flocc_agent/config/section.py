@@ -3,8 +3,11 @@
 A complaint is one sentence that names the file and the key.
 """
 
+import dataclasses
+import difflib
 import json
 import tomllib
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +15,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flocc_agent.config.removed import REMOVED
+from flocc_agent.core.parameters import INNER
 from flocc_protocol.errors import FloccError
 
 
@@ -62,19 +66,41 @@ def validated(model: type[M], fields: Mapping[str, object], source: str, folder:
         return model.model_validate(fields, context={"folder": folder})
     except (ValidationError, FloccError) as error:
         raise ConfigError(
-            first_error(error, source) if isinstance(error, ValidationError) else f"{source}: {error}"
+            first_error(error, source, model) if isinstance(error, ValidationError) else f"{source}: {error}"
         ) from error
 
 
-def first_error(error: ValidationError, source: str) -> str:
+def first_error(error: ValidationError, source: str, model: type[BaseModel]) -> str:
     """Put pydantic's first complaint into one sentence that names the source and the key."""
     complaint = error.errors()[0]
     key = ".".join(str(part) for part in complaint["loc"]) or "(top level)"
     if complaint["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{source}: the key '{key}' does not exist"
+        return f"{source}: the key '{key}' does not exist{_meant(model, complaint['loc'])}"
     if complaint["type"] in ("missing", "missing_argument"):
         return f"{source}: the key '{key}' is missing"
     return f"{source}: {key}: {complaint['msg'].removeprefix('Value error, ')}"
+
+
+def _meant(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """The key of the same section that is spelt most like one that does not exist."""
+    *sections, wrong = location
+    names = _keys(model, [part for part in sections if isinstance(part, str)])
+    near = difflib.get_close_matches(str(wrong), names, n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def _keys(kind: Any, sections: list[str]) -> list[str]:
+    """Keys of the section that lies below a model, or a union or list of models, at a path."""
+    if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__"):
+        keys = {f.name for f in dataclasses.fields(kind) if INNER not in f.metadata}
+        below = {name: hint for name, hint in typing.get_type_hints(kind).items() if name in keys}
+    elif isinstance(kind, type) and issubclass(kind, BaseModel):
+        below = {name: field.annotation for name, field in kind.model_fields.items() if not field.exclude}
+    else:
+        return [name for each in typing.get_args(kind) for name in _keys(each, sections)]
+    if not sections:
+        return list(below)
+    return _keys(below[sections[0]], sections[1:]) if sections[0] in below else []
 
 
 def read_toml(path: Path) -> dict[str, object]:

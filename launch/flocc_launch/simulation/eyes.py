@@ -17,7 +17,7 @@ from flocc_agent.composition import Perception
 from flocc_agent.config import PerceptionConfig
 from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
-from flocc_launch.simulation.playback import Capture
+from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]

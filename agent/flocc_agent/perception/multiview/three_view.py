@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import pose
-from flocc_agent.perception.classical.bundle import (
+from flocc_agent.perception.multiview.bundle import (
     Refined,
     View,
     covariance_of_view,
@@ -19,24 +19,19 @@ from flocc_agent.perception.classical.bundle import (
     refine,
     reprojection_errors_px,
 )
-from flocc_agent.perception.classical.features import Features
-from flocc_agent.perception.classical.two_view import INLIER_THRESHOLD_PX, SIGMA_PX, TwoView, usac_parameters
+from flocc_agent.perception.multiview.parameters import Geometry, Indices, Rays
+from flocc_agent.perception.multiview.two_view import TwoView, usac_parameters
 
 Float = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-COMMON_POINTS_MIN = 10
-"""Points seen in the neighbour, the query and the match that fix the closure's scale; with fewer it has none."""
-SCALE_SIGMA_RATIO_MAX = 0.3
-"""A scale more uncertain than this is not given; the back end then does without an initial one."""
 INVERSE_DEPTH_MIN = 1e-3
 """A nearer point than this many baselines has a depth to start from, in baselines^-1."""
 AGREEING_SHARE_MIN = 0.6
 """Share of the points seen by all that must fit, or the pairs contradict each other."""
 
 
-def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView) -> Refined | None:
+def three_view(query: Rays, odometry_pair: TwoView, loop_pair: TwoView, geometry: Geometry) -> Refined | None:
     """Refine both views of a query together.
 
     Returns:
@@ -46,7 +41,7 @@ def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView) -> R
     indices = np.union1d(loop_pair.query_indices, odometry_pair.query_indices)
     neighbour, match = _spread(odometry_pair, indices), _spread(loop_pair, indices)
     common = neighbour.seen & match.seen
-    if int(common.sum()) < COMMON_POINTS_MIN:
+    if int(common.sum()) < geometry.common_points_min:
         return None
     points = query.points[indices].astype(np.float64)
     depths = np.zeros(len(indices))
@@ -55,13 +50,13 @@ def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView) -> R
     loop_depths[match.seen] = loop_pair.refined.inverse_depths
     guesses = [
         _by_depth_ratio(match, depths, loop_depths, common),
-        _by_known_points(points, match, depths, common),
+        _by_known_points(points, match, depths, common, geometry),
     ]
-    refined = [_refined(points, depths, neighbour, match, T) for T in guesses if T is not None]
+    refined = [_refined(points, depths, neighbour, match, T, geometry) for T in guesses if T is not None]
     if not refined:
         return None
     best = min(refined, key=lambda candidate: candidate.cost)
-    return best if _is_certain(best, points, common) else None
+    return best if _is_certain(best, points, common, geometry) else None
 
 
 def _spread(pair: TwoView, indices: Indices) -> View:
@@ -84,10 +79,10 @@ def _by_depth_ratio(match: View, depths: Float, loop_depths: Float, common: Mask
     return T
 
 
-def _by_known_points(points: Float, match: View, depths: Float, common: Mask) -> Float | None:
+def _by_known_points(points: Float, match: View, depths: Float, common: Mask, geometry: Geometry) -> Float | None:
     """Match pose from the points that the odometry pair placed (perspective-n-point)."""
     usable = common & (depths > INVERSE_DEPTH_MIN)
-    if int(usable.sum()) < COMMON_POINTS_MIN:
+    if int(usable.sum()) < geometry.common_points_min:
         return None
     placed = np.column_stack([points[usable], np.ones(int(usable.sum()))]) / depths[usable, None]
     found, _, rotation, translation, _ = cv2.solvePnPRansac(
@@ -95,32 +90,34 @@ def _by_known_points(points: Float, match: View, depths: Float, common: Mask) ->
         match.observed[usable],
         np.eye(3),
         np.zeros(4),
-        params=usac_parameters(match.focal_px),
+        params=usac_parameters(geometry, match.focal_px),
     )
     if not found or not np.all(np.isfinite(rotation)) or not np.all(np.isfinite(translation)):
         return None
     return pose(np.asarray(cv2.Rodrigues(rotation)[0], np.float64), np.asarray(translation, np.float64).ravel())
 
 
-def _refined(points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float) -> Refined:
+def _refined(
+    points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float, geometry: Geometry
+) -> Refined:
     """Refine from one guess of the match's pose."""
     only_match = match.seen & ~neighbour.seen
     started = depths.copy()
     started[only_match] = inverse_depths_from(points[only_match], T_match_query, match.observed[only_match])
     match = replace(match, T_view_query=T_match_query, unit_translation=False, prior=None)
-    return refine(points, started, (neighbour, match), SIGMA_PX)
+    return refine(points, started, (neighbour, match), geometry.sigma_px)
 
 
-def _is_certain(refined: Refined, points: Float, common: Mask) -> bool:
+def _is_certain(refined: Refined, points: Float, common: Mask, geometry: Geometry) -> bool:
     """Whether the points seen by all agree and fix the match's distance."""
     neighbour, match = refined.views
-    limit = INLIER_THRESHOLD_PX
+    limit = geometry.inlier_threshold_px
     agrees = reprojection_errors_px(points, refined.inverse_depths, match) < limit
     agrees &= reprojection_errors_px(points, refined.inverse_depths, neighbour) < limit
     count = int((agrees & common).sum())
-    if count < COMMON_POINTS_MIN or count < AGREEING_SHARE_MIN * int(common.sum()):
+    if count < geometry.common_points_min or count < AGREEING_SHARE_MIN * int(common.sum()):
         return False
-    return length_sigma_ratio(refined, 1) < SCALE_SIGMA_RATIO_MAX
+    return length_sigma_ratio(refined, 1) < geometry.scale_sigma_ratio_max
 
 
 def length_sigma_ratio(refined: Refined, k: int) -> float:
