@@ -135,7 +135,7 @@ def _plain_views(folder: Path) -> Iterator[View]:
         T = source.truth.at(stamp_s)
         T_odom = T if source.odometry is None else source.odometry.at(stamp_s)
         if T is not None and T_odom is not None:
-            yield View(folder.name, file, source.lens.camera, T, T_odom)
+            yield View(folder.name, file, agents_camera(source.lens), T, T_odom)
 
 
 def kitti(folder: Path) -> Scene:
