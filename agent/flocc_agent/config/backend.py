@@ -54,11 +54,11 @@ class BackendConfig(Section):
     """Scales of closures: fixed, one each, one each but linked within a cluster, or one for all."""
     solver: Solver = Solver.GNC_TLS
     """lm is fastest and trusts every closure; gnc-* find and reject outliers."""
-    pairwise_consistency: bool = False
+    pairwise_consistency: bool = inner(False)
     """Filter closures by pairwise consistency maximisation before solving; needs odometry covariances that are true."""
     closures_to_join_min: int = Field(2, ge=1)
     """Maps with fewer agreeing closures between them stay apart: a single wrong one would contradict nothing."""
-    scale_initial: ScaleInitial = ScaleInitial.ODOMETRY
+    scale_initial: ScaleInitial = inner(ScaleInitial.ODOMETRY)
     """raw: network units are metres; odometry: Eq. (6); ground-truth: for ablations only."""
     steepness: float = Field(4.0, gt=0)
     """k of the logistic Eq. (2); larger trusts high match ratios more."""

@@ -30,6 +30,18 @@ def checked_endpoint(text: str) -> str:
 Endpoint = Annotated[str, AfterValidator(checked_endpoint)]
 
 
+def checked_group(text: str) -> str:
+    """Return the address of a multicast group, or say how one looks.
+
+    Raises:
+        ValueError: Not GROUP:PORT, or there is no next port.
+    """
+    group, _, port = text.rpartition(":")
+    if not group or not port.isdecimal() or not 1 <= int(port) < PORT_MAX:
+        raise ValueError(f"{text!r} is no multicast address; one looks like 224.0.0.224:7446")
+    return text
+
+
 class PeerEndpoints(Section):
     """Where one known robot listens."""
 
@@ -59,10 +71,8 @@ class TransportConfig(Section):
     """Known robots by name. Of each pair the higher name dials, for ever, also after a partition."""
     multicast: bool = True
     """Find robots of the same network by multicast; needs no roster, but many Wi-Fi access points drop it."""
-    multicast_control: str = "224.0.0.224:7446"
-    """Group and port for finding control sessions; swarms that share a network may take different ones."""
-    multicast_bulk: str = "224.0.0.224:7447"
-    """Group and port for finding bulk sessions; must differ from the one for control."""
+    multicast_address: Annotated[str, AfterValidator(checked_group)] = "224.0.0.224:7446"
+    """Group and port for finding control sessions, bulk is at the next port; swarms on one network may differ."""
     interface: str = "auto"
     """Network interface of multicast: auto, or one such as wlan0 (lo on a single machine)."""
     gossip: bool = True
@@ -90,6 +100,11 @@ class TransportConfig(Section):
     chaos: bool = False
     """Take orders of `flocc chaos`: partitions, loss, kills. For tests; without tls anybody in reach may order."""
 
+    def multicast_group(self, control: bool) -> str:
+        """Where control sessions, or bulk sessions, find each other."""
+        group, _, port = self.multicast_address.rpartition(":")
+        return self.multicast_address if control else f"{group}:{int(port) + 1}"
+
     @model_validator(mode="after")
     def _is_consistent(self) -> "TransportConfig":
         misnamed = [name for name in self.roster if not NAME_PATTERN.fullmatch(name)]
@@ -100,8 +115,6 @@ class TransportConfig(Section):
         wrong = [e for e in endpoints if not e.startswith("tls/")] if self.tls else []
         if wrong:
             raise ValueError(f"with tls every endpoint begins with tls/, but there is {wrong[0]!r}")
-        if self.multicast_control == self.multicast_bulk:
-            raise ValueError("multicast_control and multicast_bulk must differ")
         return self
 
 

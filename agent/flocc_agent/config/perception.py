@@ -93,7 +93,7 @@ class Mast3rConfig(Section):
     """latent: others decode what this robot encoded; image: send a JPEG that the receiver encodes; auto: keep both."""
     latent_dtype: Literal["fp16", "int8"] = "fp16"
     """Number format of a sent latent; int8 (per channel) halves it to 0.8 MB."""
-    place_input: Literal["native", "shorter-side", "swarm-slam"] = "swarm-slam"
+    place_input: Literal["native", "shorter-side", "swarm-slam"] = inner("swarm-slam")
     """What CosPlace sees: the picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
     subsample_px: int = Field(8, ge=1, le=64)
     """Distance of the matcher's seeds; 16 is four times faster with a quarter of the matches; equal on all robots."""

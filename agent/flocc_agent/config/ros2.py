@@ -63,7 +63,7 @@ class Ros2Config(Section):
     """Where the corrected path is published, nav_msgs/Path."""
     pose_topic: RosName = "flocc/pose"
     """Where the corrected pose is published, geometry_msgs/PoseWithCovarianceStamped."""
-    tf_period_s: float = Field(0.05, gt=0)
+    tf_period_s: float = inner(0.05, gt=0)
     """Least time between two transforms, and between two poses."""
     tf_tolerance_s: float = Field(0.1, ge=0, le=60)
     """The transform is dated so far ahead, so that it can be looked up until the next one."""

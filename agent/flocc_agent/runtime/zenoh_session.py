@@ -63,7 +63,7 @@ def session_settings(
             "period_increase_factor": 1.5,
         },
         "scouting/multicast/enabled": config.multicast,
-        "scouting/multicast/address": config.multicast_control if control else config.multicast_bulk,
+        "scouting/multicast/address": config.multicast_group(control),
         "scouting/multicast/interface": config.interface,
         "scouting/multicast/autoconnect_strategy": strategy,
         "scouting/gossip/enabled": config.gossip,
