@@ -318,7 +318,7 @@ class Agent:
             self._driver.stop()
 
     async def finished(self) -> None:
-        """Wait until the agent stops, by `stop`, or by the end of its recording and `hold_s`.
+        """Wait until the agent stops, by `stop` or by an order.
 
         Raises:
             FloccError: The recording cannot be played on.
@@ -435,9 +435,6 @@ class Agent:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
         await play(recording, source, self._selector, add, self._clock_s, self._on_position, resumed)
-        if source.hold_s > 0:
-            await asyncio.sleep(source.hold_s)
-            self.stop()
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter

@@ -38,6 +38,8 @@ from flocc_protocol.records import (
 )
 
 DECODED_MAX = 1024
+RECORDS_MAX = 200_000
+"""Records that are kept of one log: a keyframe and a closure each second for a day. Further ones are refused."""
 
 
 class Sealer(Protocol):
@@ -272,7 +274,7 @@ class Gossip:
                 record, record_kept = decoded(self._opened(batch.log, len(copy), data))
             except DecodeError as error:
                 return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
-            if not copy.accepts(record) or len(copy) >= self._parameters.records_max:
+            if not copy.accepts(record) or len(copy) >= RECORDS_MAX:
                 return new, [*effects, *self._refused(peer, f"record of {batch.log} out of place")]
             number = len(copy)
             copy.append(record_kept, data)

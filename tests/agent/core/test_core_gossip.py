@@ -8,6 +8,7 @@ from tests.agent.core.virtual_time import Robots, keyframe
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.parameters import GossipParameters
+from flocc_agent.core.pulls import BACKOFF_MAX_S, REQUEST_PERIOD_S
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import LogDigest, LogPosition, RecordBatch, RecordRequest, Records
 from flocc_protocol.records import KeyframeRecord, RejectionRecord, encode_record
@@ -66,7 +67,7 @@ def test_a_peer_that_does_not_deliver_is_asked_ever_more_rarely() -> None:
     asked_s = [t / 10 for t in range(600) if requests(reader.on_digests(R2, claims, t / 10))]
     pauses_s = [b - a for a, b in pairwise(asked_s)]
     assert pauses_s[0] < 2.0
-    assert max(pauses_s) >= PARAMETERS.backoff_max_s
+    assert max(pauses_s) >= BACKOFF_MAX_S
     assert len(asked_s) < 15
 
 
@@ -227,7 +228,7 @@ def test_requests_that_heartbeats_call_for_have_a_least_pause() -> None:
         if requests(effects):
             asked.append(t / 10)
             reader.on_records(R1, answer_to(source, effects), t / 10)
-    assert min(b - a for a, b in pairwise(asked)) >= PARAMETERS.request_period_s
+    assert min(b - a for a, b in pairwise(asked)) >= REQUEST_PERIOD_S
     assert len(asked) >= 4
 
 

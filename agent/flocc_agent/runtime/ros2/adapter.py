@@ -44,6 +44,10 @@ logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
+IMAGES_MAX = 8
+"""Images that wait for odometry or for the encoder; the oldest gives way."""
+ODOMETRY_GAP_MAX_S = 0.5
+"""Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
 INBOX_MESSAGES_MAX = 512
 INBOX_BYTES_MAX = 64 * 1024 * 1024
 WATCH_PERIOD_S = 1.0
@@ -85,7 +89,7 @@ class Ros2Adapter:
         self._selector = selector
         self._host = host
         self._types = MessageTypes()
-        self._synchroniser = Synchroniser(config.images_max, config.odometry_gap_max_s)
+        self._synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S)
         self._static = StaticFrames()
         self._counter = TrafficCounter()
         self._problems = Problems(host.report)
@@ -147,7 +151,7 @@ class Ros2Adapter:
             wanted["image"] = (config.image_topic, COMPRESSED_IMAGE if config.is_compressed() else IMAGE, SENSOR)
             wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)
             if config.camera_mounting is None:
-                wanted["tf_static"] = (config.tf_static_topic, TF, TF_STATIC)
+                wanted["tf_static"] = (f"{config.tf_topic}_static", TF, TF_STATIC)
         return wanted
 
     # What comes
