@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import inverse, pose, so3_exp
 from flocc_agent.runtime.recording import Recording, write_camera
-from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_agent.runtime.text_tables import RecordingError
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.commands import convert, info, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.drift import DriftSpec
@@ -316,4 +318,7 @@ def test_real_kitti_and_euroc_files_are_read(tmp_path: Path) -> None:
         pytest.skip(f"{SHARED / 'data' / 'kitti_short'} is not here")
     found = info(SHARED / "data" / "kitti_short" / "KITTI_sequence_1")
     assert (found.format, found.images, found.truth_poses, found.faults) == ("kitti", 51, 51, ())
-    assert len(read_tum(SHARED / "data" / "euroc" / "vio" / "MH_01.vislam.txt")) > 1000
+    vio = SHARED / "data" / "euroc" / "vio" / "MH_01.vislam.txt"
+    with pytest.raises(RecordingError, match=r"MH_01.vislam.txt:1: nothing says whether the quaternion is x y z w"):
+        read_trajectory(vio)
+    assert len(read_trajectory(vio, "tum")[0]) > 1000

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.trajectory import NEAR_S, Trajectory
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.folders import (
@@ -16,7 +17,7 @@ from flocc_launch.datasets.folders import (
 )
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import is_image
-from flocc_launch.datasets.plain import is_plain, read_plain, time_unit
+from flocc_launch.datasets.plain import is_plain, read_plain
 from flocc_launch.datasets.source import DatasetError, Source
 
 READERS: dict[str, Callable[[Path], Source]] = {
@@ -66,13 +67,16 @@ def _known_format(path: Path) -> str | None:
     return "plain" if not is_bag(path) and is_plain(path) else None
 
 
-def read_source(path: Path, format_name: str | None = None, camera: Path | None = None) -> Source:
+def read_source(
+    path: Path, format_name: str | None = None, camera: Path | None = None, form: str | None = None
+) -> Source:
     """Read one robot's data set.
 
     Args:
         path: The folder.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics, where the folder has none or others are wanted.
+        form: Of the trajectories of a plain folder (`trajectory_text.FORMS`); None finds out.
 
     Raises:
         DatasetError: Unknown, or nothing in it can be used.
@@ -80,7 +84,7 @@ def read_source(path: Path, format_name: str | None = None, camera: Path | None 
     name = format_name or detect_format(path)
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
-    source = _images_only(READERS[name](path))
+    source = _images_only(read_plain(path, form) if name == "plain" else READERS[name](path))
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None:
             check_times(source, trajectory)
@@ -119,6 +123,14 @@ def _what_stamps_look_like(source: Source, trajectory: Trajectory) -> str:
     steps_s = np.diff(trajectory.stamps_s)
     if len(trajectory) >= len(source.images) and np.all(steps_s == 1.0):
         return "the trajectory's stamps look like numbers of images, not seconds"
-    unit = time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
+    unit = _time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
     known = unit not in (None, "seconds")
     return f"the trajectory's stamps look like {unit}, not seconds" if known else "both must be of one clock"
+
+
+def _time_unit(duration_s: float, reference_s: float) -> str | None:
+    """The unit that a duration in wrong seconds seems to be in, given a true one of about the same length."""
+    if reference_s <= 0 or duration_s <= 0:
+        return None
+    close = (name for name, unit_s in UNITS_S.items() if 1 / 3 < duration_s * unit_s / reference_s < 3)
+    return next(close, None)

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import TypeVar
 
-from flocc_agent.runtime.trajectory import text_lines
+from flocc_agent.runtime.text_tables import text_lines
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.source import DatasetError, Lens
 

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.trajectory import Trajectory, checked_pose, number_lines, read_tum, text_lines
+from flocc_agent.runtime.text_tables import number_lines, text_lines
+from flocc_agent.runtime.trajectory import Trajectory, checked_pose
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import image_size

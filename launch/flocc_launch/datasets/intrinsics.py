@@ -14,7 +14,8 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import inverse
 from flocc_agent.runtime.recording import read_camera
 from flocc_agent.runtime.ros2.pixels import PINHOLE_MODELS
-from flocc_agent.runtime.trajectory import RecordingError, checked_pose
+from flocc_agent.runtime.text_tables import RecordingError
+from flocc_agent.runtime.trajectory import checked_pose
 from flocc_launch.datasets.source import DatasetError, Lens
 
 Float = NDArray[np.float64]

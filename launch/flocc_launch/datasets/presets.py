@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flocc_agent.core.interfaces import Camera
-from flocc_agent.runtime.trajectory import read_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import Progress

@@ -45,6 +45,7 @@ class Source:
         truth: `T_world_body`, or None.
         up_world: (3,) direction against gravity in the truth's world.
         faults: What is wrong with the rest, one sentence each; what is above is good.
+        notes: What was left out, or concluded where nothing said it; one sentence each.
     """
 
     path: Path
@@ -55,3 +56,4 @@ class Source:
     truth: Trajectory | None = None
     up_world: Float = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     faults: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.evaluation import associate, placed_at_true_start
 from flocc_launch.run_folder import RunFolder
 from flocc_launch.run_records import Event, KeyframeCaptured, RobotResult, of_kind, stacked_poses
