@@ -12,11 +12,11 @@ from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_tum
-from flocc_launch.data import recordings
 from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.source import DatasetError
-from flocc_launch.shipped import read_scenario
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_scenario
 
 COUNT = IMAGES * PASSES
 

@@ -11,10 +11,17 @@ from tests.launch.synthetic_run import Synthetic
 from typer.testing import CliRunner
 
 from flocc_agent.config import ConfigError, Mast3rConfig, PerceptionConfig, TransportConfig
-from flocc_launch.cli_tools import add_tools
+from flocc_launch.commands.tools import add_tools
+from flocc_launch.dashboard.status_table import (
+    RobotStatus,
+    StatusError,
+    status_from,
+    status_json,
+    status_of_run,
+    status_of_swarm,
+)
 from flocc_launch.doctor import Finding, Severity, finding_lines, installation, network
 from flocc_launch.doctor.live import diagnose_live
-from flocc_launch.status import RobotStatus, StatusError, status_from, status_json, status_of_run, status_of_swarm
 
 
 def row(robot: str, neighbours: str = "", **fields: object) -> RobotStatus:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.latents import PIECE_BYTES
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.swarm import Swarm

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from flocc_launch.dashboard.source import RunSource, SnapshotSource
-from flocc_launch.run_folder import RunFolder
+from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)

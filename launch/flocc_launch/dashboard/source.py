@@ -11,8 +11,8 @@ import numpy as np
 
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import RunTail
-from flocc_launch.run_folder import RunFolder, RunFolderError
-from flocc_launch.run_records import Run
+from flocc_launch.runs.run_folder import RunFolder, RunFolderError
+from flocc_launch.runs.run_records import Run
 
 
 class SnapshotSource(Protocol):

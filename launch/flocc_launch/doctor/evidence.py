@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable, Mapping
 
-from flocc_launch.report.closures import Pair
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.run_records import CorrectionApplied, of_kind
+from flocc_launch.runs.closure_table import Pair
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.run_records import CorrectionApplied, of_kind
 from flocc_protocol.ids import LogId
 
 

@@ -103,7 +103,7 @@ def checkpoints(config: Mast3rConfig) -> list[Finding]:
 
 def checkpoint(path: Path) -> Finding:
     """Whether one checkpoint is there, whole, and computes."""
-    from flocc_launch.weights import check
+    from flocc_launch.setup.weight_files import check
 
     try:
         checked = check(path)

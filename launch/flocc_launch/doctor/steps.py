@@ -16,9 +16,9 @@ from flocc_launch.doctor.evidence import (
     pairs_between,
 )
 from flocc_launch.doctor.finding import Finding, blocked
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.report.svg import count_of, number, seconds
-from flocc_launch.run_records import (
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import count_of, number, seconds
+from flocc_launch.runs.run_records import (
     AgentDied,
     GraphOptimised,
     LatentFailed,

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from flocc_agent.composition import build_perception
 from flocc_agent.config import KeyframeConfig
-from flocc_launch.run_folder import write_json
-from flocc_launch.scenario import FaultKind, Scenario, TracksScenario
+from flocc_launch.runs.run_folder import write_json
+from flocc_launch.scenarios.scenario import FaultKind, Scenario, TracksScenario
 from flocc_launch.simulation.alignment import Alignment
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.faults import schedule

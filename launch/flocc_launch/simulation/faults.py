@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from flocc_agent.radio import Blackout, LinkParameters, Partition, RadioParameters
-from flocc_launch.scenario import Fault, FaultKind
+from flocc_launch.scenarios.scenario import Fault, FaultKind
 from flocc_launch.simulation.swarm import Swarm
 
 

@@ -12,7 +12,7 @@ from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory
-from flocc_launch.simulation.tracks import T_BODY_CAMERA, Walk
+from flocc_launch.scenarios.walks import T_BODY_CAMERA, Walk
 
 Float = NDArray[np.float64]
 

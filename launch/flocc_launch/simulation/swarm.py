@@ -13,7 +13,7 @@ from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.reporting import Reporter
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.latents import LatentFetcher

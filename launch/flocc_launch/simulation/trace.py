@@ -36,7 +36,7 @@ from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
 from flocc_agent.geometry import pose
 from flocc_agent.radio import LinkOverride, LinkParameters, Partition, RadioParameters
-from flocc_launch.scenario import RobotScenario, Scenario, TracksScenario
+from flocc_launch.scenarios.scenario import RobotScenario, Scenario, TracksScenario
 from flocc_launch.simulation.alignment import Alignment
 from flocc_launch.simulation.playback import Capture, Playback
 from flocc_launch.simulation.robot import Station
