@@ -58,7 +58,7 @@ class Poses:
 
 
 def read_trajectory(
-    path: Path, form: str | None = None, stamps_s: Sequence[float] | None = None
+    path: Path, form: str | None = None, stamps_s: Sequence[float] | None = None, otherwise: str | None = None
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Read a trajectory, and say what was left out of it.
 
@@ -66,11 +66,12 @@ def read_trajectory(
         path: The file.
         form: One of `FORMS`, "kitti", or a line that names the columns; None finds out.
         stamps_s: Of the poses of a form without stamps, as many as there are poses.
+        otherwise: The form of a data set's own files, for those that do not name their columns.
 
     Raises:
         RecordingError: Unreadable, of no known form or of more than one, or too much of it is damaged.
     """
-    poses = read_poses(path, form)
+    poses = read_poses(path, form, otherwise)
     if poses.stamps_s is None:
         if stamps_s is None:
             raise RecordingError(
@@ -97,7 +98,7 @@ def read_tum(path: Path) -> Trajectory:
     return trajectory
 
 
-def read_poses(path: Path, form: str | None = None) -> Poses:
+def read_poses(path: Path, form: str | None = None, otherwise: str | None = None) -> Poses:
     """Read poses in the order of the file.
 
     Raises:
@@ -106,7 +107,7 @@ def read_poses(path: Path, form: str | None = None) -> Poses:
     table = read_table(path)
     if not table.rows:
         raise RecordingError(f"{path}: holds no pose")
-    columns = _columns(table, form)
+    columns = _columns(table, form, otherwise)
     if columns is None:
         return _matrices(table)
     values, lines, notes = _values(table, columns)
@@ -117,7 +118,7 @@ def read_poses(path: Path, form: str | None = None) -> Poses:
     return Poses(values[:, 0] * UNITS_S[unit], T, lines, (*notes, *unit_notes))
 
 
-def _columns(table: Table, form: str | None) -> Columns | None:
+def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns | None:
     """Columns of a table, or None where it holds matrices."""
     count = _usual_count(table)
     if form == MATRIX_FORM:
@@ -131,7 +132,7 @@ def _columns(table: Table, form: str | None) -> Columns | None:
             raise RecordingError(f"{table.path}:{line}: {error}; {WAY_OUT}") from None
         if found is not None:
             return found
-    return _by_numbers(table, count)
+    return _by_numbers(table, count) if otherwise is None else _named_form(otherwise, table.path)
 
 
 def _usual_count(table: Table) -> int:

@@ -46,6 +46,7 @@ class BagOptions:
         from_zero: Stamps are counted from the first image, so that recordings of different days run together.
         origin_m: Subtracted from ground truth's positions.
         form: Of `odometry` and `truth` (`trajectory_text.FORMS`); None finds out.
+        published_form: Of files of a data set's own that do not name their columns.
     """
 
     image_topic: str | None = None
@@ -58,6 +59,7 @@ class BagOptions:
     from_zero: bool = False
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     form: str | None = None
+    published_form: str | None = None
 
 
 def convert_bag(path: Path, out: Path, options: BagOptions | None = None, progress: Progress | None = None) -> Path:
@@ -246,7 +248,7 @@ class _Conversion:
         """A trajectory in a file beside the bag."""
         if path is None:
             return None
-        trajectory, notes = read_trajectory(path, self.options.form)
+        trajectory, notes = read_trajectory(path, self.options.form, otherwise=self.options.published_form)
         for note in notes:
             logger.warning("%s", note)
         return _shifted(trajectory, self.zero_ns)

@@ -44,14 +44,22 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     listing = next((path / name for name in LISTINGS if (path / name).exists()), None)
     images, faults, how = _named_images(path) if listing is None else (*listed_images(listing), "")
     stamps_s = [stamp_s for stamp_s, _ in images] if images else None
-    (odometry, notes), (truth, truth_notes) = (
-        _first_trajectory(path, stems, form, stamps_s) for stems in (ODOMETRY_STEMS, TRUTH_STEMS)
-    )
+    odometry, truth, notes = trajectories_beside(path, form, stamps_s)
     if images is None:
         images, faults = _stamped_by_order(path, odometry or truth)
     read_how = (f"{path}: the names of the images say their stamps as {how}",) if how in UNUSUAL else ()
-    notes = (*read_how, *notes, *truth_notes)
-    return Source(path, "plain", images, camera_file(path), odometry=odometry, truth=truth, faults=faults, notes=notes)
+    lens = camera_file(path)
+    notes = (*read_how, *notes)
+    return Source(path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+
+
+def trajectories_beside(
+    path: Path, form: str | None = None, stamps_s: list[float] | None = None
+) -> tuple[Trajectory | None, Trajectory | None, tuple[str, ...]]:
+    """Odometry and ground truth of a folder under one of the plain names, and what was left out of them."""
+    odometry, notes = _first_trajectory(path, ODOMETRY_STEMS, form, stamps_s)
+    truth, truth_notes = _first_trajectory(path, TRUTH_STEMS, form, stamps_s)
+    return odometry, truth, (*notes, *truth_notes)
 
 
 def expected_files(path: Path) -> str:

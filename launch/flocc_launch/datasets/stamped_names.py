@@ -37,9 +37,9 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     Raises:
         DatasetError: Names have two readings.
     """
-    dates = [_date_s(stem) for stem in stems]
+    dates = [date_s(stem) for stem in stems]
     if all(dates):
-        return [float(date_s) for date_s in dates if date_s is not None], "dates, read as UTC"
+        return [moment_s for moment_s in dates if moment_s is not None], "dates, read as UTC"
     split = [re.findall(r"\d+\.\d+|\d+", stem) for stem in stems]
     if len({len(numbers) for numbers in split}) != 1 or not split[0]:
         return _single_long(split, stems, folder)
@@ -50,7 +50,8 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     return _one_number(columns, stems, folder)
 
 
-def _date_s(stem: str) -> float | None:
+def date_s(stem: str) -> float | None:
+    """Seconds since 1970 of a date in a text, read as UTC, or None."""
     found = _DATE.search(stem)
     if found is None:
         return None
