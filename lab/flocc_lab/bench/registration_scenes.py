@@ -17,7 +17,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.recording import Recording
 from flocc_launch.datasets.detect import read_source
 from flocc_launch.datasets.intrinsics import read_lens
-from flocc_launch.datasets.pixels import decoded, read_bytes
+from flocc_launch.datasets.pixels import agents_camera, decoded, read_bytes
 from flocc_launch.datasets.source import DatasetError
 
 Float = NDArray[np.float64]
@@ -102,7 +102,7 @@ def sevenscenes(folder: Path, robots: int = 3) -> Scene:
             selector.took(T)
             kept.append((file, T))
     names = [f"r{1 + k * robots // len(kept)}" for k in range(len(kept))]
-    camera = source.lens.camera
+    camera = agents_camera(source.lens)
     views = tuple(View(name, file, camera, T, T) for name, (file, T) in zip(names, kept, strict=True))
     return Scene(folder.name, views, 0.4, float(np.radians(30.0)), 0.2)
 
@@ -135,7 +135,7 @@ def _plain_views(folder: Path) -> Iterator[View]:
         T = source.truth.at(stamp_s)
         T_odom = T if source.odometry is None else source.odometry.at(stamp_s)
         if T is not None and T_odom is not None:
-            yield View(folder.name, file, source.lens.camera, T, T_odom)
+            yield View(folder.name, file, agents_camera(source.lens), T, T_odom)
 
 
 def kitti(folder: Path) -> Scene:
@@ -154,7 +154,7 @@ def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:
             q_and_t = np.array(numbers.split(), np.float64)
             T_world_body = pose_from_tq(np.concatenate([q_and_t[4:], q_and_t[:4]]))
             T = T_world_body @ lens.T_body_camera
-            views.append(View(f"r{k}", folder / f"{side}_img_{k}.png", lens.camera, T, T))
+            views.append(View(f"r{k}", folder / f"{side}_img_{k}.png", agents_camera(lens), T, T))
         sides.append(tuple(views))
     return sides[0], sides[1]
 
