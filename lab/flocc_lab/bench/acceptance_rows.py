@@ -127,6 +127,28 @@ class Row:
     scale_ratio: float | None = None
 
 
+def collected(
+    front_end: str, shared: Path, recordings: Sequence[Path], scenes: Sequence[str], pairs_max: int, out: Path
+) -> list[Row]:
+    """Rows of all scenes for one front end; those that the folder has are read, others are made and kept there."""
+    found = []
+    for judged in judged_scenes(shared, recordings):
+        path = out / "rows" / front_end / f"{judged.scene.name}.jsonl"
+        if not path.exists() and (not scenes or judged.scene.name in scenes):
+            write_rows(rows_of(judged, perception_of(front_end), pairs_max, out / "latents"), path)
+        found += read_rows(path) if path.exists() else []
+    return found
+
+
+def perception_of(front_end: str) -> PerceptionConfig:
+    """The configuration of a front end that leaves the verdict to the evaluation."""
+    if front_end == "classical":
+        return PerceptionConfig.model_validate({"method": "classical", "classical": {"acceptance": "ratio"}})
+    return PerceptionConfig.model_validate(
+        {"method": "learned", "learned": {"model": front_end, "acceptance": "ratio"}}
+    )
+
+
 def rows_of(judged: JudgedScene, config: PerceptionConfig, pairs_max: int, cache: Path) -> list[Row]:
     """Register a scene's chosen pairs with one front end.
 
