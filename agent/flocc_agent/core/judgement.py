@@ -22,14 +22,24 @@ def judged(
     counts = (result.correspondences, result.odometry_correspondences)
     if isinstance(result, RegistrationFailed):
         return RejectionRecord(query, match, result.failure.value, *counts)
+    if result.judged_ratio is not None:
+        return _recorded(query, match, result, result.judged_ratio)
     ratio = match_ratio(*counts)
-    if not result.is_judged and result.correspondences < limits.correspondences_min:
+    if result.correspondences < limits.correspondences_min:
         return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
-    if not result.is_judged and ratio < limits.match_ratio_threshold:
+    if ratio < limits.match_ratio_threshold:
         return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
+    return _recorded(query, match, result, ratio)
+
+
+def _recorded(
+    query: KeyframeId, match: KeyframeId, result: Registration, ratio: float
+) -> ClosureRecord | RejectionRecord:
+    """The record of an accepted registration, or of why no log may hold it."""
     try:
         return _closure(query, match, result, ratio)
     except ValueError as error:
+        counts = (result.correspondences, result.odometry_correspondences)
         return RejectionRecord(query, match, f"no closure: {error}", *counts)
 
 
@@ -53,12 +63,13 @@ def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: 
 
 def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
     """An accepted or refused registration, for people."""
+    counted = match_ratio(record.correspondences, record.odometry_correspondences)
     facts = {
         "query": str(record.query),
         "match": str(record.match),
         "correspondences": record.correspondences,
         "odometry_correspondences": record.odometry_correspondences,
-        "ratio": round(match_ratio(record.correspondences, record.odometry_correspondences), 4),
+        "ratio": round(record.match_ratio if isinstance(record, ClosureRecord) else counted, 4),
         "by": by.robot,
     }
     if isinstance(record, RejectionRecord):
