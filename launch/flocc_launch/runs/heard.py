@@ -16,7 +16,14 @@ from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.reporting import Reporter
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import Heartbeat, LogCorrection
-from flocc_protocol.records import ClosureRecord, FixRecord, KeyframeRecord, Record, RejectionRecord
+from flocc_protocol.records import (
+    ClosureRecord,
+    KeyframeRecord,
+    MeasurementRecord,
+    Record,
+    RejectionRecord,
+    UnknownRecord,
+)
 
 ROBOTS_MAX = 256
 
@@ -36,14 +43,14 @@ class Heard:
 
     def record(self, log: LogId, record: Record, t: float) -> Reported[Fact] | None:
         """What a log's next record tells of; None where people need not know."""
+        if isinstance(record, MeasurementRecord | UnknownRecord):
+            return None
         match record:
             case KeyframeRecord(index, stamp_s, T_odom_camera):
                 taken = KeyframeTaken(keyframe=KeyframeId(log, index), stamp_s=stamp_s, T_odom_body=T_odom_camera)
                 return self._reported(log.robot, taken, t)
             case ClosureRecord() | RejectionRecord():
                 return self._reported(log.robot, told(record, log), t)
-            case FixRecord():
-                return None
             case _:
                 assert_never(record)
 

@@ -50,10 +50,8 @@ def test_a_line_of_an_old_run_is_read_and_written_as_it_was(line: str) -> None:
     assert line_of(reported_of(line)) == json.loads(line)
 
 
-def test_every_kind_has_an_old_line() -> None:
-    assert {json.loads(line)["event"] for line in OLD_LINES} == {
-        name for name, kind in KINDS.items() if kind.__module__.startswith("flocc_agent.")
-    }
+def test_every_kind_of_old_runs_is_known() -> None:
+    assert {json.loads(line)["event"] for line in OLD_LINES} <= KINDS.keys()
 
 
 def test_a_new_report_takes_its_definition_and_the_place_where_it_is_reported() -> None:

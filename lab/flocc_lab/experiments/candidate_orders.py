@@ -28,9 +28,9 @@ from flocc_lab.experiments.plots import COLOURS, from_zero
 from flocc_lab.experiments.statistics import grouped, middle, values
 from flocc_launch.runs.trajectory_errors import ate_m
 from flocc_launch.scenarios.scenario import Scenario, SimulationScenario, TracksScenario
-from flocc_launch.simulation.playback import Playback
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.simulation.virtual_playback import Playback
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
 

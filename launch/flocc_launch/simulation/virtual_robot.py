@@ -29,8 +29,8 @@ from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.robot import Robot
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
-from flocc_launch.simulation.playback import Capture, Playback
-from flocc_launch.simulation.workers import Workers
+from flocc_launch.simulation.virtual_playback import Capture, Playback
+from flocc_launch.simulation.virtual_workers import Workers
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Envelope, Message
 

@@ -31,7 +31,7 @@ from flocc_agent.core.registration import Registration, RegistrationFailed, Regi
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.stages import StageTimes
 from flocc_launch.simulation.disk import Disk
-from flocc_launch.simulation.playback import Capture
+from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId

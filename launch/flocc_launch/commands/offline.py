@@ -1,4 +1,4 @@
-"""Commands that measure: optimise, and the campaign of simulate. `add_measures` puts them into the command line."""
+"""Commands that need no swarm: optimise, and the campaign of simulate."""
 
 import sys
 from enum import Enum
@@ -15,7 +15,7 @@ PROCESSES = 2
 E = TypeVar("E", bound=Enum)
 
 
-def add_measures(app: typer.Typer) -> None:
+def add_offline(app: typer.Typer) -> None:
     """Register the commands."""
     app.command(short_help="Optimise the pose graph of a file.")(optimise)
 

@@ -6,8 +6,8 @@ from flocc_agent.budget import Budget
 from flocc_agent.core.effects import FetchLatent
 from flocc_agent.core.events import LATENT_UNKNOWN, Event, LatentFetched, LatentFetchFailed
 from flocc_launch.simulation.agenda import Agenda
-from flocc_launch.simulation.network import Network
-from flocc_launch.simulation.robot import Station
+from flocc_launch.simulation.virtual_network import Network
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import KeyframeId
 
 REQUEST_BYTES = 96
