@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.parameters import GossipParameters
-from flocc_agent.core.pulls import REMEMBERED_MAX, Pulls, remember
+from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, Pulls, remember
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import (
@@ -296,7 +296,7 @@ class Gossip:
         """Ask for a peer's copy of the own log before this number, which it says is another one."""
         if self._doubted_until_s.get(peer, now) > now or (self._own, peer) in self._forked:
             return []
-        remember(self._doubted_until_s, peer, now + self._parameters.request_timeout_s)
+        remember(self._doubted_until_s, peer, now + REQUEST_TIMEOUT_S)
         return [Unicast(peer, RecordRequest((LogPosition(self._own, max(0, end - RECORDS_BATCH_MAX)),)))]
 
     def _own_log_elsewhere(self, peer: str, batch: RecordBatch, now: float) -> list[Effect]:
