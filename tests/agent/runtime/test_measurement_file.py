@@ -11,7 +11,8 @@ from flocc_agent.runtime.trajectory import RecordingError
 from flocc_protocol.ids import KeyframeId, LogId
 
 FRAMES_S = [0.0, 1.0, 2.0, 3.0, 10.0]
-TAG = '{"stamp_s": 2.01, "kind": "tag", "tag": "7", "T_body_tag": [1, 0, 0, 1, 0, 0, 0], "covariance": [1, 1, 1, 1, 1, 1]}'
+SIXES = "[1, 1, 1, 1, 1, 1]"
+TAG = f'{{"stamp_s": 2.01, "kind": "tag", "tag": "7", "T_body_tag": [1, 0, 0, 1, 0, 0, 0], "covariance": {SIXES}}}'
 
 
 def fix(stamp_s: float, x_m: float) -> str:
