@@ -24,6 +24,8 @@ RATIO_CORRESPONDENCES_MIN = 20
 ROTATION_AGREES_RAD = float(np.radians(5.0))
 """Both pairs' rotations are right within 1 to 3 degrees where they are right at all."""
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
+NEVER = 100_000
+"""More correspondences than any picture has features."""
 
 
 class Neighbour(Enum):
