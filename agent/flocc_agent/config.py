@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -300,9 +300,11 @@ class Mast3rConfig(Section):
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
-    method: Literal["classical", "synthetic", "recorded", "mast3r"] = "classical"
+    method: str = "classical"
     """classical: OpenCV, no weights; synthetic: ground truth plus noise; recorded: looked up in a file; mast3r:
-    CosPlace and MASt3R checkpoints."""
+    CosPlace and MASt3R checkpoints; or the name of one that an installed package brings."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """What an installed package's perception is to know; flocc hands it on as it is."""
     classical: ClassicalConfig = ClassicalConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     recorded: RecordedConfig = RecordedConfig()

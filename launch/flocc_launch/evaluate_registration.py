@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import KeyframeConfig, PerceptionConfig
-from flocc_agent.core.interfaces import Describer, OdometryPair
+from flocc_agent.core.interfaces import Describer, OdometryPair, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
 from flocc_agent.geometry import angle_rad
+from flocc_agent.perception.backends import build_perception
 from flocc_launch.registration_scenes import (
     Scene,
     corridor,

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import PerceptionConfig
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.core.interfaces import Camera, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose, so3_exp
+from flocc_agent.perception.backends import build_perception
 from flocc_launch import evaluate_registration as evaluation
 from flocc_launch.evaluate_registration import Outcome, Pair, best_matches, chosen, outcome, ratio_row, recall_at_one
 from flocc_launch.registration_scenes import Scene, View, fountain, sevenscenes

@@ -16,9 +16,8 @@ from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, remember
-from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
+from flocc_agent.geometry import pose7, pose_from_tq, poses_from_tq, symmetric, tq_from_poses, upper_triangle
 from flocc_protocol.arrays import Array
-from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import (
@@ -31,7 +30,6 @@ from flocc_protocol.messages import (
 
 Float = NDArray[np.float64]
 
-_UPPER = np.triu_indices(6)
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
 
@@ -210,7 +208,7 @@ def correction_of(component: Component, log: LogId, term: Term, round_number: in
         round=round_number,
         anchor=component.anchor,
         T_map_odom=pose7(component.T_map_odom[log]),
-        covariance=None if covariance is None else Array.of(covariance[_UPPER], "f4"),
+        covariance=None if covariance is None else upper_triangle(covariance),
         first=first,
         step=step,
         T_map_camera=Array.of(tq_from_poses(poses[first::step]), "f4"),
@@ -230,22 +228,3 @@ def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
         step=message.step,
         T_map_camera=poses_from_tq(message.T_map_camera.numpy()),
     )
-
-
-def symmetric(upper: Float) -> Float:
-    """Covariance (6, 6) of its upper triangle (21)."""
-    out = np.empty((6, 6))
-    out[_UPPER] = upper
-    out.T[_UPPER] = upper
-    return out
-
-
-def upper_triangle(covariance: Float) -> Array:
-    """Upper triangle (21) of a covariance (6, 6), float32."""
-    return Array.of(covariance[_UPPER], "f4")
-
-
-def pose7(T: Float) -> Pose7:
-    """A pose as the wire has it."""
-    x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
-    return (x, y, z, qw, qx, qy, qz)

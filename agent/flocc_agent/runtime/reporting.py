@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import Report
 from flocc_agent.core.pose_graph import GraphSolution, map_frame
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.core.robot import Robot
-from flocc_agent.geometry import inverse, pose_from_tq, se3_exp, se3_log
+from flocc_agent.geometry import interpolated, inverse, pose7, pose_from_tq
 from flocc_protocol.messages import CandidatePair, LogCorrection
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -146,5 +145,4 @@ def _interpolated(k: int, indices: NDArray[np.int_], T_map_odom: Float) -> Float
         return np.asarray(T_map_odom[min(after, len(indices) - 1)])
     before = after - 1
     share = (k - indices[before]) / (indices[after] - indices[before])
-    step = se3_log(inverse(T_map_odom[before]) @ T_map_odom[after])
-    return np.asarray(T_map_odom[before] @ se3_exp(share * step))
+    return interpolated(T_map_odom[before], T_map_odom[after], share)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.core.robot import Robot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.heard import Heard

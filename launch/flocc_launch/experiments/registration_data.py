@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import KeyframeConfig, PerceptionConfig
+from flocc_agent.core.interfaces import Perception
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.recording import Recording
 from flocc_launch.data import recordings
 from flocc_launch.evaluate_registration import Pair, is_same_place

@@ -74,7 +74,7 @@ def prepare(settings: SparseKeyframesSettings, progress: Progress) -> None:
     Raises:
         FloccError: A back-end is unknown or its checkpoint is wrong, there is no ground truth, or no overlap.
     """
-    from flocc_agent.composition import build_perception
+    from flocc_agent.perception.backends import build_perception
 
     for backend in settings.backends:
         given = scenario(settings, backend, min(settings.distances_m), 1)

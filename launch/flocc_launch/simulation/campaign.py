@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from flocc_agent.composition import build_perception
 from flocc_agent.config import KeyframeConfig
+from flocc_agent.perception.backends import build_perception
 from flocc_launch.run_folder import write_json
 from flocc_launch.scenario import FaultKind, Scenario, TracksScenario
 from flocc_launch.simulation.alignment import Alignment

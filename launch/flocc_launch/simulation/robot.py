@@ -7,7 +7,6 @@ memory is gone: answers of workers and links that belong to an earlier life are 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -27,6 +26,7 @@ from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Mes
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import pose7
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.playback import Capture, Playback

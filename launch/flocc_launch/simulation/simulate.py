@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from flocc_agent.composition import build_optimiser, build_perception
+from flocc_agent.backend import build_optimiser
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.composition import build_iterator
+from flocc_agent.backend import build_iterator
 from flocc_agent.config import BackendMode
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving

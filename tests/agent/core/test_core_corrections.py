@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import Corrections, pose7
+from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.robot import Restored
-from flocc_agent.geometry import pose
+from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -29,7 +28,7 @@ from flocc_agent.core.events import (
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.registration import Registration
 from flocc_agent.core.robot import Restored, Robot
-from flocc_agent.geometry import pose
+from flocc_agent.geometry import pose, pose7
 from flocc_launch.simulation.alignment import align
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
