@@ -14,8 +14,8 @@ from tests.doc_commands import ROOT, SHELL, blocks, command_lines, complaint, pa
 from tests.doc_props import write_bag, write_own_data
 
 from flocc_agent.config import AgentConfig
-from flocc_launch.config_reference import reference
-from flocc_launch.scenario import Scenario
+from flocc_lab.reference.configuration_page import reference
+from flocc_launch.scenarios.scenario import Scenario
 
 PARTS = ("protocol", "agent", "docker")
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / part / "README.md" for part in PARTS)])
@@ -136,7 +136,7 @@ def test_the_commands_of_a_page_run(page: Path, props: Path, tmp_path: Path) -> 
         ("flocc dataset convert path/to/data", "Missing parameter: out"),
         ("flocc launch meeting --seed four", "not a valid|valid integer"),
         ("python -m flocc_launch.nothing", "there is no module"),
-        ("python -m flocc_launch.reliability idle --runz 3", "no option --runz"),
+        ("python -m flocc_lab.reliability idle --runz 3", "no option --runz"),
         ("make tset", "no target tset"),
         ("FLOCC_SHARED=/data pytest -s tests/no_test.py -k some", "tests/no_test.py is not there"),
         ("rosrun flocc", "not a program"),

@@ -20,7 +20,7 @@ INLIERS_MIN = 20
 THRESHOLD_RATIO = 0.003  # 2 pixels at a focal length of 640
 
 
-def build(config: PerceptionConfig, seed: int) -> Perception:
+def build(config: PerceptionConfig, seed: int) -> Perception:  # noqa: ARG001
     """Make the front end; `[perception.options]` of the configuration is yours."""
     features = int(config.options.get("features", FEATURES))
     return Perception(ThumbnailDescriber(), OrbEncoder(features), OrbRegistrar())
@@ -61,7 +61,7 @@ class OrbRegistrar:
     """Two latents to the relative pose of their cameras, in metres."""
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
-        """Triangulate the query with its neighbour, whose distance odometry knows; then find the match among the points."""
+        """Triangulate the query with its neighbour, metric by odometry; then find the match among the points."""
         try:
             seen, other = features_of(query), features_of(match)
             before = features_of(odometry.latent) if odometry is not None else None

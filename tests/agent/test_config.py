@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from flocc_agent.config import AgentConfig
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
 
 AGENT = """
 name = "r1"

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from tests.launch import synthetic_run
 
-from flocc_launch.cli import main
-from flocc_launch.cli_common import show_report
+from flocc_launch.commands.common import show_report
+from flocc_launch.commands.main import main
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.report import finish
-from flocc_launch.scenario import TracksScenario
-from flocc_launch.simulation.tracks import walks
+from flocc_launch.scenarios.scenario import TracksScenario
+from flocc_launch.scenarios.walks import walks
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
-from flocc_launch.cli_data import dataset
+from flocc_launch.commands.data import dataset
 from flocc_launch.datasets.bag_convert import convert_bag
 from flocc_launch.datasets.commands import convert, info, split
 from flocc_launch.datasets.presets import GRACO_GROUND, S3E_ALPHA, Team, convert_graco, convert_s3e, convert_team

@@ -10,11 +10,11 @@ from tests.launch.bag_fixtures import walking
 from flocc_agent.config import ConfigError
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
-from flocc_launch.data import recordings
 from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.source import DatasetError
-from flocc_launch.shipped import read_scenario
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_scenario
 
 COUNT = IMAGES * PASSES
 

@@ -1,6 +1,6 @@
 """The core's parameters: unit in the name, default, and what turning it does.
 
-They are plain dataclasses so that the core stays free of frameworks; `config.py` checks them with pydantic.
+They are plain dataclasses so that the core stays free of frameworks; `flocc_agent.config` checks them with pydantic.
 """
 
 from dataclasses import dataclass, field, replace

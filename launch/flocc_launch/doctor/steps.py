@@ -5,7 +5,8 @@ A step looks at two robots and gives None where it holds. Later steps may rely o
 
 from collections.abc import Callable
 
-from flocc_launch.doctor.evidence import (
+from flocc_launch.doctor.finding import Finding, blocked
+from flocc_launch.doctor.merge_evidence import (
     best_similarity,
     components_join,
     heard_s,
@@ -15,10 +16,9 @@ from flocc_launch.doctor.evidence import (
     named,
     pairs_between,
 )
-from flocc_launch.doctor.finding import Finding, blocked
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.report.svg import count_of, number, seconds
-from flocc_launch.run_records import (
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import count_of, number, seconds
+from flocc_launch.runs.run_records import (
     AgentDied,
     GraphOptimised,
     LatentFailed,

@@ -16,7 +16,7 @@ from flocc_agent import perception as perception_package
 from flocc_agent.config import PerceptionConfig
 from flocc_agent.core.interfaces import OdometryPair, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
-from flocc_launch.simulation.playback import Capture
+from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]

@@ -19,7 +19,7 @@ from flocc_agent.core.offers import FAR_TAKEOVERS
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.invariants import Invariant, Step, core
-from flocc_launch.simulation.robot import Station
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, Records
 from flocc_protocol.records import ClosureRecord, Record, RejectionRecord

@@ -30,7 +30,7 @@ from flocc_agent.perception.mast3r.network import Mast3r, View  # noqa: E402
 from flocc_agent.perception.mast3r.pair import mean_confidence  # noqa: E402
 from flocc_agent.perception.mast3r.preprocess import BadImage  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import TINY  # noqa: E402
-from flocc_launch.weights import synthesize  # noqa: E402
+from flocc_launch.setup.weight_files import synthesize  # noqa: E402
 
 CPU = Compute(torch.device("cpu"), torch.float32, torch.float32)
 T_NEIGHBOUR_QUERY = se3_exp(np.array([0.0, 0.02, 0.0, 0.5, 0.0, 0.1]))

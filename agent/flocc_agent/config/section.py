@@ -1,0 +1,124 @@
+"""What all sections of a configuration are, and how fields become one: read, changed, checked.
+
+A complaint is one sentence that names the file and the key.
+"""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+
+from flocc_protocol.errors import FloccError
+
+
+class ConfigError(FloccError):
+    """A configuration that cannot be used; the message names the file and the key."""
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, ser_json_inf_nan="constants")
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _is_relative_to_its_file(cls, value: object, info: ValidationInfo) -> object:
+        """Paths that a file names are relative to that file."""
+        folder = (info.context or {}).get("folder")
+        return folder / value if folder is not None and isinstance(value, Path) else value
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def validated(model: type[M], fields: Mapping[str, object], source: str, folder: Path | None = None) -> M:
+    """Check fields against a model.
+
+    Args:
+        model: What they should be.
+        fields: As they were read.
+        source: Where they come from, for the error's sentence.
+        folder: What relative paths in them start from; None leaves them as they are.
+
+    Raises:
+        ConfigError: One sentence that names the source and the key.
+    """
+    try:
+        return model.model_validate(fields, context={"folder": folder})
+    except (ValidationError, FloccError) as error:
+        raise ConfigError(
+            first_error(error, source) if isinstance(error, ValidationError) else f"{source}: {error}"
+        ) from error
+
+
+def first_error(error: ValidationError, source: str) -> str:
+    """Put pydantic's first complaint into one sentence that names the source and the key."""
+    complaint = error.errors()[0]
+    key = ".".join(str(part) for part in complaint["loc"]) or "(top level)"
+    if complaint["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"{source}: the key '{key}' does not exist"
+    if complaint["type"] in ("missing", "missing_argument"):
+        return f"{source}: the key '{key}' is missing"
+    return f"{source}: {key}: {complaint['msg'].removeprefix('Value error, ')}"
+
+
+def read_toml(path: Path) -> dict[str, object]:
+    """Read a TOML file.
+
+    Raises:
+        ConfigError: It is missing, unreadable or not TOML; the message names the file (and line).
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not TOML: {error}") from error
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        ConfigError: It is missing, unreadable or no such file; the message names it.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: holds no JSON object")
+    return content
+
+
+def parsed_change(text: str) -> tuple[str, object]:
+    """Key and value of `KEY=VALUE`; the value is TOML, or text as it stands.
+
+    Raises:
+        ConfigError: There is no key.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"{text!r} is no change of the configuration; one looks like radio.loss_ratio=0.3")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+def put_value(fields: dict[str, object], key: str, value: object) -> None:
+    """Put a value at a dotted key, such as `radio.loss_ratio`.
+
+    Raises:
+        ConfigError: A part of the key is no table.
+    """
+    *tables, name = key.split(".")
+    for table in tables:
+        inner = fields.setdefault(table, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"{key}: {table} is no table")
+        fields = inner
+    fields[name] = value
