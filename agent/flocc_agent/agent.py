@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend import build_iterator, build_optimiser
 from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Camera, Image, Perception
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import is_rigid

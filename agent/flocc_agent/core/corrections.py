@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
-from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.parameters import GossipParameters, RoundParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, remember
-from flocc_agent.geometry import pose7, pose_from_tq, poses_from_tq, symmetric, tq_from_poses, upper_triangle
+from flocc_agent.geometry import pose7, tq_from_poses, upper_triangle
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
@@ -184,16 +184,15 @@ class Corrections:
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
-        correction = delivered(message, changed)
         facts = {
             "term": message.term.counter,
             "leader": message.term.leader.robot,
             "round": message.round,
-            "map_frame": correction.map_frame,
-            "frame_changed": correction.frame_changed,
+            "map_frame": map_frame(message.anchor),
+            "frame_changed": changed,
             "T_map_odom": [float(x) for x in message.T_map_odom],
         }
-        return [PersistCorrection(message, changed), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
+        return [PersistCorrection(message, changed), Deliver(message, changed), Report("correction", facts)]  # type: ignore[arg-type]
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:
@@ -212,19 +211,4 @@ def correction_of(component: Component, log: LogId, term: Term, round_number: in
         first=first,
         step=step,
         T_map_camera=Array.of(tq_from_poses(poses[first::step]), "f4"),
-    )
-
-
-def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
-    """A correction as consumers get it."""
-    return Correction(
-        term=message.term,
-        round=message.round,
-        map_frame=map_frame(message.anchor),
-        frame_changed=frame_changed,
-        T_map_odom=pose_from_tq(np.array(message.T_map_odom)),
-        covariance=None if message.covariance is None else symmetric(message.covariance.numpy()),
-        first=message.first,
-        step=message.step,
-        T_map_camera=poses_from_tq(message.T_map_camera.numpy()),
     )

@@ -33,6 +33,16 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
     return own(config, seed) if own is not None else _installed(config, seed)
 
 
+def check_perception(config: PerceptionConfig) -> None:
+    """Say what can be chosen where the configured back-end is not there; nothing is imported or built.
+
+    Raises:
+        PerceptionError: No back-end has this name.
+    """
+    if config.method not in OWN:
+        _entry_point(config.method)
+
+
 def methods() -> dict[str, str]:
     """Name of every back-end that can be chosen -> the package that brings it."""
     brought = {name: _package(point) for name, point in sorted(_entry_points().items())}
@@ -41,9 +51,7 @@ def methods() -> dict[str, str]:
 
 def _installed(config: PerceptionConfig, seed: int) -> Perception:
     """Build what another package brings; whatever its code raises is told in one sentence."""
-    point = _entry_points().get(config.method)
-    if point is None:
-        raise PerceptionError(f"perception.method {config.method!r} is unknown; {_known()}")
+    point = _entry_point(config.method)
     whose = f"perception {config.method!r} of {_package(point)} ({point.value})"
     try:
         built = point.load()(config, seed)
@@ -52,6 +60,13 @@ def _installed(config: PerceptionConfig, seed: int) -> Perception:
     if not isinstance(built, Perception):
         raise PerceptionError(f"{whose} gives a {type(built).__name__}, not a flocc_agent.core.interfaces.Perception")
     return built
+
+
+def _entry_point(method: str) -> EntryPoint:
+    point = _entry_points().get(method)
+    if point is None:
+        raise PerceptionError(f"perception.method {method!r} is unknown; {_known()}")
+    return point
 
 
 def _known() -> str:

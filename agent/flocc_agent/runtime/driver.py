@@ -13,9 +13,9 @@ from typing import Any, assert_never
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.corrected import Correction, Corrector
 from flocc_agent.core.effects import (
     Broadcast,
-    Correction,
     Deliver,
     Effect,
     Encode,
@@ -83,6 +83,7 @@ class Driver:
         self._heard_gap = LongestGap()
         gaps = {"sent": self._sender.heartbeat_gap, "heard": self._heard_gap}
         self._telemetry = Telemetry(robot, tools, reporter, on_line, gaps, self._sizes)
+        self._corrector = Corrector(robot)
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
 
@@ -130,7 +131,12 @@ class Driver:
 
     def corrected_bodies(self) -> tuple[list[float], Float]:
         """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes; may be called off the loop's thread."""
-        return corrected_bodies(self.robot, self._telemetry.reporter.T_body_camera)
+        return corrected_bodies(self.robot, self._T_body_camera)
+
+    @property
+    def _T_body_camera(self) -> Float:
+        """Where the camera sits on the body, as it is known by now."""
+        return self._telemetry.reporter.T_body_camera
 
     def busy(self) -> bool:
         """Whether images, fetches, registrations or rounds are under way, or a leader still owes a round."""
@@ -147,7 +153,7 @@ class Driver:
 
     def result(self) -> dict[str, Any]:
         """What this robot knows, for `result.json`."""
-        return result_of(self.robot, self._telemetry.reporter.T_body_camera, self.last_solution)
+        return result_of(self.robot, self._T_body_camera, self.last_solution)
 
     # The loop
 
@@ -285,8 +291,8 @@ class Driver:
                 self._sender.broadcast(message)
             case Unicast(to, message):
                 self._sender.unicast(to, message)
-            case Deliver(correction):
-                self._deliver(correction)
+            case Deliver(applied, frame_changed):
+                self._deliver(self._corrector.correction(applied, frame_changed, self._T_body_camera))
             case Encode() | FetchLatent() | Register() | Optimise() | IterateBlock():
                 self._start(effect)
             case _:

@@ -16,6 +16,7 @@ from flocc_agent import perception as perception_package
 from flocc_agent.config import PerceptionConfig
 from flocc_agent.core.interfaces import OdometryPair, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.perception.backends import OWN
 from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 
@@ -27,8 +28,8 @@ class ImageEyes:
 
     def __init__(self, perception: Perception, config: PerceptionConfig, cache: Path | None) -> None:
         self._perception = perception
-        self._cache = cache
-        self._config_key = b"" if cache is None else config.model_dump_json().encode() + _code_hash()
+        self._cache = cache if config.method in OWN else None  # of a stranger's code nobody knows what it depends on
+        self._config_key = b"" if self._cache is None else config.model_dump_json().encode() + _code_hash()
 
     def encode(self, capture: Capture) -> tuple[Array, bytes]:
         """Descriptor and latent of a keyframe."""

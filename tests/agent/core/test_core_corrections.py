@@ -32,8 +32,8 @@ def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> 
 
 
 def delivered(effects: list[Effect]) -> list[tuple[int, int, bool]]:
-    found = [e.correction for e in effects if isinstance(e, Deliver)]
-    return [(c.term.counter, c.round, c.frame_changed) for c in found]
+    found = [e for e in effects if isinstance(e, Deliver)]
+    return [(e.correction.term.counter, e.correction.round, e.frame_changed) for e in found]
 
 
 def solution(shift_m: float = 0.0, keyframes: int = 3) -> GraphSolution:

@@ -26,6 +26,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
 from flocc_agent.core.robot import Restored, Robot
 from flocc_agent.geometry import pose, pose7
@@ -146,7 +147,7 @@ class Robots:
         found: dict[str, str] = {}
         for _, name, effect in self.done:
             if isinstance(effect, Deliver):
-                found[name] = effect.correction.map_frame
+                found[name] = map_frame(effect.correction.anchor)
         return {name: found[name] for name in sorted(found) if name in self.cores}
 
     def _send(self, sender: str, receiver: str, message: Message) -> None:

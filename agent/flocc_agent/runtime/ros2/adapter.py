@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector

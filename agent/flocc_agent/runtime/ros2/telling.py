@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import Correction
 from flocc_agent.runtime.ros2.names import Qos
 from flocc_agent.runtime.ros2.outgoing import Outgoing
 from flocc_agent.runtime.ros2.session import Publisher, Ros2Session
