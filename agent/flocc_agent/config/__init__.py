@@ -5,6 +5,7 @@ from flocc_agent.config.backend import BackendConfig, BackendMode, Formulation, 
 from flocc_agent.config.network import MetricsConfig, PeerEndpoints, TlsConfig, TransportConfig
 from flocc_agent.config.perception import (
     ClassicalConfig,
+    LearnedConfig,
     Mast3rConfig,
     PerceptionConfig,
     RecordedConfig,
@@ -31,6 +32,7 @@ __all__ = [
     "ConfigError",
     "Formulation",
     "KeyframeConfig",
+    "LearnedConfig",
     "LinkConfig",
     "LinkOverrideConfig",
     "Mast3rConfig",

@@ -9,7 +9,7 @@ from flocc_agent.config.section import Section
 
 
 class ClassicalConfig(Section):
-    """The classical front end: SIFT features, mutual matching, essential matrix, three-view scale."""
+    """The classical front end: SIFT features, mutual matching; two- and three-view geometry."""
 
     features_max: int = Field(1000, ge=50, le=10_000)
     """Features per image; a latent has 136 bytes for each."""
@@ -19,26 +19,21 @@ class ClassicalConfig(Section):
     """SIFT's contrast threshold; lower finds features in dim images, and more that do not repeat."""
     distance_ratio_max: float = Field(0.8, gt=0, le=1)
     """Lowe's ratio; lower keeps fewer and surer matches."""
-    inlier_threshold_px: float = Field(2.0, gt=0)
-    """A correspondence this close to its epipolar line is verified."""
-    sigma_px: float = Field(0.7, gt=0)
-    """Noise of a correspondence; weights the covariance."""
-    correspondences_min: int = Field(15, ge=8)
-    """Fewer verified correspondences are no registration."""
-    iterations_max: int = Field(2000, ge=100)
-    """Hypotheses of the robust estimator."""
-    common_points_min: int = Field(10, ge=6)
-    """Points seen in the neighbour, the query and the match that fix the closure's scale; with fewer it has none."""
-    scale_sigma_ratio_max: float = Field(0.3, gt=0)
-    """A scale more uncertain than this is not given."""
-    direction_sigma_max_rad: float = Field(0.35, gt=0)
-    """A closure without scale whose direction is more uncertain than this is degenerate."""
-    odometry_rotation_sigma_rad: float = Field(0.03, gt=0)
-    """How far odometry's rotation between neighbours may be from the images', calibration error included."""
-    odometry_direction_sigma_rad: float = Field(0.2, gt=0)
-    """How far odometry's direction of motion between neighbours may be from the images'."""
-    odometry_pairs_max: int = Field(256, ge=1)
-    """Odometry-pair results kept in memory."""
+    acceptance: Literal["fitted", "ratio"] = "fitted"
+    """fitted: the front end's own rule for closures; ratio: Eq. (1) against core.loop_closing.match_ratio_threshold."""
+
+
+class LearnedConfig(Section):
+    """The learned front end: free networks find and match features; the geometry is the classical one's."""
+
+    model: Literal["aliked-lightglue", "xfeat-lighterglue"] = "aliked-lightglue"
+    """aliked-lightglue: sees most; xfeat-lighterglue: costs what SIFT costs; the same on all robots of a swarm."""
+    weights: Path | None = None
+    """Folder with the networks' files; none: where `flocc weights get learned` puts them."""
+    device: Literal["auto", "cuda", "mps", "cpu"] = "auto"
+    """Where the networks run; auto takes the best that is there."""
+    acceptance: Literal["fitted", "ratio"] = "fitted"
+    """fitted: the front end's own rule for closures; ratio: Eq. (1) against core.loop_closing.match_ratio_threshold."""
 
 
 class SyntheticConfig(Section):
@@ -158,11 +153,13 @@ class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
     method: str = "classical"
-    """classical: OpenCV, no weights; synthetic: ground truth plus noise; recorded: looked up in a file; mast3r:
-    CosPlace and MASt3R checkpoints; or the name of one that an installed package brings."""
+    """classical: OpenCV, no weights; learned: ALIKED or XFeat with LightGlue; mast3r: CosPlace and MASt3R checkpoints;
+    synthetic: ground truth plus noise; recorded: looked up in a file; or the name of one that an installed package
+    brings."""
     options: dict[str, Any] = Field(default_factory=dict)
     """What an installed package's perception is to know; flocc hands it on as it is."""
     classical: ClassicalConfig = ClassicalConfig()
+    learned: LearnedConfig = LearnedConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     recorded: RecordedConfig = RecordedConfig()
     mast3r: Mast3rConfig = Mast3rConfig()

@@ -42,6 +42,9 @@ class Ros2Config(Section):
     """sensor_msgs/CameraInfo with the intrinsics of the images."""
     rectified: bool = False
     """Images are rectified already (image_rect): the P of CameraInfo counts, and no distortion."""
+    field_of_view_deg: float | None = Field(None, gt=0, lt=160)
+    """Of a wide lens (equidistant), the width of view that is kept when images are remapped to a pinhole, degrees; None
+    takes as much as there is, up to 100."""
     odometry_topic: RosName = "odom"
     """nav_msgs/Odometry, of base_frame in odom_frame; empty where a program or a recording feeds the agent."""
     map_frame: str = Field("map", min_length=1)

@@ -3,11 +3,13 @@
 A complaint is one sentence that names the file and the key.
 """
 
+import difflib
 import json
 import tomllib
+import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
@@ -50,19 +52,40 @@ def validated(model: type[M], fields: Mapping[str, object], source: str, folder:
         return model.model_validate(fields, context={"folder": folder})
     except (ValidationError, FloccError) as error:
         raise ConfigError(
-            first_error(error, source) if isinstance(error, ValidationError) else f"{source}: {error}"
+            first_error(error, source, model) if isinstance(error, ValidationError) else f"{source}: {error}"
         ) from error
 
 
-def first_error(error: ValidationError, source: str) -> str:
+def first_error(error: ValidationError, source: str, model: type[BaseModel]) -> str:
     """Put pydantic's first complaint into one sentence that names the source and the key."""
     complaint = error.errors()[0]
     key = ".".join(str(part) for part in complaint["loc"]) or "(top level)"
     if complaint["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{source}: the key '{key}' does not exist"
+        return f"{source}: the key '{key}' does not exist{_meant(model, complaint['loc'])}"
     if complaint["type"] in ("missing", "missing_argument"):
         return f"{source}: the key '{key}' is missing"
     return f"{source}: {key}: {complaint['msg'].removeprefix('Value error, ')}"
+
+
+def _meant(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """The key of the same section that is spelt most like one that does not exist."""
+    *sections, wrong = location
+    names = _keys(model, [part for part in sections if isinstance(part, str)])
+    near = difflib.get_close_matches(str(wrong), names, n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def _keys(kind: Any, sections: list[str]) -> list[str]:
+    """Keys of the section that lies below a model, or a union or list of models, at a path."""
+    if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__"):
+        inner = typing.get_type_hints(kind)
+    elif isinstance(kind, type) and issubclass(kind, BaseModel):
+        inner = {name: field.annotation for name, field in kind.model_fields.items()}
+    else:
+        return [name for each in typing.get_args(kind) for name in _keys(each, sections)]
+    if not sections:
+        return list(inner)
+    return _keys(inner[sections[0]], sections[1:]) if sections[0] in inner else []
 
 
 def read_toml(path: Path) -> dict[str, object]:

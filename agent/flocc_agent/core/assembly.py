@@ -21,11 +21,15 @@ Float = NDArray[np.float64]
 
 
 class _Odometry:
-    """One log's keyframes: poses as its records give them, and whether each was described."""
+    """One log's keyframes: poses as its records give them, and whether each was described.
+
+    The place of a keyframe that a later version wrote is taken by the pose of the next one; nothing is tied to it.
+    """
 
     def __init__(self) -> None:
         self.poses: list[Pose7] = []
         self.encoded: list[bool] = []
+        self.unread: set[int] = set()
         self._matrices: Float = np.empty((0, 4, 4))
 
     def matrices(self) -> Float:
@@ -121,13 +125,17 @@ class GraphAssembly:
 
     def _known(self, keyframe: KeyframeId) -> bool:
         odometry = self._odometry.get(keyframe.log)
-        return odometry is not None and keyframe.index < len(odometry.poses)
+        return odometry is not None and keyframe.index < len(odometry.poses) and keyframe.index not in odometry.unread
 
     def _add_keyframe(self, log: LogId, record: KeyframeRecord) -> None:
         """A new log, or a keyframe that a closure was waiting for, makes the last solution out of date."""
         odometry = self._odometry.get(log)
         if odometry is None:
             odometry = self._odometry[log] = _Odometry()
+        while len(odometry.poses) < record.index:
+            odometry.unread.add(len(odometry.poses))
+            odometry.poses.append(record.T_odom_camera)
+            odometry.encoded.append(False)
         odometry.poses.append(record.T_odom_camera)
         odometry.encoded.append(record.descriptor is not None)
         self.keyframes += 1

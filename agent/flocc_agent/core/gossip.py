@@ -24,7 +24,15 @@ from flocc_protocol.messages import (
     RecordRequest,
     Records,
 )
-from flocc_protocol.records import KeyframeRecord, Record, chain, decode_record, encode_record
+from flocc_protocol.records import (
+    KEYFRAME_CODE,
+    KeyframeRecord,
+    Record,
+    UnknownRecord,
+    chain,
+    decode_record,
+    encode_record,
+)
 
 DECODED_MAX = 1024
 
@@ -77,7 +85,7 @@ class LogCopy:
         self.records.append(record)
         self.encoded.append(data)
         self.checksums.append(chain(self.checksums[-1], data))
-        self.keyframes += isinstance(record, KeyframeRecord)
+        self.keyframes += isinstance(record, KeyframeRecord) or _is_later_keyframe(record)
 
     def continues(self, batch: RecordBatch) -> bool:
         """Whether a batch that starts within this copy agrees with it, as far as both go."""
@@ -307,6 +315,11 @@ def _is_full(message: Records) -> bool:
     return many or sum(sizes) >= RECORDS_BATCH_BYTES_MAX // 2
 
 
+def _is_later_keyframe(record: Record) -> bool:
+    """Whether a later version wrote a keyframe that this one cannot read: it has a number all the same."""
+    return isinstance(record, UnknownRecord) and record.code == KEYFRAME_CODE
+
+
 @lru_cache(maxsize=DECODED_MAX)
 def decoded(data: bytes) -> tuple[Record, Record]:
     """A record, and what is kept of it, decoded once where several copies of a log live in one process."""
@@ -315,5 +328,11 @@ def decoded(data: bytes) -> tuple[Record, Record]:
 
 
 def kept(record: Record) -> Record:
-    """A record without its descriptor: place recognition has that, and the record's bytes."""
-    return replace(record, descriptor=None) if isinstance(record, KeyframeRecord) else record
+    """A record without what is held elsewhere: place recognition has the descriptor, the log the record's bytes."""
+    match record:
+        case KeyframeRecord():
+            return replace(record, descriptor=None)
+        case UnknownRecord(code):
+            return UnknownRecord(code, b"")
+        case _:
+            return record

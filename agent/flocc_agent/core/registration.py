@@ -81,6 +81,7 @@ class RegistrationFailure(Enum):
     FEW_CORRESPONDENCES = "few correspondences"
     NO_MODEL = "no relative pose fits the correspondences"
     DEGENERATE = "the correspondences do not fix a relative pose"
+    UNCONVINCING = "less evidence than the front end's wrong pairs may have"
     BAD_LATENT = "a latent is damaged or of another model"
     OUT_OF_MEMORY = "out of memory"
     CRASHED = "the registration failed with an internal error"
@@ -100,6 +101,7 @@ class Registration:
             match, or None where the method gives none.
         confidence: Mean confidence that the network gives the loop pair's points; None of other methods.
         odometry_confidence: The same of the odometry pair.
+        is_judged: Whether the front end accepted it by a rule of its own, so that R_thr does not decide.
     """
 
     T_query_match_unscaled: Float
@@ -109,6 +111,7 @@ class Registration:
     covariance: Float | None = None
     confidence: float | None = None
     odometry_confidence: float | None = None
+    is_judged: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,10 +88,10 @@ def _package(point: EntryPoint) -> str:
 
 
 def _classical(config: PerceptionConfig, seed: int) -> Perception:  # noqa: ARG001
-    from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, ClassicalRegistrar
+    from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, classical_registrar
 
     given = config.classical
-    return Perception(ClassicalDescriber(given), ClassicalEncoder(given), ClassicalRegistrar(given))
+    return Perception(ClassicalDescriber(given), ClassicalEncoder(given), classical_registrar(given))
 
 
 def _synthetic(config: PerceptionConfig, seed: int) -> Perception:
@@ -114,8 +114,15 @@ def _mast3r(config: PerceptionConfig, seed: int) -> Perception:  # noqa: ARG001
     return Perception(*build(config.mast3r))
 
 
+def _learned(config: PerceptionConfig, seed: int) -> Perception:  # noqa: ARG001
+    from flocc_agent.perception.learned import build
+
+    return Perception(*build(config.learned))
+
+
 OWN: dict[str, Builder] = {
     "classical": _classical,
+    "learned": _learned,
     "synthetic": _synthetic,
     "recorded": _recorded,
     "mast3r": _mast3r,

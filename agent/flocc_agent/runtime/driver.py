@@ -29,12 +29,14 @@ from flocc_agent.core.effects import (
     Report,
     Unicast,
 )
-from flocc_agent.core.events import Event, FixMeasured, GraphOptimised, KeyframeCaptured, Leaving, MessageReceived
+from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Leaving, Measured, MessageReceived
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose7
 from flocc_agent.runtime.admission import Refusal, admitted
+from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, job_of
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import DiskQueue, Persist
@@ -75,6 +77,7 @@ class Driver:
         self._inbox: deque[tuple[float, Event]] = deque()
         self._wake = asyncio.Event()
         self._opened = asyncio.Event()
+        self._given = GivenKeyframes.of(robot)
         self._jobs: set[asyncio.Task[Event]] = set()
         self._stopping = False
         self._subscribers: list[asyncio.Queue[Correction | None]] = []
@@ -100,12 +103,17 @@ class Driver:
     async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
         """Take a keyframe in; waits while too many images wait for the encoder."""
         number = await self._tools.images.put(image)
+        self._given.add(stamp_s)
         self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), number))
 
-    def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
-        """Take in an absolute position of the last keyframe's camera."""
-        x, y, z = (float(v) for v in position_m)
-        self.put(FixMeasured((x, y, z), tuple(float(v) for v in covariance_m2.ravel())))
+    def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
+        """Take in what was measured at the keyframe that was given last, or at the one with this stamp.
+
+        Raises:
+            BadMeasurement: There is no such keyframe.
+        """
+        index = self._given.index_of(measurement, stamp_s)
+        self.put(Measured(measurement, index))
 
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""

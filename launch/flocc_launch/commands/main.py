@@ -22,23 +22,42 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="flocc",
-    help="Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots.",
     epilog="Start with 'flocc demo', or 'flocc launch FOLDER' with images and a trajectory of your own.",
     context_settings={"max_content_width": 110},
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    add_completion=True,
 )
+
+
+def _show_version(wanted: bool) -> None:
+    """Print the version of the installed distribution, and of the wire."""
+    if wanted:
+        from flocc_launch.runs.version import flocc_version
+        from flocc_protocol.messages import PROTOCOL_VERSION
+
+        typer.echo(f"flocc {flocc_version()} (protocol {PROTOCOL_VERSION})")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    """Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots."""
+
 
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
-Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
-Latency = Annotated[float | None, typer.Option(help="Delay on every link, seconds.")]
-Bandwidth = Annotated[float | None, typer.Option(help="Capacity of every link, and budget of every robot, kB/s.")]
-Range = Annotated[float | None, typer.Option("--range", help="Communication range by true position, metres.")]
-Duration = Annotated[float | None, typer.Option(help="End after this many seconds instead of when all is settled.")]
+Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
+Latency = Annotated[float | None, typer.Option(min=0.0, help="Delay on every link, seconds.")]
+Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a link and budget of a robot, kB/s.")]
+Range = Annotated[float | None, typer.Option("--range", min=0.0, help="Communication range by true position, metres.")]
+Duration = Annotated[float | None, typer.Option(min=0.0, help="End after so many seconds, not when all is settled.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flocc_agent.runtime.pictures import PictureError
 from flocc_agent.runtime.trajectory import Trajectory, read_tum
 from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
@@ -20,7 +21,7 @@ from flocc_launch.datasets.bag_messages import (
 from flocc_launch.datasets.bag_poses import PoseDecoder
 from flocc_launch.datasets.bag_reader import Bag, Topic
 from flocc_launch.datasets.intrinsics import read_lens
-from flocc_launch.datasets.pixels import decoded, undistorted, written_lens
+from flocc_launch.datasets.pixels import ImageWriter
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
@@ -138,14 +139,15 @@ class _Conversion:
     options: BagOptions
     writer: RecordingWriter
     log: PoseWriter
+    images: ImageWriter = field(init=False)
     zero_ns: int = 0
     images_seen: int = 0
     faults: list[str] = field(default_factory=list)
 
     def convert(self, progress: Progress | None) -> None:
         """Read to the end, or to the first message that cannot be used."""
-        kept = written_lens(self.lens)
-        self.writer.write_camera(kept.camera, kept.T_body_camera)
+        self.images = ImageWriter(self.lens)
+        self.writer.write_lens(self.images.lens)
         state_path = self.writer.path / "bag_state.json"
         start_ns = self._restored(state_path)
         done_s = self.writer.last_stamp_s
@@ -184,20 +186,11 @@ class _Conversion:
             self._once(f"time goes backwards, from {last_s:.6f} s to {stamp_s:.6f} s; such images were left out")
             return
         encoded, suffix = image_file(message, self.image_topic, self.options.jpeg)
-        if self.writer.count == 0:
-            self._check_size(encoded)
-        if self.lens.k3 != 0.0:
-            encoded, suffix = undistorted(encoded, f"topic {self.image_topic.name}", self.lens)
-        self.writer.add(stamp_s, encoded, suffix)
-
-    def _check_size(self, encoded: bytes) -> None:
-        height, width = decoded(encoded, f"{self.bag.path}: topic {self.image_topic.name}").shape[:2]
-        camera = self.lens.camera
-        if (width, height) != (camera.width, camera.height):
-            raise DatasetError(
-                f"topic {self.image_topic.name}: images are {width}x{height}, "
-                f"but the intrinsics are for {camera.width}x{camera.height}"
-            )
+        try:
+            written = self.images.written(encoded, suffix)
+        except PictureError as error:
+            raise DatasetError(f"topic {self.image_topic.name}: {error}") from error
+        self.writer.add(stamp_s, *written)
 
     def _once(self, fault: str) -> None:
         sentence = f"{self.bag.path}: topic {self.image_topic.name}: {fault}"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.trajectory import Trajectory, read_tum
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
@@ -37,6 +37,7 @@ class Info:
         length_m: Distance travelled, by ground truth or else by odometry.
         faults: What is wrong with it, one sentence each.
         topics: Of a bag, with types and numbers of messages.
+        notes: What was left out or not used, one sentence each.
     """
 
     path: Path
@@ -45,12 +46,13 @@ class Info:
     posed: int | None
     from_s: float
     to_s: float
-    camera: Camera | None
+    camera: CameraModel | None
     odometry_poses: int | None
     truth_poses: int | None
     length_m: float | None
     faults: tuple[str, ...]
     topics: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def info(path: Path, format_name: str | None = None) -> Info:
@@ -75,6 +77,7 @@ def info(path: Path, format_name: str | None = None) -> Info:
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source)),
+        notes=source.notes,
     )
 
 
@@ -102,11 +105,16 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
     if found.format == "bag":
         yield from (("topic", topic) for topic in found.topics)
     else:
-        size = None if camera is None else f"{camera.width}x{camera.height}, fx {camera.fx:g} fy {camera.fy:g}"
-        yield "camera", size or "none"
+        yield "camera", "none" if camera is None else _told(camera)
         yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
         yield "length", "not known" if found.length_m is None else f"{found.length_m:.1f} m"
+    yield from (("note", note) for note in found.notes)
     yield from (("fault", fault) for fault in found.faults)
+
+
+def _told(camera: CameraModel) -> str:
+    kind = "" if camera.kind is LensKind.PINHOLE else f"{camera.kind}, "
+    return f"{kind}{camera.width}x{camera.height}, fx {camera.fx:g} fy {camera.fy:g}"
 
 
 def _bag_info(path: Path) -> Info:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose, number_lines, read_tum, text_lines
 from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
 from flocc_launch.datasets.intrinsics import read_lens
@@ -37,7 +37,7 @@ def read_tum_rgbd(path: Path) -> Source:
     lens = camera_file(path)
     for name, ((fx, fy, cx, cy), distortion, k3) in TUM_CAMERAS.items():
         if lens is None and name in path.resolve().name:
-            lens = Lens(Camera(640, 480, fx, fy, cx, cy, distortion), k3=k3)
+            lens = Lens(CameraModel(640, 480, fx, fy, cx, cy, (*distortion, k3)))
     truth = _optional(path / "groundtruth.txt", read_tum)
     return Source(path, "tum", images, lens, truth=truth, faults=faults)
 
@@ -105,7 +105,7 @@ def _kitti_lens(path: Path, name: str, files: list[Path]) -> Lens | None:
     if P is None or len(P) != 12:
         raise DatasetError(f"{path}: has no row {name} of 12 numbers")
     width, height = image_size(files[0])
-    return Lens(Camera(width, height, P[0], P[5], P[2], P[6]))
+    return Lens(CameraModel(width, height, P[0], P[5], P[2], P[6]))
 
 
 def read_sevenscenes(path: Path) -> Source:
@@ -136,9 +136,9 @@ def _sevenscenes_lens(path: Path, image: Path) -> Lens:
     width, height = image_size(image)
     file = path / "camera-intrinsics.txt"
     if not file.exists():
-        return Lens(Camera(width, height, 585.0, 585.0, width / 2, height / 2))
+        return Lens(CameraModel(width, height, 585.0, 585.0, width / 2, height / 2))
     K = [values for _, values in number_lines(file, 3)]
-    return Lens(Camera(width, height, K[0][0], K[1][1], K[0][2], K[1][2]))
+    return Lens(CameraModel(width, height, K[0][0], K[1][1], K[0][2], K[1][2]))
 
 
 def _optional(path: Path, read: Callable[[Path], Trajectory]) -> Trajectory | None:

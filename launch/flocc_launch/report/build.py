@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from flocc_launch.runs.run_records import AgentDied, BytesCounted, ClosureAccept
 from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
 from flocc_launch.runs.tracks import Track
 from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
+from flocc_launch.runs.version import flocc_version
 
 Float = NDArray[np.float64]
 
@@ -69,14 +69,6 @@ def build(loaded: LoadedRun) -> Report:
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
-
-
-def flocc_version() -> str:
-    """Version of the installed distribution, or 'unknown' when run from a source tree alone."""
-    try:
-        return version("flocc")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def with_keyframes(tracks: Iterable[Track]) -> list[Track]:

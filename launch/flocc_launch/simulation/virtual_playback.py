@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import KeyframeConfig
 from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_launch.scenarios.walks import T_BODY_CAMERA, Walk
@@ -87,7 +88,7 @@ def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
             frames[k].T_odom_body,
             lambda frame=frames[k]: recording.load_image(frame),  # type: ignore[misc]
             frames[k].image_path,
-            repr(recording.camera).encode(),
+            repr(recording.camera if recording.levels == FULL else (recording.camera, recording.levels)).encode(),
         )
         for k in chosen
     )
