@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.core.registration import match_ratio
-from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, Needed, Neighbour
-from flocc_lab.bench.acceptance_rows import ANGLES_DEG, Row
+from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, Needed, OdometryNeighbour
+from flocc_lab.bench.acceptance_rows import ANGLES_DEG, AcceptanceRow
 
 ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 10_000)
 AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, 10_000)
@@ -37,7 +37,7 @@ class Kept:
     """Right ones before the rule."""
 
 
-def fitted(rows: Sequence[Row]) -> Acceptance:
+def fitted(rows: Sequence[AcceptanceRow]) -> Acceptance:
     """The rule that fits these rows, each kind by itself."""
     with_scale, without_scale = (
         best_needed([row for row in rows if row.evidence is not None and row.evidence.has_scale is has_scale])
@@ -46,7 +46,7 @@ def fitted(rows: Sequence[Row]) -> Acceptance:
     return Acceptance(with_scale, without_scale)
 
 
-def best_needed(rows: Sequence[Row]) -> Needed:
+def best_needed(rows: Sequence[AcceptanceRow]) -> Needed:
     """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
     table = Table(rows)
     scored = [(table.score(needed), needed.alone, needed.agreeing, needed.cells, needed) for needed in choices()]
@@ -61,13 +61,13 @@ def choices() -> Iterator[Needed]:
 class Table:
     """Rows of one kind as arrays, for trying many rules."""
 
-    def __init__(self, rows: Sequence[Row]) -> None:
+    def __init__(self, rows: Sequence[AcceptanceRow]) -> None:
         evidence = [row.evidence for row in rows if row.evidence is not None]
         self._right = np.array([row.is_right for row in rows], bool)
         factor = np.where(self._right, 1.0, MARGIN)
         self._count = np.array([e.correspondences for e in evidence]) * factor
         self._cells = np.array([e.cells for e in evidence]) * factor
-        self._agrees = np.array([e.neighbour is Neighbour.AGREES for e in evidence], bool)
+        self._agrees = np.array([e.neighbour is OdometryNeighbour.AGREES for e in evidence], bool)
 
     def score(self, needed: Needed) -> int:
         """Right pairs kept, less what the wrong ones cost."""
@@ -76,14 +76,14 @@ class Table:
         return int((kept & self._right).sum()) - WRONG_COST * int((kept & ~self._right).sum())
 
 
-def kept(rows: Sequence[Row], rule: Acceptance | None) -> Kept:
+def kept(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> Kept:
     """What a rule keeps; None is the paper's, Eq. (1) against R_thr."""
     accepted = [row for row in rows if accepts(row, rule)]
     right = sum(row.is_right for row in accepted)
     return Kept(right, len(accepted) - right, sum(row.is_right for row in rows))
 
 
-def accepts(row: Row, rule: Acceptance | None) -> bool:
+def accepts(row: AcceptanceRow, rule: Acceptance | None) -> bool:
     """Whether a rule accepts a pair; the neighbour is heard only where the rule asks it."""
     if row.evidence is None:
         return False
@@ -95,10 +95,10 @@ def accepts(row: Row, rule: Acceptance | None) -> bool:
 
 def heard(evidence: Evidence, rule: Acceptance) -> Evidence:
     """The evidence as the registrar would have it."""
-    return evidence if rule.needs_neighbour(evidence) else replace(evidence, neighbour=Neighbour.NOT_ASKED)
+    return evidence if rule.needs_neighbour(evidence) else replace(evidence, neighbour=OdometryNeighbour.NOT_ASKED)
 
 
-def leave_one_out(rows: Sequence[Row]) -> dict[str, Kept]:
+def leave_one_out(rows: Sequence[AcceptanceRow]) -> dict[str, Kept]:
     """By scene: what the rule of all other scenes keeps of it."""
     names = sorted({row.scene for row in rows})
     return {
@@ -107,12 +107,12 @@ def leave_one_out(rows: Sequence[Row]) -> dict[str, Kept]:
     }
 
 
-def by_angle(rows: Sequence[Row], rule: Acceptance | None) -> list[Kept]:
+def by_angle(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> list[Kept]:
     """What a rule keeps, by the angle between the viewing directions."""
     return [kept([row for row in rows if low <= row.angle_deg < high], rule) for low, high in pairwise(ANGLES_DEG)]
 
 
-def report(rows: Sequence[Row]) -> dict[str, Any]:
+def report(rows: Sequence[AcceptanceRow]) -> dict[str, Any]:
     """The rule of all scenes, and tables by scene and angle, for the paper's rule, the fitted one and leave-one-out."""
     rule = fitted(rows)
     left_out = leave_one_out(rows)

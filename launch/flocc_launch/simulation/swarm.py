@@ -20,7 +20,7 @@ from flocc_launch.simulation.virtual_fetches import LatentFetcher
 from flocc_launch.simulation.virtual_network import Network
 from flocc_launch.simulation.virtual_playback import Playback
 from flocc_launch.simulation.virtual_robot import Clock, Station, Surroundings
-from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, Workers, WorkTimes
+from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, VirtualWorkers, WorkTimes
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Envelope, Message
 
@@ -131,7 +131,7 @@ class Swarm:
             LogId(name),
             robot.compute_class,
             playback,
-            Workers(
+            VirtualWorkers(
                 self._equipment.eyes,
                 self._equipment.optimiser,
                 build_iterator(self.scenario.backend),

@@ -30,7 +30,7 @@ from flocc_agent.geometry import pose7
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture, Playback
-from flocc_launch.simulation.virtual_workers import Workers
+from flocc_launch.simulation.virtual_workers import VirtualWorkers
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Envelope, Message
 
@@ -87,7 +87,7 @@ class Station:
         log: LogId,
         compute_class: int,
         playback: Playback,
-        workers: Workers,
+        workers: VirtualWorkers,
         disk: Disk,
         clock: Clock,
         agenda: Agenda,

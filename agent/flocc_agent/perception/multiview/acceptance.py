@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import angle_rad, inverse
-from flocc_agent.perception.multiview.parameters import Rays
 from flocc_agent.perception.multiview.two_view import TwoView
+from flocc_agent.perception.multiview.view_parameters import LocalFeatures
 
 Float = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ ROTATION_AGREES_RAD = float(np.radians(5.0))
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
 
 
-class Neighbour(Enum):
+class OdometryNeighbour(Enum):
     """What the query's neighbour says of the pair."""
 
     NOT_ASKED = "not asked"
@@ -50,7 +50,7 @@ class Evidence:
     correspondences: int
     has_scale: bool
     cells: int
-    neighbour: Neighbour = Neighbour.NOT_ASKED
+    neighbour: OdometryNeighbour = OdometryNeighbour.NOT_ASKED
     neighbour_correspondences: int = 0
 
 
@@ -93,7 +93,7 @@ class Acceptance:
     def accepts(self, evidence: Evidence) -> bool:
         """Whether the evidence suffices."""
         needed = self.needed(evidence)
-        agrees = evidence.neighbour is Neighbour.AGREES
+        agrees = evidence.neighbour is OdometryNeighbour.AGREES
         enough = needed.agreeing if agrees else needed.alone
         return evidence.correspondences >= enough and evidence.cells >= needed.cells
 
@@ -111,7 +111,7 @@ class Acceptance:
         return RegistrationFailed(RegistrationFailure.UNCONVINCING, detail, *counts)
 
 
-def cells(query: Rays, pair: TwoView) -> int:
+def cells(query: LocalFeatures, pair: TwoView) -> int:
     """Cells that hold a pair's correspondences, in the image where they are fewer."""
     return min(_cells(query.points[pair.query_indices]), _cells(pair.view.observed))
 
@@ -132,9 +132,9 @@ def evidence_of_neighbour(
         T_neighbour_query: (4, 4) from odometry, metres.
     """
     if isinstance(neighbour_pair, int):
-        return replace(evidence, neighbour=Neighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
+        return replace(evidence, neighbour=OdometryNeighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
     agrees = agree(inverse(neighbour_pair.view.T_view_query), result, T_neighbour_query)
-    word = Neighbour.AGREES if agrees else Neighbour.CONTRADICTS
+    word = OdometryNeighbour.AGREES if agrees else OdometryNeighbour.CONTRADICTS
     return replace(evidence, neighbour=word, neighbour_correspondences=neighbour_pair.correspondences)
 
 
