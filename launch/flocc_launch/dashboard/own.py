@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.event_lines import Reported
