@@ -19,7 +19,7 @@ from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
@@ -67,7 +67,7 @@ def launch(
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
     metrics: str | None = None,
-) -> Report:
+) -> RunReport:
     """Run a scenario and write its run folder.
 
     Args:
@@ -141,7 +141,7 @@ class _Launch:
         self._seen: dict[str, Any] = {}
         self._watch = Watch(scenario, self._agents())
 
-    async def run(self) -> Report:
+    async def run(self) -> RunReport:
         """Start, watch, stop, write."""
         self._folder.write_run(self._run_record())
         loop = asyncio.get_running_loop()
