@@ -42,6 +42,7 @@ from flocc_agent.runtime.driver import Driver, Skills
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
@@ -256,9 +257,15 @@ class Agent:
         await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
         self._kept = True
 
-    async def add_frame(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> bool:
-        """Give the agent any frame; it becomes a keyframe when the robot moved enough. Returns whether it did."""
-        if not self._selector.wants(T_odom_body):
+    async def add_frame(
+        self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float, keep: bool = False
+    ) -> bool:
+        """Give the agent any frame; it becomes a keyframe when the robot moved enough, or where `keep` says so.
+
+        Returns:
+            Whether it became one; `keep` what something was seen in.
+        """
+        if not keep and not self._selector.wants(T_odom_body):
             self._kept = False
             return False
         await self.add_keyframe(pixels, T_odom_body, stamp_s)
@@ -436,7 +443,11 @@ class Agent:
         async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
-        await play(recording, source, self._selector, add, self._clock_s, self._on_position, resumed)
+        def measure(stamped: Stamped, frame_s: float) -> None:
+            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter

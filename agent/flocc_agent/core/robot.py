@@ -187,6 +187,10 @@ class Robot:
             self.rounds.deadline() if self.distributed is None else self.distributed.deadline(),
         )
 
+    def keyframes_given(self) -> int:
+        """Own keyframes that were captured, recorded or not: the next one's number."""
+        return self.gossip.logs[self.log].keyframes + len(self._pending)
+
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Every queue, table and cache: how much is in it, and its maximum."""
         neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
@@ -315,7 +319,7 @@ class Robot:
         return effects
 
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
-        index = self.gossip.logs[self.log].keyframes + len(self._pending)
+        index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
         return [Encode(KeyframeId(self.log, index), event.image)]
 
@@ -343,7 +347,7 @@ class Robot:
         recorded = self.gossip.logs[self.log].keyframes
         if keyframe.index < recorded:
             return self._append_measurement(measurement, keyframe, now)
-        if keyframe.index >= max(recorded + len(self._pending), 1):
+        if keyframe.index >= max(self.keyframes_given(), 1):
             return [measurement_refused(measurement, keyframe, "there is no such keyframe")]
         waiting = self._waiting.setdefault(keyframe.index, [])
         if len(waiting) >= WAITING_MAX:

@@ -236,6 +236,14 @@ class Driver:
         index = self._given.index_of(measurement, stamp_s)
         self.put(Measured(measurement, index))
 
+    def keyframe_at(self, stamp_s: float) -> KeyframeId:
+        """The own keyframe with this stamp.
+
+        Raises:
+            BadMeasurement: There is none.
+        """
+        return KeyframeId(self.robot.log, self._given.at("closure", stamp_s))
+
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""
         queue: asyncio.Queue[Correction | None] = asyncio.Queue(CORRECTIONS_MAX)

@@ -14,6 +14,7 @@ from flocc_agent.core.reports import (
 )
 from flocc_agent.runtime.event_lines import line_of
 from flocc_agent.runtime.facts import AccountKept, AgentStopped, BytesCounted
+from flocc_agent.runtime.measurement_file import rows_of
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
@@ -23,6 +24,7 @@ from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RobotResult, Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.scenarios.sensors import sense
 from flocc_launch.scenarios.walks import walks
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
@@ -83,13 +85,16 @@ def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str
     """What each robot of a scenario sees."""
     drawn = walks(scenario.tracks) if scenario.tracks else []
     walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
+    measured = sense(scenario.sensors, {name: walk.truth for name, walk in walked.items()}) if scenario.sensors else {}
     playbacks = {}
     for name in scenario.names():
         path = recordings.get(name) or scenario.robot(name).recording
         if path is not None:
             playbacks[name] = of_recording(Recording.open(path), scenario.keyframes)
         elif name in walked:
-            playbacks[name] = of_walk(walked[name], name, scenario.keyframes)
+            walk = walked[name]
+            seen = rows_of(measured.get(name, ()), walk.truth.stamps_s.tolist(), f"[sensors] of {name}")
+            playbacks[name] = of_walk(walk, name, scenario.keyframes, seen)
         else:
             playbacks[name] = nothing()
     return playbacks

@@ -38,6 +38,15 @@ def test_few_correspondences_are_refused_whatever_their_ratio() -> None:
     assert reason(replace(GOOD, correspondences=19, odometry_correspondences=20)) == "fewer than 20 correspondences"
 
 
+def test_what_its_front_end_judged_needs_no_ratio() -> None:
+    few = replace(GOOD, correspondences=18, is_judged=True)
+
+    record = judged(QUERY, MATCH, few, LIMITS)
+
+    assert isinstance(record, ClosureRecord)
+    assert record.match_ratio == 0.18
+
+
 def test_a_failed_registration_is_refused_with_its_reason() -> None:
     failed = RegistrationFailed(RegistrationFailure.DEGENERATE, correspondences=7)
     assert reason(failed) == RegistrationFailure.DEGENERATE.value
