@@ -1,6 +1,7 @@
 """Between the core and the store: what a robot keeps, and what it finds when it starts."""
 
 from collections.abc import Iterable
+from typing import assert_never
 
 from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.robot import Restored
@@ -33,6 +34,8 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
                     store.put_fact(FRAME_CHANGED, b"0")
             case PersistRecord():
                 pass
+            case _:
+                assert_never(effect)
 
 
 def restore(store: Store) -> Restored:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never
 
 from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
 from flocc_agent.runtime.event_lines import Reported
@@ -23,7 +23,7 @@ from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
-from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario, agent_config
+from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault, Scenario, agent_config
 from flocc_launch.setup.credentials import make_keys
 from flocc_launch.swarm.agent_process import Lines, recover_result
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
@@ -244,8 +244,10 @@ class _Launch:
             case FaultKind.SLOW:
                 for agent in concerned:
                     await agent.order({"slow": fault.value})
+            case FaultKind.MUTE | FaultKind.CALM:
+                raise AssertionError(f"{fault.kind.value} exists on virtual time only: check_faults refuses it")
             case _:
-                self._radio = changed_radio(self._radio, fault, self._now_s())
+                self._radio = changed_radio(self._radio, fault.kind, fault, self._now_s())
                 order = {"radio": json.loads(self._radio.model_dump_json())}
                 await asyncio.gather(*(agent.order(order) for agent in self._watch.agents))
 
@@ -314,9 +316,9 @@ class _Launch:
         return time.monotonic() - self._epoch_s
 
 
-def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig:
+def changed_radio(radio: RadioConfig, kind: LinkFault, fault: Fault, now_s: float) -> RadioConfig:
     """The radio after a fault that concerns links."""
-    match fault.kind:
+    match kind:
         case FaultKind.PARTITION:
             partition = {"groups": fault.groups, "from_s": now_s}
             return radio.model_validate({**radio.model_dump(), "partitions": [*radio.partitions, partition]})
@@ -332,7 +334,7 @@ def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig
         case FaultKind.RANGE:
             return radio.model_validate({**radio.model_dump(), "range_m": fault.value})
         case _:
-            raise ValueError(f"{fault.kind.value} does not concern links")
+            assert_never(kind)
 
 
 def _agree(alive: list[AgentProcess]) -> bool:
