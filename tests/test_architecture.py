@@ -154,12 +154,6 @@ def places_of(names: Iterable[tuple[str, Path]], allowed: Mapping[str, str]) -> 
 FILES_TWICE = {"__init__.py": "Python's", "__main__.py": "Python's"}
 CLASSES_TWICE = {
     "Trajectory": "of a log in a pose graph, and of stamped poses in a file: the word of the field for both",
-    "Report": "the core's fact until it is typed, and the report of a run",
-    "Robot": "the core, and a robot's part of the report",
-    "GraphOptimised": "the core's event, and what the run folder keeps of it",
-    "KeyframeCaptured": "the same",
-    "LatentFetched": "the same",
-    "OptimisationFailed": "the same",
 }
 """Names that may stand twice, and why; take one out when its reason is gone."""
 
