@@ -5,6 +5,7 @@ Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import time
@@ -58,6 +59,8 @@ from flocc_protocol.keys import Admin
 
 if TYPE_CHECKING:
     from flocc_agent.runtime.ros2.adapter import Ros2Adapter
+
+logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
@@ -325,7 +328,7 @@ class Agent:
             self._driver.stop()
 
     async def finished(self) -> None:
-        """Wait until the agent stops, by `stop`, or by the end of its recording and `hold_s`.
+        """Wait until the agent stops, by `stop` or by an order.
 
         Raises:
             FloccError: The recording cannot be played on.
@@ -442,13 +445,13 @@ class Agent:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
         def measure(stamped: Stamped, frame_s: float) -> None:
-            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
-            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            try:
+                measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+                self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            except BadMeasurement as error:
+                logger.warning("robot %s: %s; left out", self.config.name, error)
 
         await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
-        if source.hold_s > 0:
-            await asyncio.sleep(source.hold_s)
-            self.stop()
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
@@ -460,6 +463,7 @@ class Agent:
             lambda *keyframe: self._started.add_keyframe(*keyframe),
             lambda T_body_camera: self._started.mount_camera(T_body_camera),
             lambda: self._started.corrected_bodies(),
+            lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
             report,
         )
         return Ros2Adapter(config, self.config.name, self._selector, host)

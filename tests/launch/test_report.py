@@ -10,7 +10,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
-from flocc_agent.runtime.trajectory import read_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.report import Report, evaluate, finish, read_report
 from flocc_launch.report.build import judged
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line

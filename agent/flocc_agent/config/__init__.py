@@ -1,6 +1,6 @@
 """The configuration of an agent, by noun; what other packages use stands here."""
 
-from flocc_agent.config.agent import AgentConfig, KeyframeConfig, SourceConfig, StoreConfig
+from flocc_agent.config.agent import AgentConfig, CoreSection, KeyframeConfig, SourceConfig, StoreConfig
 from flocc_agent.config.backend import BackendConfig, BackendMode, Formulation, ScaleInitial, Solver
 from flocc_agent.config.network import MetricsConfig, PeerEndpoints, TlsConfig, TransportConfig
 from flocc_agent.config.perception import (
@@ -20,6 +20,7 @@ from flocc_agent.config.section import (
     put_value,
     read_json,
     read_toml,
+    refuse_removed,
     validated,
 )
 
@@ -30,6 +31,7 @@ __all__ = [
     "BlackoutConfig",
     "ClassicalConfig",
     "ConfigError",
+    "CoreSection",
     "Formulation",
     "KeyframeConfig",
     "LearnedConfig",
@@ -55,5 +57,6 @@ __all__ = [
     "put_value",
     "read_json",
     "read_toml",
+    "refuse_removed",
     "validated",
 ]

@@ -146,7 +146,7 @@ class Robot:
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
         self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
-        self.corrections = Corrections(log, parameters.gossip, parameters.rounds, sealer)
+        self.corrections = Corrections(log, parameters.gossip, sealer)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -406,9 +406,7 @@ class Robot:
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
         iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
-        return DistributedOptimisation(
-            self.log, self.assembly, self._parameters.distributed, self._parameters.rounds, iteration
-        )
+        return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, iteration)
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""

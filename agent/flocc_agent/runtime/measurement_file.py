@@ -17,7 +17,7 @@ import numpy as np
 
 from flocc_agent.core.measurement_text import measurement_of
 from flocc_agent.core.measurements import BadMeasurement, Fix, GeodeticFix, Measurement, MetricClosure
-from flocc_agent.runtime.trajectory import RecordingError
+from flocc_agent.runtime.text_tables import RecordingError
 from flocc_protocol.ids import KeyframeId, LogId
 
 NAME = "measurements.jsonl"

@@ -23,7 +23,9 @@ from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, read_measurements
 from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
-from flocc_agent.runtime.trajectory import GAP_MAX_S, RecordingError, Trajectory, checked_pose, read_tum, text_lines
+from flocc_agent.runtime.text_tables import RecordingError, text_lines
+from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
+from flocc_agent.runtime.trajectory_text import read_tum
 
 __all__ = ["Frame", "Recording", "RecordingError", "read_camera", "read_image_list", "write_camera"]
 

@@ -5,6 +5,7 @@ A step looks at two robots and gives None where it holds. Later steps may rely o
 
 from collections.abc import Callable
 
+from flocc_agent.core.election import ANSWER_TIMEOUT_S
 from flocc_launch.doctor.finding import Finding, blocked
 from flocc_launch.doctor.merge_evidence import (
     best_similarity,
@@ -206,7 +207,7 @@ def followed_nobody(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     return blocked(
         "no-leader",
         f"{a} and {b} are connected by closures, but neither ever followed a leader.",
-        "Check that heartbeats arrive both ways and that election.answer_timeout_s is above the round-trip time.",
+        f"Check that heartbeats arrive both ways, and that a round trip takes less than {ANSWER_TIMEOUT_S:g} s.",
         a,
         b,
     )

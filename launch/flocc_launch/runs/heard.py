@@ -6,7 +6,7 @@ bodies.
 """
 
 from flocc_agent.core.pose_graph import map_frame
-from flocc_agent.core.registration import closure_probability
+from flocc_agent.core.registration import closure_probability, match_ratio
 from flocc_launch.runs.run_records import (
     ClosureAccepted,
     ClosureRejected,
@@ -69,7 +69,7 @@ class Heard:
                     event="closure_rejected",
                     query=str(record.query),
                     match=str(record.match),
-                    ratio=ratio_of(record),
+                    ratio=match_ratio(record.correspondences, record.odometry_correspondences),
                     reason=record.reason,
                 )
             case _:
@@ -105,8 +105,3 @@ class Heard:
         if followed is None:
             return LeaderLost(t=t, robot=sender.robot, event="leader_lost")
         return LeaderFollowed(t=t, robot=sender.robot, event="leader", term=followed[0], leader=followed[1])
-
-
-def ratio_of(record: RejectionRecord) -> float | None:
-    """Match ratio of a rejected pair, Eq. (1); None where its odometry pair had no correspondences."""
-    return record.correspondences / record.odometry_correspondences if record.odometry_correspondences else None

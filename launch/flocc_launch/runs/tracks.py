@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.run_records import Event, KeyframeCaptured, RobotResult, of_kind, stacked_poses
 from flocc_launch.runs.trajectory_errors import associate, placed_at_true_start

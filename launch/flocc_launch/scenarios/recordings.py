@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
-from flocc_agent.runtime.trajectory import read_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, SensorsScenario, TracksScenario, WorldScenario
 from flocc_launch.scenarios.sensors import sense
 

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, Field, model_validator
 from flocc_agent.config import (
     AgentConfig,
     BackendConfig,
+    CoreSection,
     KeyframeConfig,
     PartitionConfig,
     PerceptionConfig,
@@ -282,7 +283,7 @@ class Scenario(Section):
     """Emulated links."""
     bandwidth_bytes_s: float | None = Field(None, gt=0)
     """What each robot lets itself use of the network; see the agent's."""
-    core: CoreParameters = CoreParameters()
+    core: CoreSection = CoreParameters()
     """Parameters of all robots' cores."""
     keyframes: KeyframeConfig = KeyframeConfig()
     """Keyframe selection of all robots."""

@@ -56,7 +56,7 @@ async def run_agent(
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
 ) -> None:
-    """Run one agent until it is told to stop (a signal, an order, or the end of its recording and `hold_s`).
+    """Run one agent until it is told to stop, by a signal or an order.
 
     Args:
         config: The agent's configuration; with `folder`, its events and result are written there.

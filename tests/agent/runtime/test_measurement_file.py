@@ -7,7 +7,7 @@ import pytest
 
 from flocc_agent.core.measurements import Fix, GeodeticFix, MetricClosure, TagSighting
 from flocc_agent.runtime.measurement_file import NOTHING, read_measurements
-from flocc_agent.runtime.trajectory import RecordingError
+from flocc_agent.runtime.text_tables import RecordingError
 from flocc_protocol.ids import KeyframeId, LogId
 
 FRAMES_S = [0.0, 1.0, 2.0, 3.0, 10.0]

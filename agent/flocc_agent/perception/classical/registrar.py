@@ -10,6 +10,8 @@ from flocc_agent.perception.multiview.acceptance import Acceptance, Needed
 from flocc_agent.perception.multiview.parameters import Geometry, Matched
 from flocc_agent.perception.multiview.registrar import PairRegistrar
 
+DISTANCE_RATIO_MAX = 0.8
+"""Lowe's ratio, as in his paper: lower keeps fewer and surer matches."""
 ACCEPTANCE = Acceptance(Needed(20, 15, 5), Needed(60, 30, 8))
 
 
@@ -18,7 +20,7 @@ def classical_registrar(config: ClassicalConfig) -> PairRegistrar[Features]:
     cv2.setNumThreads(1)
 
     def match(first: Features, second: Features) -> Matched:
-        return mutual_matches(first.descriptors, second.descriptors, config.distance_ratio_max)
+        return mutual_matches(first.descriptors, second.descriptors, DISTANCE_RATIO_MAX)
 
     acceptance = ACCEPTANCE if config.acceptance == "fitted" else None
-    return PairRegistrar(decode_features, match, Geometry(), acceptance)
+    return PairRegistrar(decode_features, match, Geometry(correspondences_min=config.correspondences_min), acceptance)
