@@ -13,7 +13,9 @@ from tests.swarm.robot_program import CAMERA, T_world_camera_at
 
 from flocc_agent import Agent, AgentConfig
 from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.core.reports import Fact, PeerRefused
 from flocc_agent.perception.synthetic import pose_image
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.codec import to_bytes
 from flocc_protocol.ids import LogId
@@ -91,26 +93,30 @@ async def test_one_robot_writes_records_that_the_others_do_not_know(tmp_path: Pa
         assert again.status()["keyframes"] == KEYFRAMES, "it starts on its own store with its own unknown records"
 
 
+def refusals(told: list[Reported[Fact]]) -> list[Fact]:
+    """Who was refused, and why."""
+    return [each.fact for each in told if isinstance(each.fact, PeerRefused)]
+
+
 async def test_another_version_of_the_messages_is_named_at_both_ends() -> None:
     """A peer of version 2, whose heartbeats are those of commit 04961b5; what it hears, it would refuse in turn."""
     transports = loopback_configs(("r1", "alice"))
-    lines: list[dict[str, Any]] = []
+    told: list[Reported[Fact]] = []
     heard: list[bytes] = []
     wire = (Path(__file__).parents[1] / "protocol" / "wire_v2.txt").read_text().splitlines()
     old = bytes.fromhex(next(line.split()[1] for line in wire if line.startswith("heartbeat ")))
     peer = ZenohTransport("test", ALICE.robot, transports["alice"])
     peer.set_receiver(lambda sender, kind, payload: heard.append(payload))
-    async with peer, Agent(config_of("r1", transports["r1"]), CAMERA, on_line=lines.append) as agent:
+    async with peer, Agent(config_of("r1", transports["r1"]), CAMERA, on_report=told.append) as agent:
         await agent.add_keyframe(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 0.0)
 
         def refused() -> bool:
             peer.broadcast("heartbeat", old)
-            return bool([line for line in lines if line["event"] == "peer_refused"]) and bool(heard)
+            return bool(refusals(told)) and bool(heard)
 
         await reached(refused, agent.status)
         assert agent.status()["neighbours"] == []
-    (line,) = [line for line in lines if line["event"] == "peer_refused"]
-    assert line["peer"] == "alice"
-    assert line["reason"] == f"protocol version 2, this robot speaks {PROTOCOL_VERSION}"
+    reason = f"protocol version 2, this robot speaks {PROTOCOL_VERSION}"
+    assert refusals(told) == [PeerRefused(peer="alice", reason=reason)]
     assert heard[0][1] == PROTOCOL_VERSION != 2, "the other end reads the version in the same byte, and says the same"
     decode(heard[0])

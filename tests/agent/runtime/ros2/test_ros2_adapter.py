@@ -18,7 +18,9 @@ from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import GeodeticFix, Measurement
+from flocc_agent.core.reports import Fact
 from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
+from flocc_agent.runtime.facts import RosProblem, RouterConnected
 from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
@@ -83,7 +85,7 @@ class Agent:
         self.keyframes: list[tuple[Image, Float, float]] = []
         self.mounted: list[Float] = []
         self.measured: list[tuple[Measurement, float]] = []
-        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.facts: list[Fact] = []
         self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
         self.poses = [(EPOCH_S + 0.25, np.eye(4)), (EPOCH_S + 1.0, T_MAP_ODOM)]
 
@@ -99,11 +101,11 @@ class Agent:
             self.mounted.append,
             self.trajectory,
             lambda measurement, stamp_s: self.measured.append((measurement, stamp_s)),
-            lambda *event: self.events.append(event),
+            self.facts.append,
         )
 
     def problems(self) -> list[str]:
-        return [fields["sentence"] for event, fields in self.events if event == "ros2_problem"]
+        return [fact.sentence for fact in self.facts if isinstance(fact, RosProblem)]
 
 
 def correction(covariance: Float | None = None) -> Correction:
@@ -326,8 +328,8 @@ async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None
         assert agent.problems() == [f"ROS 2: nobody answers at tcp/127.0.0.1:{port}; is rmw_zenohd running?"]
         with ros(port) as robot:
             await drive(robot, agent, 2)
-            linked = {"router": f"tcp/127.0.0.1:{port}", "connected": True}
-            await until(lambda: ("ros2_router", linked) in agent.events)
+            linked = RouterConnected(router=f"tcp/127.0.0.1:{port}", connected=True)
+            await until(lambda: linked in agent.facts)
 
 
 async def test_what_an_image_waits_for_is_said() -> None:
