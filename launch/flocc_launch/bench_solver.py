@@ -248,15 +248,18 @@ def gtsam_gnc(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, bench: Be
     """Run GTSAM's GNC; odometry and the anchor are known to be right."""
     closures = len(bench.graph.closures)
     known = [*range(graph.size() - 1 - closures), graph.size() - 1]
-    return gnc_with(graph, values, known)
+    return gnc_with(graph, values, known)[0]
 
 
-def gnc_with(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, known: list[int]) -> gtsam.Values:
-    """Run GTSAM's GNC with truncated least squares and its default parameters."""
+def gnc_with(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, known: list[int]
+) -> tuple[gtsam.Values, NDArray[np.float64]]:
+    """Run GTSAM's GNC with truncated least squares and its default parameters; poses and every factor's weight."""
     params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers(known)
-    return gtsam.GncLMOptimizer(graph, values, params).optimize()
+    optimiser = gtsam.GncLMOptimizer(graph, values, params)
+    return optimiser.optimize(), np.asarray(optimiser.getWeights())
 
 
 def custom_factor(problem: Problem, bench: Bench) -> float:
