@@ -69,4 +69,4 @@ $(VENV)/.test: $(DESCRIPTION) | $(VENV)/bin/python
 
 clean:
 	rm -rf $(VENV) build dist runs .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find protocol agent launch tests -name __pycache__ -prune -exec rm -rf {} +
+	find protocol agent launch lab tests -name __pycache__ -prune -exec rm -rf {} +

@@ -19,7 +19,7 @@ from typing import Any
 import typer
 import typer.main
 
-from flocc_launch.cli import app
+from flocc_launch.commands.main import app
 from flocc_protocol.errors import FloccError
 
 ROOT = Path(__file__).parents[1]

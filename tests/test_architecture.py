@@ -17,7 +17,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 HEAVY = ("torch", "gtsam", "cv2", "rerun", "zenoh")
 HELP_CPU_MAX_S = 0.3
 PACKAGES = {"flocc_protocol": "protocol", "flocc_agent": "agent", "flocc_launch": "launch"}
-SOURCES = os.pathsep.join(str(ROOT / root) for root in PACKAGES.values())
+SOURCES = os.pathsep.join(str(ROOT / root) for root in [*PACKAGES.values(), "lab"])
+ROOMS_MAX = 20
+"""Files and folders at the top of flocc_launch."""
 
 
 def run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -41,14 +43,40 @@ def test_the_import_contracts_hold() -> None:
     assert f"Contracts: {len(PROJECT['tool']['importlinter']['contracts'])} kept, 0 broken" in kept
 
 
-@pytest.mark.parametrize("module", ["flocc_protocol", "flocc_agent", "flocc_agent.config", "flocc_launch.cli"])
+def test_launch_has_few_rooms() -> None:
+    rooms = [path.name for path in (ROOT / "launch" / "flocc_launch").iterdir() if path.name != "__pycache__"]
+    assert len(rooms) <= ROOMS_MAX, sorted(rooms)
+
+
+def test_no_product_file_names_the_shared_folder() -> None:
+    files = [path for package, root in PACKAGES.items() for path in (ROOT / root / package).rglob("*.py")]
+    assert [path for path in files if "../shared" in path.read_text(encoding="utf-8")] == []
+
+
+def test_without_the_lab_its_commands_say_where_it_is(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(str(ROOT / root) for root in PACKAGES.values())}
+    hide = "import sys; sys.path = [p for p in sys.path if not p.endswith('/lab')]; "
+    program = hide + "from flocc_launch.commands.main import main; main()"
+    words = ["experiment", "scale", "--quick"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: flocc experiment is part of the lab, which is not installed: clone flocc, then pip install -e .\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "module", ["flocc_protocol", "flocc_agent", "flocc_agent.config", "flocc_launch.commands.main"]
+)
 def test_an_import_pulls_in_nothing_heavy(module: str) -> None:
     program = f"import {module}, sys; print([name for name in {HEAVY} if name in sys.modules])"
     assert run("-c", program).stdout.strip() == "[]"
 
 
 def test_help_answers_at_once() -> None:
-    times_s = [cpu_s("-c", "from flocc_launch.cli import main; main()", "--help") for _ in range(4)]
+    times_s = [cpu_s("-c", "from flocc_launch.commands.main import main; main()", "--help") for _ in range(4)]
     assert min(times_s) < HELP_CPU_MAX_S, times_s
 
 

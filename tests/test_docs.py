@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 from tests.doc_commands import ROOT, SHELL, blocks, command_lines, complaint, parsed_commands, runnable, script
 from tests.doc_props import write_bag, write_own_data
 
-from flocc_agent.config import AgentConfig
-from flocc_launch.config_reference import reference
-from flocc_launch.scenario import Scenario
+from flocc_agent.config import AgentConfig, ConfigError, refuse_removed
+from flocc_lab.reference.configuration_page import reference
+from flocc_launch.scenarios.scenario import Scenario
 
 PARTS = ("protocol", "agent", "docker")
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / part / "README.md" for part in PARTS)])
@@ -105,9 +105,12 @@ def test_configurations_on_a_page_have_no_key_that_is_unknown(page: Path) -> Non
 def unknown_keys(model: type[BaseModel], table: dict[str, object]) -> list[str]:
     """Keys of a fragment that a model does not have; what a fragment lacks does not matter."""
     try:
+        refuse_removed(table, "page")
         model.model_validate(table, context={"folder": None})
     except ValidationError as error:
         return [".".join(map(str, e["loc"])) for e in error.errors() if e["type"] == "extra_forbidden"]
+    except ConfigError as error:
+        return [str(error)]
     return []
 
 
@@ -136,7 +139,7 @@ def test_the_commands_of_a_page_run(page: Path, props: Path, tmp_path: Path) -> 
         ("flocc dataset convert path/to/data", "Missing parameter: out"),
         ("flocc launch meeting --seed four", "not a valid|valid integer"),
         ("python -m flocc_launch.nothing", "there is no module"),
-        ("python -m flocc_launch.reliability idle --runz 3", "no option --runz"),
+        ("python -m flocc_lab.reliability idle --runz 3", "no option --runz"),
         ("make tset", "no target tset"),
         ("FLOCC_SHARED=/data pytest -s tests/no_test.py -k some", "tests/no_test.py is not there"),
         ("rosrun flocc", "not a program"),

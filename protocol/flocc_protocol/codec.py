@@ -26,6 +26,11 @@ Pose7 = tuple[float, float, float, float, float, float, float]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 COORDINATE_MAX = 1e7
+MESSAGE_BYTES_MAX = 64 * 1024
+LOGS_MAX = 256
+"""Logs that one message may speak of."""
+REPEATED_MAX = 8192
+"""Small values of heartbeats that are kept as objects, because most of a heartbeat repeats the last."""
 ITEMS_MAX = 256
 """No list on the wire is longer; msgpack reserves memory for what a list's header announces."""
 
@@ -36,6 +41,10 @@ class Codec(Generic[T]):
 
     pack: Callable[[T], Any]
     unpack: Callable[[Any], T]
+
+
+Kinds = dict[str, tuple[type[Any], Codec[Any]]]
+"""Kinds of messages: the name on the wire, the class, and how its fields are packed."""
 
 
 def integer(low: int, high: int) -> Codec[int]:

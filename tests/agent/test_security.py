@@ -14,7 +14,7 @@ from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportEr
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
-from flocc_launch.keys import KeysError, make_keys
+from flocc_launch.setup.credentials import KeysError, make_keys
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin

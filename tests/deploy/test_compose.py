@@ -12,10 +12,10 @@ import pytest
 from tests.deploy import compose_schema
 
 from flocc_agent.config import AgentConfig, RadioConfig
-from flocc_launch.data import recordings
 from flocc_launch.datasets.names import robot_names
-from flocc_launch.keys import make_keys
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.setup.credentials import make_keys
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = ROOT / "docker" / "compose.yaml"
@@ -161,7 +161,9 @@ def started(name: str, folder: Path, is_secure: bool) -> "subprocess.Popen[str]"
     words = arguments(name, {"OPTIONS": options, "LATENCY": "0.01"})
     for inside, outside in places.items():
         words = [re.sub(f"(^|=){inside}", rf"\g<1>{outside}", word) for word in words]
-    return subprocess.Popen([sys.executable, "-m", "flocc_launch.cli", *words], stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-m", "flocc_launch.commands.main", *words], stderr=subprocess.PIPE, text=True
+    )
 
 
 def _hears(path: Path) -> bool:

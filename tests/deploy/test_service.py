@@ -86,7 +86,7 @@ def test_what_it_starts_hands_over_and_ends_on_sigterm(tmp_path: Path) -> None:
     program, *words = shlex.split(service()["ExecStart"])
     assert program == "/opt/flocc/bin/flocc"
     places = {"/etc/flocc/agent.toml": str(config), "folder=/var/lib/flocc": f"folder={tmp_path / 'state'}"}
-    command = [sys.executable, "-m", "flocc_launch.cli", *(places.get(word, word) for word in words)]
+    command = [sys.executable, "-m", "flocc_launch.commands.main", *(places.get(word, word) for word in words)]
     agent = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     events = tmp_path / "state" / "events.jsonl"
     ends_s = time.monotonic() + 30.0

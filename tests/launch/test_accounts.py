@@ -8,8 +8,8 @@ from tests.launch import synthetic_run
 
 from flocc_agent.stages import BOUNDS_S, Histogram
 from flocc_launch.report import Report, finish
-from flocc_launch.run_folder import RunFolder
-from flocc_launch.scenario import Scenario
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import playbacks_of, simulate, swarm_of
 
 PERFECT: dict[str, Any] = {}

@@ -8,10 +8,10 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.test_cli import run, scenario, sentence
 
-from flocc_launch import view_live
-from flocc_launch.data import recordings
-from flocc_launch.doctor.network import free_port
-from flocc_launch.shipped import read_shipped
+from flocc_launch.doctor.network_check import free_port
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_shipped
+from flocc_launch.view import live_view as view_live
 
 LOOKS = [["doctor"], ["evaluate"], ["view", "--save", "out.rrd"]]
 TRACKS = 'name = "x"\n[perception]\nmethod = "synthetic"\n[tracks]\nrobots = 2\n'

@@ -8,10 +8,11 @@ import pytest
 from tests.launch.bag_fixtures import ZERO_NS, BagScript
 
 from flocc_agent.runtime.recording import Recording, write_camera
-from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.datasets.presets import Team, convert_graco, convert_s3e
-from flocc_launch.launching import launch
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.swarm.launching import launch
 from flocc_launch.world.generate import generate
 from flocc_launch.world.spec import WorldSpec
 

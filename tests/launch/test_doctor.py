@@ -12,9 +12,9 @@ from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
 from flocc_launch.doctor import Finding, Severity, diagnose
-from flocc_launch.run_folder import RunFolder
-from flocc_launch.run_records import ClosureKnown, KeyframeResult, RobotResult, Run
-from flocc_launch.scenario import Scenario
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.runs.run_records import ClosureKnown, KeyframeResult, RobotResult, Run
+from flocc_launch.scenarios.scenario import Scenario
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 PAIR = {"query": "r1/3", "match": "r2/5"}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, se3_exp
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
-from flocc_launch import evaluation
+from flocc_launch.runs import trajectory_errors as evaluation
 
 Float = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from flocc_agent.config import Formulation, Solver
 from flocc_agent.core.pose_graph import LoopClosure
 from flocc_agent.geometry import pose, so3_exp
 from flocc_launch.graph_files import GraphFileError, read_g2o, read_graph_file, write_g2o
-from flocc_launch.optimise import OptimiseError, optimise_file
+from flocc_launch.graph_files.optimise import OptimiseError, optimise_file
 from flocc_protocol.ids import KeyframeId, LogId
 
 A, B = LogId("a"), LogId("b")

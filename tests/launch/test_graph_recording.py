@@ -8,10 +8,10 @@ import pytest
 from flocc_agent.core.pose_graph import PoseGraph
 from flocc_agent.perception.recorded import name_of, read_recorded
 from flocc_agent.runtime.recording import Recording
-from flocc_launch.generated_graph import generate
+from flocc_lab.bench.generated_graph import generate
 from flocc_launch.graph_files.graph_file import GraphFile, GraphFileError
-from flocc_launch.graph_recording import write_recordings, write_scenario
-from flocc_launch.scenario import Scenario
+from flocc_launch.graph_files.graph_recording import write_recordings, write_scenario
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
 

@@ -127,8 +127,8 @@ def test_the_plugin_loads_nothing_of_flocc_before_it_is_asked(pytester: pytest.P
         import sys
 
         def test_it_is_light():
-            heavy = {"numpy", "pydantic", "zenoh", "gtsam", "flocc_launch.scenario", "flocc_agent"}
-            assert "flocc_launch.pytest_plugin" in sys.modules
+            heavy = {"numpy", "pydantic", "zenoh", "gtsam", "flocc_launch.scenarios.scenario", "flocc_agent"}
+            assert "flocc_launch.commands.pytest_plugin" in sys.modules
             assert heavy & set(sys.modules) == set()
         """
     )

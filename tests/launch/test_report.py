@@ -10,12 +10,12 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
-from flocc_agent.runtime.trajectory import read_tum
-from flocc_launch.evaluation import ate_m
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.report import Report, evaluate, finish, read_report
 from flocc_launch.report.build import judged
-from flocc_launch.report.timeline import merged_after_s
-from flocc_launch.run_folder import RunFolder, RunFolderError, event_from_line
+from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line
+from flocc_launch.runs.timeline import merged_after_s
+from flocc_launch.runs.trajectory_errors import ate_m
 
 ROBOTS = ["r1", "r2", "r3"]
 

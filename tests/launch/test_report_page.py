@@ -11,9 +11,10 @@ from tests.launch.synthetic_run import Synthetic
 
 from flocc_launch.report import Report, finish
 from flocc_launch.report.html import page
-from flocc_launch.report.load import load
-from flocc_launch.report.svg import Axis, number, seconds, size_of, thinned
+from flocc_launch.report.svg import Axis, thinned
 from flocc_launch.report.verdict import verdict
+from flocc_launch.runs.loaded_run import load
+from flocc_launch.runs.plain_numbers import number, seconds, size_of
 
 VOID = {"meta", "input"}
 

@@ -11,14 +11,14 @@ from tests.launch import synthetic_run
 from tests.launch.test_dashboard import growing, kill_the_leader, start_swarm
 
 from flocc_agent.geometry import pose, so3_exp
-from flocc_launch.data import recordings
-from flocc_launch.report.load import load
-from flocc_launch.run_folder import RunFolder
-from flocc_launch.run_records import ClosureKnown
-from flocc_launch.shipped import read_shipped
+from flocc_launch.runs.loaded_run import load
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.runs.run_records import ClosureKnown
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.simulation.simulate import simulate
-from flocc_launch.view import ViewError, left_over, residuals, view
-from flocc_launch.view_live import view_growing
+from flocc_launch.view.live_view import view_growing
+from flocc_launch.view.run_view import ViewError, left_over, residuals, view
 
 ENTITIES = (
     b"before/r1",

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from flocc_agent.config import Mast3rConfig
-from flocc_launch.weights import NEEDED, WeightsError, check, fetch, status, synthesize
+from flocc_launch.setup.weight_files import NEEDED, WeightsError, check, fetch, status, synthesize
 
 CONTENT = bytes(range(256)) * 4000
 

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import angle_rad, between
 from flocc_agent.runtime.recording import Recording
+from flocc_lab.bench.world_overlap import Matcher
 from flocc_launch.datasets.drift import DriftSpec, drifted
-from flocc_launch.evaluation import ate_m, placed_at_true_start
+from flocc_launch.runs.trajectory_errors import ate_m, placed_at_true_start
 from flocc_launch.world import layout
 from flocc_launch.world.generate import generate
-from flocc_launch.world.overlap import Matcher
 from flocc_launch.world.routes import routes, walk
 from flocc_launch.world.spec import WorldSpec
 

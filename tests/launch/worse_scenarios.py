@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from flocc_launch.shipped import FOLDER
+from flocc_launch.scenarios.shipped import FOLDER
 
 APART = '\n[[faults]]\nat_s = 0.0\nkind = "partition"\ngroups = [["r1"], ["r2"]]\n'
 LEAVES = '\n[[faults]]\nat_s = 5.0\nkind = "leave"\nrobots = ["server"]\n'

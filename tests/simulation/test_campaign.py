@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from flocc_launch.scenario import Fault, FaultKind, Scenario
+from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.simulation.campaign import Campaign, Outcome, campaign, prepared, shrink
 from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
 from flocc_launch.simulation.invariants import Violation

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from flocc_agent.config import BackendConfig
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
 

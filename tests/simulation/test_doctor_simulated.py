@@ -8,13 +8,13 @@ import pytest
 
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.runtime.evidence import evidence_of
+from flocc_launch.dashboard.status_table import RobotStatus, status_from
 from flocc_launch.doctor import Finding, Severity, diagnose
 from flocc_launch.doctor.live import diagnose_live
-from flocc_launch.run_folder import RunFolder
-from flocc_launch.scenario import Scenario
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import playbacks_of, simulate, swarm_of, write
 from flocc_launch.simulation.swarm import Swarm
-from flocc_launch.status import RobotStatus, status_from
 
 LOOP = [[0, 0], [9, 0], [9, 6], [0, 6], [0, 0]]
 FAR_AWAY = [[60, 0], [69, 0], [69, 6], [60, 6], [60, 0]]

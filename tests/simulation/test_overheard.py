@@ -7,10 +7,10 @@ from tests.simulation.test_doctor_simulated import broken
 from flocc_agent.core.effects import Broadcast, Effect
 from flocc_agent.core.events import Event as CoreEvent
 from flocc_launch.dashboard.state import SwarmState
-from flocc_launch.run_records import ClosureAccepted, CorrectionApplied, Event, KeyframeCaptured, LeaderFollowed
-from flocc_launch.simulation.robot import Station
+from flocc_launch.runs.run_records import ClosureAccepted, CorrectionApplied, Event, KeyframeCaptured, LeaderFollowed
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
-from flocc_launch.view_live import Overheard
+from flocc_launch.simulation.virtual_robot import Station
+from flocc_launch.view.live_view import Overheard
 from flocc_protocol.messages import Envelope, decode, encode
 
 

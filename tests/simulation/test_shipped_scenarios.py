@@ -7,7 +7,7 @@ import pytest
 from tests.launch.test_cli import run
 from tests.launch.worse_scenarios import WORSE, worse
 
-from flocc_launch.shipped import names
+from flocc_launch.scenarios.shipped import names
 
 
 def missed(folder: Path) -> set[str]:

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from flocc_launch.run_folder import RunFolder, RunFolderError
-from flocc_launch.run_records import ClosureAccepted
-from flocc_launch.scenario import Scenario
+from flocc_launch.runs.run_folder import RunFolder, RunFolderError
+from flocc_launch.runs.run_records import ClosureAccepted
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from flocc_launch.launching import Watch, launch
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.swarm.launching import Watch, launch
 
 pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
@@ -98,7 +98,16 @@ def test_a_port_in_use_is_one_sentence_and_exit_code_2(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        command = [sys.executable, "-m", "flocc_launch.cli", "agent", "--config", str(config), "--metrics", str(port)]
+        command = [
+            sys.executable,
+            "-m",
+            "flocc_launch.commands.main",
+            "agent",
+            "--config",
+            str(config),
+            "--metrics",
+            str(port),
+        ]
         ran = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
     assert ran.returncode == 2
     assert f"error: robot r1: port {port} for metrics is in use; choose another one" in ran.stderr

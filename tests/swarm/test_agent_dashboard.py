@@ -15,10 +15,10 @@ from tests.launch.test_cli import run
 from tests.launch.test_dashboard import browse, rows
 
 from flocc_agent.config import AgentConfig, PerceptionConfig, SourceConfig
-from flocc_launch.data import recordings
-from flocc_launch.doctor.network import free_port
-from flocc_launch.processes import loopback_transports
-from flocc_launch.shipped import read_shipped
+from flocc_launch.doctor.network_check import free_port
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_shipped
+from flocc_launch.swarm.processes import loopback_transports
 
 START_S = 60.0
 
@@ -56,7 +56,7 @@ def test_one_agent_shows_every_robot_of_its_swarm(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.json"
         path.write_text(config.model_dump_json(), encoding="utf-8")
         page = ["--dashboard", url.removeprefix("http://").strip("/")] if name == "r2" else []
-        command = [sys.executable, "-m", "flocc_launch.cli", "agent", "--config", str(path), *page]
+        command = [sys.executable, "-m", "flocc_launch.commands.main", "agent", "--config", str(path), *page]
         agents.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
     try:
         deadline_s = time.monotonic() + START_S

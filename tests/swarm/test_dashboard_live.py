@@ -11,10 +11,10 @@ import pytest
 from tests.launch.test_dashboard import browse, rows
 
 from flocc_launch.dashboard import live_dashboard
-from flocc_launch.doctor.network import free_port
-from flocc_launch.launching import Watch, launch
-from flocc_launch.run_folder import RunFolder
-from flocc_launch.shipped import read_shipped
+from flocc_launch.doctor.network_check import free_port
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.scenarios.shipped import read_shipped
+from flocc_launch.swarm.launching import Watch, launch
 
 LOOP = [[0, 0], [9, 0], [9, 6], [0, 6], [0, 0]]
 KILL_S, PARTITION_S, HEAL_S, END_S = 8.0, 15.0, 27.0, 36.0

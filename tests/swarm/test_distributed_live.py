@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from flocc_launch.launching import launch
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.swarm.launching import launch
 
 pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 

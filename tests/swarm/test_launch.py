@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from flocc_launch.launching import Watch, launch
 from flocc_launch.report.model import Report
-from flocc_launch.scenario import Fault, FaultKind, Scenario
+from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
+from flocc_launch.swarm.launching import Watch, launch
 
 pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
@@ -98,7 +98,7 @@ def test_a_robot_comes_back_from_its_disk_with_its_numbering(tmp_path: Path) -> 
 
 def test_ctrl_c_stops_every_agent_in_order_and_still_reports(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-m", "flocc_launch.cli", "launch", "meeting", "--out", str(out)]
+    command = [sys.executable, "-m", "flocc_launch.commands.main", "launch", "meeting", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     wait_until(lambda: any(out.glob("robots/*/events.jsonl")) and '"leader"' in events_of(out), 60.0)
     process.send_signal(signal.SIGINT)

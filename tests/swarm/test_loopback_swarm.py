@@ -9,7 +9,7 @@ import pytest
 from tests.agent.runtime.loopback import loopback_configs
 from tests.swarm.robots import RobotProcess, agent_configs, frames, leaders, logs_equal, neighbours, reached
 
-from flocc_launch.chaos import disturb, parse_order
+from flocc_launch.swarm.chaos_orders import disturb, parse_order
 
 pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 

@@ -13,8 +13,8 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import pose
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_launch.datasets.writer import RecordingWriter
-from flocc_launch.launching import launch
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.swarm.launching import launch
 
 torch = pytest.importorskip("torch", reason="needs the extra flocc[mast3r]")
 
@@ -42,7 +42,7 @@ def recording(path: Path, seed: int) -> Path:
 
 
 def test_every_candidate_is_decoded_and_decided(tmp_path: Path) -> None:
-    from flocc_launch.weights import synthesize
+    from flocc_launch.setup.weight_files import synthesize
 
     weights = synthesize(tmp_path / "weights")
     scenario = Scenario.model_validate(

@@ -77,7 +77,7 @@ async def test_a_robot_without_flocc_code_gets_transform_pose_and_path(tmp_path:
     (port,) = free_ports(1)
     config = tmp_path / "r1.toml"
     config.write_text(CONFIG.replace("PORT", str(port)))
-    command = [sys.executable, "-m", "flocc_launch.cli", "agent", "--config", str(config)]
+    command = [sys.executable, "-m", "flocc_launch.commands.main", "agent", "--config", str(config)]
     with (tmp_path / "agent.log").open("wb") as log:
         agent = subprocess.Popen(command, stderr=log)
         try:

@@ -18,8 +18,8 @@ from tests.agent.runtime.ros2.raw_node import RawNode, open_router
 from flocc_agent.config import AgentConfig, PerceptionConfig, Ros2Config, TransportConfig
 from flocc_agent.geometry import Float, between, inverse, pose_from_tq, tq_from_pose
 from flocc_agent.runtime.recording import Frame, Recording
-from flocc_launch.data import recordings
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.scenario import Scenario
 
 pytestmark = [pytest.mark.swarm, pytest.mark.slow]
 
@@ -97,7 +97,7 @@ def agent(transport: TransportConfig, name: str, ros2: Ros2Config, folder: Path)
     config = AgentConfig(name=name, swarm="team", transport=transport, perception=synthetic, ros2=ros2)
     path = folder / f"{name}.json"
     path.write_text(config.model_dump_json())
-    command = [sys.executable, "-m", "flocc_launch.cli", "agent", "--config", str(path)]
+    command = [sys.executable, "-m", "flocc_launch.commands.main", "agent", "--config", str(path)]
     with (folder / f"{name}.log").open("wb") as log:
         process = subprocess.Popen(command, stderr=log)
         try:

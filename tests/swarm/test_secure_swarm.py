@@ -11,7 +11,7 @@ from tests.swarm.robots import RobotProcess, agent_configs, frames, leaders, log
 
 from flocc_agent.config import TlsConfig
 from flocc_agent.runtime.security import RecordSealer
-from flocc_launch.keys import make_keys
+from flocc_launch.setup.credentials import make_keys
 from flocc_protocol.ids import LogId
 from flocc_protocol.records import decode_record
 

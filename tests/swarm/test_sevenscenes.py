@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from flocc_launch.data import recordings
-from flocc_launch.launching import launch
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
+from flocc_launch.swarm.launching import launch
 
 
 def rooms(source: Path) -> Scenario:

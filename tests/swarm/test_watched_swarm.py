@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from flocc_agent.config import AgentConfig
+from flocc_lab.observers import LATENT_BYTES, watched, watched_scenario
+from flocc_launch.dashboard.status_table import status_of_swarm
 from flocc_launch.doctor import Finding
 from flocc_launch.doctor.live import diagnose_live
-from flocc_launch.launching import Watch, launch
-from flocc_launch.observers import LATENT_BYTES, watched, watched_scenario
-from flocc_launch.shipped import read_shipped
-from flocc_launch.status import status_of_swarm
+from flocc_launch.scenarios.shipped import read_shipped
+from flocc_launch.swarm.launching import Watch, launch
 
 PERIOD_S = 0.5
 

@@ -1,4 +1,4 @@
-"""Descent to the nearest optimum of weighted squares: Gauss-Newton steps, shortened and then damped where they overshoot.
+"""Descent to the nearest optimum of weighted squares: Gauss-Newton steps, shortened, then damped.
 
 Closures carry weights in [0, 1] that multiply their information; odometry and fixes always weigh 1. A closure of
 weight 0 takes no part at all.
@@ -126,9 +126,7 @@ def _point(objective: Objective, state: State, weights: Float, hold: bool) -> Po
     return Point(state, at, objective.cost_at(at, state, weights))
 
 
-def _lower(
-    objective: Objective, here: Point, jac: Jacobians, weights: Float, damping: float, hold: bool
-) -> Point:
+def _lower(objective: Objective, here: Point, jac: Jacobians, weights: Float, damping: float, hold: bool) -> Point:
     """The first of the shortened steps that goes down, or the least bad of them; infinite cost where there is none."""
     try:
         delta = objective.linear.step(objective.edges, here.state, here.at, jac, weights, damping)

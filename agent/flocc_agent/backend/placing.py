@@ -5,7 +5,7 @@ place is not. So every body (a robot, or robots that used closures join) is aske
 more of its closures agree than are used now? Where there is one, the solver starts again from there.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend import rotations
 from flocc_agent.backend.alignment import PairAlignment, align_pair, rays_from, travelled_m
-from flocc_agent.backend.edges import State, state_of
+from flocc_agent.backend.edges import State
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory, components_of
 from flocc_protocol.ids import LogId

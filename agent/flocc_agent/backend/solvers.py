@@ -23,9 +23,7 @@ START_RATIOS = (1e-4, 1e-6)
 PLACEMENTS_MAX = 10
 
 
-def solve(
-    objective: Objective, state: State, trusted: Bool | None = None, places: Places | None = None
-) -> Solved:
+def solve(objective: Objective, state: State, trusted: Bool | None = None, places: Places | None = None) -> Solved:
     """Run the configured solver from a state, then hold scales at their bound where they passed it.
 
     Args:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer
-from flocc_agent.core.parameters import GossipParameters, RoundParameters
+from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
-from flocc_agent.core.pulls import REMEMBERED_MAX, remember
+from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
@@ -34,17 +34,19 @@ Float = NDArray[np.float64]
 _UPPER = np.triu_indices(6)
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
+LISTED_MAX = 400
+"""Keyframes listed in a correction; a longer trajectory is thinned and interpolated, so that messages stay small."""
+TRANSLATION_TOLERANCE_M = 1e-3
+ROTATION_TOLERANCE_RAD = 1e-4
+"""A correction that moves no keyframe further is not sent again in one term: nobody would see the difference."""
 
 
 class Corrections:
     """The newest correction of every log, as one robot knows them."""
 
-    def __init__(
-        self, own: LogId, gossip: GossipParameters, rounds: RoundParameters, sealer: Sealer | None = None
-    ) -> None:
+    def __init__(self, own: LogId, gossip: GossipParameters, sealer: Sealer | None = None) -> None:
         self._own = own
         self._gossip = gossip
-        self._rounds = rounds
         self._sealer = sealer
         self._newest: dict[LogId, LogCorrection] = {}
         self._frame_unknown = False
@@ -94,7 +96,7 @@ class Corrections:
             held = self._newest.get(version.log)
             newer = held is None or (version.term, version.round) > (held.term, held.round)
             if newer and self._asked_until_s.get(version.log, now) <= now:
-                remember(self._asked_until_s, version.log, now + self._gossip.request_timeout_s)
+                remember(self._asked_until_s, version.log, now + REQUEST_TIMEOUT_S)
                 wanted.append(version.log)
             elif not newer:
                 remember(self._agreed, version.log, version)
@@ -150,7 +152,7 @@ class Corrections:
         published: list[LogCorrection] = []
         for component, log in solved:
             try:
-                message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
+                message = correction_of(component, log, term, round_number, LISTED_MAX)
             except ValueError as error:
                 facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
                 effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
@@ -175,13 +177,13 @@ class Corrections:
         if len(old) > len(new):
             return True
         shift = np.abs(new[: len(old)] - old)
-        moved = shift[:, :3].max(initial=0.0) > self._rounds.translation_tolerance_m
-        turned = shift[:, 3:].max(initial=0.0) > self._rounds.rotation_tolerance_rad
+        moved = shift[:, :3].max(initial=0.0) > TRANSLATION_TOLERANCE_M
+        turned = shift[:, 3:].max(initial=0.0) > ROTATION_TOLERANCE_RAD
         return bool(moved or turned) or self._odom_moved(held, message)
 
     def _odom_moved(self, held: LogCorrection, message: LogCorrection) -> bool:
         shift = np.abs(np.array(held.T_map_odom) - np.array(message.T_map_odom))
-        return bool(shift.max() > self._rounds.translation_tolerance_m)
+        return bool(shift.max() > TRANSLATION_TOLERANCE_M)
 
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
-from flocc_agent.core.parameters import DistributedParameters, RoundParameters
+from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
 from flocc_agent.geometry import inverse
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
@@ -25,6 +26,8 @@ Float = NDArray[np.float64]
 
 ITERATIONS_AFTER_RESTART = 1000
 """A restarted robot counts on from its last correction and this: above whatever it said before."""
+DELIVER_PERIOD_S = 2.0
+"""Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
 FAILURES_MAX = 6
 
@@ -73,7 +76,6 @@ class DistributedOptimisation:
         own: LogId,
         source: GraphSource,
         parameters: DistributedParameters,
-        rounds: RoundParameters,
         iteration: int = 0,
     ) -> None:
         self.anchor = own
@@ -82,7 +84,6 @@ class DistributedOptimisation:
         self._own = own
         self._source = source
         self._parameters = parameters
-        self._rounds = rounds
         self._neighbours: dict[LogId, _Neighbour] = {}
         self._heard: dict[CandidatePair, float] = {}
         self._epoch = 0
@@ -190,7 +191,7 @@ class DistributedOptimisation:
         if self._step is None or not self._undelivered or self._deliver_at_s > now:
             return None
         self._undelivered = False
-        self._deliver_at_s = now + self._parameters.deliver_period_s
+        self._deliver_at_s = now + DELIVER_PERIOD_S
         T = self._step.T_map_keyframe
         T_map_odom = T[-1] @ inverse(self._trajectory.T_odom_keyframe[len(T) - 1])
         logs = (self._own,) if self.anchor == self._own else (self.anchor, self._own)
@@ -225,7 +226,7 @@ class DistributedOptimisation:
             return
         if self._seen is not None:
             grown = keyframes - self._seen[1]
-            if revision == self._seen[0] and grown < self._rounds.keyframes_per_round:
+            if revision == self._seen[0] and grown < KEYFRAMES_PER_ROUND:
                 return
         self._seen = (revision, keyframes)
         graph = self._source.graph()

@@ -26,6 +26,10 @@ from flocc_protocol.messages import (
 
 Rank = tuple[int, LogId]
 
+ANSWER_TIMEOUT_S = 0.6
+"""Without an ANSWER for this long the robot claims a term: more than a round trip with a lost message."""
+COORDINATOR_TIMEOUT_S = 2.0
+"""After an ANSWER the robot waits this long for a leader, then asks again: three times as long as that one asks."""
 COUNTER_JUMP_MAX = 2**20
 LOST_MAX = 64
 PEERS_MAX = 256
@@ -136,7 +140,7 @@ class LeaderElection:
         peer = self._peers.get(sender.robot)
         if self._role is Role.ELECTING and peer is not None and peer.rank < self._rank:
             self._role = Role.WAITING
-            self._due_s = now + self._parameters.coordinator_timeout_s
+            self._due_s = now + COORDINATOR_TIMEOUT_S
         return []
 
     def on_coordinator(self, sender: LogId, message: Coordinator, now: float) -> list[Effect]:
@@ -253,7 +257,7 @@ class LeaderElection:
         if not better:
             return self._claim()
         self._role = Role.ELECTING
-        self._due_s = now + self._parameters.answer_timeout_s
+        self._due_s = now + ANSWER_TIMEOUT_S
         return [Unicast(peer.name, Election(self._counter_max)) for peer in better]
 
     def _claim(self) -> list[Effect]:

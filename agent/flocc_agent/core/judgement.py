@@ -18,14 +18,14 @@ from flocc_protocol.records import (
 def judged(
     query: KeyframeId, match: KeyframeId, result: Registration | RegistrationFailed, limits: LoopClosingParameters
 ) -> ClosureRecord | RejectionRecord:
-    """Accept a registration whose match ratio reaches R_thr, or refuse it with a reason."""
+    """Accept a registration whose match ratio reaches R_thr, or that its front end judged; else say why not."""
     counts = (result.correspondences, result.odometry_correspondences)
     if isinstance(result, RegistrationFailed):
         return RejectionRecord(query, match, result.failure.value, *counts)
     ratio = match_ratio(*counts)
-    if result.correspondences < limits.correspondences_min:
+    if not result.is_judged and result.correspondences < limits.correspondences_min:
         return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
-    if ratio < limits.match_ratio_threshold:
+    if not result.is_judged and ratio < limits.match_ratio_threshold:
         return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
     try:
         return _closure(query, match, result, ratio)

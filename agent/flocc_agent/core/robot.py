@@ -5,9 +5,7 @@ order. Same seed and same events give the same effects, on virtual time and on a
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass
 
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
@@ -20,7 +18,6 @@ from flocc_agent.core.events import (
     BlockIterated,
     BlockIterationFailed,
     Event,
-    FixMeasured,
     GraphOptimisationFailed,
     GraphOptimised,
     KeyframeCaptured,
@@ -30,6 +27,7 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
     Leaving,
+    Measured,
     MessageReceived,
     PairRegistered,
 )
@@ -37,6 +35,13 @@ from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
 from flocc_agent.core.judgement import judged, judgement_report
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
+from flocc_agent.core.measurements import (
+    WAITING_MAX,
+    Measurement,
+    belongs_to,
+    measurement_refused,
+    measurement_report,
+)
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.place_recognition import PlaceRecognition
@@ -64,10 +69,10 @@ from flocc_protocol.messages import (
 )
 from flocc_protocol.records import (
     ClosureRecord,
-    FixRecord,
     KeyframeRecord,
     Record,
     RejectionRecord,
+    encode_record,
 )
 
 NOBODY = -1
@@ -108,7 +113,6 @@ class _Pending:
     T_odom_camera: Pose7
     encoded: bool = False
     descriptor: Array | None = None
-    fixes: list[FixMeasured] = field(default_factory=list)
 
 
 class Robot:
@@ -134,6 +138,7 @@ class Robot:
         self._heartbeat_due_s = now
         self._heartbeat_s = float("-inf")
         self._pending: list[_Pending] = []
+        self._waiting: dict[int, list[Measurement]] = {}
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.__contains__)
@@ -141,7 +146,7 @@ class Robot:
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
         self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
-        self.corrections = Corrections(log, parameters.gossip, parameters.rounds, sealer)
+        self.corrections = Corrections(log, parameters.gossip, sealer)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -177,6 +182,7 @@ class Robot:
         neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
         return {
             "neighbours": neighbours,
+            "measurements": (sum(map(len, self._waiting.values())), WAITING_MAX * max(len(self._pending), 1)),
             **self.gossip.sizes(),
             **self.closing.sizes(),
             **self.corrections.sizes(),
@@ -216,8 +222,8 @@ class Robot:
                 return [] if self.distributed is None else self.distributed.on_step(number, step, now)
             case BlockIterationFailed(number, reason):
                 return [] if self.distributed is None else self.distributed.on_failed(number, reason, now)
-            case FixMeasured():
-                return self._on_fix(event, now)
+            case Measured(measurement, index):
+                return self._on_measured(measurement, index, now)
             case Leaving():
                 return self.election.leave()
 
@@ -304,7 +310,10 @@ class Robot:
         return [Encode(KeyframeId(self.log, index), event.image)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
-        """Append the records of all keyframes that are ready, in the order of capture."""
+        """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
+
+        A keyframe that failed to encode has a record all the same, with its odometry: measurements need no more.
+        """
         for pending in self._pending:
             if pending.index == keyframe.index:
                 pending.encoded, pending.descriptor = True, descriptor
@@ -314,14 +323,31 @@ class Robot:
             record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
             effects += self._append(record, now)
             effects.append(_keyframe_report(self.log, record))
+            for measurement in self._waiting.pop(ready.index, ()):
+                effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
         return effects
 
-    def _on_fix(self, event: FixMeasured, now: float) -> list[Effect]:
-        keyframes = self.gossip.logs[self.log].keyframes
-        if keyframes == 0:
-            return []
-        position = Array.of(np.array(event.position_m), "f8")
-        return self._append(FixRecord(keyframes - 1, position, Array.of(np.array(event.covariance_m2), "f8")), now)
+    def _on_measured(self, measurement: Measurement, index: int, now: float) -> list[Effect]:
+        """Append what was measured at a recorded keyframe; what belongs to a later one waits for its record."""
+        keyframe = belongs_to(measurement, self.log, index)
+        recorded = self.gossip.logs[self.log].keyframes
+        if keyframe.index < recorded:
+            return self._append_measurement(measurement, keyframe, now)
+        if keyframe.index >= max(recorded + len(self._pending), 1):
+            return [measurement_refused(measurement, keyframe, "there is no such keyframe")]
+        waiting = self._waiting.setdefault(keyframe.index, [])
+        if len(waiting) >= WAITING_MAX:
+            return [measurement_refused(measurement, keyframe, f"{WAITING_MAX} others wait for this keyframe")]
+        waiting.append(measurement)
+        return []
+
+    def _append_measurement(self, measurement: Measurement, keyframe: KeyframeId, now: float) -> list[Effect]:
+        try:
+            record = measurement.record(keyframe)
+            encode_record(record)
+        except ValueError as error:
+            return [measurement_refused(measurement, keyframe, str(error))]
+        return [*self._append(record, now), measurement_report(measurement, keyframe)]
 
     def _on_registered(
         self, pair: CandidatePair, result: Registration | RegistrationFailed, now: float
@@ -376,9 +402,7 @@ class Robot:
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
         iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
-        return DistributedOptimisation(
-            self.log, self.assembly, self._parameters.distributed, self._parameters.rounds, iteration
-        )
+        return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, iteration)
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""

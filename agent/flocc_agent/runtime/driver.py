@@ -37,7 +37,6 @@ from flocc_agent.core.events import (
     BlockIterated,
     BlockIterationFailed,
     Event,
-    FixMeasured,
     GraphOptimisationFailed,
     GraphOptimised,
     KeyframeCaptured,
@@ -47,14 +46,17 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
     Leaving,
+    Measured,
     MessageReceived,
     PairRegistered,
 )
 from flocc_agent.core.interfaces import Image, OdometryPair
+from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph, map_frame
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.outbox import Outbox
 from flocc_agent.runtime.persistence import Persist, write
@@ -172,6 +174,7 @@ class Driver:
         self._opened = asyncio.Event()
         self._images: dict[int, Image] = {}
         self._image_count = 0
+        self._given = GivenKeyframes.of(robot)
         self._image_slots = asyncio.Semaphore(IMAGES_MAX)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stopping = False
@@ -203,12 +206,17 @@ class Driver:
         await self._image_slots.acquire()
         self._image_count += 1
         self._images[self._image_count] = image
+        self._given.add(stamp_s)
         self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), self._image_count))
 
-    def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
-        """Take in an absolute position of the last keyframe's camera."""
-        x, y, z = (float(v) for v in position_m)
-        self.put(FixMeasured((x, y, z), tuple(float(v) for v in covariance_m2.ravel())))
+    def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
+        """Take in what was measured at the keyframe that was given last, or at the one with this stamp.
+
+        Raises:
+            BadMeasurement: There is no such keyframe.
+        """
+        index = self._given.index_of(measurement, stamp_s)
+        self.put(Measured(measurement, index))
 
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""

@@ -1,6 +1,7 @@
 """Playing a recording into an agent by its stamps, as if the robot were moving now."""
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 
 import numpy as np
@@ -9,7 +10,9 @@ from numpy.typing import NDArray
 from flocc_agent.config import SourceConfig
 from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.recording import Recording, RecordingError
+
+logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 AddKeyframe = Callable[[Image, Float, float], Awaitable[None]]
@@ -32,7 +35,7 @@ async def play(
     on_position: Callable[[Float], None],
     resumed: bool = False,
 ) -> None:
-    """Play frames when they are due; late ones are played at once, none is skipped.
+    """Play frames when they are due; late ones are played at once, none is skipped but what cannot be read.
 
     Args:
         recording: What to play.
@@ -42,9 +45,6 @@ async def play(
         clock_s: Seconds since the start of the run.
         on_position: Takes the true position (3,) of each frame, where it is known, for emulated range.
         resumed: The agent was restarted: frames that were due before now are skipped.
-
-    Raises:
-        RecordingError: An image cannot be read.
     """
     first_s = recording.frames[0].stamp_s
     started_s = clock_s()
@@ -57,6 +57,10 @@ async def play(
         if truth is not None:
             on_position(truth[:3, 3])
         if selector.wants(frame.T_odom_body):
+            try:
+                image = await asyncio.to_thread(recording.load_image, frame)
+            except RecordingError as error:
+                logger.warning("%s; left out", error)
+                continue
             selector.took(frame.T_odom_body)
-            image = await asyncio.to_thread(recording.load_image, frame)
             await add_keyframe(image, frame.T_odom_body, frame.stamp_s)

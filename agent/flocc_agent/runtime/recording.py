@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import ConfigError, read_toml
 from flocc_agent.core.interfaces import Camera, Image
-from flocc_agent.runtime.trajectory import GAP_MAX_S, RecordingError, Trajectory, checked_pose, read_tum, text_lines
+from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
+from flocc_agent.runtime.text_tables import RecordingError, text_lines
+from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
+from flocc_agent.runtime.trajectory_text import read_tum
 
 __all__ = ["Frame", "Recording", "RecordingError", "read_camera", "read_image_list", "write_camera"]
 
@@ -53,6 +56,7 @@ class Recording:
         T_body_camera: (4, 4) pose of the camera in the body, metres.
         frames: Images that odometry covers, in order of time; at least one.
         truth: Ground truth `T_world_body` where the recording has one.
+        levels: How images of 16 bits are brought to 8.
     """
 
     path: Path
@@ -60,14 +64,15 @@ class Recording:
     T_body_camera: Float
     frames: tuple[Frame, ...]
     truth: Trajectory | None
+    levels: Levels = FULL
 
     @classmethod
     def open(cls, path: Path) -> "Recording":
-        """Read everything but the pixels, of which only the first image's are checked.
+        """Read everything but the pixels; an image that is cut off, or of another size, is left out and said.
 
         Raises:
-            RecordingError: A file is missing or broken, an image does not exist or has another size than the
-                intrinsics, or no image lies within the odometry's time.
+            RecordingError: A file is missing or broken, many images cannot be used, or none lies within the odometry's
+                time.
         """
         if not path.is_dir():
             raise RecordingError(f"{path}: is not a folder")
@@ -75,9 +80,13 @@ class Recording:
         frames = _frames(path, read_tum(path / "odometry.tum"))
         truth_path = path / "groundtruth.tum"
         truth = read_tum(truth_path) if truth_path.exists() else None
-        recording = cls(path, camera, T_body_camera, frames, truth)
-        recording.load_image(frames[0])
-        return recording
+        try:
+            looked = good_pictures([frame.image_path for frame in frames], (camera.width, camera.height))
+        except PictureError as error:
+            raise RecordingError(f"{error}; the intrinsics are in {path / 'camera.toml'}") from error
+        if looked.fault is not None:
+            logger.warning("%s", looked.fault)
+        return cls(path, camera, T_body_camera, tuple(frames[k] for k in looked.good), truth, looked.levels)
 
     def ground_truth(self, stamp_s: float) -> Float | None:
         """True (4, 4) pose `T_world_body` at a time, or None where there is none."""
@@ -89,13 +98,13 @@ class Recording:
         Raises:
             RecordingError: The image cannot be read, or its size is not that of the intrinsics.
         """
-        pixels = _read_rgb(frame.image_path)
-        height, width = pixels.shape[:2]
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise RecordingError(
-                f"{frame.image_path}: the image is {width}x{height}, but the intrinsics in "
-                f"{self.path / 'camera.toml'} are for {self.camera.width}x{self.camera.height}"
-            )
+        try:
+            encoded = frame.image_path.read_bytes()
+            pixels = read_picture(encoded, (self.camera.width, self.camera.height), self.levels)
+        except OSError as error:
+            raise RecordingError(f"{frame.image_path}: cannot be read: {error.strerror or error}") from error
+        except PictureError as error:
+            raise RecordingError(f"{frame.image_path}: {error}") from error
         return Image(pixels, self.camera)
 
 
@@ -209,16 +218,3 @@ def _extrinsics(rows: object, path: Path) -> Float:
     if T.shape != (4, 4):
         raise RecordingError(f"{path}: camera.T_body_camera must be four rows of four numbers")
     return checked_pose(T, f"{path}: camera.T_body_camera")
-
-
-def _read_rgb(path: Path) -> NDArray[np.uint8]:
-    import cv2
-
-    try:
-        encoded = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise RecordingError(f"{path}: the image cannot be read: {error.strerror or error}") from error
-    bgr = cv2.imdecode(encoded, cv2.IMREAD_COLOR) if encoded.size else None
-    if bgr is None:
-        raise RecordingError(f"{path}: the image cannot be read: it is damaged or of an unknown format")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)

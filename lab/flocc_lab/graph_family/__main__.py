@@ -23,7 +23,7 @@ def parsed(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--draws", type=int, default=60, help="number of graphs")
     parser.add_argument("--first", type=int, default=1, help="seed of the first graph")
     parser.add_argument("--methods", default="flocc", help="names with commas between them; empty: all")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="flocc with a changed setting too")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="flocc so changed, too")
     parser.add_argument("--earlier", type=Path, help="another checkout, whose default runs beside")
     parser.add_argument("--rows", type=Path, help="file of JSON lines to add to and to go on from")
     parser.add_argument("--limit-s", type=float, default=900.0, help="no graph is begun after so long")

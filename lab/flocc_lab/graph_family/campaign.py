@@ -67,7 +67,9 @@ HEAD = (
 def table(verdicts: Sequence[Verdict]) -> str:
     """A row per method, as Markdown. Ratios are ATE over the oracle's, without groups of wrong closures."""
     names = list(dict.fromkeys(v.method for v in verdicts))
-    return "\n".join([HEAD, "|---" * 13 + "|", *(_row(name, [v for v in verdicts if v.method == name]) for name in names)])
+    return "\n".join(
+        [HEAD, "|---" * 13 + "|", *(_row(name, [v for v in verdicts if v.method == name]) for name in names)]
+    )
 
 
 def _row(name: str, of_method: Sequence[Verdict]) -> str:

@@ -26,8 +26,8 @@ from flocc_agent.core.pose_graph import (
     PoseGraph,
     components_of,
 )
+from flocc_lab.bench.solver_ratios import between_factors, gnc_with
 from flocc_lab.graph_family.graphs import Member
-from flocc_launch.bench_solver import between_factors, gnc_with
 from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
@@ -122,8 +122,7 @@ def gtsam_gnc(member: Member) -> Answer:
     for logs in groups:
         of_group = {k: c for k, c in usable.items() if c.query.log in logs}
         part = PoseGraph({log: graph.trajectories[log] for log in logs}, ())
-        for log, T in _gtsam_group(part, of_group, used).items():
-            poses[log] = T
+        poses |= _gtsam_group(part, of_group, used)
     return Answer(poses, groups, used, (), time.process_time() - began)
 
 

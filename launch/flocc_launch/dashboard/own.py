@@ -14,9 +14,9 @@ import numpy as np
 from flocc_agent.composition import Agent
 from flocc_agent.core.robot import Robot
 from flocc_launch.dashboard.state import SwarmState
-from flocc_launch.heard import Heard
-from flocc_launch.run_folder import RunFolderError, event_from_line
-from flocc_launch.run_records import (
+from flocc_launch.runs.heard import Heard
+from flocc_launch.runs.run_folder import RunFolderError, event_from_line
+from flocc_launch.runs.run_records import (
     ClosureAccepted,
     ClosureRejected,
     CorrectionApplied,

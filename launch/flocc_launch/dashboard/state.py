@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import pose_from_tq
 from flocc_launch.dashboard.words import sentence_of
-from flocc_launch.run_records import (
+from flocc_launch.runs.run_records import (
     AccountKept,
     AgentDied,
     AgentStopped,

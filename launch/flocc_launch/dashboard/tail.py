@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from flocc_launch.run_folder import RunFolderError, event_from_line
-from flocc_launch.run_records import Event
+from flocc_launch.runs.run_folder import RunFolderError, event_from_line
+from flocc_launch.runs.run_records import Event
 
 CHUNK_BYTES_MAX = 8_000_000
 

@@ -1,6 +1,6 @@
 """Events as short sentences for people who watch."""
 
-from flocc_launch.run_records import (
+from flocc_launch.runs.run_records import (
     AgentDied,
     AgentStopped,
     ClosureAccepted,

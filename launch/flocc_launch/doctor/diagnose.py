@@ -11,10 +11,10 @@ from dataclasses import replace
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.steps import STEPS
-from flocc_launch.report.load import LoadedRun, load
-from flocc_launch.report.timeline import ends
-from flocc_launch.run_folder import RunFolder
-from flocc_launch.run_records import AgentDied
+from flocc_launch.runs.loaded_run import LoadedRun, load
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.runs.run_records import AgentDied
+from flocc_launch.runs.timeline import ends
 
 
 def diagnose(folder: RunFolder) -> list[Finding]:

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 
 from flocc_launch.doctor.finding import Finding, Severity
-from flocc_launch.report.build import how_it_died
-from flocc_launch.report.closures import Pair
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.report.svg import seconds
-from flocc_launch.run_records import AgentDied, EncodingFailed, GraphOptimised, NameTaken, of_kind
+from flocc_launch.runs.closure_table import Pair
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import seconds
+from flocc_launch.runs.run_records import AgentDied, EncodingFailed, GraphOptimised, NameTaken, of_kind
+from flocc_launch.runs.timeline import how_it_died
 
 LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3

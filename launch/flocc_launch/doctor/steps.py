@@ -5,7 +5,9 @@ A step looks at two robots and gives None where it holds. Later steps may rely o
 
 from collections.abc import Callable
 
-from flocc_launch.doctor.evidence import (
+from flocc_agent.core.election import ANSWER_TIMEOUT_S
+from flocc_launch.doctor.finding import Finding, blocked
+from flocc_launch.doctor.merge_evidence import (
     best_similarity,
     components_join,
     heard_s,
@@ -15,10 +17,9 @@ from flocc_launch.doctor.evidence import (
     named,
     pairs_between,
 )
-from flocc_launch.doctor.finding import Finding, blocked
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.report.svg import count_of, number, seconds
-from flocc_launch.run_records import (
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import count_of, number, seconds
+from flocc_launch.runs.run_records import (
     AgentDied,
     GraphOptimised,
     LatentFailed,
@@ -206,7 +207,7 @@ def followed_nobody(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     return blocked(
         "no-leader",
         f"{a} and {b} are connected by closures, but neither ever followed a leader.",
-        "Check that heartbeats arrive both ways and that election.answer_timeout_s is above the round-trip time.",
+        f"Check that heartbeats arrive both ways, and that a round trip takes less than {ANSWER_TIMEOUT_S:g} s.",
         a,
         b,
     )

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 from flocc_agent.stages import BOUNDS_S, Histogram
 from flocc_launch.report.model import KindBytes, LinkBytes, StageTime
-from flocc_launch.run_records import AccountKept, Event, StageCounts, of_kind
+from flocc_launch.runs.run_records import AccountKept, Event, StageCounts, of_kind
 
 Cell = tuple[str, str, str]
 """Sender, receiver, kind."""

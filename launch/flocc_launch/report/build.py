@@ -2,15 +2,12 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.stages import BOUNDS_S
-from flocc_launch.evaluation import ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.report.accounts import links_of, stages_by_robot, stages_of
-from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import (
     Closures,
     Expectation,
@@ -21,9 +18,12 @@ from flocc_launch.report.model import (
     RobotBytes,
     TrackError,
 )
-from flocc_launch.report.timeline import corrections_of, ends, leader_changes, merged_after_s, terms_led
-from flocc_launch.report.tracks import Track
-from flocc_launch.run_records import AgentDied, BytesCounted, ClosureAccepted, GraphOptimised, PeerRefused, of_kind
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.run_records import AgentDied, BytesCounted, ClosureAccepted, GraphOptimised, PeerRefused, of_kind
+from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
+from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
+from flocc_launch.runs.version import flocc_version
 
 Float = NDArray[np.float64]
 
@@ -69,14 +69,6 @@ def build(loaded: LoadedRun) -> Report:
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
-
-
-def flocc_version() -> str:
-    """Version of the installed distribution, or 'unknown' when run from a source tree alone."""
-    try:
-        return version("flocc")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def with_keyframes(tracks: Iterable[Track]) -> list[Track]:
@@ -205,15 +197,6 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
             found.append(f"{robot} left no result; its trajectory is odometry only.")
     rounds = of_kind(events, GraphOptimised)
     return found + ([f"Last optimisation: {text}" for text in rounds[-1].warnings] if rounds else [])
-
-
-def how_it_died(event: AgentDied) -> str:
-    """The signal or exit code of an agent's death, and where it says more."""
-    if event.signal is not None:
-        return f"signal {event.signal}"
-    if event.exit_code is None:
-        return "no reason known"
-    return f"exit code {event.exit_code}; robots/{event.robot}/agent.log says why"
 
 
 def registered_by(loaded: LoadedRun) -> Counter[str]:

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from flocc_launch.evaluation import evo_ape
 from flocc_launch.report.finish import finish
 from flocc_launch.report.text import sentences
-from flocc_launch.run_folder import RunFolder
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.runs.trajectory_errors import evo_ape
 
 
 def evaluate(run: Path, with_evo: bool = False, as_json: bool = False) -> str:

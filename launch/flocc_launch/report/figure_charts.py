@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_launch.evaluation import alignment
 from flocc_launch.report.figure_map import colour
-from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.svg import Axis, element, path, svg, text_of, title
-from flocc_launch.report.tracks import Track
-from flocc_launch.run_records import setting_number
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.run_records import setting_number
+from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.trajectory_errors import alignment
 
 Float = NDArray[np.float64]
 

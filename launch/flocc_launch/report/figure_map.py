@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse
-from flocc_launch.evaluation import alignment
-from flocc_launch.report.closures import Pair
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.report.svg import PALETTE_SIZE, Axis, element, nice_step, number, path, svg, text_of, title
-from flocc_launch.report.tracks import Track
+from flocc_launch.report.svg import PALETTE_SIZE, Axis, element, nice_step, path, svg, text_of, title
+from flocc_launch.runs.closure_table import Pair
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import number
+from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.trajectory_errors import alignment
 from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from flocc_launch.report.figure_map import colour
-from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report
-from flocc_launch.report.svg import Axis, count_of, element, path, seconds, svg, text_of, title
-from flocc_launch.report.timeline import Link
-from flocc_launch.run_records import AgentDied, AgentStopped, CorrectionApplied, of_kind
+from flocc_launch.report.svg import Axis, element, path, svg, text_of, title
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import count_of, seconds
+from flocc_launch.runs.run_records import AgentDied, AgentStopped, CorrectionApplied, of_kind
+from flocc_launch.runs.timeline import Link
 from flocc_protocol.ids import LogId
 
 WIDTH_PX = 960.0

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import between, inverse, pose_from_tq, tq_from_pose
-from flocc_launch.report.load import LoadedRun
-from flocc_launch.run_records import ClosureKnown
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.run_records import ClosureKnown
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]

@@ -4,10 +4,10 @@ from importlib.resources import files
 from pathlib import Path
 
 from flocc_launch.report import section_accounts, sections
-from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report
 from flocc_launch.report.svg import element, text_of
 from flocc_launch.report.verdict import verdict
+from flocc_launch.runs.loaded_run import LoadedRun
 
 
 def write_html(path: Path, report: Report, loaded: LoadedRun) -> None:

@@ -5,7 +5,7 @@ The keys that other programs rely on stand in DESIGN.md section 8, all of them i
 
 from pydantic import Field
 
-from flocc_launch.run_records import Record
+from flocc_launch.runs.run_records import Record
 
 SCHEMA_VERSION = 1
 

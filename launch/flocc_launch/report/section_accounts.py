@@ -2,7 +2,8 @@
 
 from flocc_launch.report.model import LinkBytes, Report, StageTime
 from flocc_launch.report.sections import bar, noted, swatch, table
-from flocc_launch.report.svg import count_of, element, number, size_of, svg, text_of, title
+from flocc_launch.report.svg import element, svg, text_of, title
+from flocc_launch.runs.plain_numbers import count_of, number, size_of
 
 MATRIX_ROBOTS_MAX = 10
 LINKS_SHOWN_MAX = 20

@@ -6,12 +6,14 @@ from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from flocc_launch.doctor import Severity, diagnose_loaded
 from flocc_launch.report.figure_charts import error_figure, ratio_figure
 from flocc_launch.report.figure_map import colour, map_figure, scenes, view_of
 from flocc_launch.report.figure_time import time_figure
-from flocc_launch.report.load import LoadedRun
 from flocc_launch.report.model import Report, Robot
-from flocc_launch.report.svg import count_of, element, number, plain, seconds, size_of, text_of
+from flocc_launch.report.svg import element, text_of
+from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
 
 
 def kicker(report: Report) -> str:
@@ -86,8 +88,6 @@ def warnings(report: Report) -> str:
 
 def findings(loaded: LoadedRun) -> str:
     """What the doctor says that blocks or hinders."""
-    from flocc_launch.doctor import Severity, diagnose_loaded  # the doctor reads runs as the report does
-
     found = [f for f in diagnose_loaded(loaded) if f.severity in (Severity.BLOCKS, Severity.HINDERS)]
     found = [f for f in found if f.cause not in ("agent-died", "solver-warning")]  # these stand under warnings
     if not found:

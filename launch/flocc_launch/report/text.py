@@ -1,8 +1,8 @@
 """A report for the terminal: the verdict, the figures, expectations, warnings."""
 
 from flocc_launch.report.model import Report
-from flocc_launch.report.svg import count_of, number, plain, seconds, size_of
 from flocc_launch.report.verdict import verdict
+from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
 
 
 def sentences(report: Report) -> list[str]:

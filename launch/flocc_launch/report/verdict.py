@@ -1,7 +1,7 @@
 """The run in one or two sentences."""
 
 from flocc_launch.report.model import Report
-from flocc_launch.report.svg import number, seconds
+from flocc_launch.runs.plain_numbers import number, seconds
 
 COUNT_WORDS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine"}
 

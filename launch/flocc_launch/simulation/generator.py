@@ -4,7 +4,7 @@ import numpy as np
 
 from flocc_agent.config import KeyframeConfig, LinkOverrideConfig, PerceptionConfig, RadioConfig, SyntheticConfig
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
-from flocc_launch.scenario import Fault, FaultKind, RobotScenario, Scenario, TracksScenario
+from flocc_launch.scenarios.scenario import Fault, FaultKind, RobotScenario, Scenario, TracksScenario
 
 FAULTS_END_S = 30.0
 ROBOTS_MAX = 5

@@ -8,18 +8,18 @@ from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
 from flocc_agent.stages import fields_of
-from flocc_launch.expectations import check_measurable
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
-from flocc_launch.run_folder import RobotResult, Run, RunFolder
-from flocc_launch.scenario import Scenario
-from flocc_launch.simulation.alignment import Alignment
+from flocc_launch.runs.run_folder import RobotResult, Run, RunFolder
+from flocc_launch.scenarios.expectations import check_measurable
+from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.scenarios.walks import walks
 from flocc_launch.simulation.eyes import ImageEyes
-from flocc_launch.simulation.faults import schedule
-from flocc_launch.simulation.playback import Playback, nothing, of_recording, of_walk
+from flocc_launch.simulation.fault_schedule import schedule
+from flocc_launch.simulation.rigid_alignment import Alignment
 from flocc_launch.simulation.swarm import Equipment, Swarm
-from flocc_launch.simulation.tracks import walks
-from flocc_launch.simulation.workers import WorkTimes
+from flocc_launch.simulation.virtual_playback import Playback, nothing, of_recording, of_walk
+from flocc_launch.simulation.virtual_workers import WorkTimes
 
 LOOK_S = 1.0
 LONGEST_AFTER_LAST_S = 300.0

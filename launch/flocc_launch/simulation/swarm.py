@@ -13,14 +13,14 @@ from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.reporting import Reporter
-from flocc_launch.scenario import Scenario
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
-from flocc_launch.simulation.latents import LatentFetcher
-from flocc_launch.simulation.network import Network
-from flocc_launch.simulation.playback import Playback
-from flocc_launch.simulation.robot import Clock, Station, Surroundings
-from flocc_launch.simulation.workers import Eyes, Optimiser, Workers, WorkTimes
+from flocc_launch.simulation.virtual_fetches import LatentFetcher
+from flocc_launch.simulation.virtual_network import Network
+from flocc_launch.simulation.virtual_playback import Playback
+from flocc_launch.simulation.virtual_robot import Clock, Station, Surroundings
+from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, Workers, WorkTimes
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Envelope, Message
 

@@ -36,11 +36,11 @@ from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
 from flocc_agent.geometry import pose
 from flocc_agent.radio import LinkOverride, LinkParameters, Partition, RadioParameters
-from flocc_launch.scenario import RobotScenario, Scenario, TracksScenario
-from flocc_launch.simulation.alignment import Alignment
-from flocc_launch.simulation.playback import Capture, Playback
-from flocc_launch.simulation.robot import Station
+from flocc_launch.scenarios.scenario import RobotScenario, Scenario, TracksScenario
+from flocc_launch.simulation.rigid_alignment import Alignment
 from flocc_launch.simulation.swarm import Equipment, Swarm
+from flocc_launch.simulation.virtual_playback import Capture, Playback
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.messages import CorrectionBatch, Envelope, Handover, LogCorrection

@@ -14,7 +14,7 @@ from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import AbsoluteFix, GraphSolution
-from flocc_launch.generated_graph import GeneratedGraph, generate
+from flocc_lab.bench.generated_graph import GeneratedGraph, generate
 from flocc_protocol.ids import KeyframeId, LogId
 
 FORMULATIONS = (Formulation.BASE, Formulation.INDEPENDENT, Formulation.SMOOTHED, Formulation.SHARED)

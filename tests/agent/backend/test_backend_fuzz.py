@@ -10,7 +10,7 @@ from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import AbsoluteFix, GraphSolution, LoopClosure, OptimisationFailed, PoseGraph
 from flocc_agent.geometry import pose, so3_exp
-from flocc_launch.generated_graph import generate
+from flocc_lab.bench.generated_graph import generate
 from flocc_protocol.ids import KeyframeId, LogId
 
 SEEDS = 120

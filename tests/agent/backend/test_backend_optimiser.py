@@ -22,7 +22,7 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
 )
 from flocc_agent.geometry import between, inverse, pose, se3_exp, so3_exp
-from flocc_launch.generated_graph import GeneratedGraph, Noise, generate
+from flocc_lab.bench.generated_graph import GeneratedGraph, Noise, generate
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_protocol.ids import KeyframeId, LogId
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import Corrections, pose7
+from flocc_agent.core.corrections import LISTED_MAX, Corrections, pose7
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.parameters import GossipParameters, RoundParameters
+from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.robot import Restored
@@ -23,7 +23,7 @@ R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
 
 def corrections(own: LogId = R1) -> Corrections:
-    return Corrections(own, GossipParameters(), RoundParameters())
+    return Corrections(own, GossipParameters())
 
 
 def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> LogCorrection:
@@ -114,7 +114,7 @@ def test_a_long_trajectory_is_thinned_and_keeps_its_last_keyframe() -> None:
     message = machine.applied
     assert message is not None
     count = message.T_map_camera.shape[0]
-    assert count <= RoundParameters().correction_keyframes_max
+    assert count <= LISTED_MAX
     assert message.first + message.step * (count - 1) == 1000
 
 
@@ -150,7 +150,7 @@ def test_a_jump_in_whose_middle_the_robot_died_is_told_after_the_restart() -> No
 
 
 def test_a_relay_cannot_forge_a_correction() -> None:
-    machine = Corrections(R1, GossipParameters(), RoundParameters(), Seals("r1"))
+    machine = Corrections(R1, GossipParameters(), Seals("r1"))
     genuine = replace(correction(Term(1, R2), 1), signature=Seals("r2").sign_correction(b""))
     for forged in (replace(genuine, signature=b""), replace(genuine, term=Term(9, R3))):
         effects = machine.on_message("r3", forged)
@@ -161,7 +161,7 @@ def test_a_relay_cannot_forge_a_correction() -> None:
 
 
 def test_a_leader_signs_what_it_publishes() -> None:
-    machine = Corrections(R2, GossipParameters(), RoundParameters(), Seals("r2"))
+    machine = Corrections(R2, GossipParameters(), Seals("r2"))
     (sent,) = [e.message for e in machine.publish(Term(1, R2), 1, solution()) if isinstance(e, Broadcast)]
     assert isinstance(sent, CorrectionBatch)
     assert [c.signature.rstrip(b".") for c in sent.corrections] == [b"r2"]

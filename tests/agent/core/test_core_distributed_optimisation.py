@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.blocks import BlockState, BlockStep
 from flocc_agent.core.distributed_optimisation import DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
-from flocc_agent.core.parameters import DistributedParameters, RoundParameters
+from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
@@ -43,7 +43,7 @@ def three_robots() -> Source:
 
 
 def machine(own: LogId = B) -> DistributedOptimisation:
-    return DistributedOptimisation(own, three_robots(), PARAMETERS, RoundParameters())
+    return DistributedOptimisation(own, three_robots(), PARAMETERS)
 
 
 def lifted(shift_m: float = 0.0) -> Float:

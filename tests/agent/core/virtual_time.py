@@ -30,7 +30,7 @@ from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.registration import Registration
 from flocc_agent.core.robot import Restored, Robot
 from flocc_agent.geometry import pose
-from flocc_launch.simulation.alignment import align
+from flocc_launch.simulation.rigid_alignment import align
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Message

@@ -18,7 +18,7 @@ from flocc_agent.perception.mast3r.relative_pose import (
     reray,
     weiszfeld_focal,
 )
-from flocc_launch.pose_table import draw_scene, row, solve, table, true_K
+from flocc_lab.bench.pose_table import draw_scene, row, solve, table, true_K
 
 
 @pytest.mark.golden

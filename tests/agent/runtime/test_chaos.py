@@ -4,7 +4,7 @@ import pytest
 
 from flocc_agent.radio import Blackout, LinkParameters, Partition, RadioParameters
 from flocc_agent.runtime.chaos import BadOrder, Order, disturbed, read_order
-from flocc_launch.chaos import ChaosError, parse_order
+from flocc_launch.swarm.chaos_orders import ChaosError, parse_order
 
 
 @pytest.mark.parametrize(

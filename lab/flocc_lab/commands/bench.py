@@ -1,0 +1,52 @@
+"""`flocc bench`: benchmarks whose results are ratios measured in one run."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+bench = typer.Typer(help="Benchmarks: ratios measured in one run.", rich_markup_mode=None)
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+@bench.command()
+def solver(json_out: JsonOption = False) -> None:
+    """The back end against GTSAM's own C++ factors and solvers."""
+    from flocc_lab.bench.solver_ratios import run
+
+    _print_bench(run(), json_out)
+
+
+@bench.command()
+def registration(json_out: JsonOption = False) -> None:
+    """The MASt3R front end against its plain fp32 path."""
+    from flocc_lab.bench.registration_ratios import run
+
+    _print_bench(run(), json_out)
+
+
+@bench.command()
+def perception(
+    shared: Annotated[Path | None, typer.Argument(help="Folder of the research sets, as ../shared/data.")] = None,
+    recordings: Annotated[list[Path] | None, typer.Option(help="Recordings with ground truth.")] = None,
+    config: Annotated[Path | None, typer.Option(help="An agent's configuration; its perception is judged.")] = None,
+    json_out: JsonOption = False,
+) -> None:
+    """Precision, recall and pose errors of a perception back-end on recorded images with ground truth."""
+    from flocc_agent.config import AgentConfig
+    from flocc_lab.bench.perception_quality import run, text
+
+    chosen = None if config is None else AgentConfig.read(config).perception
+    report = run(shared, chosen, recordings or ())
+    typer.echo(json.dumps(report, indent=1) if json_out else text(report))
+
+
+def _print_bench(result: dict[str, Any], json_out: bool) -> None:
+    if json_out:
+        typer.echo(json.dumps(result, indent=1))
+        return
+    for name, ratio in result["ratios"].items():
+        shown = "n/a" if ratio is None else json.dumps(ratio)
+        typer.echo(f"{name:44} {shown}")

@@ -1,0 +1,268 @@
+"""The command line. Commands import what they need when they run, so that `--help` stays fast."""
+
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from flocc_launch.commands.common import EXIT_BAD_INPUT, progress_bar, show_report
+from flocc_launch.commands.data import add_data
+from flocc_launch.commands.lab import add_lab
+from flocc_launch.commands.offline import add_offline, run_campaign
+from flocc_launch.commands.tools import add_tools
+from flocc_protocol.errors import FloccError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from flocc_launch.scenarios.scenario import Scenario
+    from flocc_launch.swarm.launching import OnWatch
+
+app = typer.Typer(
+    name="flocc",
+    epilog="Start with 'flocc demo', or 'flocc launch FOLDER' with images and a trajectory of your own.",
+    context_settings={"max_content_width": 110},
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=True,
+)
+
+
+def _show_version(wanted: bool) -> None:
+    """Print the version of the installed distribution, and of the wire."""
+    if wanted:
+        from flocc_launch.runs.version import flocc_version
+        from flocc_protocol.messages import PROTOCOL_VERSION
+
+        typer.echo(f"flocc {flocc_version()} (protocol {PROTOCOL_VERSION})")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    """Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots."""
+
+
+WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
+HOW_MANY = "Number of robots of the world, or into which one data set is cut."
+Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
+Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
+Latency = Annotated[float | None, typer.Option(min=0.0, help="Delay on every link, seconds.")]
+Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a link and budget of a robot, kB/s.")]
+Range = Annotated[float | None, typer.Option("--range", min=0.0, help="Communication range by true position, metres.")]
+Duration = Annotated[float | None, typer.Option(min=0.0, help="End after so many seconds, not when all is settled.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Another value for a key, such as radio.loss_ratio=0.3.")]
+
+
+def main() -> None:
+    """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
+    try:
+        app()
+    except FloccError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def fail(sentence: str) -> NoReturn:
+    """Print an error and leave."""
+    typer.echo(f"error: {sentence}", err=True)
+    sys.exit(EXIT_BAD_INPUT)
+
+
+@app.command(short_help="Robots in a generated town, real zenoh: one map, one report.")
+def demo(
+    out: Out = Path("runs/demo"),
+    robots: Annotated[int, typer.Option(min=2, max=8, help="Robots in the generated world.")] = 3,
+    seed: Annotated[int, typer.Option(help="Another seed is another world.")] = 7,
+) -> None:
+    """Run the main job: robots in a generated world, real images, real zenoh, one report."""
+    from flocc_launch.scenarios.scenario import Scenario
+    from flocc_launch.scenarios.shipped import read_shipped
+
+    scenario = read_shipped("demo", {"world.robots": robots, "world.seed": seed})
+    assert isinstance(scenario, Scenario)
+    _launch(scenario, out)
+
+
+@app.command(short_help="Run a scenario or your own data, a process per robot.")
+def launch(
+    scenario: Annotated[str, typer.Argument(help=WHAT_RUNS)],
+    out: Out = Path("runs/launch"),
+    agents: Annotated[int | None, typer.Option(min=1, help=HOW_MANY)] = None,
+    loss: Loss = None,
+    latency: Latency = None,
+    bandwidth: Bandwidth = None,
+    range_m: Range = None,
+    duration: Duration = None,
+    seed: Seed = None,
+    sets: Set = None,
+    rate: Annotated[float | None, typer.Option(help="Playback speed of recordings.")] = None,
+    dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
+    metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
+    secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
+) -> None:
+    """Run a scenario with one process per robot on this machine, over real zenoh."""
+    changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
+    changes |= {} if rate is None else {"rate": rate}
+    changes |= _parsed(sets)
+    _launch(_read(scenario, changes, agents), out, secure, dashboard, metrics)
+
+
+@app.command(short_help="Run the same on virtual time: one process, repeatable.")
+def simulate(
+    scenario: Annotated[str | None, typer.Argument(help=WHAT_RUNS)] = None,
+    out: Out = Path("runs/simulate"),
+    agents: Annotated[int | None, typer.Option(min=1, help=HOW_MANY)] = None,
+    seed: Seed = None,
+    loss: Loss = None,
+    latency: Latency = None,
+    bandwidth: Bandwidth = None,
+    range_m: Range = None,
+    duration: Duration = None,
+    sets: Set = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
+    shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
+) -> None:
+    """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
+    if seeds is not None and sets:
+        fail("a campaign draws its scenarios; --set changes one, without --seeds")
+    if seeds is not None:
+        run_campaign(seeds, seed or 0, shrink, out)
+        return
+    if scenario is None:
+        fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
+    from flocc_launch.scenarios.expectations import check_measurable
+    from flocc_launch.scenarios.recordings import cache_folder, recordings
+    from flocc_launch.simulation.simulate import simulate as run
+    from flocc_launch.swarm.launching import fresh_folder
+
+    changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
+    read = _read(scenario, changes | _parsed(sets), agents)
+    with progress_bar("preparing data") as progress:
+        paths = recordings(read, progress)
+    check_measurable(read, paths)
+    fresh_folder(out)
+    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out)
+
+
+@app.command()
+def agent(
+    config: Annotated[Path, typer.Option(help="Configuration of the agent (TOML); see docs/configuration.md.")],
+    changes: Set = None,
+    dashboard: Annotated[str | None, typer.Option(help="Serve this agent's view of the swarm at [HOST:]PORT.")] = None,
+    metrics: Annotated[str | None, typer.Option(help="Serve metrics for Prometheus at [HOST:]PORT.")] = None,
+    bandwidth: Annotated[
+        float | None, typer.Option(min=0.001, help="Budget of this robot, kilobytes per second.")
+    ] = None,
+    verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
+) -> None:
+    """Run one robot's agent until it is stopped."""
+    import asyncio
+    import logging
+    import time
+
+    from flocc_agent.config import AgentConfig, MetricsConfig
+    from flocc_launch.swarm.agent_process import run_agent
+
+    level = logging.DEBUG if verbose else logging.INFO
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
+    given: dict[str, Any] = {} if metrics is None else {"metrics": MetricsConfig.at(metrics)[0]}
+    if bandwidth is not None:
+        given["bandwidth_bytes_s"] = 1000.0 * bandwidth
+    read = AgentConfig.read(config, changes or ()).model_copy(update=given)
+    asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
+
+
+@app.command(short_help="Compute a run's report anew: errors, closures, bytes, leaders.")
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
+    json_out: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Evaluate a run folder anew: ATE and RPE against ground truth, closures, bytes, leaders."""
+    from flocc_launch.report.evaluate import evaluate as run_evaluation
+
+    typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
+
+
+def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
+    from flocc_launch.scenarios.shipped import read_scenario
+
+    return read_scenario(scenario, changes, agents, typer.echo)
+
+
+def _changes(
+    loss: float | None,
+    latency: float | None,
+    bandwidth: float | None,
+    range_m: float | None,
+    duration: float | None,
+    seed: int | None,
+) -> dict[str, Any]:
+    """What the command line changes in a scenario."""
+    given = {
+        "radio.loss_ratio": loss,
+        "radio.latency_s": latency,
+        "radio.bandwidth_bytes_s": None if bandwidth is None else 1000.0 * bandwidth,
+        "bandwidth_bytes_s": None if bandwidth is None else 1000.0 * bandwidth,
+        "radio.range_m": range_m,
+        "duration_s": duration,
+        "seed": seed,
+    }
+    return {key: value for key, value in given.items() if value is not None}
+
+
+def _parsed(sets: list[str] | None) -> dict[str, Any]:
+    """Keys and values of `--set`."""
+    from flocc_agent.config import parsed_change
+
+    return dict(parsed_change(text) for text in sets or ())
+
+
+def _launch(
+    scenario: "Scenario", out: Path, secure: bool = False, dashboard: str | None = None, metrics: str | None = None
+) -> None:
+    from rich.console import Console
+
+    from flocc_launch.commands.live_table import LiveTable
+    from flocc_launch.scenarios.recordings import recordings
+    from flocc_launch.swarm.launching import launch as run
+
+    with progress_bar("preparing data") as progress:
+        recordings(scenario, progress)
+    with LiveTable(Console()) as table, _dashboard(out, dashboard, table.show) as show:
+        report = run(scenario, out, show, secure=secure, metrics=metrics)
+    show_report(report, out)
+
+
+@contextmanager
+def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWatch]":
+    """Serve the dashboard beside the table, where somebody wants one."""
+    if where is None:
+        yield show
+        return
+    from flocc_launch.dashboard import address, live_dashboard
+    from flocc_launch.runs.run_folder import RunFolder
+
+    host, port = address(where)
+    with live_dashboard(RunFolder(out), port, show, host) as both:
+        typer.echo(f"dashboard: http://{host}:{port}/")
+        yield both
+
+
+add_tools(app)
+add_data(app)
+add_offline(app)
+add_lab(app)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Run folders: what drivers write, and what reports, doctor, dashboard and views read."""

@@ -1,0 +1,78 @@
+"""Candidate pairs of keyframes and what became of each, over all robots and counted once."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from flocc_launch.runs.run_records import CandidateFound, ClosureAccepted, ClosureRejected, Event, RobotResult
+from flocc_protocol.ids import KeyframeId
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two keyframes that may show one place.
+
+    Attributes:
+        query: As registered; the lower of both for a pair that was not.
+        match: The other keyframe.
+        similarity: Best cosine similarity that a robot found, None where none was reported.
+        ratio: Match ratio of Eq. (1), None where registration gave none.
+        probability: Of Eq. (2), for accepted pairs.
+        accepted: Whether some robot accepted it.
+        reason: Why it was rejected last, None where it was not.
+        at_s: When it was accepted or rejected first, None where neither.
+        used: Whether the last solution used it; None where it is not known (no scales are estimated).
+    """
+
+    query: KeyframeId
+    match: KeyframeId
+    similarity: float | None = None
+    ratio: float | None = None
+    probability: float | None = None
+    accepted: bool = False
+    reason: str | None = None
+    at_s: float | None = None
+    used: bool | None = None
+
+    @property
+    def rejected(self) -> bool:
+        """Whether it was rejected and never accepted."""
+        return self.reason is not None and not self.accepted
+
+    @property
+    def inter_robot(self) -> bool:
+        """Whether it joins two robots."""
+        return self.query.log.robot != self.match.log.robot
+
+
+def pairs_of(events: Iterable[Event], results: Iterable[RobotResult]) -> list[Pair]:
+    """Every pair that any robot found, registered or holds in its logs at the end; sorted."""
+    pairs: dict[tuple[KeyframeId, KeyframeId], Pair] = {}
+    for event in events:
+        if isinstance(event, CandidateFound | ClosureAccepted | ClosureRejected):
+            query, match = KeyframeId.parse(event.query), KeyframeId.parse(event.match)
+            key = (min(query, match), max(query, match))
+            pairs[key] = updated(pairs.get(key, Pair(query, match)), event)
+    closures = [closure for result in results for closure in result.closures]
+    scales_known = any(closure.scale is not None for closure in closures)
+    for closure in closures:
+        query, match = KeyframeId.parse(closure.query), KeyframeId.parse(closure.match)
+        key = (min(query, match), max(query, match))
+        known = pairs.get(key, Pair(query, match, ratio=closure.match_ratio))
+        used = (known.used or closure.scale is not None) if scales_known else None
+        pairs[key] = replace(known, accepted=True, used=used)
+    return [pairs[key] for key in sorted(pairs)]
+
+
+def updated(pair: Pair, event: CandidateFound | ClosureAccepted | ClosureRejected) -> Pair:
+    """The pair after one more event; an acceptance stands whatever comes later."""
+    if isinstance(event, CandidateFound):
+        return replace(pair, similarity=max(event.similarity, pair.similarity or -1.0))
+    if pair.accepted:
+        return pair
+    at_s = event.t if pair.at_s is None else pair.at_s
+    if isinstance(event, ClosureRejected):
+        return replace(pair, ratio=event.ratio, reason=event.reason, at_s=at_s)
+    query, match = KeyframeId.parse(event.query), KeyframeId.parse(event.match)
+    return replace(
+        pair, query=query, match=match, ratio=event.ratio, probability=event.probability, accepted=True, at_s=event.t
+    )

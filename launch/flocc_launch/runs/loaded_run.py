@@ -1,0 +1,47 @@
+"""A run, read once: what the report is computed from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flocc_launch.runs.closure_table import Pair, pairs_of
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.runs.run_records import Event, RobotResult, Run
+from flocc_launch.runs.timeline import Following, Link, end_s, followings, links
+from flocc_launch.runs.tracks import Track, tracks_of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedRun:
+    """Everything that a run folder holds, and what follows from it over time."""
+
+    run: Run
+    robots: tuple[str, ...]
+    events: tuple[Event, ...]
+    results: Mapping[str, RobotResult]
+    tracks: Mapping[str, Track]
+    pairs: tuple[Pair, ...]
+    followings: tuple[Following, ...]
+    links: tuple[Link, ...]
+    end_s: float
+
+
+def load(folder: RunFolder) -> LoadedRun:
+    """Read a run folder.
+
+    Raises:
+        RunFolderError: Something in it is missing, cut off or of another type.
+        RecordingError: Its ground truth is.
+    """
+    run, events, results = folder.run(), tuple(folder.events()), folder.results()
+    end = end_s(events, run.duration_s)
+    return LoadedRun(
+        run=run,
+        robots=tuple(sorted(run.robots)),
+        events=events,
+        results=results,
+        tracks=tracks_of(folder, results, events),
+        pairs=tuple(pairs_of(events, results.values())),
+        followings=tuple(followings(events, end)),
+        links=tuple(links(events, end)),
+        end_s=end,
+    )

@@ -1,0 +1,44 @@
+"""Numbers for people: three significant digits, counts, durations, sizes."""
+
+import math
+
+
+def number(value: float | None, unit: str = "") -> str:
+    """Three significant digits, or a dash where the value is not known."""
+    if value is None:
+        return "–"
+    digits = 0 if value == 0 else max(0, 2 - math.floor(math.log10(abs(value))))
+    text = f"{value:,.{min(digits, 6)}f}".replace(",", " ")
+    return f"{text} {unit}" if unit else text
+
+
+def plain(value: float | str | None) -> str:
+    """A whole number or a name as such, any other number with three significant digits."""
+    if isinstance(value, str):
+        return value
+    return count_of(int(value)) if value is not None and value == int(value) else number(value)
+
+
+def count_of(value: int | None) -> str:
+    """A count with thin spaces between thousands."""
+    return "–" if value is None else f"{value:,}".replace(",", " ")
+
+
+def seconds(value: float | None) -> str:
+    """A duration for people."""
+    if value is None:
+        return "–"
+    if value < 120:
+        return f"{value:.1f} s"
+    minutes, rest = divmod(round(value), 60)
+    return f"{minutes} min {rest} s" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def size_of(count: float | None) -> str:
+    """Bytes for people, powers of ten."""
+    if count is None:
+        return "–"
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= scale:
+            return number(count / scale, unit)
+    return f"{count:.0f} B"

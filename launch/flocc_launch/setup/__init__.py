@@ -1,0 +1,1 @@
+"""What a robot needs before its first run: keys and weights."""

@@ -1,0 +1,1 @@
+"""A swarm of processes on this machine."""

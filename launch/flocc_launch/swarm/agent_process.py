@@ -1,0 +1,199 @@
+"""One agent process: plays its recording, writes its events and its result, tells its state once a second.
+
+`flocc agent` and `flocc launch` both run this. A launched agent speaks JSON lines: states on standard output,
+orders (`{"stop": true}`, `{"radio": {...}}`) on standard input.
+"""
+
+import argparse
+import asyncio
+import json
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from flocc_agent.config import AgentConfig, RadioConfig, validated
+from flocc_protocol.errors import FloccError
+
+if TYPE_CHECKING:
+    from flocc_launch.dashboard.own import AgentSource
+
+logger = logging.getLogger(__name__)
+
+STATUS_PERIOD_S = 0.5
+EXIT_BAD_INPUT = 2
+
+
+class Lines:
+    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file: TextIO | None = None
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("a", encoding="utf-8")
+
+    def write(self, line: dict[str, Any]) -> None:
+        """Append one event."""
+        if self._file is not None:
+            self._file.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")
+            self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+async def run_agent(
+    config: AgentConfig,
+    epoch_s: float,
+    on_status: Callable[[dict[str, Any]], None],
+    orders: asyncio.StreamReader | None = None,
+    dashboard: str | None = None,
+) -> None:
+    """Run one agent until it is told to stop, by a signal or an order.
+
+    Args:
+        config: The agent's configuration; with `folder`, its events and result are written there.
+        epoch_s: Start of the run on this machine's monotonic clock.
+        on_status: Takes a state, twice a second.
+        orders: JSON lines from the launcher.
+        dashboard: [HOST:]PORT of a page that shows this agent's own view of its swarm.
+
+    Raises:
+        FloccError: The configuration, the recording or the network cannot be used.
+    """
+    lines = Lines(config.folder / "events.jsonl" if config.folder else None)
+    with _page(config, dashboard, lambda: time.monotonic() - epoch_s) as source:
+        await _run(config, epoch_s, on_status, orders, lines, source)
+
+
+async def _run(
+    config: AgentConfig,
+    epoch_s: float,
+    on_status: Callable[[dict[str, Any]], None],
+    orders: asyncio.StreamReader | None,
+    lines: Lines,
+    source: "AgentSource | None",
+) -> None:
+    from flocc_agent.composition import Agent
+
+    def on_line(line: dict[str, Any]) -> None:
+        lines.write(line)
+        if source is not None:
+            source.line(line)
+
+    agent = Agent(config, on_line=on_line, clock_s=lambda: time.monotonic() - epoch_s)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, agent.stop)
+    background: list[asyncio.Task[None]] = []
+    try:
+        async with agent:
+            if source is not None:
+                source.attach(agent)
+            background = [asyncio.create_task(_tell(agent, on_status))]
+            if orders is not None:
+                background.append(asyncio.create_task(_obey(agent, orders)))
+            await agent.finished()
+    finally:
+        for task in background:
+            task.cancel()
+        _write_result(config.folder, agent.result())
+        lines.write({"t": round(time.monotonic() - epoch_s, 6), "robot": config.name, "event": "agent_stopped"})
+        lines.close()
+
+
+@contextmanager
+def _page(config: AgentConfig, where: str | None, clock_s: Callable[[], float]) -> "Iterator[AgentSource | None]":
+    """The page of one agent, where somebody wants one.
+
+    Raises:
+        DashboardError: Its address is none, or in use.
+    """
+    if where is None:
+        yield None
+        return
+    from flocc_launch.dashboard import Dashboard, address
+    from flocc_launch.dashboard.own import AgentSource
+
+    host, port = address(where)
+    source = AgentSource(config.swarm, config.name, config.backend.steepness, clock_s)
+    with Dashboard(source, port, host) as page:
+        logger.info("%s: dashboard at %s", config.name, page.url)
+        yield source
+
+
+def recover_result(config: AgentConfig) -> None:
+    """Write the result of an agent that was killed, from what its store holds."""
+    from flocc_agent.composition import stored_result
+
+    if config.folder is not None and (config.folder / "store").exists():
+        _write_result(config.folder, stored_result(config))
+
+
+def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
+    if folder is not None and result is not None:
+        path = folder / "result.json"
+        path.with_suffix(".tmp").write_text(json.dumps(result, allow_nan=False), encoding="utf-8")
+        path.with_suffix(".tmp").replace(path)
+
+
+async def _tell(agent: Any, on_status: Callable[[dict[str, Any]], None]) -> None:
+    while True:
+        on_status(agent.status())
+        await asyncio.sleep(STATUS_PERIOD_S)
+
+
+async def _obey(agent: Any, orders: asyncio.StreamReader) -> None:
+    """Carry out the launcher's orders; its end is an order to stop, so that no agent is left behind."""
+    while line := await orders.readline():
+        order = json.loads(line)
+        if "radio" in order:
+            agent.set_radio(validated(RadioConfig, order["radio"], "order"))
+        if "slow" in order:
+            agent.set_slowness(float(order["slow"]))
+        if order.get("stop"):
+            agent.stop()
+            return
+    agent.stop()
+
+
+async def _standard_input() -> asyncio.StreamReader:
+    reader = asyncio.StreamReader()
+    loop = asyncio.get_running_loop()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    return reader
+
+
+def _print_status(status: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(status, separators=(",", ":")) + "\n")
+    sys.stdout.flush()
+
+
+async def _run_launched(config: AgentConfig, epoch_s: float) -> None:
+    await run_agent(config, epoch_s, _print_status, await _standard_input())
+
+
+def main() -> None:
+    """Entry point of a launched agent."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--epoch-s", type=float, required=True)
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    try:
+        config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
+        asyncio.run(_run_launched(config, arguments.epoch_s))
+    except FloccError as error:
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(EXIT_BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,361 @@
+"""`flocc launch`: a scenario with N agent processes over real zenoh, watched until it is done.
+
+A run without a duration ends when every recording is played, nothing is under way, all logs are equal and nothing
+changed for `settle_s`.
+"""
+
+import asyncio
+import json
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
+from flocc_launch.report.finish import finish
+from flocc_launch.report.model import Report
+from flocc_launch.runs.run_folder import Run, RunFolder
+from flocc_launch.scenarios.expectations import check_measurable
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario, agent_config
+from flocc_launch.setup.credentials import make_keys
+from flocc_launch.swarm.agent_process import Lines, recover_result
+from flocc_launch.swarm.processes import AgentProcess, loopback_transports
+from flocc_protocol.errors import FloccError
+
+LAUNCHER_EVENTS = "launcher.events.jsonl"
+PERIOD_S = 0.25
+UNSETTLED_MAX_S = 120.0
+STOP_NOW_S = 5.0
+START_S = 20.0
+
+
+class LaunchError(FloccError):
+    """A launch that cannot go on: no agent could be started."""
+
+
+@dataclass(slots=True)
+class Watch:
+    """What the launcher shows while a run goes on.
+
+    Attributes:
+        scenario: What runs.
+        agents: All agents.
+        elapsed_s: Seconds since the start of the run.
+        notes: Sentences about faults and deaths, newest last.
+    """
+
+    scenario: Scenario
+    agents: list[AgentProcess]
+    elapsed_s: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+
+OnWatch = Callable[[Watch], None]
+
+
+def launch(
+    scenario: Scenario,
+    out: Path,
+    on_watch: OnWatch | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    secure: bool = False,
+    metrics: str | None = None,
+) -> Report:
+    """Run a scenario and write its run folder.
+
+    Args:
+        scenario: What to run.
+        out: Run folder; an earlier run in it is replaced.
+        on_watch: Called four times a second.
+        progress: Called while data is generated, with (done, all).
+        secure: Make keys for this run, and let agents trust those who have them only.
+        metrics: [HOST:]PORT of the first robot's metrics, by name; each further robot has the next port.
+
+    Raises:
+        FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
+    """
+    check_faults(scenario)
+    names = scenario.names()
+    served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
+    paths = recordings(scenario, progress)
+    check_measurable(scenario, paths)
+    folder = fresh_folder(out)
+    return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure, served).run())
+
+
+def fresh_folder(out: Path) -> RunFolder:
+    """An empty run folder; only an earlier run folder is ever replaced.
+
+    Raises:
+        LaunchError: Something else stands there.
+    """
+    if out.exists() and any(out.iterdir()):
+        if not (out / "run.json").exists():
+            raise LaunchError(f"{out}: is not empty and not an earlier run; choose another --out")
+        shutil.rmtree(out)
+    return RunFolder.create(out)
+
+
+def check_faults(scenario: Scenario) -> None:
+    """Say which fault processes over real zenoh cannot have.
+
+    Raises:
+        LaunchError: There is one.
+    """
+    simulated = {FaultKind.MUTE, FaultKind.CALM} & {fault.kind for fault in scenario.faults}
+    if simulated:
+        raise LaunchError(f"{scenario.name}: a fault '{min(simulated).value}' exists on virtual time only")
+
+
+class _Launch:
+    """One run."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        folder: RunFolder,
+        paths: dict[str, Path],
+        on_watch: OnWatch,
+        secure: bool,
+        metrics: dict[str, MetricsConfig],
+    ) -> None:
+        self._scenario = scenario
+        self._folder = folder
+        self._paths = paths
+        self._on_watch = on_watch
+        self._secure = secure
+        self._metrics = metrics
+        self._epoch_s = time.monotonic()
+        self._lines = Lines(folder.path / LAUNCHER_EVENTS)
+        self._radio = scenario.links()
+        self._faults = sorted(scenario.faults, key=lambda fault: fault.at_s)
+        self._interrupted = False
+        self._changed_s = 0.0
+        self._seen: dict[str, Any] = {}
+        self._watch = Watch(scenario, self._agents())
+
+    async def run(self) -> Report:
+        """Start, watch, stop, write."""
+        self._folder.write_run(self._run_record())
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, self._interrupt)
+        self._epoch_s = time.monotonic()
+        try:
+            await self._live()
+        finally:
+            await asyncio.gather(*(agent.stop() for agent in self._watch.agents if agent.running))
+            self._on_watch(self._watch)
+        self._collect()
+        return finish(self._folder)
+
+    def _agents(self) -> list[AgentProcess]:
+        names = self._scenario.names()
+        keys = make_keys(self._folder.path / "keys", self._scenario.name, names) if self._secure else None
+        transports = loopback_transports(names, keys)
+        agents = []
+        for name in names:
+            folder = self._folder.path / "robots" / name
+            source = SourceConfig(
+                recording=self._paths[name].resolve() if name in self._paths else None,
+                rate=self._scenario.rate,
+                start_s=self._scenario.robot(name).start_s,
+            )
+            config = agent_config(
+                self._scenario,
+                name,
+                source=source,
+                transport=transports[name],
+                folder=folder.resolve(),
+                metrics=self._metrics.get(name, MetricsConfig()),
+            )
+            agents.append(AgentProcess(config, folder))
+        return agents
+
+    async def _live(self) -> None:
+        starting = {agent.name: self._scenario.robot(agent.name).start_s for agent in self._watch.agents}
+        while not self._interrupted:
+            self._watch.elapsed_s = self._now_s()
+            for agent in self._watch.agents:
+                if agent.name in starting and starting[agent.name] <= self._now_s():
+                    del starting[agent.name]
+                    await agent.start(self._epoch_s)
+            await self._inject()
+            self._note_deaths()
+            self._on_watch(self._watch)
+            if not starting and not self._faults and self._over():
+                return
+            await asyncio.sleep(PERIOD_S)
+
+    def _over(self) -> bool:
+        duration_s = self._scenario.duration_s
+        if duration_s is not None:
+            return self._now_s() >= duration_s
+        alive = [agent for agent in self._watch.agents if agent.running]
+        if not alive:
+            return True
+        self._note_changes(alive)
+        quiet_s = self._now_s() - self._changed_s
+        if any(not agent.status or agent.status["playing"] for agent in alive):
+            return False
+        settled = _agree(alive) and not any(agent.status["busy"] for agent in alive)
+        return quiet_s >= (self._scenario.settle_s if settled else UNSETTLED_MAX_S)
+
+    def _note_changes(self, alive: Iterable[AgentProcess]) -> None:
+        """Remember when any robot's logs, frame or leader changed last."""
+        for agent in alive:
+            keys = ("logs", "map_frame", "round", "leader", "playing")
+            seen = {key: agent.status.get(key) for key in keys}
+            if seen != self._seen.get(agent.name):
+                self._seen[agent.name] = seen
+                self._changed_s = self._now_s()
+
+    # Faults
+
+    async def _inject(self) -> None:
+        while self._faults and self._faults[0].at_s <= self._now_s():
+            fault = self._faults.pop(0)
+            self._note(f"{fault.kind.value} {' '.join(fault.robots) or fault.groups or fault.value or ''}".strip())
+            await self._do(fault)
+
+    async def _do(self, fault: Fault) -> None:
+        concerned = [agent for agent in self._watch.agents if agent.name in fault.robots]
+        match fault.kind:
+            case FaultKind.KILL:
+                for agent in concerned:
+                    agent.kill()
+                    await agent.wait(STOP_NOW_S)
+            case FaultKind.RESTART:
+                for agent in concerned:
+                    await self._restart(agent, fault.disk_lost)
+            case FaultKind.START:
+                for agent in concerned:
+                    if not agent.running:
+                        await agent.start(self._epoch_s)
+            case FaultKind.LEAVE:
+                await asyncio.gather(*(agent.stop() for agent in concerned))
+            case FaultKind.SLOW:
+                for agent in concerned:
+                    await agent.order({"slow": fault.value})
+            case _:
+                self._radio = changed_radio(self._radio, fault, self._now_s())
+                order = {"radio": json.loads(self._radio.model_dump_json())}
+                await asyncio.gather(*(agent.order(order) for agent in self._watch.agents))
+
+    async def _restart(self, agent: AgentProcess, disk_lost: bool) -> None:
+        if agent.running:
+            agent.kill()
+            await agent.wait(STOP_NOW_S)
+        if disk_lost:
+            shutil.rmtree(agent.folder / "store", ignore_errors=True)
+            agent.config = agent.config.model_copy(update={"incarnation": None})
+        await agent.start(self._epoch_s)
+
+    def _note_deaths(self) -> None:
+        """Report agents that ended without being asked."""
+        for agent in self._watch.agents:
+            if agent.exit_code is None or agent.asked:
+                continue
+            agent.asked = True
+            code = agent.exit_code
+            event = {"signal": -code, "exit_code": None} if code < 0 else {"signal": None, "exit_code": code}
+            self._lines.write(self._event(agent.name, "agent_died", event))
+            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+            self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
+        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.status]
+        if died and self._now_s() < START_S:
+            raise LaunchError(f"robot {died[0].name} could not start: {_sentence(died[0].last_words())}")
+
+    # Files
+
+    def _collect(self) -> None:
+        """Merge all robots' events and the launcher's own, in order of time."""
+        self._lines.close()
+        events = _read_lines(self._folder.path / LAUNCHER_EVENTS)
+        for agent in self._watch.agents:
+            if agent.exit_code != 0:
+                recover_result(agent.config)
+            events += _read_lines(agent.folder / "events.jsonl")
+        events.sort(key=lambda event: (event["t"], event["robot"]))
+        self._folder.write_events(events)
+        self._folder.write_run(self._run_record(wall_s=self._now_s()))
+
+    def _run_record(self, wall_s: float | None = None) -> Run:
+        scenario = self._scenario
+        return Run(
+            scenario=scenario.name,
+            seed=scenario.seed,
+            robots=scenario.names(),
+            servers=scenario.servers(),
+            start=datetime.now(UTC).isoformat(timespec="seconds"),
+            driver="launch",
+            recordings={name: str(path.resolve()) for name, path in self._paths.items()},
+            radio=json.loads(scenario.links().model_dump_json(), parse_constant=lambda _: None),
+            settings=scenario.settings(),
+            expectations=scenario.expectations.limits(),
+            duration_s=wall_s,
+            wall_s=wall_s,
+        )
+
+    def _event(self, robot: str, kind: str, fields: dict[str, Any]) -> dict[str, Any]:
+        return {"t": round(self._now_s(), 6), "robot": robot, "event": kind, **fields}
+
+    def _note(self, sentence: str) -> None:
+        self._watch.notes.append(f"{self._now_s():7.1f} s  {sentence}")
+
+    def _interrupt(self) -> None:
+        self._interrupted = True
+
+    def _now_s(self) -> float:
+        return time.monotonic() - self._epoch_s
+
+
+def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig:
+    """The radio after a fault that concerns links."""
+    match fault.kind:
+        case FaultKind.PARTITION:
+            partition = {"groups": fault.groups, "from_s": now_s}
+            return radio.model_validate({**radio.model_dump(), "partitions": [*radio.partitions, partition]})
+        case FaultKind.BLACKOUT:
+            blackout = {"robots": fault.robots, "from_s": now_s}
+            return radio.model_validate({**radio.model_dump(), "blackouts": [*radio.blackouts, blackout]})
+        case FaultKind.HEAL:
+            return radio.model_copy(update={"partitions": (), "blackouts": ()})
+        case FaultKind.LOSS:
+            return radio.model_validate({**radio.model_dump(), "loss_ratio": fault.value})
+        case FaultKind.LATENCY:
+            return radio.model_validate({**radio.model_dump(), "latency_s": fault.value})
+        case FaultKind.RANGE:
+            return radio.model_validate({**radio.model_dump(), "range_m": fault.value})
+        case _:
+            raise ValueError(f"{fault.kind.value} does not concern links")
+
+
+def _agree(alive: list[AgentProcess]) -> bool:
+    """Whether all running robots hold the same logs."""
+    logs = [agent.status.get("logs") for agent in alive]
+    return all(log == logs[0] for log in logs)
+
+
+def _read_lines(path: Path) -> list[dict[str, Any]]:
+    """Lines of one robot's events; a last line that a kill cut off is left out."""
+    if not path.exists():
+        return []
+    events = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            events.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return events
+
+
+def _sentence(words: str) -> str:
+    """The error's own sentence out of the end of a log."""
+    lines = [line for line in words.splitlines() if line.strip()]
+    return next((line for line in reversed(lines) if line.startswith("error: ")), lines[-1] if lines else "no message")

@@ -1,0 +1,1 @@
+"""A run or a running swarm in rerun."""
