@@ -9,10 +9,14 @@ import tomllib
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from flocc_agent.core.effects import Effect
+from flocc_agent.core.events import Event
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -125,6 +129,15 @@ def test_every_requirement_is_pinned_within_its_range() -> None:
         assert requirement.specifier.contains(pins[name]), f"{name} {pins[name]} is outside {requirement.specifier}"
 
 
+def test_the_agents_page_names_every_file_of_the_core_and_every_effect() -> None:
+    page = (ROOT / "agent/README.md").read_text(encoding="utf-8")
+    files = {path.name for path in (ROOT / "agent/flocc_agent/core").glob("*.py")} - {"__init__.py"}
+    kinds = {kind.__name__ for kind in (*get_args(Effect), *get_args(Event))}
+    assert [name for name in sorted(files | kinds) if f"`{name}`" not in page] == []
+    named = {name for row in page.splitlines() if row.startswith("| `") for name in re.findall(r"`(\w+\.py)`", row)}
+    assert named - files == set(), "files that are no longer there"
+
+
 def product_files() -> list[Path]:
     """Every module of the four source roots."""
     return [path for root in ("protocol", "agent", "launch", "lab") for path in sorted((ROOT / root).rglob("*.py"))]
@@ -141,12 +154,7 @@ def places_of(names: Iterable[tuple[str, Path]], allowed: Mapping[str, str]) -> 
 FILES_TWICE = {"__init__.py": "Python's", "__main__.py": "Python's"}
 CLASSES_TWICE = {
     "Trajectory": "of a log in a pose graph, and of stamped poses in a file: the word of the field for both",
-    "Report": "the core's fact until it is typed, and the report of a run",
-    "Robot": "the core, and a robot's part of the report",
-    "GraphOptimised": "the core's event, and what the run folder keeps of it",
-    "KeyframeCaptured": "the same",
-    "LatentFetched": "the same",
-    "OptimisationFailed": "the same",
+    "Report": "the core's effect that tells a fact, and the report of a run",
 }
 """Names that may stand twice, and why; take one out when its reason is gone."""
 

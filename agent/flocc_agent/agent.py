@@ -20,15 +20,18 @@ from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Camera, Image, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
+from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import is_rigid
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
@@ -68,7 +71,7 @@ class Agent:
         config: AgentConfig,
         camera: Camera | None = None,
         T_body_camera: Float | None = None,
-        on_line: Callable[[dict[str, Any]], None] | None = None,
+        on_report: Callable[[Reported[Fact]], None] | None = None,
         clock_s: Callable[[], float] | None = None,
         perception: Perception | None = None,
     ) -> None:
@@ -78,7 +81,7 @@ class Agent:
             config: Everything that can be turned.
             camera: Intrinsics of the images; None where a recording brings its own.
             T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
-            on_line: Takes each event as a dictionary (see docs/report.md); must not block.
+            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
             clock_s: Seconds since the start of the run; None counts from now.
             perception: What it sees with; None builds what `config.perception` names.
 
@@ -87,7 +90,7 @@ class Agent:
         """
         started_s = time.monotonic()
         self.config = config
-        self._on_line = on_line or (lambda _: None)
+        self._on_report = on_report or (lambda _: None)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._perception = perception
         self._recording = _recording(config)
@@ -163,9 +166,15 @@ class Agent:
         await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
         self._kept = True
 
-    async def add_frame(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> bool:
-        """Give the agent any frame; it becomes a keyframe when the robot moved enough. Returns whether it did."""
-        if not self._selector.wants(T_odom_body):
+    async def add_frame(
+        self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float, keep: bool = False
+    ) -> bool:
+        """Give the agent any frame; it becomes a keyframe when the robot moved enough, or where `keep` says so.
+
+        Returns:
+            Whether it became one; `keep` what something was seen in.
+        """
+        if not keep and not self._selector.wants(T_odom_body):
             self._kept = False
             return False
         await self.add_keyframe(pixels, T_odom_body, stamp_s)
@@ -227,7 +236,7 @@ class Agent:
             self._driver.stop()
 
     async def finished(self) -> None:
-        """Wait until the agent stops, by `stop`, or by the end of its recording and `hold_s`.
+        """Wait until the agent stops, by `stop` or by an order.
 
         Raises:
             FloccError: The recording cannot be played on.
@@ -305,7 +314,9 @@ class Agent:
             transport,
             self._clock_s,
         )
-        return Driver(core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_line)
+        return Driver(
+            core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
+        )
 
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
@@ -337,16 +348,17 @@ class Agent:
         async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
-        await play(recording, source, self._selector, add, self._clock_s, self._on_position, resumed)
-        if source.hold_s > 0:
-            await asyncio.sleep(source.hold_s)
-            self.stop()
+        def measure(stamped: Stamped, frame_s: float) -> None:
+            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 
-        def report(event: str, fields: dict[str, Any]) -> None:
-            self._on_line({"t": round(self._clock_s(), 6), "robot": self.config.name, "event": event, **fields})
+        def report(fact: Fact) -> None:
+            self._on_report(Reported(self._clock_s(), self.config.name, fact))
 
         host = Host(
             lambda *keyframe: self._started.add_keyframe(*keyframe),

@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import Recording, write_camera
-from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.commands.data import dataset
 from flocc_launch.datasets.bag_convert import convert_bag
 from flocc_launch.datasets.commands import convert, info, split

@@ -8,7 +8,8 @@ import pytest
 from tests.launch.bag_fixtures import ZERO_NS, BagScript
 
 from flocc_agent.runtime.recording import Recording, write_camera
-from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.datasets.presets import Team, convert_graco, convert_s3e
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.swarm.launching import launch

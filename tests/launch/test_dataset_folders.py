@@ -12,7 +12,9 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import inverse, pose, so3_exp
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import Recording, write_camera
-from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_agent.runtime.text_tables import RecordingError
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.commands import convert, info, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.drift import DriftSpec
@@ -53,7 +55,7 @@ def write_sevenscenes(path: Path, count: int = 6) -> Path:
 def write_kitti(path: Path, images: int = 4, poses: int = 4) -> Path:
     for k in range(images):
         write_image(path / "image_0" / f"{k:06d}.png")
-    (path / "calib.txt").write_text("P0: 7 0 3 0 0 8 4 0 0 0 1 0\nP1: 7 0 3 -2 0 8 4 0 0 0 1 0\n")
+    (path / "calib.txt").write_text("P0: 7 0 16 0 0 8 12 0 0 0 1 0\nP1: 7 0 16 -2 0 8 12 0 0 0 1 0\n")
     (path / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(images)))
     np.savetxt(path / "poses.txt", moving(poses)[:, :3].reshape(poses, 12))
     return path
@@ -100,7 +102,7 @@ def test_kitti_takes_calibration_times_and_poses(tmp_path: Path) -> None:
     source = read_source(write_kitti(tmp_path / "00"))
     assert source.format == "kitti"
     assert source.lens is not None
-    assert source.lens.camera == CameraModel(32, 24, 7.0, 8.0, 3.0, 4.0)
+    assert source.lens.camera == CameraModel(32, 24, 7.0, 8.0, 16.0, 12.0)
     assert source.truth is not None
     np.testing.assert_allclose(source.truth.T_fixed_body, moving(4), atol=1e-9)
     assert source.faults == ()
@@ -321,4 +323,7 @@ def test_real_kitti_and_euroc_files_are_read(tmp_path: Path) -> None:
         pytest.skip(f"{SHARED / 'data' / 'kitti_short'} is not here")
     found = info(SHARED / "data" / "kitti_short" / "KITTI_sequence_1")
     assert (found.format, found.images, found.truth_poses, found.faults) == ("kitti", 51, 51, ())
-    assert len(read_tum(SHARED / "data" / "euroc" / "vio" / "MH_01.vislam.txt")) > 1000
+    vio = SHARED / "data" / "euroc" / "vio" / "MH_01.vislam.txt"
+    with pytest.raises(RecordingError, match=r"MH_01.vislam.txt:1: nothing says whether the quaternion is x y z w"):
+        read_trajectory(vio)
+    assert len(read_trajectory(vio, "tum")[0]) > 1000

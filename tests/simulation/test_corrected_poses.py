@@ -6,7 +6,8 @@ import numpy as np
 
 from flocc_agent.core.corrected import Correction, Corrector
 from flocc_agent.geometry import inverse
-from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.report.finish import finish
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.scenario import Scenario

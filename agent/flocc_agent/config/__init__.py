@@ -1,6 +1,6 @@
 """The configuration of an agent, by noun; what other packages use stands here."""
 
-from flocc_agent.config.agent_config import AgentConfig, KeyframeConfig, SourceConfig, StoreConfig
+from flocc_agent.config.agent_config import AgentConfig, CoreSection, KeyframeConfig, SourceConfig, StoreConfig
 from flocc_agent.config.backend import BackendConfig, BackendMode, Formulation, ScaleInitial, Solver
 from flocc_agent.config.emulated_radio import (
     BlackoutConfig,
@@ -26,6 +26,7 @@ from flocc_agent.config.section import (
     put_value,
     read_json,
     read_toml,
+    refuse_removed,
     validated,
 )
 
@@ -36,6 +37,7 @@ __all__ = [
     "BlackoutConfig",
     "ClassicalConfig",
     "ConfigError",
+    "CoreSection",
     "Formulation",
     "KeyframeConfig",
     "LearnedConfig",
@@ -61,5 +63,6 @@ __all__ = [
     "put_value",
     "read_json",
     "read_toml",
+    "refuse_removed",
     "validated",
 ]

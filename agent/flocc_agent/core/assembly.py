@@ -4,18 +4,20 @@ Every robot takes in every record, and only a leader asks for the graph: records
 matrices when somebody wants them.
 """
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.gossip import NewRecord
-from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.measured_records import MeasuredRecords
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, FixRecord, KeyframeRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord, UnknownRecord
 
 Float = NDArray[np.float64]
 
@@ -28,6 +30,7 @@ class _Odometry:
 
     def __init__(self) -> None:
         self.poses: list[Pose7] = []
+        self.stamps_s: list[float] = []
         self.encoded: list[bool] = []
         self.unread: set[int] = set()
         self._matrices: Float = np.empty((0, 4, 4))
@@ -38,6 +41,24 @@ class _Odometry:
         if known < len(self.poses):
             self._matrices = np.concatenate([self._matrices, poses_from_tq(np.array(self.poses[known:]))])
         return self._matrices
+
+    def pose(self, index: int) -> Float:
+        """`T_odom_keyframe` (4, 4)."""
+        return np.asarray(self.matrices()[index])
+
+    def stamp_s(self, index: int) -> float:
+        """When a keyframe was taken."""
+        return self.stamps_s[index]
+
+    def around(self, stamp_s: float) -> tuple[int, float] | None:
+        """Last keyframe not after a stamp, and the stamp's share of the way to the next; None outside of the log."""
+        before = bisect_right(self.stamps_s, stamp_s) - 1
+        if before < 0 or (before == len(self.stamps_s) - 1 and self.stamps_s[before] < stamp_s):
+            return None
+        if before == len(self.stamps_s) - 1:
+            return before, 0.0
+        passed_s, lasts_s = stamp_s - self.stamps_s[before], self.stamps_s[before + 1] - self.stamps_s[before]
+        return before, passed_s / lasts_s
 
     def neighbour(self, index: int) -> int | None:
         """The nearest described keyframe before this one, for the first ones the nearest after it."""
@@ -67,7 +88,7 @@ class GraphAssembly:
         self._built: dict[CandidatePair, LoopClosure] = {}
         self._order: list[CandidatePair] = []
         self._early: dict[KeyframeId, int] = {}
-        self._fixes: list[AbsoluteFix] = []
+        self._measured = MeasuredRecords()
         self._odometry_pairs: dict[KeyframeId, tuple[KeyframeId, Pose7]] = {}
 
     @property
@@ -82,12 +103,11 @@ class GraphAssembly:
                 self._add_keyframe(new.log, new.record)
             case ClosureRecord():
                 self._add_closure(new, new.record)
-            case FixRecord(index, position_m, covariance_m2):
-                covariance = covariance_m2.numpy().reshape(3, 3)
-                self._fixes.append(AbsoluteFix(KeyframeId(new.log, index), position_m.numpy(), covariance))
-                self.revision += 1
-            case _:
+            case RejectionRecord() | UnknownRecord():
                 pass
+            case _:
+                self.revision += 1
+                self._await(self._measured.add(new))
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.
@@ -108,10 +128,14 @@ class GraphAssembly:
 
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
-        trajectories = {log: Trajectory(odometry.matrices()) for log, odometry in sorted(self._odometry.items())}
+        trajectories = {log: self._trajectory(log) for log in sorted(self._odometry)}
         self._build()
         closures = tuple([self._built[pair] for pair in self._order])
-        return PoseGraph(trajectories, closures, tuple(fix for fix in self._fixes if self._known(fix.keyframe)))
+        return PoseGraph(trajectories, closures, measured=self._measured.factors(self._odometry, self._known))
+
+    def _trajectory(self, log: LogId) -> Trajectory:
+        T_odom_keyframe = self._odometry[log].matrices()
+        return Trajectory(T_odom_keyframe, self._measured.edge_covariances(log, len(T_odom_keyframe)))
 
     def _build(self) -> None:
         """Build the closures that are new since the last graph, and those whose keyframes came meanwhile."""
@@ -136,10 +160,13 @@ class GraphAssembly:
             odometry.unread.add(len(odometry.poses))
             odometry.poses.append(record.T_odom_camera)
             odometry.encoded.append(False)
+            odometry.stamps_s.append(record.stamp_s)
         odometry.poses.append(record.T_odom_camera)
+        odometry.stamps_s.append(record.stamp_s)
         odometry.encoded.append(record.descriptor is not None)
         self.keyframes += 1
         awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry.poses) - 1), 0) > 0
+        awaited |= self._measured.awaited(log.robot, record.stamp_s)
         self.revision += awaited or len(odometry.poses) == 1
 
     def _add_closure(self, new: NewRecord, record: ClosureRecord) -> None:
@@ -150,9 +177,13 @@ class GraphAssembly:
             self._closures[pair] = (new.log, new.number, record)
             self._unbuilt.add(pair)
             self.revision += 1
-            for keyframe in (record.query, record.match):
-                if not self._known(keyframe):
-                    self._early[keyframe] = self._early.get(keyframe, 0) + 1
+            self._await((record.query, record.match))
+
+    def _await(self, keyframes: Iterable[KeyframeId]) -> None:
+        """A solution will be out of date when one of these comes."""
+        for keyframe in keyframes:
+            if not self._known(keyframe):
+                self._early[keyframe] = self._early.get(keyframe, 0) + 1
 
 
 def _loop_closures(records: Sequence[ClosureRecord]) -> list[LoopClosure]:

@@ -10,31 +10,29 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 ODOMETRY_CORRESPONDENCES_MIN = 20
+"""Least denominator of Eq. (1): else a blurred odometry pair would make every loop look certain."""
 ODOMETRY_TRANSLATION_UNSCALED_MIN = 1e-6
 
 
-def match_ratio(
-    loop_correspondences: int,
-    odometry_correspondences: int,
-    denominator_min: int = ODOMETRY_CORRESPONDENCES_MIN,
-) -> float:
+def match_ratio(loop_correspondences: int, odometry_correspondences: int) -> float:
     """Correspondences of the loop pair over those of the odometry pair, Eq. (1).
+
+    A smaller denominator than `ODOMETRY_CORRESPONDENCES_MIN` is raised to it. Whoever shows or weighs a ratio takes it
+    from here, so that a person reads the number that was compared with R_thr.
 
     Args:
         loop_correspondences: Count for (query i, match j); >= 0.
         odometry_correspondences: Count for (query i-1, query i); >= 0.
-        denominator_min: A smaller odometry count is raised to this, so that a blurred odometry pair does not
-            make every loop look certain.
 
     Returns:
         The ratio, >= 0.
 
     Raises:
-        ValueError: A count is negative or the minimum is not positive.
+        ValueError: A count is negative.
     """
-    if loop_correspondences < 0 or odometry_correspondences < 0 or denominator_min <= 0:
-        raise ValueError("counts must not be negative and the denominator's minimum must be positive")
-    return loop_correspondences / max(odometry_correspondences, denominator_min)
+    if loop_correspondences < 0 or odometry_correspondences < 0:
+        raise ValueError("counts of correspondences must not be negative")
+    return loop_correspondences / max(odometry_correspondences, ODOMETRY_CORRESPONDENCES_MIN)
 
 
 def closure_probability(ratio: float, steepness: float) -> float:

@@ -33,9 +33,11 @@ from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Lea
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.reports import Fact, LogForked, NeighbourDown, PeerRefused
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose7
 from flocc_agent.runtime.admission import Refusal, admitted
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, job_of
 from flocc_agent.runtime.metrics import Look
@@ -61,15 +63,15 @@ class Driver:
     """Runs one robot's core on an event loop."""
 
     def __init__(
-        self, robot: Robot, tools: Tools, reporter: Reporter, on_line: Callable[[dict[str, Any]], None]
+        self, robot: Robot, tools: Tools, reporter: Reporter, on_report: Callable[[Reported[Fact]], None]
     ) -> None:
         """Prepare; `run` does the rest.
 
         Args:
             robot: The core, already restored from the store.
             tools: What its jobs work with; the driver opens and closes the transport, and closes the workers.
-            reporter: Turns the core's reports into lines.
-            on_line: Takes each line of `events.jsonl`; must not block.
+            reporter: Says when and where facts happened.
+            on_report: Takes each fact; must not block.
         """
         self.robot = robot
         self._tools = tools
@@ -85,7 +87,7 @@ class Driver:
         self._sender = Sender(robot, tools.transport, tools.clock_s)
         self._heard_gap = LongestGap()
         gaps = {"sent": self._sender.heartbeat_gap, "heard": self._heard_gap}
-        self._telemetry = Telemetry(robot, tools, reporter, on_line, gaps, self._sizes)
+        self._telemetry = Telemetry(robot, tools, reporter, on_report, gaps, self._sizes)
         self._corrector = Corrector(robot)
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
@@ -114,6 +116,14 @@ class Driver:
         """
         index = self._given.index_of(measurement, stamp_s)
         self.put(Measured(measurement, index))
+
+    def keyframe_at(self, stamp_s: float) -> KeyframeId:
+        """The own keyframe with this stamp.
+
+        Raises:
+            BadMeasurement: There is none.
+        """
+        return KeyframeId(self.robot.log, self._given.at("closure", stamp_s))
 
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""
@@ -264,24 +274,25 @@ class Driver:
                     self._disk.put(effect)
                 case PersistRecord() | PersistTerm() | PersistCorrection():
                     kept.append(effect)
-                case Report():
-                    self._tell(effect)
+                case Report(fact):
+                    self._tell(fact)
                 case _:
                     await self._disk.write(kept)
                     self._do(effect)
         await self._disk.write(kept)
         await self._disk.write_full()
 
-    def _tell(self, report: Report) -> None:
-        match report:
-            case Report("peer_refused", fields):
-                self._telemetry.refuse(str(fields["peer"]), str(fields["reason"]))
+    def _tell(self, fact: Fact) -> None:
+        """Report what the core tells, and act on what concerns the driver."""
+        match fact:
+            case PeerRefused():
+                self._telemetry.refuse(fact.peer, fact.reason)
                 return
-            case Report("log_forked", fields) if fields["log"] == str(self.robot.log):
-                self._end_log(str(fields["peer"]))
-            case Report("neighbour_down", fields):
-                self._heard_gap.forget(str(fields["peer"]))
-        self._telemetry.report(report)
+            case LogForked() if fact.log == self.robot.log:
+                self._end_log(fact.peer)
+            case NeighbourDown():
+                self._heard_gap.forget(fact.peer)
+        self._telemetry.report(fact)
 
     def _end_log(self, peer: str) -> None:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""

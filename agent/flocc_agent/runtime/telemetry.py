@@ -1,24 +1,40 @@
-"""What an agent tells of itself while it runs: its status, figures for a scrape, and lines of `events.jsonl`."""
+"""What an agent tells of itself while it runs: its status, figures for a scrape, and what it reports."""
 
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.effects import Report
 from flocc_agent.core.pose_graph import map_frame
+from flocc_agent.core.reports import (
+    ClosureAccepted,
+    CorrectionApplied,
+    Fact,
+    LatentLost,
+    LeaderFollowed,
+    LeaderLost,
+    LogForked,
+    NameTaken,
+    NeighbourDown,
+    NeighbourUp,
+    PeerRefused,
+    RoundFailed,
+    RoundSolved,
+    name_of,
+)
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.admission import Refusals
+from flocc_agent.runtime.event_lines import Reported, values_of
+from flocc_agent.runtime.facts import AccountKept, BytesCounted
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter
 from flocc_agent.runtime.status import AgentStatus, StageBrief
 from flocc_agent.runtime.transport import TransportCounters
-from flocc_agent.stages import brief_of, fields_of
+from flocc_agent.stages import brief_of, counts_of
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +51,7 @@ class Telemetry:
     """Looks at one agent and tells; it changes nothing.
 
     Attributes:
-        reporter: Turns the core's reports into lines.
+        reporter: Says when and where facts happened.
         refusals: What was refused of peers.
         heartbeat_gaps: How far heartbeats were apart, "sent" and "heard".
     """
@@ -45,7 +61,7 @@ class Telemetry:
         robot: Robot,
         tools: Tools,
         reporter: Reporter,
-        on_line: Callable[[dict[str, Any]], None],
+        on_report: Callable[[Reported[Fact]], None],
         heartbeat_gaps: Mapping[str, LongestGap],
         driver_sizes: Callable[[], Sizes],
     ) -> None:
@@ -54,15 +70,15 @@ class Telemetry:
         Args:
             robot: The core.
             tools: What its driver works with.
-            reporter: Turns the core's reports into lines.
-            on_line: Takes each line of `events.jsonl`; must not block.
+            reporter: Says when and where facts happened.
+            on_report: Takes each fact; must not block.
             heartbeat_gaps: "sent" and "heard", marked by the driver.
             driver_sizes: The driver's own queues.
         """
         self._robot = robot
         self._tools = tools
         self.reporter = reporter
-        self._on_line = on_line
+        self._on_report = on_report
         self.heartbeat_gaps = heartbeat_gaps
         self._driver_sizes = driver_sizes
         self.refusals = Refusals()
@@ -143,19 +159,18 @@ class Telemetry:
 
     # By itself
 
-    def report(self, report: Report) -> None:
-        """Log what the core reports, and make it a line."""
-        line = self.reporter.line(report, self._tools.clock_s())
-        if logger.isEnabledFor(level := _level(report)):
-            logger.log(level, "%s: %s %s", self._robot.log, report.event, _brief(report.fields))
-        self._on_line(line)
+    def report(self, fact: Fact) -> None:
+        """Log a fact, and tell it."""
+        if logger.isEnabledFor(level := _level(fact)):
+            logger.log(level, "%s: %s %s", self._robot.log, name_of(fact), _brief(fact))
+        self._on_report(self.reporter.reported(fact, self._tools.clock_s()))
 
     def refuse(self, peer: str, reason: str, detail: str = "") -> None:
         """Count what is refused of a peer by reason; the first is told, with what is special about it."""
         first = self.refusals.count(peer, reason)
         if first is not None:
             counted_peer, counted_reason = first
-            self.report(Report("peer_refused", {"peer": counted_peer, "reason": detail or counted_reason}))
+            self.report(PeerRefused(peer=counted_peer, reason=detail or counted_reason))
 
     def mount_camera(self, T_body_camera: Float) -> None:
         """Where the camera sits on the body, where that was not known at the start."""
@@ -174,28 +189,20 @@ class Telemetry:
         counters = self._tools.transport.counters()
         sent = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.sent.items())}
         received = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.received.items())}
-        facts = {"sent": sent, "received": received, "loss": self._losses(), "queues": self._queues()}
-        self._on_line(self.reporter.line(Report("bytes", facts), now))  # type: ignore[arg-type]
+        counted = BytesCounted(sent=sent, received=received, loss=self._losses(), queues=self._queues())
+        self._on_report(self.reporter.reported(counted, now))
         if now >= self._account_due_s or last:
             self._account_due_s = now + ACCOUNT_PERIOD_S
-            self._on_line(self._account(counters, now))
+            self._on_report(self.reporter.reported(self._account(counters), now))
 
-    def _account(self, counters: TransportCounters, now: float) -> dict[str, Any]:
+    def _account(self, counters: TransportCounters) -> AccountKept:
         """Bytes by link and kind, and time by stage, since this start of the agent."""
-        return {
-            "t": round(now, 6),
-            "robot": self._robot.log.robot,
-            "event": "account",
-            "since_s": round(self._began_s, 6),
-            **counters.links(),
-            "stages": fields_of(self._tools.workers.stages.snapshot()),
-        }
+        stages = counts_of(self._tools.workers.stages.snapshot())
+        return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = frozenset({"peer_refused", "duplicate_name", "log_forked", "latent_lost", "optimisation_failed"})
-_INFOS = frozenset(
-    {"leader", "leader_lost", "neighbour_up", "neighbour_down", "closure_accepted", "correction", "optimised"}
-)
+_WARNINGS = (PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 
 def totals(peers: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
@@ -203,11 +210,11 @@ def totals(peers: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
     return {peer: sum(kinds.values()) for peer, kinds in peers.items()}
 
 
-def _level(report: Report) -> int:
-    if report.event in _WARNINGS:
+def _level(fact: Fact) -> int:
+    if isinstance(fact, _WARNINGS):
         return logging.WARNING
-    return logging.INFO if report.event in _INFOS else logging.DEBUG
+    return logging.INFO if isinstance(fact, _INFOS) else logging.DEBUG
 
 
-def _brief(fields: Mapping[str, Any]) -> str:
-    return " ".join(f"{key}={value}" for key, value in fields.items() if not isinstance(value, (list, dict)))
+def _brief(fact: Fact) -> str:
+    return " ".join(f"{key}={value}" for key, value in values_of(fact).items() if not isinstance(value, (list, dict)))

@@ -1,9 +1,8 @@
-"""Stamped poses of one frame in another: read and written as TUM text, interpolated in between.
+"""Stamped poses of one frame in another: interpolated, and written as TUM text (`trajectory_text` reads).
 
 A TUM line is `stamp_s tx ty tz qx qy qz qw`; lines that start with `#` are comments.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,17 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, is_rigid, pose, q_wxyz_from_R, so3_exp, so3_log
-from flocc_protocol.errors import FloccError
+from flocc_agent.runtime.text_tables import RecordingError
 
 Float = NDArray[np.float64]
 
 QUATERNION_NORM_TOLERANCE = 1e-2
 GAP_MAX_S = 2.0
 NEAR_S = 0.02
-
-
-class RecordingError(FloccError):
-    """A recording that cannot be used; the message names the file and, where there is one, the line."""
+HEADER = "# timestamp[s] tx ty tz qx qy qz qw\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,29 +94,6 @@ def checked_pose(T: Float, where: str) -> Float:
     return pose(U @ Vt, T[:3, 3])
 
 
-def pose_from_tum(values: Sequence[float], where: str) -> Float:
-    """Pose of `tx ty tz qx qy qz qw`.
-
-    Raises:
-        RecordingError: A number is not finite, or the quaternion is not of unit length.
-    """
-    t, q_xyzw = np.asarray(values[:3], dtype=float), np.asarray(values[3:7], dtype=float)
-    norm = float(np.linalg.norm(q_xyzw))
-    if not (np.all(np.isfinite(t)) and np.isfinite(norm)):
-        raise RecordingError(f"{where}: the pose has a number that is not finite")
-    if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
-        raise RecordingError(f"{where}: the pose is not rigid (its quaternion has length {norm:.4g}, not 1)")
-    x, y, z, w = q_xyzw / norm
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return pose(R, t)
-
-
 def tum_line(stamp_s: float, T_fixed_body: Float) -> str:
     """One TUM line, without the line end."""
     w, x, y, z = q_wxyz_from_R(T_fixed_body[:3, :3])
@@ -128,62 +101,7 @@ def tum_line(stamp_s: float, T_fixed_body: Float) -> str:
     return f"{stamp_s:.9f} {tx:.9f} {ty:.9f} {tz:.9f} {x:.12f} {y:.12f} {z:.12f} {w:.12f}"
 
 
-def number_lines(path: Path, count: int) -> Iterator[tuple[int, list[float]]]:
-    """Yield (line number, numbers) of a text table, without comments; commas separate as well.
-
-    Raises:
-        RecordingError: The file cannot be read, or a line has fewer than `count` numbers.
-    """
-    for line, text in text_lines(path):
-        words = text.replace(",", " ").split()
-        try:
-            values = [float(word) for word in words]
-        except ValueError as error:
-            raise RecordingError(f"{path}:{line}: {str(error).split(': ')[-1]} is not a number") from None
-        if len(values) < count:
-            raise RecordingError(f"{path}:{line}: {count} numbers are needed, {len(values)} were found")
-        yield line, values
-
-
-def text_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield (line number, text) of a text file, without comments and empty lines.
-
-    Raises:
-        RecordingError: The file cannot be read as text.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    for line, text in enumerate(lines, start=1):
-        if text.strip() and not text.lstrip().startswith("#"):
-            yield line, text.strip()
-
-
-def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory; a line that repeats the stamp before it is left out.
-
-    Raises:
-        RecordingError: Unreadable, empty, time going backwards, or a broken pose.
-    """
-    stamps_s: list[float] = []
-    poses: list[Float] = []
-    for line, values in number_lines(path, 8):
-        where = f"{path}:{line}"
-        if not np.isfinite(values[0]):
-            raise RecordingError(f"{where}: the stamp is not finite")
-        if stamps_s and values[0] < stamps_s[-1]:
-            raise RecordingError(f"{where}: time goes backwards, from {stamps_s[-1]:.6f} s to {values[0]:.6f} s")
-        T = pose_from_tum(values[1:8], where)
-        if not stamps_s or values[0] > stamps_s[-1]:
-            stamps_s.append(values[0])
-            poses.append(T)
-    if not poses:
-        raise RecordingError(f"{path}: holds no pose")
-    return Trajectory(np.array(stamps_s), np.array(poses))
-
-
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM trajectory; stamps with 9 decimals, quaternions x y z w."""
+    """Write a TUM trajectory with a line that names its columns; stamps with 9 decimals, quaternions x y z w."""
     lines = [tum_line(s, T) for s, T in zip(trajectory.stamps_s, trajectory.T_fixed_body, strict=True)]
-    path.write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    path.write_text(HEADER + "".join(line + "\n" for line in lines), encoding="utf-8")

@@ -24,6 +24,16 @@ Format = Annotated[
     str | None, typer.Option("--format", help="tum, euroc, kitti, 7scenes or plain, where it is not recognised.")
 ]
 CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML or YAML) for a data set that has none.")]
+TrajectoryFormat = Annotated[
+    str | None,
+    typer.Option(
+        help="Columns of a trajectory in text that does not say them: tum, tum-wxyz, euroc, ns-xyzw, rpg, rtabmap, "
+        "kitti, or a line such as 'time[ms] x y z qw qx qy qz'."
+    ),
+]
+View = Annotated[
+    float | None, typer.Option(min=1, max=159, help="Horizontal field of view kept of a wide lens, degrees.")
+]
 Every = Annotated[int, typer.Option(min=1, help="Of a bag, keep one image of so many.")]
 
 
@@ -35,12 +45,12 @@ def add_data(app: typer.Typer) -> None:
 
 
 @dataset.command()
-def info(source: Source, format_name: Format = None) -> None:
+def info(source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None) -> None:
     """Say what a data set holds, without writing anything."""
     from flocc_launch.datasets.commands import info as look
     from flocc_launch.datasets.commands import info_lines
 
-    for name, value in info_lines(look(source, format_name)):
+    for name, value in info_lines(look(source, format_name, trajectory_format)):
         typer.echo(f"{name:14} {value}")
 
 
@@ -50,12 +60,14 @@ def convert(
     out: Annotated[Path, typer.Option(help="Folder of the recording.")],
     format_name: Format = None,
     camera: CameraFile = None,
-    odometry: Annotated[Path | None, typer.Option(help="TUM file with the robot's odometry.")] = None,
-    truth: Annotated[Path | None, typer.Option(help="TUM file with ground truth, for a bag.")] = None,
+    odometry: Annotated[Path | None, typer.Option(help="File with the robot's odometry.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="File with ground truth, for a bag.")] = None,
     image_topic: Annotated[str | None, typer.Option(help="Topic of the images, for a bag with several.")] = None,
     odometry_topic: Annotated[str | None, typer.Option(help="Topic of the odometry, for a bag with several.")] = None,
     every: Every = 1,
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
+    trajectory_format: TrajectoryFormat = None,
+    field_of_view: View = None,
 ) -> None:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended."""
     from flocc_launch.datasets.commands import convert as run
@@ -63,7 +75,8 @@ def convert(
     with progress_bar("converting") as progress:
         path = run(
             source, out, format_name=format_name, camera=camera, odometry=odometry, truth=truth,
-            image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg, progress=progress,
+            image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg,
+            form=trajectory_format, view_deg=field_of_view, progress=progress,
         )  # fmt: skip
     typer.echo(f"recording: {path}")
 
@@ -110,12 +123,17 @@ def split(
     seed: Annotated[int, typer.Option(help="Seed of the drift, where odometry is made from ground truth.")] = 0,
     format_name: Format = None,
     camera: CameraFile = None,
+    trajectory_format: TrajectoryFormat = None,
+    field_of_view: View = None,
 ) -> None:
     """Cut a data set by time into recordings of several robots; odometry that it lacks is made from ground truth."""
     from flocc_launch.datasets.commands import split as run
 
     with progress_bar("cutting") as progress:
-        paths = run(source, out, robots, seed=seed, format_name=format_name, camera=camera, progress=progress)
+        paths = run(
+            source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format,
+            view_deg=field_of_view, progress=progress,
+        )  # fmt: skip
     for path in paths:
         typer.echo(f"recording: {path}")
 

@@ -1,6 +1,7 @@
 """Converts a bag to a recording in one pass, with memory that does not grow, and goes on where it was cut short."""
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.runtime.pictures import PictureError
-from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
     IMAGE_TYPES,
@@ -24,6 +26,8 @@ from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import ImageWriter
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
+
+logger = logging.getLogger(__name__)
 
 CHECKPOINT_MESSAGES = 200
 
@@ -42,6 +46,8 @@ class BagOptions:
         jpeg: Raw images are written as JPEG instead of PNM: a tenth of the size, a fraction of the speed.
         from_zero: Stamps are counted from the first image, so that recordings of different days run together.
         origin_m: Subtracted from ground truth's positions.
+        form: Of `odometry` and `truth` (`trajectory_text.FORMS`); None finds out.
+        published_form: Of files of a data set's own that do not name their columns.
     """
 
     image_topic: str | None = None
@@ -53,6 +59,8 @@ class BagOptions:
     jpeg: bool = False
     from_zero: bool = False
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    form: str | None = None
+    published_form: str | None = None
 
 
 def convert_bag(path: Path, out: Path, options: BagOptions | None = None, progress: Progress | None = None) -> Path:
@@ -217,8 +225,8 @@ class _Conversion:
     def _finish(self) -> None:
         """Write what stands in files beside the bag, and raise the first fault."""
         self.log.finish(self.zero_ns)
-        odometry = _shifted(read_tum(self.options.odometry), self.zero_ns) if self.options.odometry else None
-        truth = _shifted(read_tum(self.options.truth), self.zero_ns) if self.options.truth else None
+        odometry = self._beside(self.options.odometry)
+        truth = self._beside(self.options.truth)
         if truth is not None:
             truth.T_fixed_body[:, :3, 3] -= self.options.origin_m
         self.writer.write_trajectories(odometry, truth)
@@ -228,6 +236,15 @@ class _Conversion:
             self.faults.append(f"{self.bag.path}: topic {self.image_topic.name} has no message")
         if self.faults:
             raise DatasetError(f"{self.faults[0]}; {self.writer.count} images were kept in {self.writer.path}")
+
+    def _beside(self, path: Path | None) -> Trajectory | None:
+        """A trajectory in a file beside the bag."""
+        if path is None:
+            return None
+        trajectory, notes = read_trajectory(path, self.options.form, otherwise=self.options.published_form)
+        for note in notes:
+            logger.warning("%s", note)
+        return _shifted(trajectory, self.zero_ns)
 
 
 def _shifted(trajectory: Trajectory, zero_ns: int) -> Trajectory:

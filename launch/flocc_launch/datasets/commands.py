@@ -1,13 +1,17 @@
 """What `flocc dataset info | convert | split` do: look at a data set, turn it into recordings, cut it into robots."""
 
+import logging
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_agent.runtime.trajectory import Trajectory, read_tum
+from flocc_agent.runtime.pictures import FULL
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
@@ -18,6 +22,8 @@ from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.writer import Progress, write_source
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +43,7 @@ class Info:
         length_m: Distance travelled, by ground truth or else by odometry.
         faults: What is wrong with it, one sentence each.
         topics: Of a bag, with types and numbers of messages.
-        notes: What was left out or not used, one sentence each.
+        notes: What was left out, or concluded where nothing said it.
     """
 
     path: Path
@@ -55,15 +61,20 @@ class Info:
     notes: tuple[str, ...] = ()
 
 
-def info(path: Path, format_name: str | None = None) -> Info:
+def info(path: Path, format_name: str | None = None, form: str | None = None) -> Info:
     """Look at a data set without writing anything.
+
+    Args:
+        path: The folder or bag.
+        format_name: One of `READERS`; None detects it.
+        form: Of trajectories (`trajectory_text.FORMS`); None finds out.
 
     Raises:
         DatasetError: Unknown, or nothing in it can be used.
     """
     if is_bag(path):
         return _bag_info(path)
-    source = read_source(path, format_name)
+    source = read_source(path, format_name, form=form)
     travelled = source.truth or source.odometry
     return Info(
         path=path,
@@ -150,6 +161,8 @@ def convert(
     truth: Path | None = None,
     every: int = 1,
     jpeg: bool = False,
+    form: str | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -167,6 +180,8 @@ def convert(
         truth: TUM file with ground truth, for a bag.
         every: Of a bag, keeps one image of so many.
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
+        form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -176,11 +191,13 @@ def convert(
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
     if is_bag(path):
-        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg)
+        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg, form=form)
         return convert_bag(path, out, options, progress)
-    source = read_source(path, format_name, camera)
+    source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
+    _tell(source)
     identity = _identity("convert", path, source, drift, seed)
-    moved = _odometry(source, odometry, drift, np.random.default_rng([seed, 0]))
+    given = None if odometry is None else _given_odometry(source, odometry, form)
+    moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
     _complain(source, out, len(source.images))
     return out
@@ -196,6 +213,8 @@ def split(
     overlap_s: float = 0.0,
     format_name: str | None = None,
     camera: Path | None = None,
+    form: str | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Cut one data set by time into recordings of several robots, which then run at the same time.
@@ -212,6 +231,8 @@ def split(
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
+        form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -220,7 +241,8 @@ def split(
     Raises:
         DatasetError: Nothing can be used, there are fewer images than robots, or a part was bad; the good one is kept.
     """
-    source = read_source(path, format_name, camera)
+    source = _viewed(read_source(path, format_name, camera, form), view_deg)
+    _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
     identity = _identity(f"split overlap_s={overlap_s}", path, source, drift, seed)
@@ -228,11 +250,18 @@ def split(
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, None, drift or needed_drift(part), rng)
+        moved = _odometry(part, drift or needed_drift(part), rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
+
+
+def _viewed(source: Source, view_deg: float | None) -> Source:
+    """The source with the field of view that is wanted of its lens."""
+    if view_deg is None or source.lens is None:
+        return source
+    return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
 
 
 def needed_drift(source: Source) -> DriftSpec | None:
@@ -240,11 +269,20 @@ def needed_drift(source: Source) -> DriftSpec | None:
     return HANDHELD_DRIFT if source.odometry is None and source.truth is not None else None
 
 
-def _odometry(source: Source, odometry: Path | None, drift: DriftSpec | None, rng: np.random.Generator) -> Trajectory:
-    if odometry is not None:
-        given = read_tum(odometry)
-        check_times(source, given, odometry)
-        return given.relative_to_first()
+def _tell(source: Source) -> None:
+    """Log what was left out or concluded; a conversion goes on."""
+    for note in source.notes:
+        logger.warning("%s", note)
+
+
+def _given_odometry(source: Source, path: Path, form: str | None) -> Trajectory:
+    given, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+    _tell(replace(source, notes=notes))
+    check_times(source, given, path)
+    return given.relative_to_first()
+
+
+def _odometry(source: Source, drift: DriftSpec | None, rng: np.random.Generator) -> Trajectory:
     if drift is not None:
         if source.truth is None:
             raise DatasetError(f"{source.path}: has no ground truth to make drifting odometry from")
@@ -265,4 +303,7 @@ def _complain(source: Source, out: Path, count: int) -> None:
 
 def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None, seed: int) -> str:
     errors = drift.model_dump_json() if drift is not None else "default"
-    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}"
+    lens, changed = source.lens, ""
+    if lens is not None and (lens.camera.agent_camera() is None or source.levels != FULL):
+        changed = f" of {lens.camera} view={lens.view_rad} {source.levels}"
+    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}{changed}"

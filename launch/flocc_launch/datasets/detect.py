@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.trajectory import NEAR_S, Trajectory
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.folders import (
@@ -15,15 +16,29 @@ from flocc_launch.datasets.folders import (
     read_tum_rgbd,
 )
 from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
+from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder
 from flocc_launch.datasets.pixels import size_of, usable_images
-from flocc_launch.datasets.plain import is_plain, read_plain, time_unit
+from flocc_launch.datasets.plain import is_plain, read_plain
+from flocc_launch.datasets.reconstructions import (
+    colmap_folder,
+    has_binary_model,
+    read_colmap,
+    read_replica,
+    read_transforms,
+)
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.video import is_video
 
 READERS: dict[str, Callable[[Path], Source]] = {
     "euroc": read_euroc,
     "kitti": read_kitti,
+    "kitti-raw": read_kitti_raw,
     "7scenes": read_sevenscenes,
     "tum": read_tum_rgbd,
+    "colmap": read_colmap,
+    "transforms": read_transforms,
+    "replica": read_replica,
     "plain": read_plain,
 }
 
@@ -41,12 +56,26 @@ def detect_format(path: Path) -> str:
         return known
     if is_bag(path):
         raise DatasetError(f"{path}: is a bag; make a recording of it first: flocc dataset convert")
+    if is_video(path):
+        raise DatasetError(f"{path}: is a video; make a recording of it first: flocc dataset convert")
+    other = kind_of_folder(path) if path.is_dir() else kind_of_file(path)
+    if other is not None:
+        raise DatasetError(f"{path}: {other}")
     inside = [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry)] if path.is_dir() else []
     raise DatasetError(
         f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
-        "(odometry.tum or groundtruth.tum) and camera.yaml"
+        f"(odometry.tum or groundtruth.tum) and camera.yaml; {_what_is_there(path)}"
         + (f"; inside of it, {', '.join(inside[:8])} would be" if inside else "")
     )
+
+
+def _what_is_there(path: Path) -> str:
+    """What a folder holds, so that its owner sees what was not found in it."""
+    if not path.is_dir():
+        return f"this is a file of type {path.suffix or 'nothing known'}"
+    names = [entry.name + "/" * entry.is_dir() for entry in sorted(path.iterdir())]
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return f"there is {', '.join(names[:6])}{more}" if names else "it is empty"
 
 
 def is_dataset(path: Path) -> bool:
@@ -61,18 +90,29 @@ def _known_format(path: Path) -> str | None:
         return "kitti"
     if any(path.glob("frame-*.color.*")):
         return "7scenes"
+    if image_folder(path) is not None:
+        return "kitti-raw"
+    if colmap_folder(path) is not None or has_binary_model(path):
+        return "colmap"
+    if (path / "transforms.json").exists():
+        return "transforms"
+    if (path / "results").is_dir() and (path / "traj.txt").exists():
+        return "replica"
     if (path / "rgb.txt").exists() and (path / "groundtruth.txt").exists():
         return "tum"
     return "plain" if not is_bag(path) and is_plain(path) else None
 
 
-def read_source(path: Path, format_name: str | None = None, camera: Path | None = None) -> Source:
+def read_source(
+    path: Path, format_name: str | None = None, camera: Path | None = None, form: str | None = None
+) -> Source:
     """Read one robot's data set.
 
     Args:
         path: The folder.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics, where the folder has none or others are wanted.
+        form: Of the trajectories of a plain folder (`trajectory_text.FORMS`); None finds out.
 
     Raises:
         DatasetError: Unknown, or nothing in it can be used.
@@ -80,7 +120,7 @@ def read_source(path: Path, format_name: str | None = None, camera: Path | None 
     name = format_name or detect_format(path)
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
-    source = READERS[name](path)
+    source = _read(path, name, form)
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None:
             check_times(source, trajectory)
@@ -95,6 +135,16 @@ def _usable(source: Source) -> Source:
     images, notes, levels = usable_images(source.images, size)
     told = (*source.notes, *(lens.notes if lens else ()), *notes)
     return replace(source, images=images, notes=told, levels=levels)
+
+
+def _read(path: Path, name: str, form: str | None) -> Source:
+    """Call a reader; what it did not foresee in a file is said as a fault of the folder."""
+    try:
+        return read_plain(path, form) if name == "plain" else READERS[name](path)
+    except OSError as error:
+        raise DatasetError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DatasetError(f"{path}: cannot be read as {name}: {error}") from error
 
 
 def check_times(source: Source, trajectory: Trajectory, where: Path | None = None) -> None:
@@ -117,6 +167,14 @@ def _what_stamps_look_like(source: Source, trajectory: Trajectory) -> str:
     steps_s = np.diff(trajectory.stamps_s)
     if len(trajectory) >= len(source.images) and np.all(steps_s == 1.0):
         return "the trajectory's stamps look like numbers of images, not seconds"
-    unit = time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
+    unit = _time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
     known = unit not in (None, "seconds")
     return f"the trajectory's stamps look like {unit}, not seconds" if known else "both must be of one clock"
+
+
+def _time_unit(duration_s: float, reference_s: float) -> str | None:
+    """The unit that a duration in wrong seconds seems to be in, given a true one of about the same length."""
+    if reference_s <= 0 or duration_s <= 0:
+        return None
+    close = (name for name, unit_s in UNITS_S.items() if 1 / 3 < duration_s * unit_s / reference_s < 3)
+    return next(close, None)

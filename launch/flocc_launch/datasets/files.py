@@ -1,18 +1,21 @@
 """What the readers of folders share: lists of images, the files in a folder, a camera beside them."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from flocc_agent.runtime.trajectory import text_lines
+from flocc_agent.runtime.columns import UNITS_S
+from flocc_agent.runtime.stamp_units import since_1970
+from flocc_agent.runtime.text_tables import number_lines, text_lines
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens
 
 T = TypeVar("T")
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
 CAMERA_FILES = ("camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "intrinsics.yaml", "sensor.yaml")
 
 
@@ -35,8 +38,8 @@ def listed_images(path: Path) -> tuple[tuple[tuple[float, Path], ...], tuple[str
     missing = []
     for line, text in text_lines(path):
         try:
-            stamp, name = re.split(r"[\s,]+", text, maxsplit=1)
-            stamp_s, file = float(stamp), path.parent / name
+            stamp, name = re.split(r"[\s,;]+", text, maxsplit=1)
+            stamp_s, file = seconds_of(float(stamp)), path.parent / name.strip()
         except ValueError:
             raise DatasetError(f"{path}:{line}: must be 'stamp_s relative/path', not {text[:80]!r}") from None
         if images and stamp_s <= images[-1][0]:
@@ -49,6 +52,25 @@ def listed_images(path: Path) -> tuple[tuple[tuple[float, Path], ...], tuple[str
     return some(tuple(images), path), faults
 
 
+def seconds_of(stamp: float) -> float:
+    """A stamp of a list in seconds; one since 1970 may be in another unit, which its size says."""
+    return stamp * UNITS_S[since_1970(stamp) or "seconds"]
+
+
+def increasing_stamps_s(path: Path) -> list[float]:
+    """Seconds of a file with one stamp a line.
+
+    Raises:
+        DatasetError: Time goes backwards or stands still, so that nobody knows which image is of which time.
+    """
+    stamps_s: list[float] = []
+    for line, values in number_lines(path, 1):
+        if stamps_s and not values[0] > stamps_s[-1]:
+            raise DatasetError(f"{path}:{line}: time goes backwards or stands still at {values[0]:.6f} s")
+        stamps_s.append(values[0])
+    return stamps_s
+
+
 def image_files(folder: Path) -> list[Path]:
     """Image files of a folder, by name.
 
@@ -57,7 +79,9 @@ def image_files(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder")
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(
+        file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+    )
 
 
 def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
@@ -67,11 +91,25 @@ def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
         DatasetError: There is none.
     """
     if not images:
-        raise DatasetError(f"{where}: no image was found")
+        raise DatasetError(f"{where}: no image was found{_what_is_there(where)}")
     return images
 
 
-def camera_file(path: Path, images: Sequence[tuple[float, Path]] = ()) -> Lens | None:
+def _what_is_there(where: Path) -> str:
+    """What a folder without images holds, and what an image would be."""
+    if not where.is_dir():
+        return ""
+    entries = [entry for entry in sorted(where.iterdir()) if not entry.name.startswith(".")]
+    kinds = Counter(entry.suffix or "nameless" for entry in entries if entry.is_file())
+    told = [f"{count} {kind} file{'s' * (count > 1)}" for kind, count in kinds.most_common(4)]
+    told += [f"{entry.name}/" for entry in entries if entry.is_dir()][:4]
+    read = ", ".join(IMAGE_SUFFIXES)
+    return f"; there is {', '.join(told) or 'nothing'}, but images are {read}: convert them to JPEG or PNG"
+
+
+def camera_file(
+    path: Path, images: Sequence[tuple[float, Path]] = (), size: tuple[int, int] | None = None
+) -> Lens | None:
     """The camera that a file in a folder describes, or None; a file without a size takes that of the images."""
     file = next((path / name for name in CAMERA_FILES if (path / name).exists()), None)
-    return None if file is None else read_lens(file, size_of(images) if images else None)
+    return None if file is None else read_lens(file, size_of(images) if images else size)

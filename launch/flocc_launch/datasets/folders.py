@@ -3,24 +3,34 @@
 Each reader takes what is good and lists what is wrong as faults; it raises only where nothing can be used.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import pose_from_tq
 from flocc_agent.lenses import CameraModel
-from flocc_agent.runtime.trajectory import Trajectory, checked_pose, number_lines, read_tum, text_lines
-from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
+from flocc_agent.runtime.text_tables import RecordingError, number_lines
+from flocc_agent.runtime.trajectory import Trajectory, checked_pose
+from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.datasets.files import (
+    camera_file,
+    image_files,
+    increasing_stamps_s,
+    listed_images,
+    some,
+    unequal,
+)
 from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.kitti_raw import rectified_lens
 from flocc_launch.datasets.pixels import image_size
+from flocc_launch.datasets.plain import trajectories_beside
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
 Float = NDArray[np.float64]
 
 SEVENSCENES_RATE_HZ = 30.0
 KITTI_RATE_HZ = 10.0
+EUROC_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt0")
 UP_CAMERA = np.array([0.0, -1.0, 0.0])
 
 # Published calibrations of the TUM RGB-D colour cameras: fx fy cx cy, k1 k2 p1 p2, k3
@@ -34,31 +44,31 @@ TUM_CAMERAS = {
 def read_tum_rgbd(path: Path) -> Source:
     """Read a TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt`; the body is the colour camera."""
     images, faults = listed_images(path / "rgb.txt")
-    lens = camera_file(path)
+    lens = camera_file(path, images)
     for name, ((fx, fy, cx, cy), distortion, k3) in TUM_CAMERAS.items():
         if lens is None and name in path.resolve().name:
             lens = Lens(CameraModel(640, 480, fx, fy, cx, cy, (*distortion, k3)))
-    truth = _optional(path / "groundtruth.txt", read_tum)
-    return Source(path, "tum", images, lens, truth=truth, faults=faults)
+    truth, notes = read_trajectory(path / "groundtruth.txt", otherwise="tum")
+    return Source(path, "tum", images, lens, truth=truth, faults=faults, notes=notes)
 
 
 def read_euroc(path: Path) -> Source:
     """Read an EuRoC ASL sequence's left camera: `mav0/cam0`, ground truth of the IMU body."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     folder = mav / "cam0" / "data"
-    images = tuple((int(file.stem) * 1e-9, file) for file in image_files(folder) if file.stem.isdigit())
-    lens = read_lens(mav / "cam0" / "sensor.yaml") if (mav / "cam0" / "sensor.yaml").exists() else None
-    truth = _optional(mav / "state_groundtruth_estimate0" / "data.csv", _read_euroc_truth)
-    return Source(path, "euroc", some(images, folder), lens, truth=truth)
-
-
-def _read_euroc_truth(path: Path) -> Trajectory:
-    rows = np.array([values[:8] for _, values in number_lines(path, 8)])
-    if len(rows) == 0:
-        raise DatasetError(f"{path}: holds no pose")
-    poses = np.array([checked_pose(pose_from_tq(row[1:8]), f"{path}: row {i + 1}") for i, row in enumerate(rows)])
-    keep = np.concatenate([[True], np.diff(rows[:, 0]) > 0])
-    return Trajectory(rows[keep, 0] * 1e-9, poses[keep])
+    images = tuple((int(file.stem) * 1e-9, file) for file in image_files(folder) if file.stem.isdecimal())
+    lens = (
+        read_lens(mav / "cam0" / "sensor.yaml")
+        if (mav / "cam0" / "sensor.yaml").exists()
+        else camera_file(path, images)
+    )
+    odometry, truth, notes = trajectories_beside(path)
+    file = next((mav / name / "data.csv" for name in EUROC_TRUTHS if (mav / name / "data.csv").exists()), None)
+    if file is not None:
+        truth, truth_notes = read_trajectory(file, otherwise="euroc")
+        notes = (*notes, *truth_notes)
+    images = tuple(sorted(some(images, folder)))
+    return Source(path, "euroc", images, lens, odometry=odometry, truth=truth, notes=notes)
 
 
 def read_kitti(path: Path) -> Source:
@@ -68,14 +78,15 @@ def read_kitti(path: Path) -> Source:
         raise DatasetError(f"{path}: has no folder image_0")
     files = image_files(folder)
     times = path / "times.txt"
-    stamps_s = (
-        [v[0] for _, v in number_lines(times, 1)] if times.exists() else [i / KITTI_RATE_HZ for i in range(len(files))]
-    )
+    stamps_s = increasing_stamps_s(times) if times.exists() else [i / KITTI_RATE_HZ for i in range(len(files))]
     truth, faults = _kitti_truth(path, stamps_s)
     count = len(files) if truth is None else len(truth)
     faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, len(stamps_s), count))
     images = tuple(zip(stamps_s, files, strict=False))
-    lens = camera_file(path) or _kitti_lens(path / "calib.txt", "P2" if folder.name == "image_2" else "P0", files)
+    calibration, number = path / "calib.txt", "2" if folder.name == "image_2" else "0"
+    lens = camera_file(path, images)
+    if lens is None and calibration.exists() and files:
+        lens = rectified_lens(calibration, number, files[0])
     return Source(path, "kitti", some(images, folder), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
 
 
@@ -94,42 +105,34 @@ def _kitti_truth(path: Path, stamps_s: list[float]) -> tuple[Trajectory | None, 
     return truth, (fault,) if len(poses) != len(stamps_s) else ()
 
 
-def _kitti_lens(path: Path, name: str, files: list[Path]) -> Lens | None:
-    if not path.exists() or not files:
-        return None
-    rows: dict[str, list[float]] = {}
-    for _, text in text_lines(path):
-        key, _, numbers = text.partition(":") if ":" in text else ("", "", text)
-        rows[key or f"P{len(rows)}"] = [float(number) for number in numbers.split()]
-    P = rows.get(name)
-    if P is None or len(P) != 12:
-        raise DatasetError(f"{path}: has no row {name} of 12 numbers")
-    width, height = image_size(files[0])
-    return Lens(CameraModel(width, height, P[0], P[5], P[2], P[6]))
-
-
 def read_sevenscenes(path: Path) -> Source:
     """Read a 7-Scenes sequence: numbered colour images with 4x4 poses beside them, stamped at 30 Hz by their number."""
-    images, poses, stamps_s, faults = [], [], [], []
+    images, poses, damaged = [], [], []
     for file in sorted(path.glob("frame-*.color.*")):
-        number = int(file.name[6:12])
-        pose_file = path / f"frame-{number:06d}.pose.txt"
-        if not pose_file.exists():
-            faults.append(f"{pose_file}: is missing beside {file.name}")
-            continue
-        rows = [values[:4] for _, values in number_lines(pose_file, 4)]
-        if len(rows) != 4:
-            raise DatasetError(f"{pose_file}: has {len(rows)} rows, a pose has 4")
-        poses.append(checked_pose(np.array(rows), str(pose_file)))
-        stamps_s.append(number / SEVENSCENES_RATE_HZ)
-        images.append((stamps_s[-1], file))
+        number = file.name[6:].partition(".")[0]
+        pose_file = path / f"frame-{number}.pose.txt"
+        try:
+            poses.append(_sevenscenes_pose(pose_file))
+            images.append((int(number) / SEVENSCENES_RATE_HZ, file))
+        except RecordingError as error:
+            damaged.append(str(error))
+    if not images and damaged:
+        raise DatasetError(damaged[0])
     some(tuple(images), path)
-    orphans = len(list(path.glob("frame-*.pose.txt"))) - len(images)
+    faults = (f"{damaged[0]} ({len(damaged)} images have no usable pose)",) if damaged else ()
+    orphans = len(list(path.glob("frame-*.pose.txt"))) - len(images) - len(damaged)
     if orphans > 0:
-        faults.append(f"{path}: has {orphans} poses more than images")
-    truth = Trajectory(np.array(stamps_s), np.array(poses))
-    lens = camera_file(path) or _sevenscenes_lens(path, images[0][1])
-    return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=tuple(faults))
+        faults = (*faults, f"{path}: has {orphans} poses more than images")
+    truth = Trajectory(np.array([stamp_s for stamp_s, _ in images]), np.array(poses))
+    lens = camera_file(path, images) or _sevenscenes_lens(path, images[0][1])
+    return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
+
+
+def _sevenscenes_pose(path: Path) -> Float:
+    rows = [values[:4] for _, values in number_lines(path, 4)]
+    if len(rows) != 4:
+        raise RecordingError(f"{path}: has {len(rows)} rows, a pose has 4")
+    return checked_pose(np.array(rows), str(path))
 
 
 def _sevenscenes_lens(path: Path, image: Path) -> Lens:
@@ -137,9 +140,4 @@ def _sevenscenes_lens(path: Path, image: Path) -> Lens:
     file = path / "camera-intrinsics.txt"
     if not file.exists():
         return Lens(CameraModel(width, height, 585.0, 585.0, width / 2, height / 2))
-    K = [values for _, values in number_lines(file, 3)]
-    return Lens(CameraModel(width, height, K[0][0], K[1][1], K[0][2], K[1][2]))
-
-
-def _optional(path: Path, read: Callable[[Path], Trajectory]) -> Trajectory | None:
-    return read(path) if path.exists() else None
+    return read_lens(file, (width, height))

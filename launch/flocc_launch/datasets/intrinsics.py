@@ -6,7 +6,7 @@ from typing import Any
 
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import read_camera
-from flocc_agent.runtime.trajectory import RecordingError
+from flocc_agent.runtime.text_tables import RecordingError
 from flocc_launch.datasets.calibrations.document import parsed_json, parsed_xml, parsed_yaml, read_text
 from flocc_launch.datasets.calibrations.fields import lens_of_keys
 from flocc_launch.datasets.calibrations.maps import FORMS, REFUSED_MAPS, Cameras, form_of

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flocc_agent.lenses import CameraModel
-from flocc_agent.runtime.trajectory import read_tum
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import Progress
@@ -115,7 +115,7 @@ def convert_graco(folder: Path, out: Path, team: Team, progress: Progress | None
         lens = GRACO_GROUND if bag.stem.startswith("ground") else None
         options = _options(team, bag.stem, "/camera_left/image_raw", lens, "GrAco's aerial cameras are not known here")
         if options.truth is not None and origin is None:
-            x, y, z = read_tum(options.truth).T_fixed_body[0, :3, 3]
+            x, y, z = read_trajectory(options.truth, otherwise="tum")[0].T_fixed_body[0, :3, 3]
             origin = (float(x), float(y), float(z))
         options = _concurrent(options, origin)
         folders.append(convert_bag(bag, out / bag.stem, options, progress))
@@ -136,7 +136,9 @@ def _options(team: Team, robot: str, topic: str, lens: Lens | None, why_not: str
     truth = None
     if team.truth is not None:
         truth = _file(team.truth, [f"{robot}.tum", f"{robot}.txt", f"{robot}_gt.txt"])
-    return BagOptions(image_topic=topic, camera=camera, odometry=odometry, truth=truth, every=team.every)
+    return BagOptions(
+        image_topic=topic, camera=camera, odometry=odometry, truth=truth, every=team.every, published_form="tum"
+    )
 
 
 def _file(folder: Path, names: list[str]) -> Path | None:

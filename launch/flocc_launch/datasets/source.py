@@ -48,7 +48,7 @@ class Source:
         truth: `T_world_body`, or None.
         up_world: (3,) direction against gravity in the truth's world.
         faults: What is wrong with the rest, one sentence each; what is above is good.
-        notes: What was left out or not used, one sentence each; it is said, and nobody has to do anything about it.
+        notes: What was left out, or concluded where nothing said it; one sentence each.
         levels: How images of 16 bits are brought to 8.
     """
 

@@ -15,8 +15,8 @@ from flocc_agent.core.measurements import BadMeasurement, Fix, StartPose, TagSig
 from flocc_agent.geometry import Float, pose
 from flocc_agent.perception.synthetic import pose_image
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import Envelope, Heartbeat, LogDigest
-from flocc_protocol.records import FixRecord, KeyframeRecord, PoseFixRecord
+from flocc_protocol.messages import Envelope, Heartbeat, LogDigest, RecordBatch, Records
+from flocc_protocol.records import FixRecord, KeyframeRecord, PoseFixRecord, encode_record
 
 ALONE = TransportConfig(
     control_listen=("tcp/127.0.0.1:0",), bulk_listen=("tcp/127.0.0.1:0",), multicast=False, gossip=False
@@ -57,14 +57,30 @@ async def test_a_robot_whose_disk_is_behind_what_it_published_begins_another_log
     config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
     async with Agent(config, camera()) as agent:
         old = agent.log
-        ahead = Heartbeat(1, 7, 0, None, 0, 0, (LogDigest(old, 5, 77),))
+        lost = KeyframeRecord(0, 1.0, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None)
+        copy = RecordBatch(old, 0, 0, (encode_record(lost),))
         assert agent._driver is not None
-        agent._driver.put(MessageReceived(Envelope(LogId("r2"), ahead)))
+        agent._driver.put(MessageReceived(Envelope(LogId("r2"), Records((copy,)))))
         while "ended" not in _log_state(agent):
             await asyncio.sleep(0.01)
     async with Agent(config, camera()) as agent:
         assert agent.log.robot == "r1"
         assert agent.log != old
+
+
+async def test_what_a_heartbeat_claims_ends_no_log(tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
+    async with Agent(config, camera()) as agent:
+        old = agent.log
+        lie = Heartbeat(1, 7, 0, None, 0, 0, (LogDigest(old, 5, 77), LogDigest(old, 0, 77)))
+        assert agent._driver is not None
+        agent._driver.put(MessageReceived(Envelope(LogId("r2"), lie)))
+        await agent.add_keyframe(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 1.0)
+        async for _ in agent.corrections():
+            break
+        assert _log_state(agent) == "continued"
+    async with Agent(config, camera()) as agent:
+        assert agent.log == old
 
 
 def _log_state(agent: Agent) -> str:

@@ -9,7 +9,8 @@ import pytest
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import angle_rad, pose, so3_exp
 from flocc_agent.runtime.recording import Recording, RecordingError, read_camera, write_camera
-from flocc_agent.runtime.trajectory import Trajectory, read_tum, write_tum
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_agent.runtime.trajectory_text import read_tum
 
 CAMERA = Camera(32, 24, 30.0, 31.0, 16.0, 12.0, (0.1, -0.2, 0.01, 0.02))
 T_BODY_CAMERA = pose(so3_exp(np.array([0.1, -1.2, 0.4])), np.array([0.1, 0.0, 0.3]))

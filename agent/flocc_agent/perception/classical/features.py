@@ -15,6 +15,8 @@ from flocc_agent.perception.multiview.picture import rays_of, reduced_to
 
 DESCRIPTOR_LENGTH = 128
 QUANTISATION = 512.0
+CONTRAST_THRESHOLD = 0.02
+"""Of SIFT: half of OpenCV's, for dim images; with less, features do not repeat."""
 """A RootSIFT component times this fits a byte; the few above 255/512 are clipped."""
 
 
@@ -40,7 +42,7 @@ class FeatureExtractor:
         cv2.setNumThreads(1)  # global in OpenCV: one worker, one core
         self._features_max = config.features_max
         self._pixels_max = config.pixels_max
-        self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=config.contrast_threshold)
+        self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=CONTRAST_THRESHOLD)
 
     def extract(self, image: Image) -> Features:
         """Find and describe the features of an image; an image of one colour has none."""

@@ -10,7 +10,11 @@ from flocc_agent.perception.multiview.acceptance import Acceptance, Needed
 from flocc_agent.perception.multiview.registrar import PairRegistrar
 from flocc_agent.perception.multiview.view_parameters import Geometry, Matched
 
-ACCEPTANCE = Acceptance(Needed(20, 15, 5), Needed(60, 30, 8))
+DISTANCE_RATIO_MAX = 0.8
+"""Lowe's ratio, as in his paper: lower keeps fewer and surer matches."""
+ROTATION_SIGMA_MAX_RAD = 0.007
+ACCEPTANCE = Acceptance(Needed(30, 15, ROTATION_SIGMA_MAX_RAD), Needed(60, 30, ROTATION_SIGMA_MAX_RAD), 0.4)
+"""Fitted on all scenes together: docs/classical.md has the command and what it keeps of scenes that were left out."""
 
 
 def classical_registrar(config: ClassicalConfig) -> PairRegistrar[Features]:
@@ -18,7 +22,7 @@ def classical_registrar(config: ClassicalConfig) -> PairRegistrar[Features]:
     cv2.setNumThreads(1)
 
     def match(first: Features, second: Features) -> Matched:
-        return mutual_matches(first.descriptors, second.descriptors, config.distance_ratio_max)
+        return mutual_matches(first.descriptors, second.descriptors, DISTANCE_RATIO_MAX)
 
     acceptance = ACCEPTANCE if config.acceptance == "fitted" else None
-    return PairRegistrar(decode_features, match, Geometry(), acceptance)
+    return PairRegistrar(decode_features, match, Geometry(correspondences_min=config.correspondences_min), acceptance)

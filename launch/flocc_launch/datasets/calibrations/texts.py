@@ -191,6 +191,8 @@ def _numbers(text: str) -> Cameras:
     if len(rows) == 1 and len(rows[0]) in (4, 8, 9, 12):
         camera: dict[str, Any] = {"intrinsics": rows[0][:4]}
         return {"camera": camera | ({"distortion": rows[0][4:]} if len(rows[0]) > 4 else {})}
+    if len(rows) > 1 and all(len(row) == 12 for row in rows):
+        return _kitti("".join(f"P{k}: {' '.join(map(str, row))}\n" for k, row in enumerate(rows)))
     if len({len(row) for row in rows}) == 1 and (len(rows), len(rows[0])) in ((3, 3), (3, 4), (4, 4)):
         return {"camera": {"K": [number for row in rows for number in row]}}
     raise ValueError(

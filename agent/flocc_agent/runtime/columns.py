@@ -1,0 +1,137 @@
+"""What the columns of a trajectory mean, by the line that names them: `timestamp [ns], p_RS_R_x [m], ..., q_RS_w []`.
+
+Names differ from tool to tool, but say the same: a group (position, quaternion) and an axis. What is not understood is
+not used, and a header that names something twice, or only a part, is refused by its reader.
+"""
+
+import re
+from dataclasses import dataclass
+
+UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+_UNIT_NAMES = {
+    "seconds": ("s", "sec", "secs", "second", "seconds"),
+    "milliseconds": ("ms", "msec", "msecs", "millis", "millisec", "millisecond", "milliseconds"),
+    "microseconds": ("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
+    "nanoseconds": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
+}
+_UNIT_OF = {name: unit for unit, names in _UNIT_NAMES.items() for name in names}
+_STAMP = re.compile(r"(.*[._/])?(t|ts|time|times|stamp|timestamp|time_stamp|unix_?time|epoch|utc|clock)")
+_HEADER_STAMP = re.compile(r"(.*[._/])?header[._/]stamp")
+_POSITION = re.compile(
+    r"|t|p|pos|position|trans|translation|loc|location|[pt]_\w+|(.*[._/])?(position|translation)(_\w+)?"
+)
+_QUATERNION = re.compile(
+    r"q|quat|quaternion|rot|rotation|ori|orient|orientation|q_\w+|(.*[._/])?(orientation|rotation|quaternion|quat)"
+)
+_ANGLES = re.compile(r"(.*[._/])?(roll|pitch|yaw|heading|azimuth|euler_?\w*|rx|ry|rz|phi|theta|psi)(_\w+)?")
+_ORDER = re.compile(
+    r"\b(q|quat|quaternion)[\w ]*?[ _(\[]+([wxyz])[, ]?([wxyz])[, ]?([wxyz])[, ]?([wxyz])[)\]]?(?=[\s,;]|$)"
+)
+"""A quaternion in one word, `q_wxyz` or `quat(x,y,z,w)`."""
+_OTHER_PARTS = ("cov", "twist", "veloc", "accel", "gyro", "bias", "sigma", "std", "error", "imu", "mag")
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Where a row has what.
+
+    Attributes:
+        stamp: Column of the stamp, or None where a form has none.
+        pose: Columns of x y z qx qy qz qw.
+        unit: What the stamp is in, one of `UNITS_S`, or None where nothing says so.
+        nanoseconds: Column of the nanoseconds that are added to the stamp's seconds, or None.
+    """
+
+    stamp: int | None
+    pose: tuple[int, ...]
+    unit: str | None = None
+    nanoseconds: int | None = None
+
+
+class HeaderError(ValueError):
+    """A line names columns, but not those of a trajectory; the message says why."""
+
+
+def columns_of(header: str, count: int | None = None) -> Columns | None:
+    """Columns that a line names, or None where the line names no position at all (it is a comment).
+
+    Args:
+        header: The line, without its comment sign.
+        count: How many fields a row has; words before that many are taken for an introduction.
+
+    Raises:
+        HeaderError: It names positions, but not one column for each number of a stamped pose.
+    """
+    names = _names(header)
+    roles = [_role(name) for name in names]
+    if roles.count("stamp") == 2 and any(_HEADER_STAMP.fullmatch(_bare(name)) for name in names):
+        roles = [
+            None if r == "stamp" and not _HEADER_STAMP.fullmatch(_bare(n)) else r
+            for r, n in zip(roles, names, strict=True)
+        ]
+    while count is not None and len(roles) > count and roles[0] is None:
+        names, roles = names[1:], roles[1:]
+    if not {"x", "y", "z"} & set(roles) or sum(role is not None for role in roles) < 4:
+        return None
+    if count is not None and len(roles) != count:
+        raise HeaderError(f"the header names {len(roles)} columns, but rows have {count}")
+    for role in (*POSE_COLUMNS, "stamp"):
+        if roles.count(role) > 1:
+            twice = [name for name, found in zip(names, roles, strict=True) if found == role]
+            raise HeaderError(f"the header names {role!r} twice ({', '.join(twice[:3])})")
+    missing = [role for role in ("stamp", *POSE_COLUMNS) if role not in roles]
+    if missing:
+        angles = [name for name in names if _ANGLES.fullmatch(_bare(name))]
+        instead = f"; it has angles ({', '.join(angles[:3])}), whose order and axes differ" if angles else ""
+        raise HeaderError(f"the header names no {', '.join(missing)}{instead}")
+    stamp = roles.index("stamp")
+    split = roles.index("nanoseconds") if "nanoseconds" in roles else None
+    unit = "seconds" if split is not None else _unit(names[stamp])
+    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split)
+
+
+def _names(header: str) -> list[str]:
+    expanded = _ORDER.sub(r"q\2 q\3 q\4 q\5", header)
+    separated = re.sub(r"\s*([\[(][^\])]*[\])])", lambda found: found[1].replace(" ", "").replace(",", "·"), expanded)
+    splitter = r"[;,]" if len(re.findall(r"[;,]", separated)) >= len(POSE_COLUMNS) - 1 else r"[\s;,]+"
+    names = [name.strip(" \t\"'") for name in re.split(splitter, separated)]
+    while names and not names[-1]:
+        names.pop()
+    return names
+
+
+def _bare(name: str) -> str:
+    """A name without its unit, in lower case; inner spaces are underscores."""
+    return re.sub(r"[\[(].*?[\])]", "", name).strip(" _.:#%").lower().replace(" ", "_")
+
+
+def _role(name: str) -> str | None:
+    bare = _bare(name)
+    if any(part in bare for part in _OTHER_PARTS):
+        return None
+    if bare in ("nsec", "nsecs", "nanosec", "nanosecs", "stamp.nanosec", "header.stamp.nanosec", "header.stamp.nsecs"):
+        return "nanoseconds"
+    if bare in ("sec", "secs", "seconds", "stamp.sec", "header.stamp.sec", "header.stamp.secs"):
+        return "stamp"
+    if _STAMP.fullmatch(_without_unit(bare)):
+        return "stamp"
+    found = re.fullmatch(r"(?P<group>.*?)[_.]?(?P<axis>[xyzw])", bare)
+    if found is None:
+        return None
+    if _QUATERNION.fullmatch(found["group"]):
+        return "q" + found["axis"]
+    is_position = _POSITION.fullmatch(found["group"]) and found["axis"] != "w"
+    return found["axis"] if is_position else None
+
+
+def _without_unit(bare: str) -> str:
+    stem, _, last = bare.rpartition("_")
+    return stem if stem and last in _UNIT_OF else bare
+
+
+def _unit(name: str) -> str | None:
+    bracketed = re.search(r"[\[(](.*?)[\])]", name)
+    words = [bracketed[1].lower()] if bracketed else []
+    return next((_UNIT_OF[word] for word in [*words, _bare(name).rpartition("_")[2]] if word in _UNIT_OF), None)

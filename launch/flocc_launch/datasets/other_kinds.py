@@ -1,0 +1,59 @@
+"""Data sets and files that flocc knows but does not read: recognised by what they are called, refused by name.
+
+Each sentence says what to convert. Nothing here is opened but to look whether it is there.
+"""
+
+from pathlib import Path
+
+FOLDERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("ScanNet, exported", ("color", "pose", "intrinsic"), "put color/ into images/ and make groundtruth.tum of pose/"),
+    ("TartanAir", ("image_left", "pose_left.txt"), "make groundtruth.tum of pose_left.txt, which is in NED axes"),
+    ("Oxford RobotCar", ("stereo", "stereo.timestamps"), "demosaic stereo/ into images/, and make odometry.tum of vo/"),
+    ("nuScenes", ("samples", "sweeps"), "export one camera's images and ego poses as a plain folder"),
+    ("4Seasons", ("undistorted_images", "KeyFrameData"), "make odometry.tum of result.txt beside the images of cam0"),
+    ("NCLT", ("lb3",), "undistort one camera of lb3/ into images/ named by microseconds"),
+    ("Stray Scanner's export", ("rgb.mp4", "odometry.csv"), "cut rgb.mp4 into images named by odometry.csv"),
+    ("Polycam's raw export", ("keyframes", "mesh_info.json"), "make transforms.json of it: ns-process-data polycam"),
+    ("ADVIO", ("iphone", "ground-truth"), "cut iphone/frames.mov into images named by iphone/frames.csv"),
+    ("Argoverse", ("sensors", "city_SE3_egovehicle.feather"), "export one camera's images and poses as a plain folder"),
+    ("an ASL sequence's parent", ("calibration", "state_groundtruth_estimate0"), "name the folder that holds mav0"),
+    ("a KITTI-360 sequence", ("data_2d_raw",), "name images by stamps and make groundtruth.tum of data_poses/"),
+)  # fmt: skip
+FILES: dict[str, tuple[str, str]] = {
+    ".zip": ("an archive", "unpack it"),
+    ".tar": ("an archive", "unpack it"),
+    ".gz": ("an archive", "unpack it"),
+    ".tgz": ("an archive", "unpack it"),
+    ".7z": ("an archive", "unpack it"),
+    ".sens": ("ScanNet's recording", "export it with ScanNet's SensReader"),
+    ".svo": ("ZED's recording", "export it with ZED_SVO_Export"),
+    ".svo2": ("ZED's recording", "export it with ZED_SVO_Export"),
+    ".klg": ("Kintinuous' log", "export its images and name them by stamps"),
+    ".oni": ("OpenNI's recording", "export its images and name them by stamps"),
+    ".db": ("RTAB-Map's database", "export images and poses in RTAB-Map, or rtabmap-export --images --poses"),
+    ".tfrecord": ("Waymo's recording", "export one camera's images and poses as a plain folder"),
+    ".h5": ("an HDF5 file", "export its images and poses as a plain folder"),
+    ".hdf5": ("an HDF5 file", "export its images and poses as a plain folder"),
+    ".rrd": ("a recording of Rerun", "give the data that it shows"),
+    ".pcap": ("a capture of network packets", "give a bag with images"),
+    ".ply": ("a point cloud", "give images and a trajectory"),
+    ".pcd": ("a point cloud", "give images and a trajectory"),
+    ".npz": ("arrays of numpy", "write images and a trajectory as files"),
+    ".npy": ("arrays of numpy", "write images and a trajectory as files"),
+}
+SUFFIX_GLOBS = (".sens", ".svo", ".svo2", ".klg", ".oni", ".db", ".tfrecord")
+
+
+def kind_of_folder(path: Path) -> str | None:
+    """What a folder is and what to convert, or None where it is no kind that is known."""
+    for name, markers, advice in FOLDERS:
+        if all((path / marker).exists() for marker in markers):
+            return f"is {name}, which flocc does not read; {advice}"
+    inside = next((file for suffix in SUFFIX_GLOBS for file in sorted(path.glob(f"*{suffix}"))), None)
+    return None if inside is None else f"holds {inside.name}: {kind_of_file(inside)}"
+
+
+def kind_of_file(path: Path) -> str | None:
+    """What a file is and what to do with it, or None where it is no kind that is known."""
+    found = FILES.get(path.suffix.lower())
+    return None if found is None else f"is {found[0]}, which flocc does not read; {found[1]}"

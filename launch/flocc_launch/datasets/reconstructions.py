@@ -1,0 +1,157 @@
+"""Readers of what reconstruction programs write: COLMAP's text model, nerfstudio's transforms.json.
+
+Both give camera poses, taken as ground truth of the camera, and intrinsics. Neither has stamps nor metric scale of its
+own: stamps are those that the names say, else one image every `STEP_S`; and that the scale may not be metres is told.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.geometry import R_from_q_wxyz, inverse, pose
+from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
+from flocc_agent.runtime.trajectory import Trajectory, checked_pose
+from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.datasets.files import image_files
+from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.pixels import size_of
+from flocc_launch.datasets.source import DatasetError, Lens, Source
+from flocc_launch.datasets.stamped_names import stamps_of_names
+
+Float = NDArray[np.float64]
+
+STEP_S = 1.0
+REPLICA_RATE_HZ = 30.0
+CAMERA_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL's camera looks along -z with y up; ours along z with y down."""
+
+COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap_text")
+
+
+def colmap_folder(path: Path) -> Path | None:
+    """Where a folder has COLMAP's cameras.txt and images.txt, or None."""
+    places = (path / name for name in COLMAP_FOLDERS)
+    return next(
+        (place for place in places if (place / "cameras.txt").exists() and (place / "images.txt").exists()), None
+    )
+
+
+def has_binary_model(path: Path) -> bool:
+    """Whether a folder has COLMAP's model in its binary form."""
+    return any((path / name / "images.bin").exists() for name in COLMAP_FOLDERS)
+
+
+def read_colmap(path: Path) -> Source:
+    """Read COLMAP's text model: `cameras.txt`, `images.txt` (camera from world, w first), and the folder of images.
+
+    Raises:
+        DatasetError: It is the binary form, a line is of another form, or no image is there.
+    """
+    place = colmap_folder(path)
+    if place is None:
+        raise DatasetError(
+            f"{path}: is a model of COLMAP in its binary form; write it as text: colmap model_converter --input_path "
+            "FOLDER --output_path FOLDER --output_type TXT"
+        )
+    poses: dict[str, Float] = {}
+    used: dict[str, int] = {}
+    lines = [(line, text.split()) for line, text in numbered_lines(place / "images.txt") if not text.startswith("#")]
+    for line, words in lines:
+        if len(words) < 10 or is_number(words[9]) or not all(is_number(word) for word in words[:9]):
+            continue  # the 2-D points of the image above
+        where = f"{place / 'images.txt'}:{line}"
+        w, x, y, z, *t_m = (float(word) for word in words[1:8])
+        try:
+            T_camera_world = pose(R_from_q_wxyz(np.array([w, x, y, z])), np.array(t_m))
+        except ValueError as error:
+            raise DatasetError(f"{where}: {error}") from error
+        name = " ".join(words[9:])
+        poses[name], used[name] = inverse(checked_pose(T_camera_world, where)), int(words[8])
+    if not poses:
+        raise DatasetError(
+            f"{place / 'images.txt'}: holds no pose of an image (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME)"
+        )
+    if len(set(used.values())) > 1:
+        raise DatasetError(f"{place / 'images.txt'}: images are of {len(set(used.values()))} cameras; flocc takes one")
+    lens = read_lens(place / f"cameras.txt#{next(iter(used.values()))}")
+    return _source(path, "colmap", _image_folder(path), poses, lens)
+
+
+def read_transforms(path: Path) -> Source:
+    """Read `transforms.json`: intrinsics and camera-to-world matrices in OpenGL's axes.
+
+    Raises:
+        DatasetError: It is no such file, has frames without a pose, or names a lens that flocc does not read.
+    """
+    file = path / "transforms.json"
+    try:
+        table: Any = json.loads(read_text(file))
+        frames = table["frames"]
+        poses = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=float) for f in frames}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{file}: is no transforms.json of nerfstudio ({type(error).__name__}: {error})") from error
+    if not poses:
+        raise DatasetError(f"{file}: has no frames")
+    wrong = next((name for name, T in poses.items() if T.shape != (4, 4)), None)
+    if wrong is not None:
+        raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
+    world = {name: checked_pose(T @ CAMERA_OF_OPENGL, f"{file}: {name}") for name, T in poses.items()}
+    return _source(path, "transforms", path, world, None, file)
+
+
+def _image_folder(path: Path) -> Path:
+    return next((path / name for name in ("images", "rgb", "input") if (path / name).is_dir()), path)
+
+
+def _source(
+    path: Path, name: str, folder: Path, poses: dict[str, Float], lens: Lens | None, calibration: Path | None = None
+) -> Source:
+    """Images with their poses in the order of their names, and a lens, or one of a file that may not say their size."""
+    found = {key: file for key in sorted(poses) if (file := _file(folder, key)) is not None}
+    if not found:
+        raise DatasetError(f"{folder}: has none of the {len(poses)} images, of which the first is {next(iter(poses))}")
+    stamps_s, _ = stamps_of_names([Path(key).stem for key in found], folder)
+    invented = stamps_s is None
+    stamps_s = [STEP_S * k for k in range(len(found))] if stamps_s is None else stamps_s
+    order = np.argsort(stamps_s)
+    stamps, keys = np.array(stamps_s)[order], [list(found)[k] for k in order]
+    if np.any(np.diff(stamps) <= 0):
+        raise DatasetError(f"{folder}: two images have one stamp in their names")
+    truth = Trajectory(stamps, np.array([poses[key] for key in keys]))
+    missing = len(poses) - len(found)
+    notes = [f"{path}: a reconstruction has no metric scale unless it was set; its distances are taken as metres"]
+    if invented:
+        notes.append(f"{path}: images have no stamps; one every {STEP_S:g} s was assumed, in the order of their names")
+    if missing:
+        notes.append(f"{folder}: {missing} of {len(poses)} images do not exist and were left out")
+    images = tuple(zip(stamps.tolist(), (found[key] for key in keys), strict=True))
+    if calibration is not None:
+        lens = read_lens(calibration, size_of(images))
+    return Source(path, name, images, lens, truth=truth, notes=tuple(notes))
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    """An image by its name, which instant-ngp writes without suffix."""
+    exact = folder / name
+    if exact.is_file():
+        return exact
+    return next((file for suffix in (".png", ".jpg", ".jpeg") if (file := folder / (name + suffix)).is_file()), None)
+
+
+def read_replica(path: Path) -> Source:
+    """Read a sequence of Replica as SLAM programs render it: `results/frame*.jpg` and 4x4 rows in `traj.txt`.
+
+    Raises:
+        DatasetError: There are not as many poses as images, or `cam_params.json` cannot be read.
+    """
+    files = [file for file in image_files(path / "results") if file.stem.startswith("frame")]
+    stamps_s = [k / REPLICA_RATE_HZ for k in range(len(files))]
+    truth, notes = read_trajectory(path / "traj.txt", "kitti", stamps_s)
+    place = next((p for p in (path / "cam_params.json", path.parent / "cam_params.json") if p.exists()), None)
+    lens = None if place is None else read_lens(place)
+    told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
+    images = tuple(zip(stamps_s, files, strict=True))
+    return Source(path, "replica", images, lens, truth=truth, notes=(told, *notes))

@@ -1,0 +1,142 @@
+"""Stamps in the names of images, as cameras and exporters write them.
+
+All names of a folder are read together: what is the same in every name (a camera's number) says nothing, and the unit
+of a number follows from its size where it counts from 1970, else from its steps. What has two readings is refused with
+both.
+"""
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+
+import numpy as np
+
+from flocc_agent.runtime.columns import UNITS_S
+from flocc_agent.runtime.stamp_units import plausible_units, since_1970
+from flocc_launch.datasets.source import DatasetError
+
+DIGITS_MIN = 9
+"""Shorter numbers only count images."""
+FRACTIONS_S = {3: 1e-3, 6: 1e-6, 9: 1e-9}
+WAY_OUT = "list the images in images.txt with lines 'stamp_s relative/path'"
+
+_DATE = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])[-_.T ]{0,3}"
+    r"([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d|60)(?:[-_.,]?(\d{1,9}))?(?!\d)"
+)
+
+
+def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] | None, str]:
+    """Seconds that names say, in the order of `stems`, and how they were read; None where names only count.
+
+    Args:
+        stems: Names without suffix.
+        folder: Named in a sentence.
+
+    Raises:
+        DatasetError: Names have two readings.
+    """
+    dates = [date_s(stem) for stem in stems]
+    if all(dates):
+        return [moment_s for moment_s in dates if moment_s is not None], "dates, read as UTC"
+    split = [re.findall(r"\d+\.\d+|\d+", stem) for stem in stems]
+    if len({len(numbers) for numbers in split}) != 1 or not split[0]:
+        return _single_long(split, stems, folder)
+    columns = list(zip(*split, strict=True))
+    pair = _seconds_and_fraction(columns, stems, folder)
+    if pair is not None:
+        return pair
+    return _one_number(columns, stems, folder)
+
+
+def date_s(stem: str) -> float | None:
+    """Seconds since 1970 of a date in a text, read as UTC, or None."""
+    found = _DATE.search(stem)
+    if found is None:
+        return None
+    year, month, day, hour, minute, second = (int(found[k]) for k in range(1, 7))
+    try:
+        moment = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC)
+    except ValueError:
+        return None
+    return moment.timestamp() + (float(f"0.{found[7]}") if found[7] else 0.0) + (second == 60)
+
+
+def _varies(column: Sequence[str]) -> bool:
+    return len(set(column)) > 1 or len(column) == 1
+
+
+def _seconds_and_fraction(
+    columns: list[tuple[str, ...]], stems: Sequence[str], folder: object
+) -> tuple[list[float], str] | None:
+    """Stamps of two neighbouring numbers: seconds since 1970, and their fraction in one unit."""
+    for first, second in pairwise(columns):
+        if not all(word.isdigit() and since_1970(float(word)) == "seconds" for word in first):
+            continue
+        widths = {len(word) for word in second}
+        if not all(word.isdigit() for word in second) or not _varies(second) or max(widths) > 9:
+            continue
+        if widths == {max(widths)} and max(widths) in FRACTIONS_S:
+            unit_s = FRACTIONS_S[max(widths)]
+        elif max(widths) == 9:
+            unit_s = 1e-9
+        elif max(widths) > 4:
+            raise DatasetError(
+                f"{folder}: names such as {stems[0]} end in {second[0]}, which can be a fraction of a second or a "
+                f"number of its own; {WAY_OUT}"
+            )
+        else:
+            continue
+        return [int(a) + int(b) * unit_s for a, b in zip(first, second, strict=True)], "seconds and their fraction"
+    return None
+
+
+def _one_number(columns: list[tuple[str, ...]], stems: Sequence[str], folder: object) -> tuple[list[float] | None, str]:
+    decimal = [column for column in columns if all("." in word for word in column) and _varies(column)]
+    if len(decimal) == 1:
+        _check_padding(decimal[0], folder)
+        return [float(word) for word in decimal[0]], "seconds"
+    long = [c for c in columns if all(word.isdigit() and _is_long(word) for word in c) and _varies(c)]
+    if not long:
+        return None, "numbers of images"
+    readings = [_in_unit(column, folder) for column in long]
+    if len(readings) > 1:
+        raise DatasetError(
+            f"{folder}: names such as {stems[0]} hold {len(readings)} stamps, {long[0][0]} and {long[1][0]}; {WAY_OUT}"
+        )
+    return readings[0]
+
+
+def _single_long(split: list[list[str]], stems: Sequence[str], folder: object) -> tuple[list[float] | None, str]:
+    """Stamps of names that are not alike, where each holds one number that is long enough."""
+    found = [[word for word in numbers if "." in word or _is_long(word)] for numbers in split]
+    if not all(len(words) == 1 for words in found):
+        return None, "numbers of images"
+    return _one_number([tuple(words[0] for words in found)], stems, folder)
+
+
+def _is_long(word: str) -> bool:
+    return len(word.lstrip("0")) >= DIGITS_MIN or since_1970(float(word)) is not None
+
+
+def _in_unit(column: Sequence[str], folder: object) -> tuple[list[float], str]:
+    values = np.array([float(word) for word in column])
+    units = plausible_units(np.sort(values))
+    if len(units) != 1:
+        readings = " or ".join(units) or "no unit of time"
+        raise DatasetError(f"{folder}: numbers in names such as {column[0]} can be {readings}; {WAY_OUT}")
+    unit_s = round(1 / UNITS_S[units[0]])
+    return [int(word) / unit_s for word in column], units[0]
+
+
+def _check_padding(words: Sequence[str], folder: object) -> None:
+    """Refuse what looks like seconds and nanoseconds with a point between them, without leading zeros."""
+    fractions = [word.partition(".")[2] for word in words]
+    widths = {len(fraction) for fraction in fractions}
+    if len(widths) > 1 and max(widths) >= 8:
+        digits = f"{min(widths)} to {max(widths)} digits after the point"
+        raise DatasetError(
+            f"{folder}: names such as {words[0]} have {digits}, which can be a fraction of a second, or nanoseconds "
+            f"without leading zeros; {WAY_OUT}"
+        )

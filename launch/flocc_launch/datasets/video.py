@@ -1,0 +1,174 @@
+"""A video file, as a phone writes it: cut into images with the stamps of its frames, counted from its start.
+
+A video says neither where the camera was nor how its lens draws. Both stand beside it: `walk.mp4` with `walk.tum` (or
+`odometry.tum`) and `walk.yaml` (or `camera.yaml`); or they are named.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.datasets.files import camera_file
+from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.pixels import JPEG_QUALITY, ImageWriter
+from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRAJECTORY_SUFFIXES
+from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_launch.datasets.writer import Progress, RecordingWriter
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
+WHAT_ODOMETRY = (
+    "a video has no odometry: give the camera's metric trajectory with --odometry FILE (from a visual-inertial "
+    "odometry, or what the phone's AR software logged), with stamps in seconds from the video's first frame"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Video:
+    """What a video's head says.
+
+    Attributes:
+        frames: How many, as the head says; some cannot be read.
+        rate_hz: Frames a second, on average.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    frames: int
+    rate_hz: float
+    width: int
+    height: int
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a video file, by its suffix."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def videos_in(folder: Path) -> list[Path]:
+    """Video files in a folder."""
+    return sorted(file for file in folder.iterdir() if is_video(file))
+
+
+def read_head(path: Path) -> Video:
+    """Read a video's head.
+
+    Raises:
+        DatasetError: OpenCV cannot read it.
+    """
+    import cv2
+
+    with _opened(path) as video:
+        size = [int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        return Video(max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0), float(video.get(cv2.CAP_PROP_FPS)), *size)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    import cv2
+
+    video = cv2.VideoCapture(str(path))
+    try:
+        if not video.isOpened():
+            raise DatasetError(f"{path}: cannot be read as a video; write it as MP4 with H.264, or as images")
+        yield video
+    finally:
+        video.release()
+
+
+def odometry_beside(path: Path) -> Path | None:
+    """The trajectory of a video: of its own name, or one of the plain names in its folder."""
+    stems = (path.stem, *ODOMETRY_STEMS)
+    names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
+    return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
+
+
+def lens_beside(path: Path, size: tuple[int, int] | None = None) -> Lens | None:
+    """The camera of a video: of its own name, or the folder's; `size` is that of the video."""
+    own = next((path.with_suffix(s) for s in (".toml", ".yaml", ".yml") if path.with_suffix(s).is_file()), None)
+    return camera_file(path.parent, size=size) if own is None else read_lens(own, size)
+
+
+def convert_video(
+    path: Path,
+    out: Path,
+    camera: Path | None = None,
+    odometry: Path | None = None,
+    form: str | None = None,
+    every: int = 1,
+    progress: Progress | None = None,
+) -> tuple[str, ...]:
+    """Write a video as a recording.
+
+    Args:
+        path: The video.
+        out: The recording's folder.
+        camera: Intrinsics; None takes what stands beside the video.
+        odometry: Trajectory; None takes what stands beside the video.
+        form: Of the trajectory.
+        every: Keeps one frame of so many.
+        progress: Called with frames done and frames in all.
+
+    Returns:
+        What was left out, one sentence each.
+
+    Raises:
+        DatasetError: There is no odometry or no intrinsics, or the video cannot be read.
+    """
+    file = odometry or odometry_beside(path)
+    if file is None:
+        raise DatasetError(f"{path}: {WHAT_ODOMETRY}")
+    head = read_head(path)
+    size = (head.width, head.height)
+    lens = lens_beside(path, size) if camera is None else read_lens(camera, size)
+    if lens is None:
+        raise DatasetError(f"{path}: intrinsics are missing; name a camera file with --camera")
+    trajectory, notes = read_trajectory(file, form)
+    if (head.width, head.height) != (lens.camera.width, lens.camera.height):
+        raise DatasetError(
+            f"{path}: frames are {head.width}x{head.height}, but the intrinsics are for "
+            f"{lens.camera.width}x{lens.camera.height}"
+        )
+    _check_clock(path, file, trajectory, head)
+    with RecordingWriter(out, f"video {path.resolve()} every={every} odometry={file}") as writer:
+        images = ImageWriter(lens)
+        writer.write_lens(images.lens)
+        writer.write_trajectories(trajectory.relative_to_first(), None)
+        for number, (stamp_s, encoded) in enumerate(_frames(path, every), start=1):
+            if writer.last_stamp_s is None or stamp_s > writer.last_stamp_s:
+                writer.add(stamp_s, *images.written(encoded, ".jpg"))
+            if progress is not None:
+                progress(number * every, max(head.frames, number * every))
+        if writer.count == 0:
+            raise DatasetError(f"{path}: no frame of it can be read")
+        lost = head.frames // every - writer.count
+    notes = (*notes, *lens.notes)
+    return (*notes, *([f"{path}: {lost} of {head.frames // every} frames could not be read"] if lost > 1 else []))
+
+
+def _check_clock(path: Path, file: Path, trajectory: Trajectory, head: Video) -> None:
+    first_s, last_s = float(trajectory.stamps_s[0]), float(trajectory.stamps_s[-1])
+    duration_s = head.frames / head.rate_hz if head.rate_hz > 0 else float("inf")
+    if first_s > duration_s or last_s < 0:
+        raise DatasetError(
+            f"{file}: the trajectory is from {first_s:.3f} s to {last_s:.3f} s, but {path.name} is from 0 s to "
+            f"{duration_s:.3f} s; stamps count from the video's first frame"
+        )
+
+
+def _frames(path: Path, every: int) -> Iterator[tuple[float, bytes]]:
+    """Stamps and JPEG files of a video's frames."""
+    import cv2
+
+    with _opened(path) as video:
+        number = 0
+        while video.grab():
+            if number % every == 0:
+                stamp_s = float(video.get(cv2.CAP_PROP_POS_MSEC)) * 1e-3
+                found, pixels = video.retrieve()
+                if found:
+                    yield stamp_s, cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+            number += 1

@@ -1,0 +1,70 @@
+"""Stamps in the names of images: what cameras and exporters write is read, and what has two readings refused."""
+
+from collections.abc import Callable
+
+import pytest
+
+from flocc_launch.datasets.source import DatasetError
+from flocc_launch.datasets.stamped_names import stamps_of_names
+
+ZERO_S = 1_700_000_000  # 2023-11-14 22:13:20 UTC
+NS = 10**9
+
+READ: dict[str, tuple[Callable[[int], str], float]] = {
+    "seconds and nanoseconds": (lambda k: f"{ZERO_S}_{k * 10**8:09d}", ZERO_S),
+    "without leading zeros": (lambda k: f"frame_{ZERO_S}-{k * 10**8}", ZERO_S),
+    "seconds and microseconds": (lambda k: f"{ZERO_S}-{k * 10**5:06d}", ZERO_S),
+    "decimal seconds": (lambda k: f"{ZERO_S}.{k:01d}00000", ZERO_S),
+    "a camera's number behind": (lambda k: f"{ZERO_S}.{k:01d}00000_cam0", ZERO_S),
+    "phone": (lambda k: f"PXL_20231114_2213{20000 + 100 * k:05d}", ZERO_S),
+    "ISO with dashes": (lambda k: f"2023-11-14T22-13-20.{k}00000", ZERO_S),
+    "date with microseconds": (lambda k: f"2023-11-14_22-13-20-{k * 10**5:06d}", ZERO_S),
+    "milliseconds": (lambda k: f"{ZERO_S * 1000 + 100 * k}", ZERO_S),
+    "a counter and microseconds": (lambda k: f"{k:04d}_{ZERO_S * 10**6 + 10**5 * k}", ZERO_S),
+    "nanoseconds": (lambda k: f"cam0_{ZERO_S * NS + 10**8 * k}", ZERO_S),
+    "nanoseconds since a start": (lambda k: f"{5000 * NS + 10**8 * k}", 5000.0),
+    "microseconds since a start": (lambda k: f"{5000 * 10**6 + 10**5 * k}", 5000.0),
+    "seconds since a start": (lambda k: f"{0.1 * k:.3f}", 0.0),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_form_is_read(name: str) -> None:
+    written, first_s = READ[name]
+    stamps_s, _ = stamps_of_names([written(k) for k in range(10)], "images")
+    assert stamps_s == pytest.approx([first_s + 0.1 * k for k in range(10)], abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda k: f"{k:010d}",
+        lambda k: f"frame{k:06d}",
+        lambda k: f"DSC_{k:04d}",
+        lambda k: f"GOPR0001_{k:05d}",
+        lambda k: f"{ZERO_S}_{k:04d}",
+        lambda k: "abcdefghij"[k],
+    ],
+)
+def test_numbers_of_images_are_no_stamps(written: Callable[[int], str]) -> None:
+    assert stamps_of_names([written(k) for k in range(10)], "images")[0] is None
+
+
+@pytest.mark.parametrize(
+    ("written", "sentence"),
+    [
+        (
+            lambda k: f"{ZERO_S * NS + k * 10**8}_{ZERO_S * NS + k * 10**8 + 5}",
+            "hold 2 stamps, 1700000000000000000 and",
+        ),
+        (
+            lambda k: f"{ZERO_S}.{k % 10 * 10**8 + 7}",
+            "1 to 9 digits after .* a fraction of a second, or nanoseconds without",
+        ),
+        (lambda k: f"{ZERO_S + k}_{17 + k * 1013 % 90000}", "can be a fraction of a second or a number of its own"),
+        (lambda k: f"{10**10 + 4 * k}", "can be seconds or milliseconds"),
+    ],
+)
+def test_two_readings_are_refused_with_both(written: Callable[[int], str], sentence: str) -> None:
+    with pytest.raises(DatasetError, match=f"images: .*{sentence}.*; list the images in images.txt"):
+        stamps_of_names([written(k) for k in range(60)], "images")
