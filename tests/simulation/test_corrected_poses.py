@@ -3,7 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from flocc_agent.core import corrections
 from flocc_agent.core.corrected import Correction, Corrector
 from flocc_agent.geometry import inverse
 from flocc_agent.runtime.trajectory import Trajectory
@@ -24,7 +26,6 @@ SCENARIO = Scenario.model_validate(
         "keyframes": {"distance_m": 1.0},
         "perception": {"method": "synthetic", "synthetic": {"outlier_probability": 0.0, "alias_probability": 0.0}},
         "simulation": {"optimiser": "quick"},
-        "core": {"rounds": {"correction_keyframes_max": 8}},
     }
 )
 
@@ -38,7 +39,10 @@ def told(swarm: Swarm, name: str) -> Correction:
     return Corrector(station.core).correction(applied, False, station.playback.T_body_camera)
 
 
-def test_poses_of_keyframes_and_times_are_those_of_the_reports_trajectories(tmp_path: Path) -> None:
+def test_poses_of_keyframes_and_times_are_those_of_the_reports_trajectories(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(corrections, "LISTED_MAX", 8)
     swarm = swarm_of(SCENARIO, playbacks_of(SCENARIO, {}), 1)
     folder = RunFolder.create(tmp_path / "run")
     write(folder, swarm, 1, run(swarm))
