@@ -171,3 +171,26 @@ def test_no_two_classes_have_one_name() -> None:
     ]
     assert places_of(classes, CLASSES_TWICE) == {}
     assert CLASSES_TWICE.keys() <= {name for name, _ in classes}, "a name that is allowed twice is not there at all"
+
+
+SHELL = {"asyncio", "zenoh", "rclpy"}
+SHELL_RATIO_MAX = 0.10
+
+
+def imported(path: Path) -> set[str]:
+    """Top names of all that a module imports, also inside of functions."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def test_the_asyncio_and_zenoh_shell_is_a_tenth_of_the_product_at_most() -> None:
+    """Every line of a module counts that imports one of them anywhere."""
+    product = [path for path in product_files() if path.relative_to(ROOT).parts[0] != "lab"]
+    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in product}
+    shell = sum(count for path, count in lines.items() if imported(path) & SHELL)
+    assert shell < SHELL_RATIO_MAX * sum(lines.values()), f"{shell} of {sum(lines.values())} lines"
