@@ -33,13 +33,16 @@ from flocc_agent.core.interfaces import (
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import is_rigid
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver, Skills
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
@@ -162,7 +165,7 @@ class Agent:
         config: AgentConfig,
         camera: Camera | None = None,
         T_body_camera: Float | None = None,
-        on_line: Callable[[dict[str, Any]], None] | None = None,
+        on_report: Callable[[Reported[Fact]], None] | None = None,
         clock_s: Callable[[], float] | None = None,
     ) -> None:
         """Prepare an agent; `async with` starts it.
@@ -171,7 +174,7 @@ class Agent:
             config: Everything that can be turned.
             camera: Intrinsics of the images; None where a recording brings its own.
             T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
-            on_line: Takes each event as a dictionary (see docs/report.md); must not block.
+            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
             clock_s: Seconds since the start of the run; None counts from now.
 
         Raises:
@@ -179,7 +182,7 @@ class Agent:
         """
         started_s = time.monotonic()
         self.config = config
-        self._on_line = on_line or (lambda _: None)
+        self._on_report = on_report or (lambda _: None)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._recording = _recording(config)
         self._camera = self._recording.camera if self._recording else camera
@@ -254,9 +257,15 @@ class Agent:
         await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
         self._kept = True
 
-    async def add_frame(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> bool:
-        """Give the agent any frame; it becomes a keyframe when the robot moved enough. Returns whether it did."""
-        if not self._selector.wants(T_odom_body):
+    async def add_frame(
+        self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float, keep: bool = False
+    ) -> bool:
+        """Give the agent any frame; it becomes a keyframe when the robot moved enough, or where `keep` says so.
+
+        Returns:
+            Whether it became one; `keep` what something was seen in.
+        """
+        if not keep and not self._selector.wants(T_odom_body):
             self._kept = False
             return False
         await self.add_keyframe(pixels, T_odom_body, stamp_s)
@@ -399,7 +408,7 @@ class Agent:
                 perception.encode_s,
             ),
             Reporter(config.name, self._T_body_camera, config.backend.steepness),
-            self._on_line,
+            self._on_report,
             self._clock_s,
         )
 
@@ -434,13 +443,17 @@ class Agent:
         async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
-        await play(recording, source, self._selector, add, self._clock_s, self._on_position, resumed)
+        def measure(stamped: Stamped, frame_s: float) -> None:
+            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 
-        def report(event: str, fields: dict[str, Any]) -> None:
-            self._on_line({"t": round(self._clock_s(), 6), "robot": self.config.name, "event": event, **fields})
+        def report(fact: Fact) -> None:
+            self._on_report(Reported(self._clock_s(), self.config.name, fact))
 
         host = Host(
             lambda *keyframe: self._started.add_keyframe(*keyframe),

@@ -16,6 +16,7 @@ from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
+from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
 from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
@@ -113,9 +114,9 @@ class Corrections:
         if held is not None and (message.term, message.round) <= (held.term, held.round):
             return []
         if held is None and len(self._newest) >= self._gossip.logs_max:
-            return [Report("peer_refused", {"peer": peer, "reason": "too many corrections"})]
+            return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
-            return [Report("peer_refused", {"peer": peer, "reason": "correction without its leader's signature"})]
+            return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
@@ -154,8 +155,8 @@ class Corrections:
             try:
                 message = correction_of(component, log, term, round_number, LISTED_MAX)
             except ValueError as error:
-                facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
-                effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
+                reason = f"robot {log.robot}: {error}"
+                effects.append(Report(RoundFailed(term=term, round=round_number, reason=reason)))
                 continue
             if self._changed(message):
                 message = self._signed(message)
@@ -189,15 +190,15 @@ class Corrections:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
         correction = delivered(message, changed)
-        facts = {
-            "term": message.term.counter,
-            "leader": message.term.leader.robot,
-            "round": message.round,
-            "map_frame": correction.map_frame,
-            "frame_changed": correction.frame_changed,
-            "T_map_odom": [float(x) for x in message.T_map_odom],
-        }
-        return [PersistCorrection(message, changed), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
+        fact = CorrectionApplied(
+            term=message.term.counter,
+            leader=message.term.leader.robot,
+            round=message.round,
+            map_frame=correction.map_frame,
+            frame_changed=correction.frame_changed,
+            T_map_odom=message.T_map_odom,
+        )
+        return [PersistCorrection(message, changed), Deliver(correction), Report(fact)]
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:

@@ -13,6 +13,7 @@ from enum import Enum
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
 from flocc_agent.core.parameters import ElectionParameters
+from flocc_agent.core.reports import LeaderFollowed, LeaderLost, PeerRefused
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
 from flocc_protocol.messages import (
     COUNTER_MAX,
@@ -243,7 +244,7 @@ class LeaderElection:
         self._lost[self._leader.term] = self._leader.beat if beat is None else beat
         while len(self._lost) > LOST_MAX:
             del self._lost[min(self._lost)]
-        report = Report("leader_lost", {"term": str(self._leader.term), "reason": why})
+        report = Report(LeaderLost(term=self._leader.term, reason=why))
         self._leader = None
         return [report, *self._start(now)]
 
@@ -290,8 +291,8 @@ class LeaderElection:
 
 
 def _leader_report(term: Term) -> Report:
-    return Report("leader", {"term": term.counter, "leader": term.leader.robot, "leader_log": str(term.leader)})
+    return Report(LeaderFollowed(term=term.counter, leader=term.leader.robot, leader_log=term.leader))
 
 
 def _refused(sender: LogId, reason: str) -> Report:
-    return Report("peer_refused", {"peer": sender.robot, "reason": reason})
+    return Report(PeerRefused(peer=sender.robot, reason=reason))

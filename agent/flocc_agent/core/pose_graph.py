@@ -236,10 +236,19 @@ class OptimisationFailed:
     reason: str
 
 
+class LandmarkLog(LogId):
+    """What stands for a log where a landmark is: its name is none that a robot may have."""
+
+    __slots__ = ()
+
+    def __new__(cls, robot: str, incarnation: int = 0) -> "LandmarkLog":
+        """Take any name."""
+        return tuple.__new__(cls, (robot, incarnation))
+
+
 def landmark(name: str) -> KeyframeId:
     """A landmark, which is in the graph what a robot with one keyframe would be."""
-    log: LogId = tuple.__new__(LogId, (LANDMARK + name, 0))
-    return KeyframeId(log, 0)
+    return KeyframeId(LandmarkLog(LANDMARK + name), 0)
 
 
 def is_landmark(log: LogId) -> bool:

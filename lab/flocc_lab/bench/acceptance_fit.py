@@ -12,18 +12,24 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.core.registration import match_ratio
-from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, Needed, Neighbour
+from flocc_agent.perception.multiview.acceptance import (
+    RATIO_CORRESPONDENCES_MIN,
+    Acceptance,
+    Evidence,
+    Needed,
+    Neighbour,
+)
 from flocc_lab.bench.acceptance_rows import ANGLES_DEG, Row
 
 ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 10_000)
 AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, 10_000)
-CELLS = (0, 4, 6, 8, 10, 12, 15)
+SIGMAS_DEG = (0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.7)
 WRONG_COST = 50
 """Right pairs that one wrong pair outweighs in the fit: at most 2 % wrong among the pairs that a step adds."""
-MARGIN = 1.2
-"""A wrong pair counts with this many times its correspondences: another scene's may have more."""
+MARGIN = 1.35
+"""A wrong pair counts with this many times its correspondences and certainty: another scene's may have more."""
+RATIOS = (0.2, 0.25, 0.3, 0.4, 0.5, 10.0)
 RATIO_MIN = 0.3
-CORRESPONDENCES_MIN = 20
 """The paper's rule, for comparison."""
 
 
@@ -38,24 +44,41 @@ class Kept:
 
 
 def fitted(rows: Sequence[Row]) -> Acceptance:
-    """The rule that fits these rows, each kind by itself."""
+    """The rule that fits these rows: the ratio first, then each kind of what it leaves."""
+    posed = [(row, row.evidence) for row in rows if row.evidence is not None]
+    ratio_min = max(RATIOS, key=lambda ratio: (ratio_score(rows, ratio), ratio))
     with_scale, without_scale = (
-        best_needed([row for row in rows if row.evidence is not None and row.evidence.has_scale is has_scale])
+        best_needed([row for row, e in posed if e.has_scale is has_scale and not has_ratio(row, ratio_min)])
         for has_scale in (True, False)
     )
-    return Acceptance(with_scale, without_scale)
+    return Acceptance(with_scale, without_scale, ratio_min)
+
+
+def ratio_score(rows: Sequence[Row], ratio_min: float) -> int:
+    """Right pairs that a threshold of Eq. (1) keeps, less what the wrong ones cost."""
+    right = sum(row.is_right and has_ratio(row, ratio_min) for row in rows)
+    return right - WRONG_COST * sum(not row.is_right and has_ratio(row, ratio_min / MARGIN) for row in rows)
+
+
+def has_ratio(row: Row, ratio_min: float) -> bool:
+    """Whether the paper's rule accepts a pair with this threshold."""
+    ratio = match_ratio(row.correspondences, row.odometry_correspondences)
+    return row.evidence is not None and row.correspondences >= RATIO_CORRESPONDENCES_MIN and ratio >= ratio_min
 
 
 def best_needed(rows: Sequence[Row]) -> Needed:
     """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
     table = Table(rows)
-    scored = [(table.score(needed), needed.alone, needed.agreeing, needed.cells, needed) for needed in choices()]
+    scored = [
+        (table.score(needed), needed.alone, needed.agreeing, -needed.rotation_sigma_max_rad, needed)
+        for needed in choices()
+    ]
     return max(scored, key=lambda entry: entry[:4])[4]
 
 
 def choices() -> Iterator[Needed]:
     """All rules that are tried."""
-    return (Needed(a, g, c) for a in ALONE for g in AGREEING if g <= a for c in CELLS)
+    return (Needed(a, g, float(np.radians(s))) for a in ALONE for g in AGREEING if g <= a for s in SIGMAS_DEG)
 
 
 class Table:
@@ -66,13 +89,13 @@ class Table:
         self._right = np.array([row.is_right for row in rows], bool)
         factor = np.where(self._right, 1.0, MARGIN)
         self._count = np.array([e.correspondences for e in evidence]) * factor
-        self._cells = np.array([e.cells for e in evidence]) * factor
+        self._sigma_rad = np.array([e.rotation_sigma_rad for e in evidence]) / factor
         self._agrees = np.array([e.neighbour is Neighbour.AGREES for e in evidence], bool)
 
     def score(self, needed: Needed) -> int:
         """Right pairs kept, less what the wrong ones cost."""
         least = np.where(self._agrees, needed.agreeing, needed.alone)
-        kept = (self._count >= least) & (self._cells >= needed.cells)
+        kept = (self._count >= least) & (self._sigma_rad <= needed.rotation_sigma_max_rad)
         return int((kept & self._right).sum()) - WRONG_COST * int((kept & ~self._right).sum())
 
 
@@ -88,8 +111,7 @@ def accepts(row: Row, rule: Acceptance | None) -> bool:
     if row.evidence is None:
         return False
     if rule is None:
-        ratio = match_ratio(row.correspondences, row.odometry_correspondences)
-        return row.correspondences >= CORRESPONDENCES_MIN and ratio >= RATIO_MIN
+        return has_ratio(row, RATIO_MIN)
     return rule.accepts(heard(row.evidence, rule))
 
 
@@ -117,7 +139,11 @@ def report(rows: Sequence[Row]) -> dict[str, Any]:
     rule = fitted(rows)
     left_out = leave_one_out(rows)
     return {
-        "rule": {"with_scale": _plain(rule.with_scale), "without_scale": _plain(rule.without_scale)},
+        "rule": {
+            "with_scale": _plain(rule.with_scale),
+            "without_scale": _plain(rule.without_scale),
+            "match_ratio_min": rule.match_ratio_min,
+        },
         "pairs": len(rows),
         "scenes": {
             name: {
@@ -140,7 +166,7 @@ def report(rows: Sequence[Row]) -> dict[str, Any]:
 def text(name: str, found: dict[str, Any]) -> str:
     """A report as lines for people: right/wrong of possible."""
     lines = [f"{name}: {found['pairs']} pairs; with scale {found['rule']['with_scale']}"]
-    lines.append(f"  without scale {found['rule']['without_scale']}")
+    lines.append(f"  without scale {found['rule']['without_scale']}, ratio {found['rule']['match_ratio_min']}")
     totals = {key: [0, 0, 0] for key in ("by_ratio", "fitted", "left_out")}
     for scene, entry in found["scenes"].items():
         shown = []
@@ -156,5 +182,5 @@ def text(name: str, found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _plain(value: Needed | Kept) -> dict[str, int]:
+def _plain(value: Needed | Kept) -> dict[str, Any]:
     return {name: getattr(value, name) for name in value.__slots__}

@@ -1,6 +1,7 @@
 """What `flocc dataset info | convert | split` do: look at a data set, turn it into recordings, cut it into robots."""
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
+from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
@@ -160,6 +162,7 @@ def convert(
     every: int = 1,
     jpeg: bool = False,
     form: str | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -178,6 +181,7 @@ def convert(
         every: Of a bag, keeps one image of so many.
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -189,7 +193,7 @@ def convert(
     if is_bag(path):
         options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg, form=form)
         return convert_bag(path, out, options, progress)
-    source = read_source(path, format_name, camera, form if odometry is None else None)
+    source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
     _tell(source)
     identity = _identity("convert", path, source, drift, seed)
     given = None if odometry is None else _given_odometry(source, odometry, form)
@@ -210,6 +214,7 @@ def split(
     format_name: str | None = None,
     camera: Path | None = None,
     form: str | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Cut one data set by time into recordings of several robots, which then run at the same time.
@@ -227,6 +232,7 @@ def split(
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -235,7 +241,7 @@ def split(
     Raises:
         DatasetError: Nothing can be used, there are fewer images than robots, or a part was bad; the good one is kept.
     """
-    source = read_source(path, format_name, camera, form)
+    source = _viewed(read_source(path, format_name, camera, form), view_deg)
     _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
@@ -249,6 +255,13 @@ def split(
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
+
+
+def _viewed(source: Source, view_deg: float | None) -> Source:
+    """The source with the field of view that is wanted of its lens."""
+    if view_deg is None or source.lens is None:
+        return source
+    return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
 
 
 def needed_drift(source: Source) -> DriftSpec | None:
@@ -290,4 +303,7 @@ def _complain(source: Source, out: Path, count: int) -> None:
 
 def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None, seed: int) -> str:
     errors = drift.model_dump_json() if drift is not None else "default"
-    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}"
+    lens, changed = source.lens, ""
+    if lens is not None and (lens.camera.agent_camera() is None or source.levels != FULL):
+        changed = f" of {lens.camera} view={lens.view_rad} {source.levels}"
+    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}{changed}"

@@ -16,6 +16,7 @@ from flocc_agent.core.effects import (
 )
 from flocc_agent.core.gossip import decoded
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
+from flocc_agent.core.reports import NeighbourDown, NeighbourUp
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.invariants import Invariant, Step, core
 from flocc_launch.simulation.virtual_robot import Station
@@ -130,8 +131,8 @@ class Once:
             match effect:
                 case PersistRecord(log, number, data):
                     self._note_record(log, number, decoded(data)[0])
-                case Report("neighbour_up" | "neighbour_down", fields):
-                    self._changed_s[step.station.name, str(fields["peer"])] = step.at_s
+                case Report(NeighbourUp() | NeighbourDown() as changed):
+                    self._changed_s[step.station.name, changed.peer] = step.at_s
                 case Register(pair):
                     yield from self._registers(step, pair)
 

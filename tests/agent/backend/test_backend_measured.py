@@ -1,5 +1,6 @@
 """Claims on measured factors: they correct, join maps where they fix all that is open, and wrong ones are named."""
 
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -261,6 +262,14 @@ def test_a_metric_closure_joins_and_is_weighed() -> None:
     solution = solved(graph([R1, R2], [MeasuredFactor("closure", at, at, match, T_match, TIGHT)]))
     assert groups(solution) == [["r1", "r2"]]
     assert joint_error_m(solution) < 0.01
+
+
+def test_a_graph_with_landmarks_is_sent_to_a_worker_and_back() -> None:
+    given = graph([R1, R2], [sighting(R1, 15, TAG), sighting(R2, 3, TAG)])
+    sent = pickle.loads(pickle.dumps(given))  # our own bytes
+    solution = pickle.loads(pickle.dumps(solved(sent)))
+    assert groups(solution) == [["r1", "r2"]]
+    assert solution.measured[0].factor.match == given.measured[0].match
 
 
 def test_points_on_a_line_do_not_fix_a_rotation() -> None:

@@ -19,6 +19,7 @@ from flocc_agent.core.measurements import (
     StartPose,
     TagSighting,
 )
+from flocc_agent.core.reports import MeasurementRefused
 from flocc_agent.geometry import Float, inverse, pose, se3_exp, se3_log, so3_exp
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
@@ -99,7 +100,7 @@ def test_what_belongs_to_no_keyframe_is_refused_with_a_reason() -> None:
     robots.capture("r1", 0.0, look=0)
     robots.run(1.0)
     robots.put("r1", Measured(OdometryCovariance(np.eye(6)), 0))
-    reasons = [report.fields["reason"] for report in robots.reports("r1", "measurement_refused")]
+    reasons = [refused.reason for refused in robots.facts("r1", MeasurementRefused)]
     assert reasons == ["there is no such keyframe", "odometry: the first keyframe has no edge before it"]
 
 
@@ -118,8 +119,8 @@ def test_as_many_measurements_wait_for_a_keyframe_as_the_limit_says() -> None:
     robots.capture("r1", 0.0, look=0)
     for _ in range(WAITING_MAX + 1):
         robots.put("r1", Measured(fix(0.0), 0))
-    (report,) = robots.reports("r1", "measurement_refused")
-    assert report.fields["reason"] == f"{WAITING_MAX} others wait for this keyframe"
+    (refused,) = robots.facts("r1", MeasurementRefused)
+    assert refused.reason == f"{WAITING_MAX} others wait for this keyframe"
     held, most = robots.cores["r1"].sizes()["measurements"]
     assert held == most == WAITING_MAX
 

@@ -12,7 +12,9 @@ from flocc_agent.perception.multiview.registrar import PairRegistrar
 
 DISTANCE_RATIO_MAX = 0.8
 """Lowe's ratio, as in his paper: lower keeps fewer and surer matches."""
-ACCEPTANCE = Acceptance(Needed(20, 15, 5), Needed(60, 30, 8))
+ROTATION_SIGMA_MAX_RAD = 0.007
+ACCEPTANCE = Acceptance(Needed(30, 15, ROTATION_SIGMA_MAX_RAD), Needed(60, 30, ROTATION_SIGMA_MAX_RAD), 0.4)
+"""Fitted on all scenes together: docs/classical.md has the command and what it keeps of scenes that were left out."""
 
 
 def classical_registrar(config: ClassicalConfig) -> PairRegistrar[Features]:

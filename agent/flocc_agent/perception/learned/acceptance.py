@@ -5,6 +5,6 @@ from flocc_agent.perception.multiview.parameters import Geometry
 
 GEOMETRY = Geometry()
 ACCEPTANCE = {
-    "aliked-lightglue": Acceptance(Needed(40, 20, 6), Needed(80, 30, 8)),
-    "xfeat-lighterglue": Acceptance(Needed(40, 20, 6), Needed(80, 30, 8)),
+    "aliked-lightglue": Acceptance(Needed(40, 20, 0.017), Needed(80, 30, 0.017), 0.3),
+    "xfeat-lighterglue": Acceptance(Needed(40, 20, 0.017), Needed(80, 30, 0.017), 0.3),
 }

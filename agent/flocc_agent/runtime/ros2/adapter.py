@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
@@ -66,13 +67,13 @@ class Host:
         add_keyframe: Takes (image, T_odom_camera, stamp_s); may wait.
         mount_camera: Told `T_body_camera` once it is known, before the first keyframe.
         trajectory: Gives stamps (s) and (N, 4, 4) corrected body poses of all keyframes; called off the loop's thread.
-        report: Takes an event and its fields.
+        report: Takes facts for people.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
     mount_camera: Callable[[Float], None]
     trajectory: Callable[[], tuple[list[float], Float]]
-    report: Callable[[str, dict[str, Any]], None]
+    report: Callable[[Fact], None]
 
 
 class Ros2Adapter:
@@ -262,7 +263,7 @@ class Ros2Adapter:
             waited_s += WATCH_PERIOD_S
             if self._session.is_connected() != connected:
                 connected = not connected
-                self._host.report("ros2_router", {"router": self._config.router, "connected": connected})
+                self._host.report(RouterConnected(router=self._config.router, connected=connected))
                 logger.info("ROS 2: %s to %s", "connected" if connected else "no longer connected", self._config.router)
             if waited_s == PATIENCE_S and not connected:
                 self._complain("router", f"nobody answers at {self._config.router}; is rmw_zenohd running?")
