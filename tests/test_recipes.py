@@ -42,6 +42,7 @@ import sys
 from flocc_agent.core.effects import Report
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.reports import PeerPauses
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.zenoh_transport import PRIORITY
 from flocc_protocol.ids import LogId
@@ -53,7 +54,7 @@ envelope = Envelope(LogId("r2"), Pause(3.0))
 assert decode(encode(envelope)) == envelope
 assert set(PRIORITY) == set(MESSAGE_KINDS) == {kind.value for kind in Kind}
 effects = Robot(LogId("r1"), 0, 1, CoreParameters(), 0.0).handle(MessageReceived(envelope), 1.0)
-assert Report("peer_pauses", {"peer": "r2", "seconds": 3.0}) in effects
+assert Report(PeerPauses(peer="r2", seconds=3.0)) in effects
 sys.stdout.write("done")
 """
 

@@ -20,8 +20,9 @@ from flocc_lab.reference.scenario_page import keys
 from flocc_launch.scenarios.scenario import Scenario
 
 AGENT_KEYS_MAX = 120
-BOTH_KEYS_MAX = 165
-"""The issue's limit is on the agent's; a scenario's own say what data there are, what goes wrong and what is hoped."""
+BOTH_KEYS_MAX = 180
+"""The limit is on the agent's; a scenario's own (44 at 04961b5, and 16 of simulated sensors) say what data there
+are, what goes wrong and what is hoped."""
 ROW = re.compile(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$")
 
 
