@@ -28,7 +28,7 @@ NEVER = 100_000
 """More correspondences than any picture has features."""
 
 
-class Neighbour(Enum):
+class OdometryNeighbour(Enum):
     """What the query's neighbour says of the pair."""
 
     NOT_ASKED = "not asked"
@@ -54,7 +54,7 @@ class Evidence:
     match_ratio: float
     has_scale: bool
     rotation_sigma_rad: float
-    neighbour: Neighbour = Neighbour.NOT_ASKED
+    neighbour: OdometryNeighbour = OdometryNeighbour.NOT_ASKED
     neighbour_correspondences: int = 0
 
 
@@ -111,7 +111,7 @@ class Acceptance:
     def ratio(self, evidence: Evidence) -> float:
         """Evidence over what suffices: Eq. (1) over its threshold, or correspondences over those needed."""
         needed = self.needed(evidence)
-        enough = needed.agreeing if evidence.neighbour is Neighbour.AGREES else needed.alone
+        enough = needed.agreeing if evidence.neighbour is OdometryNeighbour.AGREES else needed.alone
         is_certain = evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
         by_count = evidence.correspondences / enough if is_certain else 0.0
         by_ratio = evidence.match_ratio / self.match_ratio_min if self.has_ratio(evidence) else 0.0
@@ -152,9 +152,9 @@ def evidence_of_neighbour(
         T_neighbour_query: (4, 4) from odometry, metres.
     """
     if isinstance(neighbour_pair, int):
-        return replace(evidence, neighbour=Neighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
+        return replace(evidence, neighbour=OdometryNeighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
     agrees = agree(inverse(neighbour_pair.view.T_view_query), result, T_neighbour_query)
-    word = Neighbour.AGREES if agrees else Neighbour.CONTRADICTS
+    word = OdometryNeighbour.AGREES if agrees else OdometryNeighbour.CONTRADICTS
     return replace(evidence, neighbour=word, neighbour_correspondences=neighbour_pair.correspondences)
 
 
