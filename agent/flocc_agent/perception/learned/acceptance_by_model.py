@@ -1,4 +1,6 @@
-"""What a closure of learned features needs, by model; docs/learned.md has the scenes, the fit and what it keeps.
+"""What a closure of learned features needs, by model; docs/learned.md has the scenes and what is kept of them.
+
+XFeat's numbers are fitted, ALIKED's set by hand, about as strict.
 
 Their wrong pairs have as many correspondences as right ones (repeated facades, the other side of a street), but the
 odometry neighbour contradicts them, so it is asked nearly always.
