@@ -30,6 +30,7 @@ from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
+from flocc_agent.runtime.facts import KilledByOrder
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
@@ -341,6 +342,7 @@ class Agent:
         if order.kind == "slow" and order.value is not None:
             self.set_slowness(order.value)
         if order.kind == "kill":
+            self._on_report(Reported(self._clock_s(), self.config.name, KilledByOrder()))
             asyncio.get_running_loop().call_later(KILL_AFTER_S, os.kill, os.getpid(), signal.SIGKILL)
         return b"done"
 

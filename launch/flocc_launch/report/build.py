@@ -22,7 +22,15 @@ from flocc_launch.report.model import (
     TrackError,
 )
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
+from flocc_launch.runs.timeline import (
+    corrections_of,
+    deaths_unasked,
+    ends,
+    how_it_died,
+    leader_changes,
+    merged_after_s,
+    terms_led,
+)
 from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.runs.version import flocc_version
@@ -68,6 +76,7 @@ def build(loaded: LoadedRun) -> RunReport:
         optimisations=optimisations_part(loaded),
         expectations=[],
         robot_details=robots,
+        deaths_unasked=deaths_unasked(loaded.events),
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
@@ -250,5 +259,6 @@ def measured(report: RunReport, registered: Mapping[str, int]) -> dict[str, floa
         "bytes_max": sum(report.bytes.values()),
         "wall_max_s": report.wall_s,
         "leader": leader,
+        "deaths_max": len(report.deaths_unasked),
         "leader_registered_ratio_min": None if leader is None or not closures else registered.get(leader, 0) / closures,
     }

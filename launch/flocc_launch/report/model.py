@@ -185,4 +185,6 @@ class RunReport(Record):
     optimisations: Optimisations
     expectations: list[Expectation]
     robot_details: list[RobotReport]
+    deaths_unasked: list[str] = Field(default_factory=list)
+    """Robots whose agents died without a fault of the scenario or an operator's order, once for each death."""
     warnings: list[str]

@@ -139,6 +139,7 @@ class _Launch:
         self._radio = scenario.links()
         self._faults = sorted(scenario.faults, key=lambda fault: fault.at_s)
         self._interrupted = False
+        self._killed: set[str] = set()
         self._changed_s = 0.0
         self._seen: dict[str, Any] = {}
         self._watch = Watch(scenario, self._agents())
@@ -232,6 +233,7 @@ class _Launch:
         match fault.kind:
             case FaultKind.KILL:
                 for agent in concerned:
+                    self._killed.add(agent.name)
                     agent.kill()
                     await agent.wait(STOP_NOW_S)
             case FaultKind.RESTART:
@@ -269,7 +271,10 @@ class _Launch:
                 continue
             agent.asked = True
             code = agent.exit_code
-            death = AgentDied(signal=-code) if code < 0 else AgentDied(exit_code=code)
+            scripted = agent.name in self._killed
+            self._killed.discard(agent.name)
+            signal_number, exit_code = (-code, None) if code < 0 else (None, code)
+            death = AgentDied(signal=signal_number, exit_code=exit_code, scripted=scripted)
             self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
