@@ -154,12 +154,6 @@ def places_of(names: Iterable[tuple[str, Path]], allowed: Mapping[str, str]) -> 
 FILES_TWICE = {"__init__.py": "Python's", "__main__.py": "Python's"}
 CLASSES_TWICE = {
     "Trajectory": "of a log in a pose graph, and of stamped poses in a file: the word of the field for both",
-    "Report": "the core's fact until it is typed, and the report of a run",
-    "Robot": "the core, and a robot's part of the report",
-    "GraphOptimised": "the core's event, and what the run folder keeps of it",
-    "KeyframeCaptured": "the same",
-    "LatentFetched": "the same",
-    "OptimisationFailed": "the same",
 }
 """Names that may stand twice, and why; take one out when its reason is gone."""
 
@@ -177,3 +171,26 @@ def test_no_two_classes_have_one_name() -> None:
     ]
     assert places_of(classes, CLASSES_TWICE) == {}
     assert CLASSES_TWICE.keys() <= {name for name, _ in classes}, "a name that is allowed twice is not there at all"
+
+
+SHELL = {"asyncio", "zenoh", "rclpy"}
+SHELL_RATIO_MAX = 0.10
+
+
+def imported(path: Path) -> set[str]:
+    """Top names of all that a module imports, also inside of functions."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def test_the_asyncio_and_zenoh_shell_is_a_tenth_of_the_product_at_most() -> None:
+    """Every line of a module counts that imports one of them anywhere."""
+    product = [path for path in product_files() if path.relative_to(ROOT).parts[0] != "lab"]
+    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in product}
+    shell = sum(count for path, count in lines.items() if imported(path) & SHELL)
+    assert shell < SHELL_RATIO_MAX * sum(lines.values()), f"{shell} of {sum(lines.values())} lines"

@@ -147,7 +147,7 @@ def test_a_report_touches_two_files_as_the_recipe_says(tmp_path: Path) -> None:
 
 def test_the_front_end_of_the_recipe_is_chosen_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", recipe("Add a front end"), re.DOTALL)
-    (entry,) = re.findall(r'\[project.entry-points."flocc.perception"\]\n(\w+) = "([\w:]+)"', recipe("Add a front end"))
+    (entry,) = re.findall(r'"flocc.perception"\]\n\s*(\w+) = "([\w:]+)"', recipe("Add a front end"))
     (tmp_path / "grey_eyes.py").write_text(code, encoding="utf-8")
     install(tmp_path, *entry)
     monkeypatch.syspath_prepend(tmp_path)

@@ -36,7 +36,7 @@ from flocc_protocol.records import (
 Float = NDArray[np.float64]
 
 
-class Track(Protocol):
+class OdometryTrack(Protocol):
     """One log's odometry, as far as factors need it."""
 
     def stamp_s(self, index: int) -> float:
@@ -59,7 +59,7 @@ class Waiting(NamedTuple):
     stamp_s: float
 
 
-Tracks = Mapping[LogId, Track]
+Tracks = Mapping[LogId, OdometryTrack]
 Made = MeasuredFactor | Waiting | None
 
 

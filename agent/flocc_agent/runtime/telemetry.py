@@ -1,4 +1,4 @@
-"""What an agent tells of itself while it runs: its status, figures for a scrape, and lines of `events.jsonl`."""
+"""What an agent tells of itself while it runs: its status, figures for a scrape, and what it reports."""
 
 import logging
 from collections.abc import Callable, Mapping
