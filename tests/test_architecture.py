@@ -154,7 +154,6 @@ def places_of(names: Iterable[tuple[str, Path]], allowed: Mapping[str, str]) -> 
 FILES_TWICE = {"__init__.py": "Python's", "__main__.py": "Python's"}
 CLASSES_TWICE = {
     "Trajectory": "of a log in a pose graph, and of stamped poses in a file: the word of the field for both",
-    "Report": "the core's effect that tells a fact, and the report of a run",
 }
 """Names that may stand twice, and why; take one out when its reason is gone."""
 

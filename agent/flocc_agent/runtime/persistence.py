@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterable
+from typing import assert_never
 
 from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.robot import Restored
@@ -90,6 +91,8 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
                     store.put_fact(FRAME_CHANGED, b"0")
             case PersistRecord():
                 pass
+            case _:
+                assert_never(effect)
 
 
 def restore(store: Store) -> Restored:

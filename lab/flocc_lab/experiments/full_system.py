@@ -32,7 +32,7 @@ from flocc_lab.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_lab.experiments.rbcd_run import optimise_together
 from flocc_lab.experiments.statistics import grouped, middle, values, with_spread
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.recordings import cache_folder
 from flocc_launch.scenarios.scenario import Scenario
@@ -93,7 +93,7 @@ def measure(settings: FullSystemSettings, cell: Cell, seed: int) -> Row:
     }
 
 
-def simulated_with_graph(scenario: Scenario, seed: int, recordings: dict[str, Path]) -> tuple[Report, PoseGraph]:
+def simulated_with_graph(scenario: Scenario, seed: int, recordings: dict[str, Path]) -> tuple[RunReport, PoseGraph]:
     """Run a scenario on virtual time; its report, and the pose graph of the first robot's logs at the end."""
     with TemporaryDirectory(prefix="flocc-experiment-") as folder:
         out = RunFolder.create(Path(folder) / "run")

@@ -11,7 +11,7 @@ from flocc_launch.report.svg import PALETTE_SIZE, Axis, element, nice_step, path
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import number
-from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import alignment
 from flocc_protocol.ids import KeyframeId
 
@@ -94,7 +94,7 @@ def in_map(loaded: LoadedRun, frame: str) -> list[MapScene]:
     ]
 
 
-def from_corrected_start(track: Track) -> Float:
+def from_corrected_start(track: RobotTrack) -> Float:
     """Odometry positions (N, 3) in the map frame, put at the first corrected pose."""
     if not track.corrected.any():
         return np.full((len(track), 3), np.nan)

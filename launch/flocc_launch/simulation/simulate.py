@@ -21,7 +21,7 @@ from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
 from flocc_agent.stages import counts_of
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RobotResult, Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.scenario import Scenario
@@ -45,7 +45,7 @@ def simulate(
     seed: int | None = None,
     recordings: Mapping[str, Path] | None = None,
     cache: Path | None = None,
-) -> Report:
+) -> RunReport:
     """Run a scenario on virtual time.
 
     Args:

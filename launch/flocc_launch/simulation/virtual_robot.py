@@ -6,6 +6,7 @@ memory is gone: answers of workers and links that belong to an earlier life are 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import assert_never
 
 from flocc_agent.core.effects import (
     Broadcast,
@@ -262,3 +263,5 @@ class Station:
                 self.disk.correction, self.disk.frame_changed = correction, frame_changed
             case Deliver() | Report():
                 pass
+            case _:
+                assert_never(effect)
