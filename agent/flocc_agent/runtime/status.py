@@ -76,3 +76,46 @@ class AgentStatus(BaseModel):
     busy: bool = False
     playing: bool = False
     disk_failure: str | None = None
+
+
+class PairStatus(BaseModel):
+    """What came of pairs of keyframes of two robots, as one robot's logs tell."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    robots: tuple[str, str]
+    accepted: int = 0
+    rejected: int = 0
+    best_ratio: float | None = None
+    reason: str | None = None
+
+
+class SolverStatus(BaseModel):
+    """What the last solution that a robot made used and warned of."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    components: list[list[str]] = []
+    closures_used: int = 0
+    closures_rejected: int = 0
+    warnings: list[str] = []
+
+
+class MergeEvidence(BaseModel):
+    """What one robot can tell of maps that have not merged.
+
+    Attributes:
+        best_similarities: Robot -> best cosine similarity of any of its keyframes with one of this robot's.
+        similarity_threshold: What a candidate needs.
+        match_ratio_threshold: What a closure needs, R_thr.
+        pairs: What came of pairs of keyframes, by pair of robots.
+        solver: What its last solution said, None where it made none.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    best_similarities: dict[str, float] = {}
+    similarity_threshold: float
+    match_ratio_threshold: float
+    pairs: tuple[PairStatus, ...] = ()
+    solver: SolverStatus | None = None

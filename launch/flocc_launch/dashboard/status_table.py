@@ -14,6 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.status import PairStatus, SolverStatus
 from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.snapshot import RobotView
 from flocc_launch.runs.run_folder import RunFolder
@@ -25,29 +26,6 @@ LEFT = frozenset({"robot", "state", "leader", "map frame", "hears"})
 
 class StatusError(FloccError):
     """Nobody answered; one sentence says who was asked."""
-
-
-class PairStatus(BaseModel):
-    """What came of pairs of keyframes of two robots, as one robot's logs tell."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    robots: tuple[str, str]
-    accepted: int = 0
-    rejected: int = 0
-    best_ratio: float | None = None
-    reason: str | None = None
-
-
-class SolverStatus(BaseModel):
-    """What the last solution that a robot made used and warned of."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    components: list[list[str]] = []
-    closures_used: int = 0
-    closures_rejected: int = 0
-    warnings: list[str] = []
 
 
 class RobotStatus(BaseModel):

@@ -206,16 +206,16 @@ class _Launch:
             return True
         self._note_changes(alive)
         quiet_s = self._now_s() - self._changed_s
-        if any(not agent.status or agent.status["playing"] for agent in alive):
+        if any(not agent.spoke or agent.status.playing for agent in alive):
             return False
-        settled = _agree(alive) and not any(agent.status["busy"] for agent in alive)
+        settled = _agree(alive) and not any(agent.status.busy for agent in alive)
         return quiet_s >= (self._scenario.settle_s if settled else UNSETTLED_MAX_S)
 
     def _note_changes(self, alive: Iterable[AgentProcess]) -> None:
         """Remember when any robot's logs, frame or leader changed last."""
         for agent in alive:
-            keys = ("logs", "map_frame", "round", "leader", "playing")
-            seen = {key: agent.status.get(key) for key in keys}
+            status = agent.status
+            seen = (status.logs, status.map_frame, status.round, status.leader, status.playing)
             if seen != self._seen.get(agent.name):
                 self._seen[agent.name] = seen
                 self._changed_s = self._now_s()
@@ -278,7 +278,7 @@ class _Launch:
             self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
-        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.status]
+        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.spoke]
         if died and self._now_s() < START_S:
             raise LaunchError(f"robot {died[0].name} could not start: {_sentence(died[0].last_words())}")
 
@@ -346,7 +346,7 @@ def changed_radio(radio: RadioConfig, kind: LinkFault, fault: Fault, now_s: floa
 
 def _agree(alive: list[AgentProcess]) -> bool:
     """Whether all running robots hold the same logs."""
-    logs = [agent.status.get("logs") for agent in alive]
+    logs = [agent.status.logs for agent in alive]
     return all(log == logs[0] for log in logs)
 
 

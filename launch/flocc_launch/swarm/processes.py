@@ -13,7 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from flocc_agent.config import AgentConfig, PeerEndpoints, TlsConfig, TransportConfig
+from flocc_agent.runtime.status import AgentStatus
 
 STOP_TIMEOUT_S = 20.0
 LOG_TAIL_LINES = 5
@@ -27,7 +30,7 @@ class AgentProcess:
         config: Its configuration.
         folder: Where its files are.
         process: The process, None before it was started.
-        status: Its last state.
+        status: What it said last.
         heard_s: When that came, on the monotonic clock.
         asked: Whether it was told to stop or killed on purpose.
         exit_code: How it ended; negative for a signal.
@@ -36,11 +39,19 @@ class AgentProcess:
     config: AgentConfig
     folder: Path
     process: asyncio.subprocess.Process | None = None
-    status: dict[str, Any] = field(default_factory=dict)
+    status: AgentStatus = field(init=False)
     heard_s: float = 0.0
     asked: bool = False
     exit_code: int | None = None
     reader: asyncio.Task[None] | None = None
+
+    def __post_init__(self) -> None:
+        self.status = AgentStatus(robot=self.name)
+
+    @property
+    def spoke(self) -> bool:
+        """Whether it said anything since it was started."""
+        return bool(self.status.log)
 
     @property
     def name(self) -> str:
@@ -68,7 +79,7 @@ class AgentProcess:
                 start_new_session=True,
                 limit=4 * 1024 * 1024,
             )
-        self.exit_code, self.asked, self.status = None, False, {}
+        self.exit_code, self.asked, self.status = None, False, AgentStatus(robot=self.name)
         self.reader = asyncio.create_task(self._read())
 
     async def order(self, order: dict[str, Any]) -> None:
@@ -112,8 +123,8 @@ class AgentProcess:
         assert self.process is not None
         assert self.process.stdout is not None
         async for line in self.process.stdout:
-            with contextlib.suppress(json.JSONDecodeError):
-                self.status = json.loads(line)
+            with contextlib.suppress(ValidationError):
+                self.status = AgentStatus.model_validate_json(line)
                 self.heard_s = time.monotonic()
         self.exit_code = await self.process.wait()
         with contextlib.suppress(ProcessLookupError):
