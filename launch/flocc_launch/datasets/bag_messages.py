@@ -18,8 +18,11 @@ POSE_TYPES = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Path",
 )
+TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_TYPES = (TRANSFORMS_TYPE, "tf/msg/tfMessage")
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 
 _MAGIC = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))
@@ -75,8 +78,21 @@ def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]
         for posed in message.poses:
             yield stamp_ns(posed.header), _numbers(posed.pose, topic)
         return
+    if topic.type == "geometry_msgs/msg/TransformStamped":
+        yield stamp_ns(message.header), transform_numbers(message.transform, topic)
+        return
     pose = message.pose if topic.type == "geometry_msgs/msg/PoseStamped" else message.pose.pose
     yield stamp_ns(message.header), _numbers(pose, topic)
+
+
+def transform_numbers(transform: Any, topic: Topic) -> tuple[float, ...]:
+    """`tx ty tz qx qy qz qw` of a transform.
+
+    Raises:
+        DatasetError: As `checked_numbers`.
+    """
+    t, q = transform.translation, transform.rotation
+    return checked_numbers((t.x, t.y, t.z, q.x, q.y, q.z, q.w), topic)
 
 
 def _numbers(pose: Any, topic: Topic) -> tuple[float, ...]:
@@ -94,6 +110,8 @@ def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ..
     norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     if not math.isfinite(x + y + z + norm):
         raise DatasetError(f"topic {topic.name}: a pose has a number that is not finite")
+    if norm < QUATERNION_NORM_TOLERANCE:
+        raise DatasetError(f"topic {topic.name}: odometry gives no pose (its quaternion is zero), as where it is lost")
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
         raise DatasetError(f"topic {topic.name}: a pose is not rigid (its quaternion has length {norm:.4g}, not 1)")
     return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm

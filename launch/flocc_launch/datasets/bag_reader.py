@@ -3,9 +3,11 @@
 A bag that was cut off in the middle is read as far as it goes; `Bag.damage` then says what is wrong with it.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -13,7 +15,8 @@ from typing import Any
 from flocc_launch.datasets.source import DatasetError
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
-Decoder = Callable[[bytes], Any]
+PARTS_GAP_MAX_S = 60.0
+"""Parts of one ROS 1 recording follow each other; bags of several robots overlap, or are of other days."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +38,57 @@ class Topic:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a file by its suffix, or a folder with one inside."""
-    return (path.suffix in BAG_SUFFIXES and path.is_file()) or (path.is_dir() and bool(_storages(path)))
+    """Whether a path is one bag: a file by its suffix, or a folder with one inside, also in parts."""
+    if path.is_file():
+        return path.suffix in BAG_SUFFIXES
+    return path.is_dir() and (_is_rosbag2(path) or bool(_storages(path)) or bool(ros1_parts(path)))
+
+
+def _is_rosbag2(folder: Path) -> bool:
+    metadata = folder / "metadata.yaml"
+    try:
+        return metadata.is_file() and b"rosbag2_bagfile_information" in metadata.read_bytes()[:4096]
+    except OSError:
+        return False
 
 
 def _storages(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix in (".db3", ".mcap"))
+
+
+def ros1_parts(folder: Path) -> list[Path]:
+    """The ROS 1 bags of a folder in order, where they are one recording: a single one, or parts that follow each other.
+
+    `rosbag record --split` names them STEM_DATE_0.bag, STEM_DATE_1.bag ...
+    """
+    files = [file for file in folder.iterdir() if file.suffix == ".bag" and file.is_file()]
+    if len(files) < 2:
+        return files
+    found = [re.fullmatch(r"(.*?)(?:_?\d{4}(?:-\d\d){5})?_(\d+)", file.stem) for file in files]
+    if not all(found) or len({match[1] for match in found if match}) > 1:
+        return []
+    files = [
+        file for _, file in sorted((int(match[2]), file) for match, file in zip(found, files, strict=True) if match)
+    ]
+    spans = [_span_s(file) for file in files]
+    follow = all(
+        before is not None and after is not None and -0.5 <= after[0] - before[1] <= PARTS_GAP_MAX_S
+        for before, after in pairwise(spans)
+    )
+    return files if follow else []
+
+
+def _span_s(file: Path) -> tuple[float, float] | None:
+    """First and last time of a ROS 1 bag, or None where it cannot be opened."""
+    try:
+        from rosbags.rosbag1 import Reader, ReaderError
+    except ImportError:
+        return None
+    try:
+        with Reader(file) as reader:
+            return reader.start_time * 1e-9, reader.end_time * 1e-9
+    except (ReaderError, OSError, AssertionError, EOFError, ValueError):
+        return None
 
 
 class Bag:
@@ -56,6 +104,7 @@ class Bag:
         self._reader: Any = None
         self._salvage: Any = None
         self._known_errors: tuple[type[Exception], ...] = ()
+        self._ros1 = path.suffix == ".bag"
 
     def __enter__(self) -> "Bag":
         try:
@@ -65,11 +114,11 @@ class Bag:
         if not self.path.exists():
             raise DatasetError(f"{self.path}: does not exist")
         self._known_errors = (AnyReaderError, *_storage_errors(), OSError, EOFError, AssertionError)
-        path = self._storage()
+        paths = self._paths()
         try:
-            self._reader = self._stack.enter_context(AnyReader([path], default_typestore=_default_types()))
+            self._reader = self._stack.enter_context(AnyReader(paths, default_typestore=_default_types()))
         except self._known_errors as error:
-            self._open_damaged(path, str(error))
+            self._open_damaged(paths[0], str(error))
             return self
         self.topics = {
             name: Topic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
@@ -85,37 +134,44 @@ class Bag:
     @property
     def ros1(self) -> bool:
         """Whether messages are in ROS 1's serialisation, not in CDR."""
-        return self.path.suffix == ".bag"
+        return self._ros1
 
-    def messages(
-        self, names: list[str], start_ns: int | None = None, decoders: Mapping[str, Decoder] | None = None
-    ) -> Iterator[tuple[Topic, int, Any]]:
-        """Yield topic, bag time in nanoseconds and message, in the bag's order.
+    def raw(self, names: Sequence[str], start_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
+        """Yield topic, bag time in nanoseconds and the undecoded message, in the bag's order.
 
         Args:
             names: Topics.
             start_ns: Leave out what the bag recorded before.
-            decoders: By topic, what is called with raw bytes in place of rosbags' decoder.
-
-        Raises:
-            DatasetError: A message is not of the type that the bag says.
         """
         if self._reader is None:
-            yield from self._salvaged(names, start_ns, decoders or {})
+            for name, stamp_ns, message in self._salvage.messages(list(names)):
+                if start_ns is None or stamp_ns >= start_ns:
+                    yield self.topics[name], stamp_ns, message
             return
         connections = [c for c in self._reader.connections if c.topic in names]
+        if not connections:
+            return
         stream = self._reader.messages(connections=connections, start=start_ns)
+        topics = self.topics
         while True:
             try:
-                connection, stamp_ns, raw = next(stream)
+                connection, stamp_ns, message = next(stream)
             except StopIteration:
                 return
             except self._known_errors as error:
                 self.damage = f"{self.path}: is damaged or cut off: {error}"
                 return
-            topic = self.topics[connection.topic]
-            decoder = decoders.get(topic.name) if decoders else None
-            yield topic, stamp_ns, self.decoded(raw, topic) if decoder is None else decoder(raw)
+            yield topics[connection.topic], stamp_ns, message
+
+    def first(self, name: str, tries: int = 20) -> tuple[int, Any] | None:
+        """Bag time and content of a topic's first message that can be decoded, or None."""
+        for number, (topic, stamp_ns, message) in enumerate(self.raw([name])):
+            try:
+                return stamp_ns, self.decoded(message, topic)
+            except DatasetError:
+                if number + 1 >= tries:
+                    break
+        return None
 
     def decoded(self, raw: bytes, topic: Topic) -> Any:
         """Decode a message.
@@ -132,15 +188,19 @@ class Bag:
                 f"the type may be of another ROS distribution ({type(error).__name__}: {error})"
             ) from error
 
-    def _storage(self) -> Path:
+    def _paths(self) -> list[Path]:
         """What to open: a ROS 2 folder without its metadata (a recorder that was killed) is opened by its file."""
         if not self.path.is_dir() or (self.path / "metadata.yaml").exists():
-            return self.path
+            return [self.path]
+        parts = ros1_parts(self.path)
+        if parts:
+            self._ros1 = True
+            return parts
         found = _storages(self.path)
         if not found:
             raise DatasetError(f"{self.path}: has no metadata.yaml and no db3 or mcap file")
         self.damage = None if len(found) == 1 else f"{self.path}: has no metadata.yaml; only {found[0].name} was read"
-        return found[0]
+        return [found[0]]
 
     def _open_damaged(self, path: Path, reason: str) -> None:
         from flocc_launch.datasets.bag_salvage import Salvage
@@ -153,14 +213,6 @@ class Bag:
         if not self.topics:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         self.damage = f"{self.path}: is damaged or cut off: {reason}"
-
-    def _salvaged(
-        self, names: list[str], start_ns: int | None, decoders: Mapping[str, Decoder]
-    ) -> Iterator[tuple[Topic, int, Any]]:
-        for name, stamp_ns, raw in self._salvage.messages(names):
-            if start_ns is None or stamp_ns >= start_ns:
-                topic, decoder = self.topics[name], decoders.get(name)
-                yield topic, stamp_ns, self.decoded(raw, topic) if decoder is None else decoder(raw)
 
 
 def _default_types() -> Any:

@@ -143,9 +143,8 @@ def _transforms_lens(table: dict[str, Any], file: Path) -> Lens:
     model = table.get("camera_model", "OPENCV")
     others = [key for key in ("k3", "k4", "k5", "k6") if table.get(key)]
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or others or table.get("is_fisheye"):
-        raise DatasetError(
-            f"{file}: the lens is {model}{' with ' + ', '.join(others) if others else ''}; flocc reads OPENCV's k1 k2 p1 p2"
-        )
+        more = f" with {', '.join(others)}" if others else ""
+        raise DatasetError(f"{file}: the lens is {model}{more}; flocc reads OPENCV's k1 k2 p1 p2")
     try:
         width, height = int(table["w"]), int(table["h"])
         fx = float(table["fl_x"]) if "fl_x" in table else width / 2 / np.tan(float(table["camera_angle_x"]) / 2)

@@ -11,6 +11,7 @@ from pathlib import Path
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.commands import needed_drift
 from flocc_launch.datasets.detect import detect_format, is_dataset, read_source
+from flocc_launch.datasets.names import robot_name as name_of
 from flocc_launch.datasets.source import DatasetError, Source
 
 ROBOTS = 3
@@ -18,7 +19,6 @@ ROBOTS_MAX = 16
 KEYFRAMES_WANTED = 25
 DISTANCE_MIN_M, DISTANCE_MAX_M = 0.05, 0.5
 ROTATION_NEAR_RAD = 0.17
-NAME_LENGTH_MAX = 32
 
 
 def is_own_data(path: Path) -> bool:
@@ -106,9 +106,8 @@ class OwnData:
 
 
 def robot_name(path: Path) -> str:
-    """A name that keys can hold, made of a folder's."""
-    stem = path.resolve().stem if path.is_file() else path.resolve().name
-    return re.sub(r"[^a-z0-9_-]+", "-", stem.lower()).strip("-_")[:NAME_LENGTH_MAX] or "robots"
+    """A name that keys can hold, made of a folder's or a file's."""
+    return name_of(path.resolve().stem if path.is_file() else path.resolve().name)
 
 
 def _holds_bags(path: Path) -> bool:
