@@ -164,6 +164,8 @@ class Layout:
         if name is not None:
             return named(self.bag, IMAGE_TYPES, name)
         kept = [topic for topic in images if not self._is_depth(topic)]
+        if images and not kept:
+            raise DatasetError(f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}")
         by_base: dict[str, Topic] = {}
         for topic in kept:
             base = topic.name.removesuffix("/compressed")

@@ -41,7 +41,12 @@ def is_bag(path: Path) -> bool:
     """Whether a path is one bag: a file by its suffix, or a folder with one inside, also in parts."""
     if path.is_file():
         return path.suffix in BAG_SUFFIXES
-    return path.is_dir() and (_is_rosbag2(path) or bool(_storages(path)) or bool(ros1_parts(path)))
+    return path.is_dir() and (_is_rosbag2(path) or _is_one_bag(_storages(path)) or bool(ros1_parts(path)))
+
+
+def _is_one_bag(storages: list[Path]) -> bool:
+    """Whether files are parts of one bag, as rosbag2 names them: `run_0.db3`, `run_1.db3`."""
+    return len({re.sub(r"_\d+$", "", file.stem) for file in storages}) == 1
 
 
 def _is_rosbag2(folder: Path) -> bool:
@@ -61,9 +66,10 @@ def ros1_parts(folder: Path) -> list[Path]:
 
     `rosbag record --split` names them STEM_DATE_0.bag, STEM_DATE_1.bag ...
     """
-    files = [file for file in folder.iterdir() if file.suffix == ".bag" and file.is_file()]
+    entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    files = [file for file in entries if file.suffix == ".bag" and file.is_file()]
     if len(files) < 2:
-        return files
+        return [] if any(entry.is_dir() for entry in entries) else files
     found = [re.fullmatch(r"(.*?)(?:_?\d{4}(?:-\d\d){5})?_(\d+)", file.stem) for file in files]
     if not all(found) or len({match[1] for match in found if match}) > 1:
         return []

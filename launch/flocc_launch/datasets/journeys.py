@@ -38,21 +38,31 @@ class JourneyWatch:
             numbers: `tx ty tz qx qy qz qw`.
         """
         now = (stamp_ns, numbers)
-        held, self._held = self._held, None
-        if not self._jumps(self._last, now):
-            self.outliers += held is not None
-            return [self._passed(False, now)]
-        if held is None:
+        if self._held is None:
+            if not self._jumps(self._last, now):
+                return [self._passed(False, now)]
             self._held = now
             return []
-        self._last, self._speed_m_per_s = None, None
-        begun = self._passed(True, held)
-        return [begun, *self.take(stamp_ns, numbers)]
+        held, self._held = self._held, None
+        if self._goes_on_from(held, now):
+            self._last, self._speed_m_per_s = None, None
+            return [self._passed(True, held), self._passed(False, now)]
+        self.outliers += 1
+        return [self._passed(False, now)]
+
+    def _goes_on_from(self, held: Posed, now: Posed) -> bool:
+        """Whether a pose fits the one that jumped better than the one before it."""
+        if self._last is None or self._speed_m_per_s is None or now[0] <= held[0]:
+            return False
+        off_m_per_s = [abs(_speed_m_per_s(before, now) - self._speed_m_per_s) for before in (held, self._last)]
+        return off_m_per_s[0] < off_m_per_s[1]
 
     def _passed(self, is_new: bool, now: Posed) -> tuple[bool, int, Numbers]:
         if self._last is None or now[0] > self._last[0]:
             self._speed_m_per_s = None if self._last is None else _speed_m_per_s(self._last, now)
             self._last = now
+        else:
+            self._speed_m_per_s = None  # a clock that was set back says nothing about speed
         return is_new, *now
 
     def _jumps(self, last: Posed | None, now: Posed) -> bool:
