@@ -29,7 +29,8 @@ def mounted(script: BagScript, body: str = "body") -> BagScript:
 def test_the_mounting_is_the_chain_of_static_transforms(tmp_path: Path, ros1: bool) -> None:
     bag = mounted(walking(ros1)).write(tmp_path / ("run.bag" if ros1 else "run"), "bag" if ros1 else "mcap")
     T = Recording.open(convert(bag, tmp_path / "out")).T_body_camera
-    np.testing.assert_allclose(T, [[0, 0, 1, 0.2], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]], atol=1e-9)
+    expected = np.array([[0, 0, 1, 0.2], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+    np.testing.assert_allclose(T, expected, atol=1e-9)
 
 
 def test_transforms_that_do_not_reach_the_camera_are_refused(tmp_path: Path) -> None:

@@ -66,9 +66,9 @@ class PoseDecoder:
     def _agrees(self, raw: bytes, expected: Posed) -> bool:
         try:
             stamp_ns, numbers, _, self._tail = self._read(raw)
-        except struct.error:
+            return (stamp_ns, checked_numbers(numbers, self._topic)) == expected
+        except (struct.error, DatasetError):
             return False
-        return (stamp_ns, checked_numbers(numbers, self._topic)) == expected
 
     def _read(self, raw: bytes) -> tuple[int, tuple[float, ...], float, int]:
         """Stamp, pose, the first number behind it, and the bytes from the pose on; what is behind is not looked at.

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from flocc_launch.datasets.foxglove import ROS_TYPES, ForeignMcap, as_ros, is_foreign, short_name
 from flocc_launch.datasets.source import DatasetError
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
@@ -111,6 +112,8 @@ class Bag:
         self._salvage: Any = None
         self._known_errors: tuple[type[Exception], ...] = ()
         self._ros1 = path.suffix == ".bag"
+        self._is_foreign = False
+        self._foxglove: dict[str, str] = {}
 
     def __enter__(self) -> "Bag":
         try:
@@ -129,6 +132,10 @@ class Bag:
         self.topics = {
             name: Topic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
         }
+        for name, topic in self.topics.items():
+            if (short := short_name(topic.type)) is not None:
+                self._foxglove[name] = topic.type
+                self.topics[name] = Topic(name, ROS_TYPES[short], topic.count)
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
         return self
 
@@ -185,9 +192,14 @@ class Bag:
         Raises:
             DatasetError: The bytes are not of the topic's type.
         """
-        decode = self._salvage.decode if self._reader is None else self._reader.deserialize
         try:
-            return decode(raw, topic.type)
+            if self._is_foreign:
+                return self._salvage.decode(raw, topic.name)
+            decode = self._salvage.decode if self._reader is None else self._reader.deserialize
+            foxglove = self._foxglove.get(topic.name)
+            if foxglove is None:
+                return decode(raw, topic.type)
+            return as_ros(short_name(foxglove) or "", decode(raw, foxglove))
         except Exception as error:
             raise DatasetError(
                 f"{self.path}: topic {topic.name}: a message cannot be read as {topic.type}; "
@@ -214,11 +226,28 @@ class Bag:
         file = path if path.is_file() else next(iter(_storages(path)), None)
         if file is None:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}")
+        if file.suffix == ".mcap" and is_foreign(file):
+            self._open_foreign(file)
+            return
         self._salvage = Salvage(file)
         self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
         if not self.topics:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         self.damage = f"{self.path}: is damaged or cut off: {reason}"
+
+    def _open_foreign(self, file: Path) -> None:
+        """Open an MCAP file of protobuf or JSON, of which Foxglove's messages are read."""
+        self._salvage, self._is_foreign = ForeignMcap(file), True
+        try:
+            self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
+        except ValueError as error:
+            raise DatasetError(f"{self.path}: is an MCAP of protobuf messages, not of ROS: {error}") from error
+        if not any(topic.type in ROS_TYPES.values() for topic in self.topics.values()):
+            listed = ", ".join(f"{topic.name} ({topic.type})" for topic in self.topics.values())
+            raise DatasetError(
+                f"{self.path}: is an MCAP of {' and '.join(self._salvage.encodings)} messages, not of ROS; flocc reads "
+                f"Foxglove's {', '.join(ROS_TYPES)}, and it has {listed}"
+            )
 
 
 def _default_types() -> Any:
