@@ -39,11 +39,13 @@ def add_data(app: typer.Typer) -> None:
 @dataset.command()
 def info(source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None) -> None:
     """Say what a data set holds, without writing anything."""
-    from flocc_launch.datasets.commands import info as look
-    from flocc_launch.datasets.commands import info_lines
+    from flocc_launch.datasets.commands import info_lines, infos
 
-    for name, value in info_lines(look(source, format_name, trajectory_format)):
-        typer.echo(f"{name:14} {value}")
+    for number, found in enumerate(infos(source, format_name, trajectory_format)):
+        if number:
+            typer.echo("")
+        for name, value in info_lines(found):
+            typer.echo(f"{name:14} {value}")
 
 
 @dataset.command()

@@ -13,14 +13,23 @@ from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
+from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.cut import cut
-from flocc_launch.datasets.detect import check_times, read_source
+from flocc_launch.datasets.detect import check_times, read_source, team_folder
 from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.video import (
+    WHAT_ODOMETRY,
+    convert_video,
+    is_video,
+    lens_beside,
+    odometry_beside,
+    read_head,
+)
 from flocc_launch.datasets.writer import Progress, write_source
 
 logger = logging.getLogger(__name__)
@@ -44,6 +53,7 @@ class Info:
         faults: What is wrong with it, one sentence each.
         topics: Of a bag, with types and numbers of messages.
         notes: What was left out, or concluded where nothing said it.
+        robots: Of a bag, which topics belong together.
     """
 
     path: Path
@@ -59,6 +69,7 @@ class Info:
     faults: tuple[str, ...]
     topics: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
 
 
 def info(path: Path, format_name: str | None = None, form: str | None = None) -> Info:
@@ -74,6 +85,8 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
     """
     if is_bag(path):
         return _bag_info(path)
+    if is_video(path):
+        return _video_info(path)
     source = read_source(path, format_name, form=form)
     travelled = source.truth or source.odometry
     return Info(
@@ -115,6 +128,7 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
     yield "images", f"{found.images}, from {found.from_s:.3f} s to {found.to_s:.3f} s{covered}"
     if found.format == "bag":
         yield from (("topic", topic) for topic in found.topics)
+        yield from (("robot", robot) for robot in found.robots)
     else:
         yield "camera", "none" if camera is None else _told(camera)
         yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
@@ -131,6 +145,7 @@ def _told(camera: CameraModel) -> str:
 def _bag_info(path: Path) -> Info:
     with Bag(path) as bag:
         images = [topic.count for topic in bag.topics.values() if topic.type in IMAGE_TYPES and topic.count is not None]
+        robots, faults = _robots_of(Layout.of(bag))
         return Info(
             path=path,
             format="bag",
@@ -142,9 +157,65 @@ def _bag_info(path: Path) -> Info:
             odometry_poses=None,
             truth_poses=None,
             length_m=None,
-            faults=(bag.damage,) if bag.damage else (),
+            faults=((bag.damage,) if bag.damage else ()) + tuple(faults),
             topics=tuple(str(topic) for topic in bag.topics.values()),
+            robots=tuple(robots),
         )
+
+
+def _robots_of(layout: Layout) -> tuple[list[str], list[str]]:
+    """Which topics belong together, one sentence for each robot, and why a bag cannot be converted as it is."""
+    try:
+        robots = layout.robots()
+    except DatasetError as error:
+        return [], [str(error)]
+    sentences, faults = [], []
+    for robot in robots:
+        sentences.append(str(robot))
+        try:
+            layout.mounting(robot)
+        except DatasetError as error:
+            faults.append(str(error))
+    return sentences, faults
+
+
+def _video_info(path: Path) -> Info:
+    head, odometry, lens = read_head(path), odometry_beside(path), lens_beside(path)
+    trajectory = None if odometry is None else read_trajectory(odometry)[0]
+    lacks = [
+        *([f"{path}: {WHAT_ODOMETRY}"] if odometry is None else []),
+        *([f"{path}: intrinsics are missing; name a camera file with --camera"] if lens is None else []),
+    ]
+    return Info(
+        path=path,
+        format="video",
+        images=head.frames,
+        posed=None,
+        from_s=0.0,
+        to_s=head.frames / head.rate_hz if head.rate_hz > 0 else 0.0,
+        camera=lens.camera if lens else None,
+        odometry_poses=None if trajectory is None else len(trajectory),
+        truth_poses=None,
+        length_m=None if trajectory is None else trajectory.length_m(),
+        faults=tuple(lacks),
+    )
+
+
+def infos(path: Path, format_name: str | None = None, form: str | None = None) -> Iterator[Info]:
+    """Look at what a path holds: one data set, bag or video, or those of a team in a folder.
+
+    Raises:
+        DatasetError: Nothing that is known is there.
+    """
+    team = team_folder(path) if format_name is None else {}
+    if not team:
+        yield info(path, format_name, form)
+        return
+    for entry in team.values():
+        yield info(entry, None, form)
+    others = [entry.name for entry in sorted(path.iterdir()) if entry not in team.values() and entry.name[0] != "."]
+    if others:
+        logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
 
 
 def convert(
@@ -163,6 +234,7 @@ def convert(
     jpeg: bool = False,
     form: str | None = None,
     view_deg: float | None = None,
+    robot: str | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -182,6 +254,7 @@ def convert(
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
         view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
+        robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
         progress: Called with images done and images in all.
 
     Returns:
@@ -191,8 +264,23 @@ def convert(
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
     if is_bag(path):
-        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg, form=form)
+        options = BagOptions(
+            image_topic,
+            odometry_topic,
+            camera,
+            odometry,
+            truth,
+            every,
+            jpeg,
+            form=form,
+            robot=robot,
+            view_rad=None if view_deg is None else math.radians(view_deg),
+        )
         return convert_bag(path, out, options, progress)
+    if is_video(path):
+        for note in convert_video(path, out, camera, odometry, form, every, progress):
+            logger.warning("%s", note)
+        return out
     source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
     _tell(source)
     identity = _identity("convert", path, source, drift, seed)
