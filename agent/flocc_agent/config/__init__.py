@@ -1,10 +1,11 @@
 """The configuration of an agent, by noun; what other packages use stands here."""
 
-from flocc_agent.config.agent import AgentConfig, KeyframeConfig, SourceConfig, StoreConfig
+from flocc_agent.config.agent import AgentConfig, CoreSection, KeyframeConfig, SourceConfig, StoreConfig
 from flocc_agent.config.backend import BackendConfig, BackendMode, Formulation, ScaleInitial, Solver
 from flocc_agent.config.network import MetricsConfig, PeerEndpoints, TlsConfig, TransportConfig
 from flocc_agent.config.perception import (
     ClassicalConfig,
+    LearnedConfig,
     Mast3rConfig,
     PerceptionConfig,
     RecordedConfig,
@@ -19,6 +20,7 @@ from flocc_agent.config.section import (
     put_value,
     read_json,
     read_toml,
+    refuse_removed,
     validated,
 )
 
@@ -29,8 +31,10 @@ __all__ = [
     "BlackoutConfig",
     "ClassicalConfig",
     "ConfigError",
+    "CoreSection",
     "Formulation",
     "KeyframeConfig",
+    "LearnedConfig",
     "LinkConfig",
     "LinkOverrideConfig",
     "Mast3rConfig",
@@ -53,5 +57,6 @@ __all__ = [
     "put_value",
     "read_json",
     "read_toml",
+    "refuse_removed",
     "validated",
 ]

@@ -4,10 +4,11 @@ Parameters of the core are plain dataclasses in `core/parameters.py`; pydantic c
 """
 
 from collections.abc import Iterable
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, model_validator
 
 from flocc_agent.config.backend import BackendConfig
 from flocc_agent.config.network import MetricsConfig, TransportConfig
@@ -15,8 +16,18 @@ from flocc_agent.config.perception import PerceptionConfig
 from flocc_agent.config.radio import RadioConfig
 from flocc_agent.config.ros2 import Ros2Config
 from flocc_agent.config.section import Section, parsed_change, put_value, read_json, read_toml, validated
-from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.parameters import INNER, CoreParameters
 from flocc_protocol.ids import checked_name
+
+
+def written(value: Any) -> Any:
+    """Parameters of the core as a file may hold them: without those that are no keys."""
+    if not is_dataclass(value):
+        return value
+    return {f.name: written(getattr(value, f.name)) for f in fields(value) if INNER not in f.metadata}
+
+
+CoreSection = Annotated[CoreParameters, PlainSerializer(written)]
 
 
 class KeyframeConfig(Section):
@@ -37,8 +48,6 @@ class SourceConfig(Section):
     """Playback speed relative to the stamps."""
     start_s: float = Field(0.0, ge=0)
     """Pause before the first frame."""
-    hold_s: float = Field(0.0, ge=0)
-    """How long the agent goes on after its last frame; 0: until it is stopped."""
 
 
 class StoreConfig(Section):
@@ -65,7 +74,7 @@ class AgentConfig(Section):
     """Seed of emulated links and synthetic perception; the same for all robots of a swarm."""
     folder: Path | None = None
     """Where the robot's log, latents and events are kept; None keeps them in memory."""
-    core: CoreParameters = CoreParameters()
+    core: CoreSection = CoreParameters()
     """Neighbours, election, gossip, place recognition, loop closing, rounds."""
     keyframes: KeyframeConfig = KeyframeConfig()
     """Keyframe selection."""

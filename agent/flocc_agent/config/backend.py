@@ -5,7 +5,7 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
-from flocc_agent.config.section import Section
+from flocc_agent.config.section import Section, inner
 
 
 class Formulation(StrEnum):
@@ -48,17 +48,17 @@ class BackendConfig(Section):
     mode: BackendMode = BackendMode.CENTRALISED
     """centralised: the elected leader optimises everything; distributed: every robot its own block (RBCD), with scales
     held at their initial values. All robots of a swarm need the same."""
-    rank: int = Field(5, ge=3, le=5)
+    rank: int = inner(5, ge=3, le=5)
     """Dimensions to which distributed mode relaxes rotations; 3 relaxes nothing, more leave fewer local minima."""
     formulation: Formulation = Formulation.INDEPENDENT
     """Scales of closures: fixed, one each, one each but linked within a cluster, or one for all."""
     solver: Solver = Solver.GNC_TLS
     """lm is fastest and trusts every closure; gnc-* find and reject outliers."""
-    pairwise_consistency: bool = False
+    pairwise_consistency: bool = inner(False)
     """Filter closures by pairwise consistency maximisation before solving; needs odometry covariances that are true."""
     closures_to_join_min: int = Field(2, ge=1)
     """Maps with fewer agreeing closures between them stay apart: a single wrong one would contradict nothing."""
-    scale_initial: ScaleInitial = ScaleInitial.ODOMETRY
+    scale_initial: ScaleInitial = inner(ScaleInitial.ODOMETRY)
     """raw: network units are metres; odometry: Eq. (6); ground-truth: for ablations only."""
     steepness: float = Field(4.0, gt=0)
     """k of the logistic Eq. (2); larger trusts high match ratios more."""
@@ -66,39 +66,39 @@ class BackendConfig(Section):
     """Standard deviation of one odometry edge's rotation where the source gives no covariance."""
     odometry_translation_sigma_m: float = Field(0.05, gt=0)
     """Standard deviation of one odometry edge's translation where the source gives no covariance."""
-    closure_rotation_sigma_rad: float = Field(0.05, gt=0)
+    closure_rotation_sigma_rad: float = inner(0.05, gt=0)
     """Standard deviation of a closure's rotation at probability one."""
-    closure_translation_sigma_m: float = Field(0.2, gt=0)
+    closure_translation_sigma_m: float = inner(0.2, gt=0)
     """Standard deviation of a closure's translation at probability one, metres."""
-    cluster_keyframes_max: int = Field(10, ge=1)
+    cluster_keyframes_max: int = inner(10, ge=1)
     """Closures whose keyframes are fewer than this apart on both sides share a scale cluster."""
-    scale_link_sigma_ratio: float = Field(0.2, gt=0)
+    scale_link_sigma_ratio: float = inner(0.2, gt=0)
     """Standard deviation of a scale around its cluster's scale, both relative to their initial values by Eq. (6)."""
-    scale_link_unknown_sigma_ratio: float = Field(3.0, gt=0)
+    scale_link_unknown_sigma_ratio: float = inner(3.0, gt=0)
     """The same where no initial scale makes the closures' network units comparable."""
-    scale_prior_sigma_ratio: float = Field(0.5, gt=0)
+    scale_prior_sigma_ratio: float = inner(0.5, gt=0)
     """Prior on a scale that Eq. (6) initialises: standard deviation relative to its initial value. Robots that met at
     one place only are placed by it; much smaller rejects closures whose scale is far from its initial value."""
-    scale_prior_unknown_sigma_ratio: float = Field(20.0, gt=0)
+    scale_prior_unknown_sigma_ratio: float = inner(20.0, gt=0)
     """The same for closures without an initial scale, around one metre per network unit."""
-    weight_by_probability: bool = True
+    weight_by_probability: bool = inner(True)
     """Multiply each closure's information by the probability of Eq. (2); off for measurements that carry a trusted
     covariance of their own."""
-    inlier_probability: float = Field(0.9999, gt=0, lt=1)
+    inlier_probability: float = inner(0.9999, gt=0, lt=1)
     """Chi-square quantile below which a closure counts as right; larger rejects less."""
-    gnc_start_ratio: float = Field(1e-4, gt=0)
+    gnc_start_ratio: float = inner(1e-4, gt=0)
     """Control parameter at which GNC starts at the latest; smaller starts more convex and takes more solves."""
-    gnc_step: float = Field(2.0, gt=1)
+    gnc_step: float = inner(2.0, gt=1)
     """Factor of the control parameter per GNC round; smaller is more careful and slower."""
-    gnc_inner_steps: int = Field(1, ge=1)
+    gnc_inner_steps: int = inner(1, ge=1)
     """Linear solves per GNC round; more follows each round's optimum more closely."""
-    relative_tolerance: float = Field(1e-5, gt=0)
+    relative_tolerance: float = inner(1e-5, gt=0)
     """Stop when a step lowers the cost by less than this part of it."""
-    absolute_tolerance: float = Field(1e-9, ge=0)
+    absolute_tolerance: float = inner(1e-9, ge=0)
     """Stop when the cost is below this."""
     covariances: bool = True
-    """Compute the marginal covariance of every robot's T_map_odom."""
-    iterations_max: int = Field(100, ge=1)
+    """Compute the marginal covariance of every robot's T_map_odom; false saves time above 10,000 closures."""
+    iterations_max: int = inner(100, ge=1)
     """Linear solves in one optimisation."""
 
     @model_validator(mode="after")

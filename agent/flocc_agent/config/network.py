@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
-from flocc_agent.config.section import ConfigError, Section
+from flocc_agent.config.section import ConfigError, Section, inner
 from flocc_protocol.ids import NAME_PATTERN
 
 ENDPOINT_PATTERN = re.compile(r"(tcp|tls|quic|udp)/(\[[0-9a-fA-F:.]+\]|[^/:#?\s]+):([0-9]{1,5})([#?]\S*)?")
@@ -28,6 +28,18 @@ def checked_endpoint(text: str) -> str:
 
 
 Endpoint = Annotated[str, AfterValidator(checked_endpoint)]
+
+
+def checked_group(text: str) -> str:
+    """Return the address of a multicast group, or say how one looks.
+
+    Raises:
+        ValueError: Not GROUP:PORT, or there is no next port.
+    """
+    group, _, port = text.rpartition(":")
+    if not group or not port.isdecimal() or not 1 <= int(port) < PORT_MAX:
+        raise ValueError(f"{text!r} is no multicast address; one looks like 224.0.0.224:7446")
+    return text
 
 
 class PeerEndpoints(Section):
@@ -59,46 +71,39 @@ class TransportConfig(Section):
     """Known robots by name. Of each pair the higher name dials, for ever, also after a partition."""
     multicast: bool = True
     """Find robots of the same network by multicast; needs no roster, but many Wi-Fi access points drop it."""
-    multicast_control: str = "224.0.0.224:7446"
-    """Group and port for finding control sessions; swarms that share a network may take different ones."""
-    multicast_bulk: str = "224.0.0.224:7447"
-    """Group and port for finding bulk sessions; must differ from the one for control."""
+    multicast_address: Annotated[str, AfterValidator(checked_group)] = "224.0.0.224:7446"
+    """Group and port for finding control sessions, bulk is at the next port; swarms on one network may differ."""
     interface: str = "auto"
     """Network interface of multicast: auto, or one such as wlan0 (lo on a single machine)."""
     gossip: bool = True
     """Learn robots from robots; such links are not dialled again after a cut, the roster's are."""
     lease_s: float = Field(3.0, ge=1.0)
     """A silent TCP link is given up after this; at least twice the outage to ride through, more under load."""
-    open_timeout_s: float = Field(2.0, gt=0)
-    """Time for one attempt to open a link; longer leaves pairs apart for longer under heavy loss."""
-    retry_max_s: float = Field(1.0, gt=0)
-    """Longest pause between two attempts to dial a robot of the roster."""
     bulk_send_buffer_bytes: int = Field(65536, ge=4096)
     """Kernel buffer of the bulk session; larger is faster on long links and delays control more on slow ones."""
-    message_bytes_max: int = Field(1024 * 1024, ge=1024)
+    message_bytes_max: int = inner(1024 * 1024, ge=1024)
     """Larger messages are neither sent nor accepted; latents have their own limit."""
-    latent_bytes_max: int = Field(8 * 1024 * 1024, ge=1024)
+    latent_bytes_max: int = inner(8 * 1024 * 1024, ge=1024)
     """Larger latents are neither served nor fetched."""
-    chunk_bytes: int = Field(256 * 1024, ge=1024, le=4 * 1024 * 1024)
+    chunk_bytes: int = inner(256 * 1024, ge=1024, le=4 * 1024 * 1024)
     """A latent travels in pieces of this size; a fetch that was cut goes on with the piece that is missing."""
-    chunk_timeout_s: float = Field(5.0, gt=0)
-    """One piece that takes longer is asked for again."""
-    fetches_max: int = Field(2, ge=1, le=8)
-    """Latents in flight at once; more share the same link and make each later."""
-    inbox_messages_max: int = Field(4096, ge=16)
+    inbox_messages_max: int = inner(4096, ge=16)
     """Messages of one kind that wait for the robot; the oldest is dropped for a new one."""
-    inbox_bytes_max: int = Field(32 * 1024 * 1024, ge=1024 * 1024)
-    """Bytes of one kind that wait for the robot."""
-    peers_max: int = Field(256, ge=1)
+    peers_max: int = inner(256, ge=1)
     """Different senders; messages of any further one are dropped."""
-    peer_messages_per_s: float = Field(2000.0, gt=0)
+    peer_messages_per_s: float = inner(2000.0, gt=0)
     """What one sender may sustain, with bursts of two seconds' worth; the rest is dropped and counted."""
-    peer_bytes_per_s: float = Field(16.0 * 1024 * 1024, gt=0)
+    peer_bytes_per_s: float = inner(16.0 * 1024 * 1024, gt=0)
     """The same in bytes."""
     tls: TlsConfig | None = None
     """Mutual TLS and one writer per key; None is for trusted networks and emulation."""
     chaos: bool = False
     """Take orders of `flocc chaos`: partitions, loss, kills. For tests; without tls anybody in reach may order."""
+
+    def multicast_group(self, control: bool) -> str:
+        """Where control sessions, or bulk sessions, find each other."""
+        group, _, port = self.multicast_address.rpartition(":")
+        return self.multicast_address if control else f"{group}:{int(port) + 1}"
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "TransportConfig":
@@ -110,8 +115,6 @@ class TransportConfig(Section):
         wrong = [e for e in endpoints if not e.startswith("tls/")] if self.tls else []
         if wrong:
             raise ValueError(f"with tls every endpoint begins with tls/, but there is {wrong[0]!r}")
-        if self.multicast_control == self.multicast_bulk:
-            raise ValueError("multicast_control and multicast_bulk must differ")
         return self
 
 

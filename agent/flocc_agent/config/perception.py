@@ -5,40 +5,33 @@ from typing import Literal
 
 from pydantic import Field
 
-from flocc_agent.config.section import Section
+from flocc_agent.config.section import Section, inner
 
 
 class ClassicalConfig(Section):
-    """The classical front end: SIFT features, mutual matching, essential matrix, three-view scale."""
+    """The classical front end: SIFT features, mutual matching; two- and three-view geometry."""
 
     features_max: int = Field(1000, ge=50, le=10_000)
     """Features per image; a latent has 136 bytes for each."""
     pixels_max: int = Field(180_000, ge=10_000)
     """Larger images are shrunk to this many pixels before features are sought (480x375); more cost more time."""
-    contrast_threshold: float = Field(0.02, gt=0)
-    """SIFT's contrast threshold; lower finds features in dim images, and more that do not repeat."""
-    distance_ratio_max: float = Field(0.8, gt=0, le=1)
-    """Lowe's ratio; lower keeps fewer and surer matches."""
-    inlier_threshold_px: float = Field(2.0, gt=0)
-    """A correspondence this close to its epipolar line is verified."""
-    sigma_px: float = Field(0.7, gt=0)
-    """Noise of a correspondence; weights the covariance."""
     correspondences_min: int = Field(15, ge=8)
-    """Fewer verified correspondences are no registration."""
-    iterations_max: int = Field(2000, ge=100)
-    """Hypotheses of the robust estimator."""
-    common_points_min: int = Field(10, ge=6)
-    """Points seen in the neighbour, the query and the match that fix the closure's scale; with fewer it has none."""
-    scale_sigma_ratio_max: float = Field(0.3, gt=0)
-    """A scale more uncertain than this is not given."""
-    direction_sigma_max_rad: float = Field(0.35, gt=0)
-    """A closure without scale whose direction is more uncertain than this is degenerate."""
-    odometry_rotation_sigma_rad: float = Field(0.03, gt=0)
-    """How far odometry's rotation between neighbours may be from the images', calibration error included."""
-    odometry_direction_sigma_rad: float = Field(0.2, gt=0)
-    """How far odometry's direction of motion between neighbours may be from the images'."""
-    odometry_pairs_max: int = Field(256, ge=1)
-    """Odometry-pair results kept in memory."""
+    """Fewer verified correspondences are no registration; lower registers more pairs, and more of them wrongly."""
+    acceptance: Literal["fitted", "ratio"] = "fitted"
+    """fitted: the front end's own rule for closures; ratio: Eq. (1) against core.loop_closing.match_ratio_threshold."""
+
+
+class LearnedConfig(Section):
+    """The learned front end: free networks find and match features; the geometry is the classical one's."""
+
+    model: Literal["aliked-lightglue", "xfeat-lighterglue"] = "aliked-lightglue"
+    """aliked-lightglue: sees most; xfeat-lighterglue: costs what SIFT costs; the same on all robots of a swarm."""
+    weights: Path | None = None
+    """Folder with the networks' files; none: where `flocc weights get learned` puts them."""
+    device: Literal["auto", "cuda", "mps", "cpu"] = "auto"
+    """Where the networks run; auto takes the best that is there."""
+    acceptance: Literal["fitted", "ratio"] = "fitted"
+    """fitted: the front end's own rule for closures; ratio: Eq. (1) against core.loop_closing.match_ratio_threshold."""
 
 
 class SyntheticConfig(Section):
@@ -46,34 +39,18 @@ class SyntheticConfig(Section):
 
     dimension: int = Field(128, ge=8, le=4096)
     """Length of a descriptor; a longer one has less accidental similarity, about 1/sqrt(dimension)."""
-    place_distance_m: float = Field(3.0, gt=0)
-    """Distance at which the similarity of two descriptors has fallen to 0.6."""
-    place_angle_rad: float = Field(0.7, gt=0)
-    """Angle between viewing directions at which the similarity of two descriptors has fallen to about 0.6."""
-    descriptor_noise_ratio: float = Field(0.2, ge=0)
+    descriptor_noise_ratio: float = inner(0.2, ge=0)
     """Length of a descriptor's own noise relative to the place's signature."""
     alias_probability: float = Field(0.05, ge=0, le=1)
     """Share of places that look like one of a few others."""
-    alias_places: int = Field(4, ge=1)
+    alias_places: int = inner(4, ge=1)
     """Number of looks that aliased places share; fewer means more mistaken candidates."""
-    alias_cell_m: float = Field(10.0, gt=0)
-    """Edge of the cubes that are aliased as a whole."""
-    visibility_distance_m: float = Field(4.0, gt=0)
-    """Distance at which the correspondences have fallen to 0.6 of the typical number."""
-    visibility_angle_rad: float = Field(0.6, gt=0)
-    """Angle between viewing directions at which the correspondences have fallen to 0.6 of the typical number."""
-    correspondences_typical: int = Field(400, ge=20)
-    """Correspondences of two images of one place."""
-    correspondences_min: int = Field(20, ge=1)
-    """Fewer correspondences are no registration."""
-    rotation_sigma_rad: float = Field(0.01, ge=0)
+    rotation_sigma_rad: float = inner(0.01, ge=0)
     """Rotation noise at the typical number of correspondences; grows as they become few."""
-    translation_sigma_ratio: float = Field(0.05, ge=0)
+    translation_sigma_ratio: float = inner(0.05, ge=0)
     """Translation noise per distance, at the typical number of correspondences."""
     outlier_probability: float = Field(0.05, ge=0, le=1)
     """Share of registrations that give a wrong pose, with fewer correspondences than a right one."""
-    outlier_distance_m: float = Field(10.0, gt=0)
-    """Typical length of a wrong translation."""
     scale_sigma_ratio: float = Field(0.3, ge=0)
     """Spread of metres per network unit between registrations (log-normal)."""
     scale_drift_sigma_ratio: float = Field(0.1, ge=0)
@@ -110,46 +87,22 @@ class Mast3rConfig(Section):
     """CPU threads of the networks; fewer leave more to the rest of the robot; 0: torch's choice."""
     compile: bool = False
     """Compile the networks at start: half a minute once, then up to a third faster with bf16."""
-    warm_up: bool = False
-    """Run the networks once at start, so that the first keyframe is not slower."""
-    memory_check: bool = True
-    """Refuse to start where the networks will not fit in the memory that is free."""
     image_size_px: Literal[512, 224] = 512
     """Longer side of the network's input; 224 (square) is five times cheaper and less accurate."""
     exchange: Literal["latent", "image", "auto"] = "latent"
     """latent: others decode what this robot encoded; image: send a JPEG that the receiver encodes; auto: keep both."""
     latent_dtype: Literal["fp16", "int8"] = "fp16"
     """Number format of a sent latent; int8 (per channel) halves it to 0.8 MB."""
-    jpeg_quality: int = Field(90, ge=50, le=100)
-    """Quality of sent images; lower is smaller and less exact."""
-    place_input: Literal["native", "shorter-side", "swarm-slam"] = "swarm-slam"
+    place_input: Literal["native", "shorter-side", "swarm-slam"] = inner("swarm-slam")
     """What CosPlace sees: the picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
     subsample_px: int = Field(8, ge=1, le=64)
     """Distance of the matcher's seeds; 16 is four times faster with a quarter of the matches; equal on all robots."""
-    border_px: int = Field(3, ge=0)
-    """Matches nearer to a border than this are dropped."""
-    match_confidence_min: float = Field(0.0, ge=0)
-    """Matches whose descriptor confidence is below this are dropped; the authors use 1.001 for localisation."""
-    match_both_directions: bool = False
-    """Match from both images' seeds; about twice the matches in twice the time."""
-    count: Literal["matches", "inliers"] = "matches"
-    """Correspondences of Eq. (1): all reciprocal matches as in the paper, or only those that agree with the pose."""
     calibrated: bool = True
     """Use the camera's calibration; false estimates focal lengths from the pointmaps, with a second decode."""
-    consistency_check: bool = False
+    consistency_check: bool = inner(False)
     """Decode (match, query) too and reject closures on which the two disagree; doubles the time."""
-    consistency_rotation_rad: float = Field(0.2, gt=0)
-    """How far the two decodes' rotations, and directions of translation, may differ."""
-    reprojection_px: float = Field(5.0, gt=0)
-    """Matches that reproject within this, at the network's resolution, agree with a pose."""
-    iterations: int = Field(2000, ge=1000)
-    """Samples of PnP's RANSAC; below 1000 it fails at 70 % outliers."""
-    inliers_min: int = Field(12, ge=6)
-    """Fewer agreeing matches are no pose."""
-    odometry_pairs_max: int = Field(256, ge=1)
+    odometry_pairs_max: int = inner(256, ge=1)
     """Odometry-pair results kept in memory."""
-    encoded_images_max: int = Field(8, ge=1)
-    """Latents of received images kept in memory, 1.5 to 3 MB each."""
     batch_max: int = Field(1, ge=1, le=64)
     """Images encoded, or pairs decoded, at once; more is faster on a GPU and takes about 1 GB each."""
 
@@ -157,10 +110,11 @@ class Mast3rConfig(Section):
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
-    method: Literal["classical", "synthetic", "recorded", "mast3r"] = "classical"
-    """classical: OpenCV, no weights; synthetic: ground truth plus noise; recorded: looked up in a file; mast3r:
-    CosPlace and MASt3R checkpoints."""
+    method: Literal["classical", "synthetic", "recorded", "mast3r", "learned"] = "classical"
+    """classical: OpenCV, no weights; learned: ALIKED or XFeat with LightGlue; mast3r: CosPlace and MASt3R checkpoints;
+    synthetic: ground truth plus noise; recorded: looked up in a file."""
     classical: ClassicalConfig = ClassicalConfig()
+    learned: LearnedConfig = LearnedConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     recorded: RecordedConfig = RecordedConfig()
     mast3r: Mast3rConfig = Mast3rConfig()

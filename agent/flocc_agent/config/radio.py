@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from flocc_agent.config.section import Section
+from flocc_agent.config.section import Section, inner
 
 if TYPE_CHECKING:
     from flocc_agent.radio import LinkParameters, RadioParameters
@@ -17,7 +17,7 @@ class LinkConfig(Section):
     """Probability that a message is lost, independently of others."""
     burst_ratio: float = Field(0.0, ge=0, le=1)
     """Share of messages that fall into bursts of loss."""
-    burst_messages_mean: float = Field(5.0, ge=1)
+    burst_messages_mean: float = inner(5.0, ge=1)
     """Mean length of such a burst, messages."""
     latency_s: float = Field(0.0, ge=0)
     """Least delay of a message."""
@@ -27,11 +27,11 @@ class LinkConfig(Section):
     """Probability that a message arrives twice."""
     reorder_ratio: float = Field(0.0, ge=0, le=1)
     """Probability that a message may be overtaken."""
-    reorder_delay_s: float = Field(0.2, ge=0)
+    reorder_delay_s: float = inner(0.2, ge=0)
     """How long such a message is held back."""
     bandwidth_bytes_s: float | None = Field(None, gt=0)
     """Capacity of each directed link; None is unlimited."""
-    queue_bytes_max: int = Field(4 * 1024 * 1024, ge=0)
+    queue_bytes_max: int = inner(4 * 1024 * 1024, ge=0)
     """What may wait for a link before messages are lost."""
 
     def link(self) -> "LinkParameters":

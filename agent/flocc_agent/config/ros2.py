@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from flocc_agent.config.network import Endpoint
-from flocc_agent.config.section import Section
+from flocc_agent.config.section import Section, inner
 
 TOPIC_PATTERN = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
@@ -36,7 +36,7 @@ class Ros2Config(Section):
     """Namespace of relative topics, such as /r1."""
     image_topic: RosName = "camera/image_raw"
     """sensor_msgs/Image or CompressedImage; empty where a program or a recording feeds the agent."""
-    image_type: Literal["auto", "raw", "compressed"] = "auto"
+    image_type: Literal["auto", "raw", "compressed"] = inner("auto")
     """Type of the image topic; auto: compressed where the topic's name ends with compressed."""
     camera_info_topic: RosName = "camera/camera_info"
     """sensor_msgs/CameraInfo with the intrinsics of the images."""
@@ -56,28 +56,20 @@ class Ros2Config(Section):
     camera_frame: str = ""
     """Optical frame of the images; images of another one are refused. Empty takes what the images say."""
     camera_mounting: tuple[float, float, float, float, float, float, float] | None = None
-    """Optical frame in base_frame: x y z qx qy qz qw, metres; None takes it from tf_static_topic."""
+    """Optical frame in base_frame: x y z qx qy qz qw, metres; None takes it from the topic `tf_topic`_static."""
     tf_topic: RosName = "/tf"
     """Where map_frame to odom_frame is published."""
-    tf_static_topic: RosName = "/tf_static"
-    """Where the camera's mounting is read."""
     path_topic: RosName = "flocc/path"
     """Where the corrected path is published, nav_msgs/Path."""
     pose_topic: RosName = "flocc/pose"
     """Where the corrected pose is published, geometry_msgs/PoseWithCovarianceStamped."""
-    map_frame_topic: RosName = "flocc/map_frame"
-    """Where the name of the swarm's map frame is published, std_msgs/String; when it changes, every pose jumps."""
-    tf_period_s: float = Field(0.05, gt=0)
+    tf_period_s: float = inner(0.05, gt=0)
     """Least time between two transforms, and between two poses."""
     tf_tolerance_s: float = Field(0.1, ge=0, le=60)
     """The transform is dated so far ahead, so that it can be looked up until the next one."""
-    path_period_s: float = Field(1.0, gt=0)
+    path_period_s: float = inner(1.0, gt=0)
     """Least time between two paths."""
-    odometry_gap_max_s: float = Field(0.5, gt=0)
-    """Images in a longer pause of the odometry are left out."""
-    images_max: int = Field(8, ge=1, le=256)
-    """Images that wait for odometry or for the encoder; the oldest gives way."""
-    path_poses_max: int = Field(1000, ge=2, le=100_000)
+    path_poses_max: int = inner(1000, ge=2, le=100_000)
     """A longer path is thinned out evenly."""
 
     def is_compressed(self) -> bool:
@@ -89,7 +81,7 @@ class Ros2Config(Section):
     def _is_consistent(self) -> "Ros2Config":
         if self.image_topic and not (self.odometry_topic and self.camera_info_topic):
             raise ValueError("images need odometry_topic and camera_info_topic")
-        outputs = ("tf_topic", "tf_static_topic", "path_topic", "pose_topic", "map_frame_topic")
+        outputs = ("tf_topic", "path_topic", "pose_topic")
         missing = [name for name in outputs if not getattr(self, name)]
         if missing:
             raise ValueError(f"{missing[0]} must not be empty")

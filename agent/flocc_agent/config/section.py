@@ -3,14 +3,19 @@
 A complaint is one sentence that names the file and the key.
 """
 
+import dataclasses
+import difflib
 import json
 import tomllib
+import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
+from flocc_agent.config.removed import REMOVED
+from flocc_agent.core.parameters import INNER
 from flocc_protocol.errors import FloccError
 
 
@@ -31,6 +36,16 @@ class Section(BaseModel):
         return folder / value if folder is not None and isinstance(value, Path) else value
 
 
+def inner(default: Any, **limits: Any) -> Any:
+    """A parameter that a program may give, an experiment above all, but no file: it is no key and is not written.
+
+    Args:
+        default: Its value.
+        limits: As of pydantic's `Field`.
+    """
+    return Field(default, exclude=True, **limits)
+
+
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -46,23 +61,46 @@ def validated(model: type[M], fields: Mapping[str, object], source: str, folder:
     Raises:
         ConfigError: One sentence that names the source and the key.
     """
+    refuse_removed(fields, source)
     try:
         return model.model_validate(fields, context={"folder": folder})
     except (ValidationError, FloccError) as error:
         raise ConfigError(
-            first_error(error, source) if isinstance(error, ValidationError) else f"{source}: {error}"
+            first_error(error, source, model) if isinstance(error, ValidationError) else f"{source}: {error}"
         ) from error
 
 
-def first_error(error: ValidationError, source: str) -> str:
+def first_error(error: ValidationError, source: str, model: type[BaseModel]) -> str:
     """Put pydantic's first complaint into one sentence that names the source and the key."""
     complaint = error.errors()[0]
     key = ".".join(str(part) for part in complaint["loc"]) or "(top level)"
     if complaint["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{source}: the key '{key}' does not exist"
+        return f"{source}: the key '{key}' does not exist{_meant(model, complaint['loc'])}"
     if complaint["type"] in ("missing", "missing_argument"):
         return f"{source}: the key '{key}' is missing"
     return f"{source}: {key}: {complaint['msg'].removeprefix('Value error, ')}"
+
+
+def _meant(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """The key of the same section that is spelt most like one that does not exist."""
+    *sections, wrong = location
+    names = _keys(model, [part for part in sections if isinstance(part, str)])
+    near = difflib.get_close_matches(str(wrong), names, n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def _keys(kind: Any, sections: list[str]) -> list[str]:
+    """Keys of the section that lies below a model, or a union or list of models, at a path."""
+    if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__"):
+        keys = {f.name for f in dataclasses.fields(kind) if INNER not in f.metadata}
+        below = {name: hint for name, hint in typing.get_type_hints(kind).items() if name in keys}
+    elif isinstance(kind, type) and issubclass(kind, BaseModel):
+        below = {name: field.annotation for name, field in kind.model_fields.items() if not field.exclude}
+    else:
+        return [name for each in typing.get_args(kind) for name in _keys(each, sections)]
+    if not sections:
+        return list(below)
+    return _keys(below[sections[0]], sections[1:]) if sections[0] in below else []
 
 
 def read_toml(path: Path) -> dict[str, object]:
@@ -92,6 +130,26 @@ def read_json(path: Path) -> dict[str, object]:
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: holds no JSON object")
     return content
+
+
+def refuse_removed(fields: Mapping[str, object], source: str) -> None:
+    """Refuse a key of an earlier version.
+
+    Raises:
+        ConfigError: One sentence that names the source, the key and what replaced it.
+    """
+    for key, replacement in REMOVED.items():
+        if _is_given(fields, key.split(".")):
+            raise ConfigError(f"{source}: the key '{key}' is gone: {replacement}")
+
+
+def _is_given(fields: object, path: list[str]) -> bool:
+    """Whether a key stands somewhere in fields; tables of a list are looked through, too."""
+    if isinstance(fields, list | tuple):
+        return any(_is_given(table, path) for table in fields)
+    if not isinstance(fields, Mapping) or path[0] not in fields:
+        return False
+    return len(path) == 1 or _is_given(fields[path[0]], path[1:])
 
 
 def parsed_change(text: str) -> tuple[str, object]:

@@ -4,7 +4,7 @@ Recordings of several robots, and the research sets of `../shared/data`, which a
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +118,30 @@ def fountain(folder: Path) -> Scene:
         fx, fy, cx, cy = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) * FOUNTAIN_REDUCTION
         views.append(View(f"r{k:02d}", file, Camera(width, height, fx, fy, cx, cy), T, T))
     return Scene(folder.name, tuple(views), 4.0, float(np.radians(30.0)), 1.0)
+
+
+def robots_beside(folder: Path, place_distance_m: float) -> Scene:
+    """A folder with a plain data set per robot, such as street or herz_jesu."""
+    views = [view for robot in sorted(folder.iterdir()) if robot.is_dir() for view in _plain_views(robot)]
+    return Scene(folder.name, tuple(views), place_distance_m, float(np.radians(40.0)), 1.0)
+
+
+def _plain_views(folder: Path) -> Iterator[View]:
+    """A robot's images that have a true pose."""
+    source = read_source(folder)
+    if source.lens is None or source.truth is None:
+        raise DatasetError(f"{folder}: has no intrinsics or no ground truth")
+    for stamp_s, file in source.images:
+        T = source.truth.at(stamp_s)
+        T_odom = T if source.odometry is None else source.odometry.at(stamp_s)
+        if T is not None and T_odom is not None:
+            yield View(folder.name, file, agents_camera(source.lens), T, T_odom)
+
+
+def kitti(folder: Path) -> Scene:
+    """A drive as two robots that took turns, four images (5 m) each."""
+    views = [replace(view, robot=f"r{1 + k // 4 % 2}") for k, view in enumerate(_plain_views(folder))]
+    return Scene(folder.parent.name, tuple(views), 10.0, float(np.radians(40.0)), 1.0)
 
 
 def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:

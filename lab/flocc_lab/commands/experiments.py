@@ -175,7 +175,10 @@ def _run(chosen: "Experiment[Any]", settings: Any, seed: int, out: Path, process
     from flocc_lab.experiments.runner import processes_of, run_experiment
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with progress_bar("preparing") as on_prepare, Progress(*columns, TimeRemainingColumn(), transient=True) as bar:
+    with (
+        progress_bar("preparing", "part") as on_prepare,
+        Progress(*columns, TimeRemainingColumn(), transient=True) as bar,
+    ):
         task = bar.add_task(chosen.name, total=None)
 
         def on_row(row: "Row", done: int, cells: int) -> None:

@@ -85,7 +85,7 @@ def leaderless(rows: Sequence[RobotStatus]) -> list[Finding]:
     nobody = [row.robot for row in rows if row.leader is None]
     found = []
     if nobody:
-        advice = "An election takes a few seconds; if it does not end, heartbeats get lost: see core.election."
+        advice = "An election takes a few seconds; if it does not end, heartbeats get lost: see the loss of links."
         found.append(
             blocked("no-leader", f"{named(nobody)} follow{'s' * (len(nobody) == 1)} no leader.", advice, *nobody)
         )

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
@@ -44,6 +45,10 @@ logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
+IMAGES_MAX = 8
+"""Images that wait for odometry or for the encoder; the oldest gives way."""
+ODOMETRY_GAP_MAX_S = 0.5
+"""Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
 INBOX_MESSAGES_MAX = 512
 INBOX_BYTES_MAX = 64 * 1024 * 1024
 WATCH_PERIOD_S = 1.0
@@ -62,13 +67,13 @@ class Host:
         add_keyframe: Takes (image, T_odom_camera, stamp_s); may wait.
         mount_camera: Told `T_body_camera` once it is known, before the first keyframe.
         trajectory: Gives stamps (s) and (N, 4, 4) corrected body poses of all keyframes; called off the loop's thread.
-        report: Takes an event and its fields.
+        report: Takes facts for people.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
     mount_camera: Callable[[Float], None]
     trajectory: Callable[[], tuple[list[float], Float]]
-    report: Callable[[str, dict[str, Any]], None]
+    report: Callable[[Fact], None]
 
 
 class Ros2Adapter:
@@ -85,7 +90,7 @@ class Ros2Adapter:
         self._selector = selector
         self._host = host
         self._types = MessageTypes()
-        self._synchroniser = Synchroniser(config.images_max, config.odometry_gap_max_s)
+        self._synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S)
         self._static = StaticFrames()
         self._counter = TrafficCounter()
         self._problems = Problems(host.report)
@@ -147,7 +152,7 @@ class Ros2Adapter:
             wanted["image"] = (config.image_topic, COMPRESSED_IMAGE if config.is_compressed() else IMAGE, SENSOR)
             wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)
             if config.camera_mounting is None:
-                wanted["tf_static"] = (config.tf_static_topic, TF, TF_STATIC)
+                wanted["tf_static"] = (f"{config.tf_topic}_static", TF, TF_STATIC)
         return wanted
 
     # What comes
@@ -258,7 +263,7 @@ class Ros2Adapter:
             waited_s += WATCH_PERIOD_S
             if self._session.is_connected() != connected:
                 connected = not connected
-                self._host.report("ros2_router", {"router": self._config.router, "connected": connected})
+                self._host.report(RouterConnected(router=self._config.router, connected=connected))
                 logger.info("ROS 2: %s to %s", "connected" if connected else "no longer connected", self._config.router)
             if waited_s == PATIENCE_S and not connected:
                 self._complain("router", f"nobody answers at {self._config.router}; is rmw_zenohd running?")

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.config import ClassicalConfig
 from flocc_agent.geometry import pose
-from flocc_agent.perception.classical.bundle import (
+from flocc_agent.perception.multiview.bundle import (
     Refined,
     View,
     covariance_of_view,
@@ -20,11 +19,10 @@ from flocc_agent.perception.classical.bundle import (
     refine,
     reprojection_errors_px,
 )
-from flocc_agent.perception.classical.features import Features
-from flocc_agent.perception.classical.two_view import TwoView, usac_parameters
+from flocc_agent.perception.multiview.parameters import Geometry, Indices, Rays
+from flocc_agent.perception.multiview.two_view import TwoView, usac_parameters
 
 Float = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 INVERSE_DEPTH_MIN = 1e-3
@@ -33,7 +31,7 @@ AGREEING_SHARE_MIN = 0.6
 """Share of the points seen by all that must fit, or the pairs contradict each other."""
 
 
-def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView, config: ClassicalConfig) -> Refined | None:
+def three_view(query: Rays, odometry_pair: TwoView, loop_pair: TwoView, geometry: Geometry) -> Refined | None:
     """Refine both views of a query together.
 
     Returns:
@@ -43,7 +41,7 @@ def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView, conf
     indices = np.union1d(loop_pair.query_indices, odometry_pair.query_indices)
     neighbour, match = _spread(odometry_pair, indices), _spread(loop_pair, indices)
     common = neighbour.seen & match.seen
-    if int(common.sum()) < config.common_points_min:
+    if int(common.sum()) < geometry.common_points_min:
         return None
     points = query.points[indices].astype(np.float64)
     depths = np.zeros(len(indices))
@@ -52,13 +50,13 @@ def three_view(query: Features, odometry_pair: TwoView, loop_pair: TwoView, conf
     loop_depths[match.seen] = loop_pair.refined.inverse_depths
     guesses = [
         _by_depth_ratio(match, depths, loop_depths, common),
-        _by_known_points(points, match, depths, common, config),
+        _by_known_points(points, match, depths, common, geometry),
     ]
-    refined = [_refined(points, depths, neighbour, match, T, config) for T in guesses if T is not None]
+    refined = [_refined(points, depths, neighbour, match, T, geometry) for T in guesses if T is not None]
     if not refined:
         return None
     best = min(refined, key=lambda candidate: candidate.cost)
-    return best if _is_certain(best, points, common, config) else None
+    return best if _is_certain(best, points, common, geometry) else None
 
 
 def _spread(pair: TwoView, indices: Indices) -> View:
@@ -81,10 +79,10 @@ def _by_depth_ratio(match: View, depths: Float, loop_depths: Float, common: Mask
     return T
 
 
-def _by_known_points(points: Float, match: View, depths: Float, common: Mask, config: ClassicalConfig) -> Float | None:
+def _by_known_points(points: Float, match: View, depths: Float, common: Mask, geometry: Geometry) -> Float | None:
     """Match pose from the points that the odometry pair placed (perspective-n-point)."""
     usable = common & (depths > INVERSE_DEPTH_MIN)
-    if int(usable.sum()) < config.common_points_min:
+    if int(usable.sum()) < geometry.common_points_min:
         return None
     placed = np.column_stack([points[usable], np.ones(int(usable.sum()))]) / depths[usable, None]
     found, _, rotation, translation, _ = cv2.solvePnPRansac(
@@ -92,7 +90,7 @@ def _by_known_points(points: Float, match: View, depths: Float, common: Mask, co
         match.observed[usable],
         np.eye(3),
         np.zeros(4),
-        params=usac_parameters(config, match.focal_px),
+        params=usac_parameters(geometry, match.focal_px),
     )
     if not found or not np.all(np.isfinite(rotation)) or not np.all(np.isfinite(translation)):
         return None
@@ -100,26 +98,26 @@ def _by_known_points(points: Float, match: View, depths: Float, common: Mask, co
 
 
 def _refined(
-    points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float, config: ClassicalConfig
+    points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float, geometry: Geometry
 ) -> Refined:
     """Refine from one guess of the match's pose."""
     only_match = match.seen & ~neighbour.seen
     started = depths.copy()
     started[only_match] = inverse_depths_from(points[only_match], T_match_query, match.observed[only_match])
     match = replace(match, T_view_query=T_match_query, unit_translation=False, prior=None)
-    return refine(points, started, (neighbour, match), config.sigma_px)
+    return refine(points, started, (neighbour, match), geometry.sigma_px)
 
 
-def _is_certain(refined: Refined, points: Float, common: Mask, config: ClassicalConfig) -> bool:
+def _is_certain(refined: Refined, points: Float, common: Mask, geometry: Geometry) -> bool:
     """Whether the points seen by all agree and fix the match's distance."""
     neighbour, match = refined.views
-    limit = config.inlier_threshold_px
+    limit = geometry.inlier_threshold_px
     agrees = reprojection_errors_px(points, refined.inverse_depths, match) < limit
     agrees &= reprojection_errors_px(points, refined.inverse_depths, neighbour) < limit
     count = int((agrees & common).sum())
-    if count < config.common_points_min or count < AGREEING_SHARE_MIN * int(common.sum()):
+    if count < geometry.common_points_min or count < AGREEING_SHARE_MIN * int(common.sum()):
         return False
-    return length_sigma_ratio(refined, 1) < config.scale_sigma_ratio_max
+    return length_sigma_ratio(refined, 1) < geometry.scale_sigma_ratio_max
 
 
 def length_sigma_ratio(refined: Refined, k: int) -> float:

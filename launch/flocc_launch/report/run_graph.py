@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.registration import closure_probability
-from flocc_agent.geometry import between, inverse, pose_from_tq, tq_from_pose
+from flocc_agent.geometry import between, inverse, pose_from_tq
+from flocc_launch.graph_files.g2o import edge_line, vertex_line
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.run_records import ClosureKnown
 from flocc_protocol.ids import KeyframeId, LogId
@@ -48,22 +49,9 @@ def vertices_of(loaded: LoadedRun) -> dict[KeyframeId, int]:
     return vertices
 
 
-def vertex_line(vertex: int, T: Float) -> str:
-    """One vertex."""
-    return f"VERTEX_SE3:QUAT {vertex} {numbers(T)}"
-
-
-def edge_line(first: int, second: int, T: Float, sigma_m: float, sigma_rad: float) -> str:
-    """One edge with its information: translation first, as g2o has it, upper triangle."""
-    diagonal = [1 / sigma_m**2] * 3 + [1 / sigma_rad**2] * 3
-    upper = [f"{diagonal[i]:.9g}" if i == j else "0" for i in range(6) for j in range(i, 6)]
-    return f"EDGE_SE3:QUAT {first} {second} {numbers(T)} {' '.join(upper)}"
-
-
-def numbers(T: Float) -> str:
-    """Pose as `x y z qx qy qz qw`."""
-    x, y, z, qw, qx, qy, qz = tq_from_pose(T)
-    return " ".join(f"{v:.12g}" for v in (x, y, z, qx, qy, qz, qw))
+def isotropic(sigma_m: float, sigma_rad: float) -> Float:
+    """Information (6, 6), rotation first, of a measurement as sure in every direction."""
+    return np.diag([1 / sigma_rad**2] * 3 + [1 / sigma_m**2] * 3)
 
 
 def odometry_lines(loaded: LoadedRun, vertices: Mapping[KeyframeId, int]) -> Iterator[str]:
@@ -75,7 +63,7 @@ def odometry_lines(loaded: LoadedRun, vertices: Mapping[KeyframeId, int]) -> Ite
         if second in vertices:
             T_odom_body = loaded.tracks[first.log.robot].T_odom_body
             T = between(T_odom_body[first.index], T_odom_body[second.index])
-            yield edge_line(vertex, vertices[second], T, sigma_m, sigma_rad)
+            yield edge_line(vertex, vertices[second], T, isotropic(sigma_m, sigma_rad))
 
 
 def closure_lines(loaded: LoadedRun, vertices: Mapping[KeyframeId, int]) -> Iterator[str]:
@@ -101,14 +89,8 @@ def closure_line(closure: ClosureKnown, loaded: LoadedRun, vertices: Mapping[Key
         return f"# closure {query} {match}: its metric scale is not known"
     sigmas = BackendConfig()
     ratio = 1.0 if closure.match_ratio is None else closure.match_ratio
-    spread = 1 / np.sqrt(closure_probability(ratio, sigmas.steepness))
-    return edge_line(
-        first,
-        second,
-        T,
-        sigmas.closure_translation_sigma_m * float(spread),
-        sigmas.closure_rotation_sigma_rad * float(spread),
-    )
+    information = isotropic(sigmas.closure_translation_sigma_m, sigmas.closure_rotation_sigma_rad)
+    return edge_line(first, second, T, closure_probability(ratio, sigmas.steepness) * information)
 
 
 def metric_body_pose(closure: ClosureKnown, loaded: LoadedRun) -> Float | None:

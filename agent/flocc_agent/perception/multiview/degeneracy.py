@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.config import ClassicalConfig
 from flocc_agent.geometry import angle_rad, nearest_rotation, pose
-from flocc_agent.perception.classical.bundle import (
+from flocc_agent.perception.multiview.bundle import (
     View,
     covariance_of_view,
     inverse_depths_from,
     refine,
 )
-from flocc_agent.perception.classical.two_view import TwoView, usac_parameters
+from flocc_agent.perception.multiview.parameters import Geometry
+from flocc_agent.perception.multiview.two_view import TwoView, usac_parameters
 
 Float = NDArray[np.float64]
 
@@ -30,21 +30,21 @@ SAME_ANGLE_RAD = 0.05
 INVERSE_DEPTH_MIN = -0.01
 
 
-def degeneracy(points: Float, pair: TwoView, config: ClassicalConfig) -> str | None:
+def degeneracy(points: Float, pair: TwoView, geometry: Geometry) -> str | None:
     """Say why a pair's direction of translation is not fixed; None where it is.
 
     Args:
         points: (K, 2) x/z and y/z of the pair's correspondences in the query.
         pair: The verified pair.
-        config: Thresholds.
+        geometry: Thresholds.
     """
     view = pair.view
-    if rotation_share(points, view, config) > EXPLAINED_SHARE_MIN:
+    if rotation_share(points, view, geometry) > EXPLAINED_SHARE_MIN:
         return "the images differ by a rotation only, and odometry gives no structure"
     sigma_rad = direction_sigma_rad(pair)
-    if sigma_rad > config.direction_sigma_max_rad:
+    if sigma_rad > geometry.direction_sigma_max_rad:
         return f"the direction of translation is uncertain by {sigma_rad:.2f} rad"
-    if _plane_is_ambiguous(points, pair, config):
+    if _plane_is_ambiguous(points, pair, geometry):
         return "the correspondences lie in one plane, which two motions explain equally well"
     return None
 
@@ -55,11 +55,11 @@ def direction_sigma_rad(pair: TwoView) -> float:
     return float(np.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0)))
 
 
-def rotation_share(points: Float, view: View, config: ClassicalConfig) -> float:
+def rotation_share(points: Float, view: View, geometry: Geometry) -> float:
     """Share of the correspondences that a rotation alone explains."""
     bearings, seen = _bearings(points), _bearings(view.observed)
     weights = np.ones(len(points))
-    threshold = config.inlier_threshold_px
+    threshold = geometry.inlier_threshold_px
     errors = np.full(len(points), np.inf)
     for _ in range(ROTATION_ROUNDS):
         R = nearest_rotation((seen * weights[:, None]).T @ bearings)
@@ -72,10 +72,10 @@ def rotation_share(points: Float, view: View, config: ClassicalConfig) -> float:
     return float(np.mean(errors < threshold))
 
 
-def _plane_is_ambiguous(points: Float, pair: TwoView, config: ClassicalConfig) -> bool:
+def _plane_is_ambiguous(points: Float, pair: TwoView, geometry: Geometry) -> bool:
     """Whether one plane holds most correspondences and a second motion fits as well as the pair's."""
     view = pair.view
-    H, mask = cv2.findHomography(points, view.observed, usac_parameters(config, view.focal_px))
+    H, mask = cv2.findHomography(points, view.observed, usac_parameters(geometry, view.focal_px))
     if H is None or mask is None or float(np.mean(mask)) < PLANE_SHARE_MIN:
         return False
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
@@ -84,7 +84,7 @@ def _plane_is_ambiguous(points: Float, pair: TwoView, config: ClassicalConfig) -
         if length < 1e-6:
             continue
         other = pose(np.asarray(R, np.float64), np.asarray(t, np.float64).ravel() / length)
-        if not _is_same(other, view.T_view_query) and _fits_as_well(points, pair, other, config):
+        if not _is_same(other, view.T_view_query) and _fits_as_well(points, pair, other, geometry):
             return True
     return False
 
@@ -96,13 +96,13 @@ def _is_same(T: Float, T_other: Float) -> bool:
     return turned < SAME_ANGLE_RAD and float(np.arccos(direction)) < SAME_ANGLE_RAD
 
 
-def _fits_as_well(points: Float, pair: TwoView, T_other: Float, config: ClassicalConfig) -> bool:
+def _fits_as_well(points: Float, pair: TwoView, T_other: Float, geometry: Geometry) -> bool:
     """Whether another motion, refined, has about the pair's cost, points in front, and remains another one."""
     view = replace(pair.view, T_view_query=T_other)
     inverse_depths = inverse_depths_from(points, T_other, view.observed)
     if float(np.mean(inverse_depths > INVERSE_DEPTH_MIN)) < EXPLAINED_SHARE_MIN:
         return False
-    refined = refine(points, inverse_depths, (view,), config.sigma_px)
+    refined = refine(points, inverse_depths, (view,), geometry.sigma_px)
     if _is_same(refined.views[0].T_view_query, pair.view.T_view_query):
         return False
     in_front = float(np.mean(refined.inverse_depths > INVERSE_DEPTH_MIN))

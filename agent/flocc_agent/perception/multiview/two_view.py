@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.config import ClassicalConfig
 from flocc_agent.geometry import nearest_rotation, pose
-from flocc_agent.perception.classical.bundle import (
+from flocc_agent.perception.multiview.bundle import (
     DirectionPrior,
     Refined,
     View,
@@ -16,8 +15,7 @@ from flocc_agent.perception.classical.bundle import (
     refine,
     reprojection_errors_px,
 )
-from flocc_agent.perception.classical.features import Features
-from flocc_agent.perception.classical.matching import Indices, mutual_matches
+from flocc_agent.perception.multiview.parameters import Geometry, Indices, Matched, Rays
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,23 +52,24 @@ class TwoView:
 
 
 def two_view(
-    query: Features, other: Features, config: ClassicalConfig, prior: DirectionPrior | None = None
+    query: Rays, other: Rays, matched: Matched, geometry: Geometry, prior: DirectionPrior | None = None
 ) -> TwoView | int:
-    """Match and verify two images.
+    """Verify the matches of two images.
 
     Args:
         query: Features of the query.
         other: Features of the other image.
-        config: Thresholds.
+        matched: Which of them look alike.
+        geometry: Thresholds.
         prior: What odometry says of the other image's pose; it refines the pose but verifies nothing.
 
     Returns:
         The verified pair, or how many verified correspondences there were where they are too few.
     """
-    query_indices, other_indices = mutual_matches(query.descriptors, other.descriptors, config.distance_ratio_max)
+    query_indices, other_indices = matched
     points = query.points[query_indices].astype(np.float64)
     observed = other.points[other_indices].astype(np.float64)
-    found = _verified(points, observed, other.focal_px, config)
+    found = _verified(points, observed, other.focal_px, geometry)
     if isinstance(found, int):
         return found
     view, depths, verified = found
@@ -80,32 +79,30 @@ def two_view(
         by_odometry = replace(view, T_view_query=unit_translation(prior.T_view_query), prior=prior)
         depths_by_odometry = inverse_depths_from(points, by_odometry.T_view_query, view.observed)
         guesses = [(replace(view, prior=prior), depths), (by_odometry, depths_by_odometry)]
-    candidates = [refine(points, start, (guess,), config.sigma_px) for guess, start in guesses]
+    candidates = [refine(points, start, (guess,), geometry.sigma_px) for guess, start in guesses]
     refined = min(candidates, key=lambda candidate: candidate.cost)
     return TwoView(query_indices[verified], other_indices[verified], refined)
 
 
-def _verified(
-    points: Float, observed: Float, focal_px: float, config: ClassicalConfig
-) -> tuple[View, Float, Mask] | int:
+def _verified(points: Float, observed: Float, focal_px: float, geometry: Geometry) -> tuple[View, Float, Mask] | int:
     """Find the relative pose and verify the matches with it, the same way for loop pairs and odometry pairs.
 
     Returns:
         The other image as a view of the verified points, their inverse depths, and which are verified; or how many
         are verified where they are too few.
     """
-    found = essential_pose(points, observed, focal_px, config)
+    found = essential_pose(points, observed, focal_px, geometry)
     if found is None:
         return 0
     T_other_query, agree = found
-    if int(agree.sum()) < config.correspondences_min:
+    if int(agree.sum()) < geometry.correspondences_min:
         return int(agree.sum())
     view = View(T_other_query, observed, agree, focal_px, unit_translation=True)
-    refined = refine(points, inverse_depths_from(points, T_other_query, observed), (view,), config.sigma_px)
+    refined = refine(points, inverse_depths_from(points, T_other_query, observed), (view,), geometry.sigma_px)
     errors = reprojection_errors_px(points, refined.inverse_depths, refined.views[0])
-    verified = (errors < config.inlier_threshold_px) & (refined.inverse_depths > INVERSE_DEPTH_MIN)
+    verified = (errors < geometry.inlier_threshold_px) & (refined.inverse_depths > INVERSE_DEPTH_MIN)
     count = int(verified.sum())
-    if count < config.correspondences_min:
+    if count < geometry.correspondences_min:
         return count
     pose_found = refined.views[0].T_view_query
     view = View(pose_found, observed[verified], np.ones(count, np.bool_), focal_px, unit_translation=True)
@@ -117,9 +114,7 @@ def unit_translation(T: Float) -> Float:
     return pose(T[:3, :3], T[:3, 3] / np.linalg.norm(T[:3, 3]))
 
 
-def essential_pose(
-    points: Float, observed: Float, focal_px: float, config: ClassicalConfig
-) -> tuple[Float, Mask] | None:
+def essential_pose(points: Float, observed: Float, focal_px: float, geometry: Geometry) -> tuple[Float, Mask] | None:
     """Pose of the query in the other image by a robust essential matrix.
 
     Returns:
@@ -128,7 +123,7 @@ def essential_pose(
     if len(points) < 8:
         return None
     K = np.eye(3)
-    parameters = usac_parameters(config, focal_px)
+    parameters = usac_parameters(geometry, focal_px)
     E, mask = cv2.findEssentialMat(points, observed, K, K, None, None, parameters)
     if E is None or E.shape != (3, 3) or mask is None or not np.all(np.isfinite(E)):
         return None
@@ -144,12 +139,12 @@ def essential_pose(
     return None if best is None else (best, best_mask)
 
 
-def usac_parameters(config: ClassicalConfig, focal_px: float) -> cv2.UsacParams:
+def usac_parameters(geometry: Geometry, focal_px: float) -> cv2.UsacParams:
     """Parameters of OpenCV's robust estimators with a generator of their own, so that results repeat."""
     parameters = cv2.UsacParams()
-    parameters.threshold = config.inlier_threshold_px / focal_px
+    parameters.threshold = geometry.inlier_threshold_px / focal_px
     parameters.confidence = 0.999
-    parameters.maxIterations = config.iterations_max
+    parameters.maxIterations = geometry.iterations_max
     parameters.isParallel = False
     parameters.randomGeneratorState = GENERATOR_STATE
     parameters.score = cv2.SCORE_METHOD_MAGSAC
