@@ -282,9 +282,14 @@ def _is_of_camera(values: Map) -> bool:
     return isinstance(listed, list) or (isinstance(listed, dict) and "data" in listed)
 
 
+OF_OTHERS = ("type", "model", "name", "id", "label")
+"""Keys that, above a camera's map, are of what it stands in."""
+
+
 def _nested(document: Map, path: tuple[str, ...] = (), above: Map | None = None) -> Cameras:
     """Maps of cameras inside of others, each with the plain values that stand above it."""
-    around = {**(above or {}), **{key: value for key, value in document.items() if not isinstance(value, dict)}}
+    own = {key: value for key, value in document.items() if not isinstance(value, dict) and plain(key) not in OF_OTHERS}
+    around = {**(above or {}), **own}
     found: Cameras = {}
     for key, value in document.items():
         if not isinstance(value, dict):

@@ -213,7 +213,7 @@ def _zed(text: str) -> Cameras:
         if size is None:
             continue
         values = dict(line.split("=", 1) for line in _lines(body) if "=" in line)
-        cameras[name] = {key.strip(): float(value) for key, value in values.items()} | {"resolution": size}
+        cameras[name] = {"resolution": size} | {key.strip(): float(value) for key, value in values.items()}
     return cameras
 
 
