@@ -1,15 +1,18 @@
 """The recipes of CONTRIBUTING.md, done: what they insert goes into a copy of the packages, and is used there."""
 
+import json
 import re
 import shutil
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from flocc_agent.config import PerceptionConfig
 from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, Registrar
 from flocc_agent.core.registration import RegistrationFailed
 from flocc_protocol.records import UnknownRecord, decode_record
@@ -42,6 +45,7 @@ import sys
 from flocc_agent.core.effects import Report
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.reports import PeerPauses
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.zenoh_transport import PRIORITY
 from flocc_protocol.ids import LogId
@@ -53,8 +57,31 @@ envelope = Envelope(LogId("r2"), Pause(3.0))
 assert decode(encode(envelope)) == envelope
 assert set(PRIORITY) == set(MESSAGE_KINDS) == {kind.value for kind in Kind}
 effects = Robot(LogId("r1"), 0, 1, CoreParameters(), 0.0).handle(MessageReceived(envelope), 1.0)
-assert Report("peer_pauses", {"peer": "r2", "seconds": 3.0}) in effects
+assert Report(PeerPauses(peer="r2", seconds=3.0)) in effects
 sys.stdout.write("done")
+"""
+
+REPORT = """
+import json, sys
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.gossip import NewRecord
+from flocc_agent.core.parameters import RoundParameters
+from flocc_agent.core.reports import RoundsFailing
+from flocc_agent.core.rounds import Rounds
+from flocc_agent.runtime.event_lines import Reported, line_of, reported_of
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.records import KeyframeRecord
+
+assembly, term = GraphAssembly(), Term(3, LogId("r1"))
+assembly.add(NewRecord(LogId("r1"), 0, KeyframeRecord(0, 0.0, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None)))
+rounds = Rounds(assembly, RoundParameters())
+rounds.on_term(term)
+rounds.tick(0.0)
+told = [effect.fact for effect in rounds.tick(rounds.deadline())]
+assert told[1] == RoundsFailing(term=term, failures=1)
+line = json.dumps(line_of(Reported(7.5, "r1", told[1])))
+assert reported_of(line) == Reported(7.5, "r1", told[1])
+sys.stdout.write(line)
 """
 
 
@@ -110,13 +137,21 @@ def test_a_message_is_added_as_the_recipe_says(tmp_path: Path) -> None:
     assert run_there(tmp_path, MESSAGE) == "done"
 
 
+def test_a_report_touches_two_files_as_the_recipe_says(tmp_path: Path) -> None:
+    files = follow("Add a report", tmp_path)
+    assert files == ["agent/flocc_agent/core/reports.py", "agent/flocc_agent/core/rounds.py"]
+    line = json.loads(run_there(tmp_path, REPORT))
+    assert line == {"t": 7.5, "robot": "r1", "event": "rounds_failing", "term": "3:r1", "failures": 1}
+
+
 def test_the_front_end_of_the_recipe_is_one() -> None:
     (code,) = re.findall(r"```python\n(.*?)```", recipe("Add a front end"), re.DOTALL)
-    names: dict[str, type] = {}
+    names: dict[str, Any] = {}
     exec(code, names)  # the page's own block
-    describer: Describer = names["GreyDescriber"]()
-    encoder: Encoder = names["GreyEncoder"]()
-    registrar: Registrar = names["GreyRegistrar"]()
+    built = names["build"](PerceptionConfig(), 0)
+    describer: Describer = built.describer
+    encoder: Encoder = built.encoder
+    registrar: Registrar = built.registrar
     camera = Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     image = Image(np.full((48, 64, 3), 90, np.uint8), camera)
     descriptor = describer.describe(image)
@@ -127,6 +162,6 @@ def test_the_front_end_of_the_recipe_is_one() -> None:
     assert isinstance(registrar.register(latent, latent, None), RegistrationFailed)
 
 
-@pytest.mark.parametrize("title", ["Add a record", "Add a message"])
+@pytest.mark.parametrize("title", ["Add a record", "Add a message", "Add a report"])
 def test_every_block_of_a_recipe_is_a_step(title: str) -> None:
-    assert recipe(title).count("```python") == len(list(STEP.finditer(recipe(title)))) >= 5
+    assert recipe(title).count("```python") == len(list(STEP.finditer(recipe(title)))) >= 3

@@ -12,7 +12,7 @@ from tests.launch.synthetic_run import Synthetic
 
 from flocc_agent.runtime.event_lines import Reported, UnknownFact
 from flocc_agent.runtime.trajectory_text import read_tum
-from flocc_launch.report import Report, evaluate, finish, read_report
+from flocc_launch.report import RunReport, evaluate, finish, read_report
 from flocc_launch.report.build import judged
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line
 from flocc_launch.runs.timeline import merged_after_s
@@ -153,7 +153,9 @@ def test_evaluate_says_what_the_report_holds(folder: RunFolder) -> None:
     assert text.startswith("All three robots found one common map")
     assert "joint ATE     0.134 m; odometry at its true starts 1.64 m, aligned 1.46 m" in text
     assert "expected      merged_within_s 60: 41.3, met" in text
-    assert Report.model_validate_json(evaluate(folder.path, as_json=True)) == read_report(folder.path / "report.json")
+    assert RunReport.model_validate_json(evaluate(folder.path, as_json=True)) == read_report(
+        folder.path / "report.json"
+    )
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ class Rig:
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class WriterForm:
     """How one tool writes a calibration.
 
     Attributes:
@@ -549,45 +549,47 @@ def nested(rig: Rig) -> str:
     return f"Results:\n  save_dir: out/a\nDataset:\n  type: tum\n  Calibration:\n{keys}{size}Training:\n  lr: 0.1\n"
 
 
-FORMS: dict[str, Form] = {
-    "flocc YAML": Form("camera.yaml", flat, mounting=True),
-    "flocc TOML": Form("camera.toml", toml, mounting=True),
-    "EuRoC, Kimera": Form("sensor.yaml", euroc, (P, E), (4,), True),
-    "Kalibr": Form("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
-    "OpenVINS": Form("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
-    "ROS camera_info": Form("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
-    "ros2 topic echo": Form("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
-    "ROS INI": Form("ost.txt", ros_ini, counts=(0, 4, 5)),
-    "OpenCV YAML": Form("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
-    "OpenCV XML": Form("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV JSON": Form("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV stereo": Form("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
-    "ORB-SLAM 2": Form("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
-    "ORB-SLAM 3": Form("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
-    "VINS-Fusion (camodocal)": Form("cam0.yaml", camodocal, (P, E, MEI)),
-    "VINS-Mono": Form("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
-    "Basalt": Form("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
-    "COLMAP": Form("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
-    "nerfstudio, instant-ngp": Form("transforms.json", nerfstudio, (P, E)),
-    "DSO, TUM monoVO": Form("camera.txt", dso, (P, E, F)),
-    "RTAB-Map": Form("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
-    "SVO, maplab": Form("svo.yaml", svo, (P, E), mounting=True),
-    "OKVIS": Form("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
-    "MASt3R-SLAM": Form("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
-    "DROID-SLAM": Form("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
-    "matrix (7-Scenes, ScanNet, Stray Scanner)": Form("intrinsic_color.txt", matrix_text, counts=(0,), sized=False),
-    "KITTI odometry": Form("calib.txt", kitti, counts=(0,), sized=False),
-    "KITTI raw": Form("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
-    "Open3D": Form("camera_intrinsic.json", open3d, counts=(0,)),
-    "Replica": Form("cam_params.json", replica, counts=(0,)),
-    "OpenSfM, ODM": Form("camera_models.json", opensfm, (P, E), (0, 4, 5)),
-    "DepthAI": Form("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
-    "Gyroflow": Form("gyroflow.json", gyroflow, (E,)),
-    "vikit (SVO 1, FAST-LIVO)": Form("pinhole.yaml", vikit, (P, E, F)),
-    "Record3D": Form("metadata.json", record3d, counts=(0,)),
-    "SpectacularAI": Form("spectacular.json", spectacular, (P, E), mounting=True),
-    "ZED": Form("SN123.conf", zed, counts=(0, 4, 5), sizes=((672, 376), (1280, 720), (1920, 1080)), sized=False),
-    "NICE-SLAM, MonoGS": Form("fr1_desk.yaml", nested, counts=(0, 4, 5)),
+FORMS: dict[str, WriterForm] = {
+    "flocc YAML": WriterForm("camera.yaml", flat, mounting=True),
+    "flocc TOML": WriterForm("camera.toml", toml, mounting=True),
+    "EuRoC, Kimera": WriterForm("sensor.yaml", euroc, (P, E), (4,), True),
+    "Kalibr": WriterForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
+    "OpenVINS": WriterForm("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
+    "ROS camera_info": WriterForm("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
+    "ros2 topic echo": WriterForm("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
+    "ROS INI": WriterForm("ost.txt", ros_ini, counts=(0, 4, 5)),
+    "OpenCV YAML": WriterForm("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
+    "OpenCV XML": WriterForm("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV JSON": WriterForm("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV stereo": WriterForm("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
+    "ORB-SLAM 2": WriterForm("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
+    "ORB-SLAM 3": WriterForm("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
+    "VINS-Fusion (camodocal)": WriterForm("cam0.yaml", camodocal, (P, E, MEI)),
+    "VINS-Mono": WriterForm("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
+    "Basalt": WriterForm("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
+    "COLMAP": WriterForm("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
+    "nerfstudio, instant-ngp": WriterForm("transforms.json", nerfstudio, (P, E)),
+    "DSO, TUM monoVO": WriterForm("camera.txt", dso, (P, E, F)),
+    "RTAB-Map": WriterForm("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
+    "SVO, maplab": WriterForm("svo.yaml", svo, (P, E), mounting=True),
+    "OKVIS": WriterForm("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
+    "MASt3R-SLAM": WriterForm("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
+    "DROID-SLAM": WriterForm("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
+    "matrix (7-Scenes, ScanNet, Stray Scanner)": WriterForm(
+        "intrinsic_color.txt", matrix_text, counts=(0,), sized=False
+    ),
+    "KITTI odometry": WriterForm("calib.txt", kitti, counts=(0,), sized=False),
+    "KITTI raw": WriterForm("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
+    "Open3D": WriterForm("camera_intrinsic.json", open3d, counts=(0,)),
+    "Replica": WriterForm("cam_params.json", replica, counts=(0,)),
+    "OpenSfM, ODM": WriterForm("camera_models.json", opensfm, (P, E), (0, 4, 5)),
+    "DepthAI": WriterForm("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
+    "Gyroflow": WriterForm("gyroflow.json", gyroflow, (E,)),
+    "vikit (SVO 1, FAST-LIVO)": WriterForm("pinhole.yaml", vikit, (P, E, F)),
+    "Record3D": WriterForm("metadata.json", record3d, counts=(0,)),
+    "SpectacularAI": WriterForm("spectacular.json", spectacular, (P, E), mounting=True),
+    "ZED": WriterForm("SN123.conf", zed, counts=(0, 4, 5), sizes=((672, 376), (1280, 720), (1920, 1080)), sized=False),
+    "NICE-SLAM, MonoGS": WriterForm("fr1_desk.yaml", nested, counts=(0, 4, 5)),
 }
 """Every form that is read, by the name that docs/data-sets.md has for it."""
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 
 if TYPE_CHECKING:
-    from flocc_launch.report.model import Expectation, Report
+    from flocc_launch.report.model import Expectation, RunReport
     from flocc_launch.scenarios.scenario import Scenario
 
 MARKER = "flocc(scenario, driver='simulate', seed=None, **changes): the scenario that flocc_run runs"
@@ -37,7 +37,7 @@ class ScenarioRun:
     """
 
     folder: Path
-    report: "Report"
+    report: "RunReport"
 
     @property
     def missed(self) -> "list[Expectation]":

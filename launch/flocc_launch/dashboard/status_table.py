@@ -15,6 +15,7 @@ from rich.table import Table
 
 from flocc_agent.config import TransportConfig
 from flocc_launch.dashboard.page_source import RunSource
+from flocc_launch.dashboard.snapshot import RobotView
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
@@ -118,13 +119,26 @@ def status_of_run(path: Path) -> list[RobotStatus]:
         RunFolderError: It is not a run folder.
     """
     snapshot = RunSource(RunFolder.open(path)).snapshot()
-    return [status_of_robot(robot) for robot in snapshot["robots"]]
+    return [status_of_robot(robot) for robot in snapshot.robots]
 
 
-def status_of_robot(robot: dict[str, Any]) -> RobotStatus:
+def status_of_robot(robot: RobotView) -> RobotStatus:
     """One robot of a snapshot."""
-    known = {peer: link["loss_ratio"] for peer, link in robot["links"].items() if link["loss_ratio"] is not None}
-    return RobotStatus.model_validate({**robot, "closures": robot["accepted"], "loss": known})
+    return RobotStatus(
+        robot=robot.robot,
+        state=robot.state,
+        leader=robot.leader,
+        term=robot.term,
+        neighbours=list(robot.neighbours),
+        map_frame=robot.map_frame,
+        keyframes=robot.keyframes,
+        closures=robot.accepted,
+        candidates=robot.candidates,
+        sent_bytes=robot.sent_bytes,
+        received_bytes=robot.received_bytes,
+        loss={peer: link.loss_ratio for peer, link in robot.links.items() if link.loss_ratio is not None},
+        queues=dict(robot.queues),
+    )
 
 
 def status_json(rows: Sequence[RobotStatus]) -> str:

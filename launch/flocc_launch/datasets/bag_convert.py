@@ -23,7 +23,7 @@ from flocc_launch.datasets.bag_messages import (
     stamp_ns,
 )
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
@@ -190,7 +190,7 @@ class Tally:
         self.backwards += 1
         self.step = self.step or f"time goes backwards, from {last_s:.6f} s to {stamp_s:.6f} s"
 
-    def sentences(self, topic: Topic) -> list[str]:
+    def sentences(self, topic: BagTopic) -> list[str]:
         """What was left out."""
         damaged = f"topic {topic.name}: {self.damaged} of {self.seen} messages were left out: {self.reason}"
         back = f"topic {topic.name}: {self.step}; {self.backwards} of {self.seen} messages were left out"
@@ -417,7 +417,7 @@ def _decoder(bag: Bag, source: PoseSource) -> PoseDecoder | TransformDecoder:
     return PoseDecoder(bag, source.topic) if source.edge is None else TransformDecoder(bag, source.topic, source.edge)
 
 
-def _bare(error: Exception, topic: Topic) -> str:
+def _bare(error: Exception, topic: BagTopic) -> str:
     """What went wrong, without the topic's name, which the sentence around it says."""
     return str(error).rpartition(f"topic {topic.name}: ")[2]
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from flocc_agent.runtime.picture_heads import SUFFIXES, PictureError, head_of
 from flocc_agent.runtime.pictures import FULL, SAMPLE_MAX, Levels, levels_of
-from flocc_agent.runtime.ros2.pixels import camera_of, compressed_pixels, raw_pixels, refuse_depth
+from flocc_agent.runtime.ros2.raw_images import camera_of, compressed_pixels, raw_pixels, refuse_depth
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.pixels import encoded_image, pnm
 from flocc_launch.datasets.source import DatasetError, Lens
 
@@ -35,7 +35,7 @@ def stamp_ns(header: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
+def image_file(message: Any, topic: BagTopic, jpeg: bool) -> tuple[bytes, str]:
     """Bytes and suffix of an image message.
 
     A compressed image is passed on as it is; a raw one becomes PNM (fast, lossless) or JPEG (small), of 16 bits PNG.
@@ -61,7 +61,7 @@ def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
     return pnm(pixels)
 
 
-def sampled_levels(bag: Bag, topic: Topic) -> Levels:
+def sampled_levels(bag: Bag, topic: BagTopic) -> Levels:
     """How a topic's images of 16 bits are brought to 8, by a sample over the whole bag."""
     first = bag.first(topic.name)
     if first is None or _deep_pixels(first[1]) is None:
@@ -69,10 +69,10 @@ def sampled_levels(bag: Bag, topic: Topic) -> Levels:
     return levels_of(pixels for message in _spread(bag, topic) if (pixels := _deep_pixels(message)) is not None)
 
 
-def _spread(bag: Bag, topic: Topic) -> Iterator[Any]:
+def _spread(bag: Bag, topic: BagTopic) -> Iterator[Any]:
     """Messages at even distances of bag time, or the first ones of a bag that cannot be searched."""
     if bag.start_ns is None or bag.end_ns is None:
-        sample: Iterator[tuple[Topic, int, bytes]] = islice(bag.raw([topic.name]), SAMPLE_MAX)
+        sample: Iterator[tuple[BagTopic, int, bytes]] = islice(bag.raw([topic.name]), SAMPLE_MAX)
     else:
         times_ns = np.linspace(bag.start_ns, bag.end_ns, SAMPLE_MAX, endpoint=False)
         sample = (found for t in times_ns if (found := next(bag.raw([topic.name], int(t)), None)) is not None)
@@ -93,7 +93,7 @@ def _deep_pixels(message: Any) -> Any:
     return pixels if pixels.dtype == np.uint16 else None
 
 
-def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]:
+def poses(message: Any, topic: BagTopic) -> Iterator[tuple[int, tuple[float, ...]]]:
     """Yield stamps in nanoseconds and `tx ty tz qx qy qz qw` of a pose message; a path has many.
 
     Raises:
@@ -110,7 +110,7 @@ def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]
     yield stamp_ns(message.header), _numbers(pose, topic)
 
 
-def transform_numbers(transform: Any, topic: Topic) -> tuple[float, ...]:
+def transform_numbers(transform: Any, topic: BagTopic) -> tuple[float, ...]:
     """`tx ty tz qx qy qz qw` of a transform.
 
     Raises:
@@ -120,12 +120,12 @@ def transform_numbers(transform: Any, topic: Topic) -> tuple[float, ...]:
     return checked_numbers((t.x, t.y, t.z, q.x, q.y, q.z, q.w), topic)
 
 
-def _numbers(pose: Any, topic: Topic) -> tuple[float, ...]:
+def _numbers(pose: Any, topic: BagTopic) -> tuple[float, ...]:
     p, q = pose.position, pose.orientation
     return checked_numbers((p.x, p.y, p.z, q.x, q.y, q.z, q.w), topic)
 
 
-def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ...]:
+def checked_numbers(numbers: tuple[float, ...], topic: BagTopic) -> tuple[float, ...]:
     """`tx ty tz qx qy qz qw` with a quaternion of unit length.
 
     Raises:
@@ -142,7 +142,7 @@ def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ..
     return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm
 
 
-def lens_of(message: Any, topic: Topic) -> Lens:
+def lens_of(message: Any, topic: BagTopic) -> Lens:
     """Intrinsics of a CameraInfo message; the camera is taken as the body.
 
     Raises:

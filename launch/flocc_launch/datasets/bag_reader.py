@@ -21,7 +21,7 @@ PARTS_GAP_MAX_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class BagTopic:
     """A topic of a bag.
 
     Attributes:
@@ -103,7 +103,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.topics: dict[str, Topic] = {}
+        self.topics: dict[str, BagTopic] = {}
         self.damage: str | None = None
         self.start_ns: int | None = None
         self.end_ns: int | None = None
@@ -130,12 +130,12 @@ class Bag:
             self._open_damaged(paths[0], str(error))
             return self
         self.topics = {
-            name: Topic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
+            name: BagTopic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
         }
         for name, topic in self.topics.items():
             if (short := short_name(topic.type)) is not None:
                 self._foxglove[name] = topic.type
-                self.topics[name] = Topic(name, ROS_TYPES[short], topic.count)
+                self.topics[name] = BagTopic(name, ROS_TYPES[short], topic.count)
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
         return self
 
@@ -149,7 +149,7 @@ class Bag:
         """Whether messages are in ROS 1's serialisation, not in CDR."""
         return self._ros1
 
-    def raw(self, names: Sequence[str], start_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
+    def raw(self, names: Sequence[str], start_ns: int | None = None) -> Iterator[tuple[BagTopic, int, bytes]]:
         """Yield topic, bag time in nanoseconds and the undecoded message, in the bag's order.
 
         Args:
@@ -186,7 +186,7 @@ class Bag:
                     break
         return None
 
-    def decoded(self, raw: bytes, topic: Topic) -> Any:
+    def decoded(self, raw: bytes, topic: BagTopic) -> Any:
         """Decode a message.
 
         Raises:
@@ -230,7 +230,7 @@ class Bag:
             self._open_foreign(file)
             return
         self._salvage = Salvage(file)
-        self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
+        self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
         if not self.topics:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         self.damage = f"{self.path}: is damaged or cut off: {reason}"
@@ -239,7 +239,7 @@ class Bag:
         """Open an MCAP file of protobuf or JSON, of which Foxglove's messages are read."""
         self._salvage, self._is_foreign = ForeignMcap(file), True
         try:
-            self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
+            self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
         except ValueError as error:
             raise DatasetError(f"{self.path}: is an MCAP of protobuf messages, not of ROS: {error}") from error
         if not any(topic.type in ROS_TYPES.values() for topic in self.topics.values()):

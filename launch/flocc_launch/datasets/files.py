@@ -18,9 +18,9 @@ T = TypeVar("T")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
 CAMERA_FILES = (
-    "camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "intrinsics.yaml", "intrinsics.yml",
-    "sensor.yaml", "camera_info.yaml", "camchain.yaml", "ost.yaml", "camera.json", "calibration.json", "intrinsics.json",
-    "cameras.txt", "camera.txt", "intrinsics.txt", "calibration.txt", "ost.txt", "camera_matrix.csv",
+    "camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "intrinsics.yaml",
+    "intrinsics.yml", "sensor.yaml", "camera_info.yaml", "camchain.yaml", "ost.yaml", "camera.json", "calibration.json",
+    "intrinsics.json", "cameras.txt", "camera.txt", "intrinsics.txt", "calibration.txt", "ost.txt", "camera_matrix.csv",
 )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ class TrackError(Record):
     """RMSE of the turn from one keyframe to the next."""
 
 
-class Robot(Record):
+class RobotReport(Record):
     """One robot at the end of the run."""
 
     robot: str
@@ -139,7 +139,7 @@ class Optimisations(Record):
     """Longest one."""
 
 
-class Report(Record):
+class RunReport(Record):
     """`report.json`."""
 
     schema_version: int = SCHEMA_VERSION
@@ -184,5 +184,5 @@ class Report(Record):
     """How often the robots went from one leader to another, the upper median over the robots."""
     optimisations: Optimisations
     expectations: list[Expectation]
-    robot_details: list[Robot]
+    robot_details: list[RobotReport]
     warnings: list[str]

@@ -182,6 +182,12 @@ class FaultKind(StrEnum):
     CALM = "calm"
 
 
+LinkFault = Literal[
+    FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.HEAL, FaultKind.LOSS, FaultKind.LATENCY, FaultKind.RANGE
+]
+"""Faults that concern links; the others concern robots."""
+
+
 class Fault(Section):
     """One entry of the timeline."""
 

@@ -13,17 +13,18 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never
 
 from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
+from flocc_agent.perception.backends import check_perception
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
-from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario, agent_config
+from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault, Scenario, agent_config
 from flocc_launch.setup.credentials import make_keys
 from flocc_launch.swarm.agent_process import Lines, recover_result
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
@@ -67,7 +68,7 @@ def launch(
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
     metrics: str | None = None,
-) -> Report:
+) -> RunReport:
     """Run a scenario and write its run folder.
 
     Args:
@@ -82,6 +83,7 @@ def launch(
         FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
     """
     check_faults(scenario)
+    check_perception(scenario.perception)
     names = scenario.names()
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
     paths = recordings(scenario, progress)
@@ -141,7 +143,7 @@ class _Launch:
         self._seen: dict[str, Any] = {}
         self._watch = Watch(scenario, self._agents())
 
-    async def run(self) -> Report:
+    async def run(self) -> RunReport:
         """Start, watch, stop, write."""
         self._folder.write_run(self._run_record())
         loop = asyncio.get_running_loop()
@@ -244,8 +246,10 @@ class _Launch:
             case FaultKind.SLOW:
                 for agent in concerned:
                     await agent.order({"slow": fault.value})
+            case FaultKind.MUTE | FaultKind.CALM:
+                raise AssertionError(f"{fault.kind.value} exists on virtual time only: check_faults refuses it")
             case _:
-                self._radio = changed_radio(self._radio, fault, self._now_s())
+                self._radio = changed_radio(self._radio, fault.kind, fault, self._now_s())
                 order = {"radio": json.loads(self._radio.model_dump_json())}
                 await asyncio.gather(*(agent.order(order) for agent in self._watch.agents))
 
@@ -314,9 +318,9 @@ class _Launch:
         return time.monotonic() - self._epoch_s
 
 
-def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig:
+def changed_radio(radio: RadioConfig, kind: LinkFault, fault: Fault, now_s: float) -> RadioConfig:
     """The radio after a fault that concerns links."""
-    match fault.kind:
+    match kind:
         case FaultKind.PARTITION:
             partition = {"groups": fault.groups, "from_s": now_s}
             return radio.model_validate({**radio.model_dump(), "partitions": [*radio.partitions, partition]})
@@ -332,7 +336,7 @@ def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig
         case FaultKind.RANGE:
             return radio.model_validate({**radio.model_dump(), "range_m": fault.value})
         case _:
-            raise ValueError(f"{fault.kind.value} does not concern links")
+            assert_never(kind)
 
 
 def _agree(alive: list[AgentProcess]) -> bool:
