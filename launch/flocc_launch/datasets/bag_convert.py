@@ -24,7 +24,7 @@ from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_MESSAGES = 200
+CHECKPOINT_MESSAGES = 1000
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
 

@@ -16,7 +16,7 @@ from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, read_source, team_folder
-from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
+from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
@@ -31,6 +31,9 @@ from flocc_launch.datasets.video import (
 from flocc_launch.datasets.writer import Progress, write_source
 
 logger = logging.getLogger(__name__)
+
+ODOMETRY_MADE = "odometry_made.txt"
+"""In a recording: how its odometry was made of ground truth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,6 +271,7 @@ def convert(
     given = None if odometry is None else _given_odometry(source, odometry, form)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
+    _note_drift(out, drift if given is None else None)
     _complain(source, out, len(source.images))
     return out
 
@@ -283,6 +287,7 @@ def split(
     format_name: str | None = None,
     camera: Path | None = None,
     form: str | None = None,
+    kind: DriftKind | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Cut one data set by time into recordings of several robots, which then run at the same time.
@@ -295,7 +300,8 @@ def split(
         out: Gets one folder per robot: alpha, bravo, charlie.
         robots: How many parts.
         seed: Of the drift; each robot has its own.
-        drift: Makes odometry from the ground truth; None takes the data set's own, else `HANDHELD_DRIFT`.
+        drift: Makes odometry from the ground truth; None takes the data set's own, else `needed_drift`.
+        kind: What carried the camera, where odometry is made; None tells it by the data set and the motion.
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
@@ -312,21 +318,36 @@ def split(
     _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
-    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift, seed)
+    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift or needed_drift(source, kind), seed)
     folders = []
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, drift or needed_drift(part), rng)
+        spec = drift or needed_drift(part, kind)
+        moved = _odometry(part, spec, rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
+        _note_drift(out / name, spec)
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
 
 
-def needed_drift(source: Source) -> DriftSpec | None:
-    """How odometry is made of ground truth where a data set has none of its own."""
-    return HANDHELD_DRIFT if source.odometry is None and source.truth is not None else None
+def needed_drift(source: Source, kind: DriftKind | None = None) -> DriftSpec | None:
+    """How odometry is made of ground truth where a data set has none of its own; None where it has.
+
+    Args:
+        source: The data set, or a robot's part of it.
+        kind: What carried the camera; None tells it by the data set and the motion.
+    """
+    if source.odometry is not None or source.truth is None:
+        return None
+    return fitted(kind or kind_of(source.format, source.truth), source.truth.length_m())
+
+
+def _note_drift(recording: Path, spec: DriftSpec | None) -> None:
+    """Say in a recording how its odometry was made, for the report of a run."""
+    if spec is not None:
+        (recording / ODOMETRY_MADE).write_text(summary(spec) + "\n", encoding="utf-8")
 
 
 def _tell(source: Source) -> None:
