@@ -7,10 +7,14 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from flocc_agent.core.effects import Effect
+from flocc_agent.core.events import Event
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -121,3 +125,12 @@ def test_every_requirement_is_pinned_within_its_range() -> None:
             continue
         assert name in pins, f"{name} is not in constraints.txt; run `make constraints`"
         assert requirement.specifier.contains(pins[name]), f"{name} {pins[name]} is outside {requirement.specifier}"
+
+
+def test_the_agents_page_names_every_file_of_the_core_and_every_effect() -> None:
+    page = (ROOT / "agent/README.md").read_text(encoding="utf-8")
+    files = {path.name for path in (ROOT / "agent/flocc_agent/core").glob("*.py")} - {"__init__.py"}
+    kinds = {kind.__name__ for kind in (*get_args(Effect), *get_args(Event))}
+    assert [name for name in sorted(files | kinds) if f"`{name}`" not in page] == []
+    named = {name for row in page.splitlines() if row.startswith("| `") for name in re.findall(r"`(\w+\.py)`", row)}
+    assert named - files == set(), "files that are no longer there"

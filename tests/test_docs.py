@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from tests.doc_commands import ROOT, SHELL, blocks, command_lines, complaint, parsed_commands, runnable, script
 from tests.doc_props import write_bag, write_own_data
 
-from flocc_agent.config import AgentConfig
+from flocc_agent.config import AgentConfig, ConfigError, refuse_removed
 from flocc_lab.reference.configuration_page import reference
 from flocc_launch.scenarios.scenario import Scenario
 
@@ -105,9 +105,12 @@ def test_configurations_on_a_page_have_no_key_that_is_unknown(page: Path) -> Non
 def unknown_keys(model: type[BaseModel], table: dict[str, object]) -> list[str]:
     """Keys of a fragment that a model does not have; what a fragment lacks does not matter."""
     try:
+        refuse_removed(table, "page")
         model.model_validate(table, context={"folder": None})
     except ValidationError as error:
         return [".".join(map(str, e["loc"])) for e in error.errors() if e["type"] == "extra_forbidden"]
+    except ConfigError as error:
+        return [str(error)]
     return []
 
 

@@ -30,15 +30,19 @@ from flocc_agent.core.interfaces import (
     PictureEncoder,
     Registrar,
 )
+from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import is_rigid
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver, Skills
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
@@ -50,7 +54,6 @@ from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_agent.stages import stage
 from flocc_protocol.arrays import Array
-from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
@@ -110,10 +113,12 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
     """
     match config.method:
         case "classical":
-            from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, ClassicalRegistrar
+            from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, classical_registrar
 
             classical = config.classical
-            return Perception(ClassicalDescriber(classical), ClassicalEncoder(classical), ClassicalRegistrar(classical))
+            return Perception(
+                ClassicalDescriber(classical), ClassicalEncoder(classical), classical_registrar(classical)
+            )
         case "synthetic":
             from flocc_agent.perception.synthetic import SyntheticPerception
 
@@ -128,6 +133,10 @@ def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
             from flocc_agent.perception.mast3r import build
 
             return Perception(*build(config.mast3r))
+        case "learned":
+            from flocc_agent.perception.learned import build as build_learned
+
+            return Perception(*build_learned(config.learned))
 
 
 def build_optimiser(config: BackendConfig) -> Optimiser:
@@ -156,7 +165,7 @@ class Agent:
         config: AgentConfig,
         camera: Camera | None = None,
         T_body_camera: Float | None = None,
-        on_line: Callable[[dict[str, Any]], None] | None = None,
+        on_report: Callable[[Reported[Fact]], None] | None = None,
         clock_s: Callable[[], float] | None = None,
     ) -> None:
         """Prepare an agent; `async with` starts it.
@@ -165,7 +174,7 @@ class Agent:
             config: Everything that can be turned.
             camera: Intrinsics of the images; None where a recording brings its own.
             T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
-            on_line: Takes each event as a dictionary (see docs/report.md); must not block.
+            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
             clock_s: Seconds since the start of the run; None counts from now.
 
         Raises:
@@ -173,13 +182,14 @@ class Agent:
         """
         started_s = time.monotonic()
         self.config = config
-        self._on_line = on_line or (lambda _: None)
+        self._on_report = on_report or (lambda _: None)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._recording = _recording(config)
         self._camera = self._recording.camera if self._recording else camera
         given = np.eye(4) if T_body_camera is None else T_body_camera
         self._T_body_camera = self._recording.T_body_camera if self._recording else given
         self._selector = KeyframeSelector(config.keyframes)
+        self._kept = True
         self._driver: Driver | None = None
         self._store: Store | None = None
         self._run: asyncio.Task[None] | None = None
@@ -245,31 +255,60 @@ class Agent:
         except ValueError as error:
             raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
         await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+        self._kept = True
 
-    async def add_frame(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> bool:
-        """Give the agent any frame; it becomes a keyframe when the robot moved enough. Returns whether it did."""
-        if not self._selector.wants(T_odom_body):
+    async def add_frame(
+        self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float, keep: bool = False
+    ) -> bool:
+        """Give the agent any frame; it becomes a keyframe when the robot moved enough, or where `keep` says so.
+
+        Returns:
+            Whether it became one; `keep` what something was seen in.
+        """
+        if not keep and not self._selector.wants(T_odom_body):
+            self._kept = False
             return False
         await self.add_keyframe(pixels, T_odom_body, stamp_s)
         self._selector.took(T_odom_body)
         return True
 
-    def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
-        """Give the agent an absolute position of the last keyframe's camera.
+    def add_fix(self, position_m: Float, covariance_m2: Float, stamp_s: float | None = None) -> None:
+        """Give the agent an absolute position of the camera: `add_measurement(Fix(position_m, covariance_m2))`.
 
         Args:
             position_m: (3,) in a local frame such as ENU, within 1e7 m of its origin.
             covariance_m2: (3, 3), positive definite.
+            stamp_s: Of its keyframe; None: it belongs to the one that was given last.
 
         Raises:
-            BadFix: The position is not finite or too far, or the covariance is none.
+            BadMeasurement: It cannot be used, with the reason; the agent goes on without it.
         """
-        position, covariance = np.asarray(position_m, dtype=float), np.asarray(covariance_m2, dtype=float)
-        if position.shape != (3,) or not np.all(np.abs(position) < COORDINATE_MAX):
-            raise BadFix(f"robot {self.config.name}: the fix {position.tolist()} is no position in a local frame")
-        if covariance.shape != (3, 3) or not np.all(np.isfinite(covariance)) or np.linalg.eigvalsh(covariance)[0] <= 0:
-            raise BadFix(f"robot {self.config.name}: the covariance of the fix is not positive definite")
-        self._started.add_fix(position, covariance)
+        try:
+            self.add_measurement(Fix(np.asarray(position_m), np.asarray(covariance_m2)), stamp_s)
+        except BadMeasurement as error:
+            raise self._named(error) from error
+
+    def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
+        """Give the agent what was measured at a keyframe: docs/measurements.md names the kinds.
+
+        Args:
+            measurement: One of the classes of `flocc_agent.core.measurements`; it speaks of the robot's body.
+            stamp_s: Of the keyframe that it belongs to; None: the frame that was given last.
+
+        Raises:
+            BadMeasurement: No keyframe has that stamp, or the last frame did not become one.
+        """
+        in_camera = measurement.in_camera(self._T_body_camera)
+        try:
+            if stamp_s is None and not self._kept and not isinstance(measurement, StartPose):
+                raise BadMeasurement(f"{measurement.kind}: the frame that was given last did not become a keyframe")
+            self._started.add_measurement(in_camera, stamp_s)
+        except BadMeasurement as error:
+            raise self._named(error) from error
+
+    def _named(self, error: BadMeasurement) -> BadMeasurement:
+        named = f"robot {self.config.name}: "
+        return error if str(error).startswith(named) else BadMeasurement(f"{named}{error}")
 
     async def corrections(self) -> AsyncIterator[Correction]:
         """Corrections as they come, the last one first; ends when the agent stops."""
@@ -288,7 +327,7 @@ class Agent:
             self._driver.stop()
 
     async def finished(self) -> None:
-        """Wait until the agent stops, by `stop`, or by the end of its recording and `hold_s`.
+        """Wait until the agent stops, by `stop` or by an order.
 
         Raises:
             FloccError: The recording cannot be played on.
@@ -369,7 +408,7 @@ class Agent:
                 perception.encode_s,
             ),
             Reporter(config.name, self._T_body_camera, config.backend.steepness),
-            self._on_line,
+            self._on_report,
             self._clock_s,
         )
 
@@ -404,16 +443,17 @@ class Agent:
         async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
-        await play(recording, source, self._selector, add, self._clock_s, self._on_position, resumed)
-        if source.hold_s > 0:
-            await asyncio.sleep(source.hold_s)
-            self.stop()
+        def measure(stamped: Stamped, frame_s: float) -> None:
+            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 
-        def report(event: str, fields: dict[str, Any]) -> None:
-            self._on_line({"t": round(self._clock_s(), 6), "robot": self.config.name, "event": event, **fields})
+        def report(fact: Fact) -> None:
+            self._on_report(Reported(self._clock_s(), self.config.name, fact))
 
         host = Host(
             lambda *keyframe: self._started.add_keyframe(*keyframe),
@@ -432,10 +472,6 @@ class Agent:
             await self._metrics.close()
         if self._store is not None:
             self._store.close()
-
-
-class BadFix(FloccError):
-    """An absolute position that cannot be used; the agent goes on without it."""
 
 
 class BadKeyframe(FloccError):

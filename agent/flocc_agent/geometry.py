@@ -102,6 +102,15 @@ def se3_log(T: Float) -> Float:
     return np.concatenate([omega, V_inverse @ T[:3, 3]])
 
 
+def adjoint(T: Float) -> Float:
+    """Adjoint (6, 6) of a pose, rotation first."""
+    R, t = T[:3, :3], T[:3, 3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = R
+    out[3:, :3] = hat(t) @ R
+    return out
+
+
 def angle_rad(R: Float) -> float:
     """Angle of a rotation, in [0, pi]."""
     return float(np.linalg.norm(so3_log(R)))

@@ -19,14 +19,18 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig, SourceConfig
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
+from flocc_agent.core.reports import CorrectionApplied, Fact, LeaderFollowed, NeighbourDown
+from flocc_agent.runtime.event_lines import Reported, of_kind, reported_of
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario, TracksScenario, agent_config
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
+
+F = TypeVar("F", bound=Fact)
 
 START_S = 60.0
 CROWD_START_S = 120.0
@@ -106,12 +110,12 @@ class Swarm:
         return self.now_s()
 
 
-def events(agent: AgentProcess, name: str, after_s: float) -> list[dict[str, Any]]:
-    """An agent's events of one name after a time, from its file."""
+def events(agent: AgentProcess, kind: type[F], after_s: float) -> list[Reported[F]]:
+    """An agent's events of one kind after a time, from its file."""
     path = agent.folder / "events.jsonl"
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    found = (json.loads(line) for line in lines if f'"{name}"' in line and line.endswith("}"))
-    return [event for event in found if event.get("event") == name and event["t"] >= after_s]
+    whole = [reported_of(line) for line in lines if line.endswith("}")]
+    return [event for event in of_kind(whole, kind) if event.t >= after_s]
 
 
 def follow(agents: Iterable[AgentProcess], leader: str) -> bool:
@@ -184,13 +188,13 @@ async def _failed_over(swarm: Swarm) -> tuple[float, float]:
     rest, killed_s = swarm.agents[1:], swarm.now_s()
     swarm.agents[0].kill()
 
-    def told(name: str) -> list[float]:
+    def told(kind: type[LeaderFollowed] | type[CorrectionApplied]) -> list[float]:
         """When each heard of r2 first."""
-        found = [[e["t"] for e in events(agent, name, killed_s) if e["leader"] == "r2"] for agent in rest]
+        found = [[e.t for e in events(agent, kind, killed_s) if e.fact.leader == "r2"] for agent in rest]
         return [min(times) - killed_s for times in found if times]
 
-    await swarm.until(lambda: len(told("correction")) == len(rest), START_S, "r2 leads and corrects")
-    return max(told("leader")), max(told("correction"))
+    await swarm.until(lambda: len(told(CorrectionApplied)) == len(rest), START_S, "r2 leads and corrects")
+    return max(told(LeaderFollowed)), max(told(CorrectionApplied))
 
 
 async def partition(folder: Path, runs: int, outage_s: float) -> dict[str, Any]:
@@ -255,7 +259,7 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
             await asyncio.sleep(LOAD_LOOK_S)
             watched.look(swarm.agents, swarm.now_s() - began_s)
         lasted_s, used_s = swarm.now_s() - began_s, sum(map(cpu_s, swarm.agents)) - used_s
-        lost = sum(len(events(agent, "neighbour_down", began_s)) for agent in swarm.agents)
+        lost = sum(len(events(agent, NeighbourDown, began_s)) for agent in swarm.agents)
         after, refused = _sums(swarm.agents), _refused(swarm.agents)
         behind = _records_behind(swarm.agents)
     finally:

@@ -94,7 +94,7 @@ __all__ = [
     "version_of",
 ]
 
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 VERSION_MAX = 127
 
 

@@ -2,10 +2,14 @@
 
 A record's number in its log is its position, counted from 0 without gaps. Each replica chains the records' bytes
 into a checksum, so that a fork (two writers of one log) is noticed and refused.
+
+Records outlive versions (docs/compatibility.md): a record of a code that this version does not know, or with more
+fields than it knows, is an `UnknownRecord`. It is kept and passed on byte for byte, and nothing is derived from it.
 """
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +23,6 @@ from flocc_protocol.codec import (
     Codec,
     Pose7,
     from_bytes,
-    integer,
     optional,
     real,
     struct,
@@ -27,7 +30,7 @@ from flocc_protocol.codec import (
     to_bytes,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import KeyframeId
+from flocc_protocol.ids import KeyframeId, checked_name
 
 RECORD_BYTES_MAX = 8 * 1024
 SIGNATURE_BYTES = 64
@@ -35,6 +38,9 @@ SEALED_RECORD_BYTES_MAX = RECORD_BYTES_MAX + SIGNATURE_BYTES
 DESCRIPTOR_DIMENSION_MAX = 2048
 REASON_LENGTH_MAX = 80
 UPPER_TRIANGLE = 21
+TAG_LENGTH_MAX = 64
+NAME_LENGTH_MAX = 32
+ALTITUDE_MAX_M = 1e5
 SCALE_INITIAL_MIN, SCALE_INITIAL_MAX = 1e-9, 1e9
 
 
@@ -117,16 +123,137 @@ class FixRecord:
     def __post_init__(self) -> None:
         if self.position_m.shape != (3,) or self.covariance_m2.shape != (9,):
             raise ValueError("a fix has a position of 3 and a covariance of 9")
-        if np.max(np.abs(self.position_m.numpy())) > COORDINATE_MAX:
-            raise ValueError("a fix must be within the map")
+        _check_position(self.position_m)
 
 
-Record = KeyframeRecord | ClosureRecord | RejectionRecord | FixRecord
+@dataclass(frozen=True, slots=True)
+class GeodeticFixRecord:
+    """Where a keyframe's camera was on the WGS 84 ellipsoid, with its covariance east, north, up (9 values, m^2)."""
+
+    index: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    covariance_m2: Array
+
+    def __post_init__(self) -> None:
+        _check_covariance(self.covariance_m2, 9)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFixRecord:
+    """The whole pose of a keyframe's camera in a world frame, such as a known start."""
+
+    index: int
+    T_world_camera: Pose7
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        _check_covariance(self.covariance, UPPER_TRIANGLE)
+
+
+@dataclass(frozen=True, slots=True)
+class TagSightingRecord:
+    """A tag seen by a keyframe's camera; its name is the same for all robots."""
+
+    index: int
+    tag: str
+    T_camera_tag: Pose7
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        _check_covariance(self.covariance, UPPER_TRIANGLE)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSightingRecord:
+    """Another robot seen from a keyframe: the whole pose of its camera at the keyframe's stamp."""
+
+    index: int
+    robot: str
+    T_camera_seen: Pose7
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        checked_name(self.robot)
+        _check_covariance(self.covariance, UPPER_TRIANGLE)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotBearingRecord:
+    """Another robot seen from a keyframe, by bearing and range: the position (3) of its camera, covariance (9, m^2)."""
+
+    index: int
+    robot: str
+    position_m: Array
+    covariance_m2: Array
+
+    def __post_init__(self) -> None:
+        checked_name(self.robot)
+        _check_covariance(self.covariance_m2, 9)
+        _check_position(self.position_m)
+
+
+@dataclass(frozen=True, slots=True)
+class MetricClosureRecord:
+    """A registration of a user's own between two keyframes, in metres."""
+
+    query: KeyframeId
+    match: KeyframeId
+    T_query_match: Pose7
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        if self.query == self.match:
+            raise ValueError(f"a closure joins two different keyframes, not {self.query} with itself")
+        _check_covariance(self.covariance, UPPER_TRIANGLE)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryCovarianceRecord:
+    """How exact the odometry is from the keyframe before to this one, in the tangent of this one's camera."""
+
+    index: int
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        _check_covariance(self.covariance, UPPER_TRIANGLE)
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownRecord:
+    """A record of a later version: its code and all its bytes, the code among them.
+
+    Attributes:
+        code: Number of its kind; a known one where it has more fields than this version knows.
+        data: The record, byte for byte as its writer encoded it.
+    """
+
+    code: int
+    data: bytes
+
+
+MeasurementRecord = (
+    FixRecord
+    | GeodeticFixRecord
+    | PoseFixRecord
+    | TagSightingRecord
+    | RobotSightingRecord
+    | RobotBearingRecord
+    | MetricClosureRecord
+    | OdometryCovarianceRecord
+)
+Record = KeyframeRecord | ClosureRecord | RejectionRecord | MeasurementRecord | UnknownRecord
+KEYFRAME_CODE = 1
+CODE_MAX = 127
+"""A code is one byte of msgpack, the second one of a record."""
+PAIR_HEADER = 0x92
+"""First byte of every record: a msgpack array of two, its code and its fields."""
 
 
 _STAMP = real(-1e12, 1e12)
-_BY_CODE: dict[int, Codec[Record]] = {
-    1: struct(KeyframeRecord, index=COUNT, stamp_s=_STAMP, T_odom_camera=POSE, descriptor=optional(ARRAY)),
+_BY_CODE: dict[int, Codec[Any]] = {
+    KEYFRAME_CODE: struct(KeyframeRecord, index=COUNT, stamp_s=_STAMP, T_odom_camera=POSE, descriptor=optional(ARRAY)),
     2: struct(
         ClosureRecord,
         query=KEYFRAME_ID,
@@ -147,9 +274,45 @@ _BY_CODE: dict[int, Codec[Record]] = {
         odometry_correspondences=COUNT,
     ),
     4: struct(FixRecord, index=COUNT, position_m=ARRAY, covariance_m2=ARRAY),
+    5: struct(
+        GeodeticFixRecord,
+        index=COUNT,
+        latitude_deg=real(-90.0, 90.0),
+        longitude_deg=real(-180.0, 180.0),
+        altitude_m=real(-ALTITUDE_MAX_M, ALTITUDE_MAX_M),
+        covariance_m2=ARRAY,
+    ),
+    6: struct(PoseFixRecord, index=COUNT, T_world_camera=POSE, covariance=ARRAY),
+    7: struct(TagSightingRecord, index=COUNT, tag=text(TAG_LENGTH_MAX), T_camera_tag=POSE, covariance=ARRAY),
+    8: struct(RobotSightingRecord, index=COUNT, robot=text(NAME_LENGTH_MAX), T_camera_seen=POSE, covariance=ARRAY),
+    9: struct(RobotBearingRecord, index=COUNT, robot=text(NAME_LENGTH_MAX), position_m=ARRAY, covariance_m2=ARRAY),
+    10: struct(MetricClosureRecord, query=KEYFRAME_ID, match=KEYFRAME_ID, T_query_match=POSE, covariance=ARRAY),
+    11: struct(OdometryCovarianceRecord, index=COUNT, covariance=ARRAY),
 }
-_CODES: dict[type[Record], int] = {KeyframeRecord: 1, ClosureRecord: 2, RejectionRecord: 3, FixRecord: 4}
-_CODE = integer(1, max(_BY_CODE))
+_CODES: dict[type[Record], int] = {
+    KeyframeRecord: 1,
+    ClosureRecord: 2,
+    RejectionRecord: 3,
+    FixRecord: 4,
+    GeodeticFixRecord: 5,
+    PoseFixRecord: 6,
+    TagSightingRecord: 7,
+    RobotSightingRecord: 8,
+    RobotBearingRecord: 9,
+    MetricClosureRecord: 10,
+    OdometryCovarianceRecord: 11,
+}
+_FIELDS = {_CODES[kind]: len(fields(kind)) for kind in _CODES}
+
+
+def _check_covariance(covariance: Array, size: int) -> None:
+    if covariance.shape != (size,):
+        raise ValueError(f"a covariance has {size} numbers here, not {covariance.shape}")
+
+
+def _check_position(position_m: Array) -> None:
+    if position_m.shape != (3,) or not np.max(np.abs(position_m.numpy())) <= COORDINATE_MAX:
+        raise ValueError("a position has three numbers and must be within the map")
 
 
 def encode_record(record: Record) -> bytes:
@@ -158,6 +321,8 @@ def encode_record(record: Record) -> bytes:
     Raises:
         ValueError: The other robots would refuse it; a log must never hold such a record.
     """
+    if isinstance(record, UnknownRecord):
+        return record.data
     code = _CODES[type(record)]
     try:
         data = to_bytes([code, _BY_CODE[code].pack(record)])
@@ -169,15 +334,34 @@ def encode_record(record: Record) -> bytes:
 
 
 def decode_record(data: bytes) -> Record:
-    """Parse and check a record.
+    """Parse and check a record; one of a later version is not looked into.
 
     Raises:
-        DecodeError: The bytes are anything else.
+        DecodeError: The bytes are no record of any version.
     """
+    code = code_of(data)
+    if code not in _BY_CODE:
+        return UnknownRecord(code, data)
     value = from_bytes(data, RECORD_BYTES_MAX)
     if type(value) is not list or len(value) != 2:
         raise DecodeError("a record is a code and its fields")
-    return _BY_CODE[_CODE.unpack(value[0])].unpack(value[1])
+    if type(value[1]) is list and len(value[1]) > _FIELDS[code]:
+        return UnknownRecord(code, data)
+    record: Record = _BY_CODE[code].unpack(value[1])
+    return record
+
+
+def code_of(data: bytes) -> int:
+    """Read the code of a record of any version.
+
+    Raises:
+        DecodeError: The bytes are too many, or do not start as a record does.
+    """
+    if len(data) > RECORD_BYTES_MAX:
+        raise DecodeError(f"{len(data)} bytes are more than {RECORD_BYTES_MAX}")
+    if len(data) < 3 or data[0] != PAIR_HEADER or not 1 <= data[1] <= CODE_MAX:
+        raise DecodeError("a record is a code and its fields")
+    return data[1]
 
 
 def chain(before: int, record_bytes: bytes) -> int:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-from flocc_agent.config import AgentConfig
+import pytest
+
+from flocc_agent.config import AgentConfig, TransportConfig
 from flocc_launch.scenarios.scenario import Scenario
 
 AGENT = """
@@ -41,3 +43,14 @@ def test_paths_of_a_scenario_start_at_its_file(tmp_path: Path) -> None:
 
 def test_a_configuration_made_in_a_program_keeps_its_paths() -> None:
     assert AgentConfig(name="r1", folder=Path("state")).folder == Path("state")
+
+
+def test_bulk_sessions_are_found_at_the_port_after_that_of_control() -> None:
+    config = TransportConfig(multicast_address="224.0.0.224:7500")
+    assert [config.multicast_group(control) for control in (True, False)] == ["224.0.0.224:7500", "224.0.0.224:7501"]
+
+
+@pytest.mark.parametrize("address", ["224.0.0.224", ":7446", "224.0.0.224:", "224.0.0.224:0", "224.0.0.224:65535"])
+def test_a_multicast_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(ValueError, match="is no multicast address"):
+        TransportConfig(multicast_address=address)

@@ -210,8 +210,9 @@ def fill_corrections(made: Synthetic) -> None:
     for k, t in enumerate(np.arange(6.0, end, 5.0)):
         leader = "r1" if made.died is None or t < made.died[1] + 3 else "r2"
         merged = made.merged_s is not None and t >= made.merged_s
+        parts = [["r1", "r2", "r3"]] if merged else [["r1"], ["r2"], ["r3"]]
         say(
-            made, float(t), leader, "optimised", term=2, round=k, components=1 if merged else 3, keyframes=30 + 9 * k,
+            made, float(t), leader, "optimised", term=2, round=k, components=parts, keyframes=30 + 9 * k,
             closures_used=3 * k, closures_rejected=k // 6, cost=40.0 / (k + 1), solve_s=0.02 + 0.004 * k,
             warnings=["the scale of one closure is unobservable"] if k % 7 == 0 else [],
         )  # fmt: skip

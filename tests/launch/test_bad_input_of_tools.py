@@ -8,7 +8,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.test_cli import run, scenario, sentence
 
-from flocc_launch.doctor.network import free_port
+from flocc_launch.doctor.network_check import free_port
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.view import live_view as view_live

@@ -12,7 +12,7 @@ from flocc_launch.commands.common import show_report
 from flocc_launch.commands.main import main
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.report import finish
-from flocc_launch.scenarios.scenario import TracksScenario
+from flocc_launch.scenarios.scenario import Scenario, TracksScenario
 from flocc_launch.scenarios.walks import walks
 
 
@@ -64,6 +64,51 @@ def test_a_bad_scenario_is_named_in_one_sentence(
     assert run(monkeypatch, command, path, "--out", str(tmp_path / "out")) == 2
     assert said in (line := sentence(capsys))
     assert path in line
+
+
+BAD_CHANGES = [
+    ("loss", "'loss' is no change of the configuration"),
+    ("tracks.robotts=2", "the key 'tracks.robotts' does not exist"),
+    ("radio.loss_ratio=3", "radio.loss_ratio: Input should be less than or equal to 1"),
+    ("core.election.hops_max=4", "the key 'core.election.hops_max' is gone: always 8"),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), BAD_CHANGES)
+@pytest.mark.parametrize("command", ["launch", "simulate"])
+def test_a_change_that_cannot_be_is_named_in_one_sentence(
+    change: str,
+    said: str,
+    command: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = scenario(tmp_path, "[tracks]\n")
+    assert run(monkeypatch, command, path, "--set", change, "--out", str(tmp_path / "out")) == 2
+    assert said in sentence(capsys)
+
+
+@pytest.mark.parametrize("command", ["launch", "simulate"])
+def test_a_change_reaches_the_scenario(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = scenario(tmp_path, "rate = 2.0\n[tracks]\n")
+    seen: list[Scenario] = []
+
+    def stop(given: Scenario, *_: object) -> None:
+        seen.append(given)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("flocc_launch.scenarios.recordings.recordings", stop)
+    changes = ["--set", "tracks.robots=2", "--set", "core.place_recognition.best_matches=3", "--set", "rate=4"]
+    assert run(monkeypatch, command, path, "--out", str(tmp_path / "out"), *changes) == 130
+    (read,) = seen
+    assert read.tracks is not None
+    assert (read.tracks.robots, read.core.place_recognition.best_matches, read.rate) == (2, 3, 4.0)
+
+
+def test_a_campaign_takes_no_changes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, "simulate", "--seeds", "1", "--set", "rate=2") == 2
+    assert "--set" in sentence(capsys)
 
 
 def test_a_missing_scenario_names_the_shipped_ones(

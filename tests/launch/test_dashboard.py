@@ -15,7 +15,7 @@ from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
 from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard
-from flocc_launch.dashboard.source import RunSource
+from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import LineTail
 from flocc_launch.runs.run_folder import RunFolder, event_from_line

@@ -14,6 +14,7 @@ from tests.launch.bag_fixtures import HEIGHT, WIDTH, ZERO_NS, BagScript, walking
 from typer.testing import CliRunner
 
 from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_tum
@@ -241,7 +242,7 @@ def test_an_unknown_compression_is_said_and_the_rest_is_kept(tmp_path: Path, cap
     script = walking(False)
     script.compressed("/cam/image/compressed", ZERO_NS + 9 * 10**9, form="webp")
     convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
-    assert "/cam/image/compressed: 1 of 6 messages were left out: images are compressed as 'webp'" in caplog.text
+    assert "/cam/image/compressed: 1 of 6 messages were left out: an image compressed as 'webp' cannot be read" in caplog.text
     assert len(Recording.open(tmp_path / "out").frames) == 5
 
 
@@ -249,7 +250,7 @@ def test_an_unknown_encoding_is_said(tmp_path: Path) -> None:
     script = walking(False, 1)
     script.raw("/depth", ZERO_NS, np.zeros((HEIGHT, WIDTH), np.float32), "32FC1")
     with pytest.raises(
-        DatasetError, match="topic /depth: 1 of 1 messages were left out: images are encoded as '32FC1'; "
+        DatasetError, match="topic /depth: 1 of 1 messages were left out: images are encoded as '32FC1', "
     ):
         convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out", image_topic="/depth")
 
@@ -295,7 +296,7 @@ def test_too_many_damaged_messages_are_refused(tmp_path: Path) -> None:
     script = walking(False)
     for k in range(3):
         script.compressed("/cam/image/compressed", ZERO_NS + (9 + k) * 10**9, form="webp")
-    with pytest.raises(DatasetError, match=r"3 of 8 messages were left out: images are compressed as 'webp'.*5 images"):
+    with pytest.raises(DatasetError, match=r"3 of 8 messages were left out: an image compressed as 'webp'.*5 images"):
         convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
 
 
@@ -303,7 +304,7 @@ def test_images_of_another_size_than_the_intrinsics_are_refused(tmp_path: Path) 
     script = walking(False, 0)
     script.compressed("/cam/image/compressed", ZERO_NS, size=(64, 48))
     script.odometry("/odom", ZERO_NS, 0.0)
-    with pytest.raises(DatasetError, match="images are 64x48, but the intrinsics are for 32x24"):
+    with pytest.raises(DatasetError, match="the image is 64x48, but the intrinsics are for 32x24"):
         convert(script.write(tmp_path / "run", "db3"), tmp_path / "out")
 
 
@@ -328,7 +329,7 @@ def test_a_message_of_another_distribution_is_said(tmp_path: Path) -> None:
         convert(bag, tmp_path / "out")
 
 
-def small(lens_camera: Camera) -> tuple[int, int]:
+def small(lens_camera: CameraModel) -> tuple[int, int]:
     return lens_camera.width, lens_camera.height
 
 
@@ -358,7 +359,7 @@ def test_s3e_in_its_published_layout(tmp_path: Path) -> None:
     folders = convert_s3e(bag, tmp_path / "out", team)
     assert [folder.name for folder in folders] == ["alpha", "bob", "carol"]
     recordings = [Recording.open(folder) for folder in folders]
-    assert recordings[0].camera == S3E_ALPHA.camera
+    assert recordings[0].camera == S3E_ALPHA.camera.agent_camera()
     np.testing.assert_allclose(recordings[0].T_body_camera, S3E_ALPHA.T_body_camera, atol=1e-6)
     assert [len(recording.frames) for recording in recordings] == [4, 4, 4]
     assert all(recording.truth is not None for recording in recordings)
@@ -367,7 +368,7 @@ def test_s3e_in_its_published_layout(tmp_path: Path) -> None:
 def test_s3e_says_whose_camera_is_missing(tmp_path: Path) -> None:
     bag = walking(False, image="/Alpha/left_camera/compressed").write(tmp_path / "S3E", "db3")
     team = Team(odometry=write_motion(tmp_path / "odometry", ["alpha.tum", "bob.tum"], 1.6e9))
-    with pytest.raises(DatasetError, match="images are 32x24, but the intrinsics are for 1224x1024"):
+    with pytest.raises(DatasetError, match="the image is 32x24, but the intrinsics are for 1224x1024"):
         convert_s3e(bag, tmp_path / "out", team)
     team = replace(team, cameras={"alpha": camera_file(tmp_path)})
     with pytest.raises(DatasetError, match="bob: intrinsics are missing: S3E publishes no calibration of Bob"):
@@ -419,4 +420,4 @@ def test_graco_in_its_published_layout(tmp_path: Path) -> None:
     assert [[frame.stamp_s for frame in recording.frames] for recording in recordings] == [[0, 1, 2], [0, 1, 2]]
     starts = [recording.ground_truth(0.0) for recording in recordings]
     assert [float(T[0, 3]) for T in starts if T is not None] == pytest.approx([0.0, 7.0], abs=1e-3)
-    assert recordings[1].camera == GRACO_GROUND.camera
+    assert recordings[1].camera == GRACO_GROUND.camera.agent_camera()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import inverse, pose, so3_exp
+from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
@@ -54,7 +55,7 @@ def write_sevenscenes(path: Path, count: int = 6) -> Path:
 def write_kitti(path: Path, images: int = 4, poses: int = 4) -> Path:
     for k in range(images):
         write_image(path / "image_0" / f"{k:06d}.png")
-    (path / "calib.txt").write_text("P0: 7 0 3 0 0 8 4 0 0 0 1 0\nP1: 7 0 3 -2 0 8 4 0 0 0 1 0\n")
+    (path / "calib.txt").write_text("P0: 7 0 16 0 0 8 12 0 0 0 1 0\nP1: 7 0 16 -2 0 8 12 0 0 0 1 0\n")
     (path / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(images)))
     np.savetxt(path / "poses.txt", moving(poses)[:, :3].reshape(poses, 12))
     return path
@@ -94,14 +95,14 @@ def test_sevenscenes_is_stamped_by_its_frame_numbers(tmp_path: Path) -> None:
     assert source.truth is not None
     np.testing.assert_allclose(source.truth.T_fixed_body, moving(6), atol=1e-9)
     assert source.lens is not None
-    assert source.lens.camera == Camera(32, 24, 585.0, 585.0, 16.0, 12.0)
+    assert source.lens.camera == CameraModel(32, 24, 585.0, 585.0, 16.0, 12.0)
 
 
 def test_kitti_takes_calibration_times_and_poses(tmp_path: Path) -> None:
     source = read_source(write_kitti(tmp_path / "00"))
     assert source.format == "kitti"
     assert source.lens is not None
-    assert source.lens.camera == Camera(32, 24, 7.0, 8.0, 3.0, 4.0)
+    assert source.lens.camera == CameraModel(32, 24, 7.0, 8.0, 16.0, 12.0)
     assert source.truth is not None
     np.testing.assert_allclose(source.truth.T_fixed_body, moving(4), atol=1e-9)
     assert source.faults == ()
@@ -109,9 +110,12 @@ def test_kitti_takes_calibration_times_and_poses(tmp_path: Path) -> None:
 
 def test_tum_needs_a_calibration_unless_its_name_says_which_camera(tmp_path: Path) -> None:
     assert read_source(write_tum_rgbd(tmp_path / "desk")).lens is None
-    lens = read_source(write_tum_rgbd(tmp_path / "rgbd_dataset_freiburg1_desk")).lens
+    path = write_tum_rgbd(tmp_path / "rgbd_dataset_freiburg1_desk")
+    for file in (path / "rgb").iterdir():
+        cv2.imwrite(str(file), np.full((480, 640, 3), 90, np.uint8))
+    lens = read_source(path).lens
     assert lens is not None
-    assert (lens.camera.fx, lens.k3) == (517.3, 1.1633)
+    assert (lens.camera.fx, lens.camera.distortion[4]) == (517.3, 1.1633)
 
 
 def test_euroc_takes_the_left_camera_in_the_body(tmp_path: Path) -> None:
@@ -119,7 +123,7 @@ def test_euroc_takes_the_left_camera_in_the_body(tmp_path: Path) -> None:
     assert source.format == "euroc"
     assert source.images[1][0] - source.images[0][0] == pytest.approx(0.05)
     assert source.lens is not None
-    assert source.lens.camera == Camera(32, 24, 45.8, 45.7, 16.7, 12.4, (-0.28, 0.07, 0.0002, 1.8e-05))
+    assert source.lens.camera == CameraModel(32, 24, 45.8, 45.7, 16.7, 12.4, (-0.28, 0.07, 0.0002, 1.8e-05))
     assert source.lens.T_body_camera[:3, 3].tolist() == [0.1, 0.2, 0.3]
     assert source.truth is not None
     assert source.truth.T_fixed_body[2, :3, 3].tolist() == [2, 2, 3]
@@ -128,7 +132,7 @@ def test_euroc_takes_the_left_camera_in_the_body(tmp_path: Path) -> None:
 def test_a_plain_folder_takes_stamps_from_names(tmp_path: Path) -> None:
     found = info(write_plain(tmp_path / "p"))
     assert (found.format, found.images, found.from_s, found.to_s) == ("plain", 6, 100.0, 102.5)
-    assert (found.truth_poses, found.odometry_poses, found.camera) == (6, None, CAMERA)
+    assert (found.truth_poses, found.odometry_poses, found.camera) == (6, None, CameraModel.of_camera(CAMERA))
     assert found.length_m == pytest.approx(5.0)
 
 
@@ -283,14 +287,15 @@ def test_kalibr_gives_the_inverse_of_its_mounting(tmp_path: Path) -> None:
         "  distortion_model: radtan\n  intrinsics: [30.0, 31.0, 16.0, 12.0]\n  resolution: [32, 24]\n"
     )
     lens = read_lens(tmp_path / "camchain.yaml")
-    assert lens.camera == Camera(32, 24, 30.0, 31.0, 16.0, 12.0, (0.1, 0.2, 0.3, 0.4))
+    assert lens.camera == CameraModel(32, 24, 30.0, 31.0, 16.0, 12.0, (0.1, 0.2, 0.3, 0.4))
     np.testing.assert_allclose(lens.T_body_camera, inverse(T_camera_imu), atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("fx: 1\n", "the image size is missing"),
+        ("fx: 1\n", "of the intrinsics, fy, cx, cy is missing"),
+        ("fx: 1\nfy: 1\ncx: 1\ncy: 1\n", "the image size is missing"),
         ("width: 3\nheight: 4\n", "the intrinsics are missing"),
         ("resolution: [3, 4]\nintrinsics: [1, 1, 1, 1]\ndistortion_model: equidistant\n", "'equidistant'"),
     ],

@@ -10,6 +10,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.runtime.event_lines import Reported, UnknownFact
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.report import Report, evaluate, finish, read_report
 from flocc_launch.report.build import judged
@@ -229,7 +230,7 @@ def test_a_run_is_not_written_over_another(folder: RunFolder) -> None:
 
 def test_an_event_of_a_later_version_is_kept_as_it_is() -> None:
     event = event_from_line('{"t": 2.5, "robot": "r1", "event": "teleported", "where": "mars"}', "here")
-    assert (event.t, event.robot, event.event) == (2.5, "r1", "teleported")
+    assert event == Reported(2.5, "r1", UnknownFact("teleported", {"where": "mars"}))
 
 
 def test_a_run_without_any_event_has_a_report(tmp_path: Path) -> None:

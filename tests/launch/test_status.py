@@ -20,7 +20,7 @@ from flocc_launch.dashboard.status_table import (
     status_of_run,
     status_of_swarm,
 )
-from flocc_launch.doctor import Finding, Severity, finding_lines, installation, network
+from flocc_launch.doctor import Finding, Severity, finding_lines, installation, network_check
 from flocc_launch.doctor.live import diagnose_live
 
 
@@ -114,7 +114,7 @@ def test_a_port_in_use_is_found_before_the_agent_finds_it() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        (finding,) = network.ports(TransportConfig(control_listen=(endpoint,)))
+        (finding,) = network_check.ports(TransportConfig(control_listen=(endpoint,)))
     assert (finding.cause, finding.severity) == ("port", Severity.BLOCKS)
     assert endpoint in finding.sentence
 
@@ -148,12 +148,12 @@ def test_checkpoints_are_asked_for_only_where_perception_needs_them(tmp_path: Pa
 
 @pytest.mark.swarm
 def test_two_zenoh_peers_find_each_other_through_a_third() -> None:
-    assert network.by_gossip(TransportConfig())
+    assert network_check.by_gossip(TransportConfig())
 
 
 @pytest.mark.swarm
 def test_two_zenoh_peers_of_this_machine_find_each_other() -> None:
-    assert network.two_peers(TransportConfig(), by_multicast=False)
+    assert network_check.two_peers(TransportConfig(), by_multicast=False)
 
 
 def test_findings_read_as_lines() -> None:

@@ -228,7 +228,7 @@ def test_a_cut_or_lengthened_message_is_a_decode_error(envelope: Envelope) -> No
 
 def test_a_message_larger_than_its_limit_is_a_decode_error() -> None:
     with pytest.raises(DecodeError, match="more than"):
-        decode(b"\x94\x02" + bytes(MESSAGE_BYTES_MAX))
+        decode(bytes([0x94, PROTOCOL_VERSION]) + bytes(MESSAGE_BYTES_MAX))
 
 
 # --- sizes -----------------------------------------------------------------------------------------------------------

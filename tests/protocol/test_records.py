@@ -23,6 +23,7 @@ from flocc_protocol.records import (
     KeyframeRecord,
     Record,
     RejectionRecord,
+    UnknownRecord,
     chain,
     decode_record,
     encode_record,
@@ -106,7 +107,7 @@ def test_the_same_shapes_are_checked_on_the_wire(dtype: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [[], [0, []], [5, []], [1, []], [True, []], [1], [1, [], []], 1, None, "x", [1, None]]
+    "value", [[], [0, []], [-1, []], [128, []], [1, []], [True, []], [1], [1, [], []], [99], 1, None, "x", [1, None]]
 )
 def test_anything_else_is_a_decode_error(value: Any) -> None:
     with pytest.raises(DecodeError):
@@ -147,3 +148,24 @@ def test_logs_that_differ_have_other_checksums(one: list[bytes], other: list[byt
 def test_a_keyframe_with_an_int8_descriptor_of_512_is_below_700_bytes() -> None:
     record = KeyframeRecord(100_000, 1_700_000_000.25, (1.5, -2.0, 0.25, 0.5, 0.5, -0.5, 0.5), descriptor(512))
     assert len(encode_record(record)) < 700
+
+
+@pytest.mark.parametrize("data", [to_bytes([99, [1, "two"]]), b"\x92\x63\xc1 what a later version may write"])
+def test_a_record_of_an_unknown_code_is_kept_byte_for_byte(data: bytes) -> None:
+    record = decode_record(data)
+    assert record == UnknownRecord(99, data)
+    assert encode_record(record) == data
+
+
+@pytest.mark.parametrize("data", ENCODED)
+def test_a_record_with_more_fields_than_known_is_kept_byte_for_byte(data: bytes) -> None:
+    code, fields = from_bytes(data, RECORD_BYTES_MAX)
+    longer = to_bytes([code, [*fields, "more"]])
+    assert decode_record(longer) == UnknownRecord(code, longer)
+    assert encode_record(decode_record(longer)) == longer
+
+
+def test_a_record_with_fewer_fields_than_known_is_a_decode_error() -> None:
+    code, fields = from_bytes(ENCODED[0], RECORD_BYTES_MAX)
+    with pytest.raises(DecodeError, match="fields"):
+        decode_record(to_bytes([code, fields[:-1]]))

@@ -46,11 +46,19 @@ from flocc_protocol.records import (
     REASON_LENGTH_MAX,
     SEALED_RECORD_BYTES_MAX,
     SIGNATURE_BYTES,
+    TAG_LENGTH_MAX,
     ClosureRecord,
     FixRecord,
+    GeodeticFixRecord,
     KeyframeRecord,
+    MetricClosureRecord,
+    OdometryCovarianceRecord,
+    PoseFixRecord,
     Record,
     RejectionRecord,
+    RobotBearingRecord,
+    RobotSightingRecord,
+    TagSightingRecord,
     encode_record,
 )
 
@@ -98,6 +106,13 @@ RECORDS: tuple[Record, ...] = (
     ClosureRecord(KeyframeId(ALICE, 3), KeyframeId(BOB, 9), IDENTITY, 48, 51, 48 / 51),
     RejectionRecord(KeyframeId(ALICE, 4), KeyframeId(BOB, 1), "few correspondences: 12 < 30", 12, 530),
     FixRecord(5, Array.of(np.array([1.0, 2.0, 3.0]), "f8"), Array.of(np.eye(3).ravel())),
+    GeodeticFixRecord(5, 48.137, 11.575, 519.5, Array.of(np.eye(3).ravel(), "f8")),
+    PoseFixRecord(0, IDENTITY, Array.of(np.arange(21.0), "f8")),
+    TagSightingRecord(6, "36h11/7", IDENTITY, Array.of(np.arange(21.0), "f8")),
+    RobotSightingRecord(6, "bob-2", IDENTITY, Array.of(np.arange(21.0), "f8")),
+    RobotBearingRecord(7, "bob-2", Array.of(np.array([1.0, 2.0, 3.0]), "f8"), Array.of(np.eye(3).ravel(), "f8")),
+    MetricClosureRecord(KeyframeId(ALICE, 4), KeyframeId(BOB, 1), IDENTITY, Array.of(np.arange(21.0), "f8")),
+    OdometryCovarianceRecord(7, Array.of(np.arange(21.0), "f8")),
 )
 ENCODED = tuple(encode_record(record) for record in RECORDS)
 
@@ -225,7 +240,8 @@ def largest_messages() -> list[Message]:
 _counts = st.integers(0, INDEX_MAX)
 _counters = st.integers(0, COUNTER_MAX)
 _term_counters = st.integers(0, TERM_COUNTER_MAX)
-log_ids = st.builds(LogId, st.from_regex(r"\A[a-z0-9][a-z0-9_-]{0,31}\Z"), st.integers(0, INCARNATION_MAX))
+_names = st.from_regex(r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")
+log_ids = st.builds(LogId, _names, st.integers(0, INCARNATION_MAX))
 keyframe_ids = st.builds(KeyframeId, log_ids, _counts)
 terms = st.builds(Term, _term_counters, log_ids)
 
@@ -290,6 +306,15 @@ records: st.SearchStrategy[Record] = st.one_of(
         )
     ),
     st.builds(FixRecord, _counts, arrays((3,), "f8 f4"), arrays((9,))),
+    st.builds(GeodeticFixRecord, _counts, reals(-90.0, 90.0), reals(-180.0, 180.0), reals(-1e5, 1e5), arrays((9,))),
+    st.builds(PoseFixRecord, _counts, poses(), arrays((21,))),
+    st.builds(TagSightingRecord, _counts, st.text(max_size=TAG_LENGTH_MAX), poses(), arrays((21,))),
+    st.builds(RobotSightingRecord, _counts, _names, poses(), arrays((21,))),
+    st.builds(RobotBearingRecord, _counts, _names, arrays((3,), "f8 f4"), arrays((9,))),
+    pairs.flatmap(
+        lambda pair: st.builds(MetricClosureRecord, st.just(pair.low), st.just(pair.high), poses(), arrays((21,)))
+    ),
+    st.builds(OdometryCovarianceRecord, _counts, arrays((21,))),
 )
 
 

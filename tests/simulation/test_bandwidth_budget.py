@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from flocc_launch.scenarios.scenario import Scenario
-from flocc_launch.simulation.latents import PIECE_BYTES
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.simulation.virtual_fetches import PIECE_BYTES
 
 BUDGET_BYTES_S = 20_000.0
 END_S = 60.0

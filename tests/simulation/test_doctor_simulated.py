@@ -140,7 +140,7 @@ def test_two_robots_with_one_name_are_named(tmp_path: Path) -> None:
     swarm.add_twin("r2")
     swarm.run_until(15.0)
     del swarm.stations["r2-twin"]  # it belongs to somebody else, and so do its files
-    swarm.lines = [line for line in swarm.lines if line["robot"] != "r2-twin"]
+    swarm.told = [told for told in swarm.told if told.robot != "r2-twin"]
     folder = RunFolder.create(tmp_path / "run")
     write(folder, swarm, scenario.seed, 15.0)
     assert [(finding.cause, finding.robots) for finding in diagnose(folder)] == [

@@ -8,7 +8,6 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +53,7 @@ async def tell(agent: Agent) -> None:
 async def main(path: Path, keyframes: int, period_s: float, phase_rad: float) -> None:
     """Be a robot."""
     config = AgentConfig.model_validate_json(path.read_text(encoding="utf-8"))
-    lines: list[dict[str, Any]] = []
-    async with Agent(config, CAMERA, on_line=lines.append) as agent:
+    async with Agent(config, CAMERA) as agent:
         tasks = [
             asyncio.create_task(drive(agent, config.name, keyframes, period_s, phase_rad)),
             asyncio.create_task(tell(agent)),

@@ -15,7 +15,7 @@ from tests.launch.test_cli import run
 from tests.launch.test_dashboard import browse, rows
 
 from flocc_agent.config import AgentConfig, PerceptionConfig, SourceConfig
-from flocc_launch.doctor.network import free_port
+from flocc_launch.doctor.network_check import free_port
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.swarm.processes import loopback_transports

@@ -11,7 +11,7 @@ import pytest
 from tests.launch.test_dashboard import browse, rows
 
 from flocc_launch.dashboard import live_dashboard
-from flocc_launch.doctor.network import free_port
+from flocc_launch.doctor.network_check import free_port
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.swarm.launching import Watch, launch

@@ -9,7 +9,6 @@ import logging
 import os
 import random
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -93,8 +92,7 @@ def attack(rng: random.Random, material: list[tuple[str, bytes]]) -> tuple[str, 
 async def test_mutated_bytes_change_nothing(caplog: pytest.LogCaptureFixture) -> None:
     rng = random.Random(SEED)
     configs = loopback_configs(("r1", "r2", "r3"))
-    lines: list[dict[str, Any]] = []
-    async with Agent(agent_config("r1", configs["r1"]), CAMERA, on_line=lines.append) as agent:
+    async with Agent(agent_config("r1", configs["r1"]), CAMERA) as agent:
         material = await overheard(agent, configs["r3"])
         await until(lambda: agent.status()["keyframes"] == 6 and not agent.status()["busy"], 20.0)
         own_log = agent.status()["logs"]["r1"]

@@ -16,6 +16,7 @@ from scipy.special import chdtri
 
 from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
+from flocc_agent.backend.measured import measured_odometry
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
 from flocc_agent.backend.rbcd import Block, Links
 from flocc_agent.backend.screening import first_not_rigid
@@ -315,7 +316,7 @@ def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, wei
     T_odom = np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)
     n, rank = len(T_odom), measured.fixed.shape[2]
     used = weights > 0
-    covariances = problem.trajectory.edge_covariances
+    covariances = measured_odometry(problem.trajectory, config).edge_covariances
     if covariances is None:
         one = diagonal_covariance(config.odometry_rotation_sigma_rad, config.odometry_translation_sigma_m)
         covariances = np.broadcast_to(one, (n - 1, 6, 6))

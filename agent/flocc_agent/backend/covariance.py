@@ -10,21 +10,12 @@ from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.solvers import WEIGHT_MIN, Objective, Solved
 from flocc_agent.core.pose_graph import Trajectory
-from flocc_agent.geometry import Float, hat
+from flocc_agent.geometry import Float, adjoint
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
 
 COVARIANCE_MAX = 1e30
-
-
-def adjoint(T: Float) -> Float:
-    """Adjoint (6, 6) of a pose, rotation first."""
-    R, t = T[:3, :3], T[:3, 3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = R
-    out[3:, :3] = hat(t) @ R
-    return out
 
 
 def covariances_of(

@@ -21,15 +21,15 @@ def too_few(logs: Sequence[LogId], closures: Mapping[int, LoopClosure], closures
     return sorted(k for ids in _between(group, closures).values() for k in ids)
 
 
-def _between(group: Mapping[LogId, LogId], closures: Mapping[int, LoopClosure]) -> dict[Pair, list[int]]:
-    """Closures between each two groups."""
-    found: dict[Pair, list[int]] = {}
+def _between(group: Mapping[LogId, LogId], closures: Mapping[int, LoopClosure]) -> dict[Pair, dict[int, int]]:
+    """Closures between each two groups, with their support."""
+    found: dict[Pair, dict[int, int]] = {}
     for k, closure in closures.items():
         low, high = sorted((group[closure.query.log], group[closure.match.log]))
         if low != high:
-            found.setdefault((low, high), []).append(k)
+            found.setdefault((low, high), {})[k] = closure.support
     return found
 
 
-def _joined(between: Mapping[Pair, list[int]], closures_min: int) -> Pair | None:
-    return min((pair for pair, ids in between.items() if len(ids) >= closures_min), default=None)
+def _joined(between: Mapping[Pair, Mapping[int, int]], closures_min: int) -> Pair | None:
+    return min((pair for pair, ids in between.items() if sum(ids.values()) >= closures_min), default=None)

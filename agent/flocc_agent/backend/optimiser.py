@@ -17,6 +17,7 @@ from flocc_agent.backend.edges import state_of
 from flocc_agent.backend.initial import initial_poses, initial_world, trusted_closures
 from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
+from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.problem import build
 from flocc_agent.backend.results import Outcome, Solution, collect, excluded, odometry_component, rejected
 from flocc_agent.backend.screening import Screened, screen
@@ -47,7 +48,7 @@ def optimise(
     """Optimise every connected component of a pose graph.
 
     Args:
-        graph: Odometry, closures and fixes; nothing in it is trusted.
+        graph: Odometry, closures, fixes and measured factors; nothing in it is trusted.
         config: Formulation, solver, noise model and priors.
         initial: An earlier solution to start from; keyframes that it lacks follow their odometry.
         covariance_of: Keyframes whose marginal covariance is wanted, beside every robot's `T_map_odom`.
@@ -55,6 +56,15 @@ def optimise(
     Returns:
         The solution, with one result per closure and a sentence for whatever was left out; or why there is none.
     """
+    expanded = with_factors(graph, config, initial)
+    solution = _optimise(expanded.graph, config, expanded.initial, covariance_of)
+    return solution if isinstance(solution, OptimisationFailed) else without_factors(solution, graph, expanded)
+
+
+def _optimise(
+    graph: PoseGraph, config: BackendConfig, initial: GraphSolution | None, covariance_of: Sequence[KeyframeId]
+) -> GraphSolution | OptimisationFailed:
+    """Optimise a graph of odometry, closures and fixes."""
     began = time.perf_counter()
     screened = screen(graph)
     if not screened.trajectories:

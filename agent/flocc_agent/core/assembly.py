@@ -4,29 +4,36 @@ Every robot takes in every record, and only a leader asks for the graph: records
 matrices when somebody wants them.
 """
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.corrections import pose7, symmetric
 from flocc_agent.core.gossip import NewRecord
-from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.measured_records import MeasuredRecords
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import between, pose_from_tq, poses_from_tq
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, FixRecord, KeyframeRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord, UnknownRecord
 
 Float = NDArray[np.float64]
 
 
 class _Odometry:
-    """One log's keyframes: poses as its records give them, and whether each was described."""
+    """One log's keyframes: poses as its records give them, and whether each was described.
+
+    The place of a keyframe that a later version wrote is taken by the pose of the next one; nothing is tied to it.
+    """
 
     def __init__(self) -> None:
         self.poses: list[Pose7] = []
+        self.stamps_s: list[float] = []
         self.encoded: list[bool] = []
+        self.unread: set[int] = set()
         self._matrices: Float = np.empty((0, 4, 4))
 
     def matrices(self) -> Float:
@@ -35,6 +42,24 @@ class _Odometry:
         if known < len(self.poses):
             self._matrices = np.concatenate([self._matrices, poses_from_tq(np.array(self.poses[known:]))])
         return self._matrices
+
+    def pose(self, index: int) -> Float:
+        """`T_odom_keyframe` (4, 4)."""
+        return np.asarray(self.matrices()[index])
+
+    def stamp_s(self, index: int) -> float:
+        """When a keyframe was taken."""
+        return self.stamps_s[index]
+
+    def around(self, stamp_s: float) -> tuple[int, float] | None:
+        """Last keyframe not after a stamp, and the stamp's share of the way to the next; None outside of the log."""
+        before = bisect_right(self.stamps_s, stamp_s) - 1
+        if before < 0 or (before == len(self.stamps_s) - 1 and self.stamps_s[before] < stamp_s):
+            return None
+        if before == len(self.stamps_s) - 1:
+            return before, 0.0
+        passed_s, lasts_s = stamp_s - self.stamps_s[before], self.stamps_s[before + 1] - self.stamps_s[before]
+        return before, passed_s / lasts_s
 
     def neighbour(self, index: int) -> int | None:
         """The nearest described keyframe before this one, for the first ones the nearest after it."""
@@ -64,7 +89,7 @@ class GraphAssembly:
         self._built: dict[CandidatePair, LoopClosure] = {}
         self._order: list[CandidatePair] = []
         self._early: dict[KeyframeId, int] = {}
-        self._fixes: list[AbsoluteFix] = []
+        self._measured = MeasuredRecords()
         self._odometry_pairs: dict[KeyframeId, tuple[KeyframeId, Pose7]] = {}
 
     @property
@@ -79,12 +104,11 @@ class GraphAssembly:
                 self._add_keyframe(new.log, new.record)
             case ClosureRecord():
                 self._add_closure(new, new.record)
-            case FixRecord(index, position_m, covariance_m2):
-                covariance = covariance_m2.numpy().reshape(3, 3)
-                self._fixes.append(AbsoluteFix(KeyframeId(new.log, index), position_m.numpy(), covariance))
-                self.revision += 1
-            case _:
+            case RejectionRecord() | UnknownRecord():
                 pass
+            case _:
+                self.revision += 1
+                self._await(self._measured.add(new))
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.
@@ -105,10 +129,14 @@ class GraphAssembly:
 
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
-        trajectories = {log: Trajectory(odometry.matrices()) for log, odometry in sorted(self._odometry.items())}
+        trajectories = {log: self._trajectory(log) for log in sorted(self._odometry)}
         self._build()
         closures = tuple([self._built[pair] for pair in self._order])
-        return PoseGraph(trajectories, closures, tuple(fix for fix in self._fixes if self._known(fix.keyframe)))
+        return PoseGraph(trajectories, closures, measured=self._measured.factors(self._odometry, self._known))
+
+    def _trajectory(self, log: LogId) -> Trajectory:
+        T_odom_keyframe = self._odometry[log].matrices()
+        return Trajectory(T_odom_keyframe, self._measured.edge_covariances(log, len(T_odom_keyframe)))
 
     def _build(self) -> None:
         """Build the closures that are new since the last graph, and those whose keyframes came meanwhile."""
@@ -122,17 +150,24 @@ class GraphAssembly:
 
     def _known(self, keyframe: KeyframeId) -> bool:
         odometry = self._odometry.get(keyframe.log)
-        return odometry is not None and keyframe.index < len(odometry.poses)
+        return odometry is not None and keyframe.index < len(odometry.poses) and keyframe.index not in odometry.unread
 
     def _add_keyframe(self, log: LogId, record: KeyframeRecord) -> None:
         """A new log, or a keyframe that a closure was waiting for, makes the last solution out of date."""
         odometry = self._odometry.get(log)
         if odometry is None:
             odometry = self._odometry[log] = _Odometry()
+        while len(odometry.poses) < record.index:
+            odometry.unread.add(len(odometry.poses))
+            odometry.poses.append(record.T_odom_camera)
+            odometry.encoded.append(False)
+            odometry.stamps_s.append(record.stamp_s)
         odometry.poses.append(record.T_odom_camera)
+        odometry.stamps_s.append(record.stamp_s)
         odometry.encoded.append(record.descriptor is not None)
         self.keyframes += 1
         awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry.poses) - 1), 0) > 0
+        awaited |= self._measured.awaited(log.robot, record.stamp_s)
         self.revision += awaited or len(odometry.poses) == 1
 
     def _add_closure(self, new: NewRecord, record: ClosureRecord) -> None:
@@ -143,9 +178,13 @@ class GraphAssembly:
             self._closures[pair] = (new.log, new.number, record)
             self._unbuilt.add(pair)
             self.revision += 1
-            for keyframe in (record.query, record.match):
-                if not self._known(keyframe):
-                    self._early[keyframe] = self._early.get(keyframe, 0) + 1
+            self._await((record.query, record.match))
+
+    def _await(self, keyframes: Iterable[KeyframeId]) -> None:
+        """A solution will be out of date when one of these comes."""
+        for keyframe in keyframes:
+            if not self._known(keyframe):
+                self._early[keyframe] = self._early.get(keyframe, 0) + 1
 
 
 def _loop_closures(records: Sequence[ClosureRecord]) -> list[LoopClosure]:

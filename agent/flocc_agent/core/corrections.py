@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer
-from flocc_agent.core.parameters import GossipParameters, RoundParameters
+from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
-from flocc_agent.core.pulls import REMEMBERED_MAX, remember
+from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
+from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
 from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
@@ -34,17 +35,19 @@ Float = NDArray[np.float64]
 _UPPER = np.triu_indices(6)
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
+LISTED_MAX = 400
+"""Keyframes listed in a correction; a longer trajectory is thinned and interpolated, so that messages stay small."""
+TRANSLATION_TOLERANCE_M = 1e-3
+ROTATION_TOLERANCE_RAD = 1e-4
+"""A correction that moves no keyframe further is not sent again in one term: nobody would see the difference."""
 
 
 class Corrections:
     """The newest correction of every log, as one robot knows them."""
 
-    def __init__(
-        self, own: LogId, gossip: GossipParameters, rounds: RoundParameters, sealer: Sealer | None = None
-    ) -> None:
+    def __init__(self, own: LogId, gossip: GossipParameters, sealer: Sealer | None = None) -> None:
         self._own = own
         self._gossip = gossip
-        self._rounds = rounds
         self._sealer = sealer
         self._newest: dict[LogId, LogCorrection] = {}
         self._frame_unknown = False
@@ -94,7 +97,7 @@ class Corrections:
             held = self._newest.get(version.log)
             newer = held is None or (version.term, version.round) > (held.term, held.round)
             if newer and self._asked_until_s.get(version.log, now) <= now:
-                remember(self._asked_until_s, version.log, now + self._gossip.request_timeout_s)
+                remember(self._asked_until_s, version.log, now + REQUEST_TIMEOUT_S)
                 wanted.append(version.log)
             elif not newer:
                 remember(self._agreed, version.log, version)
@@ -111,9 +114,9 @@ class Corrections:
         if held is not None and (message.term, message.round) <= (held.term, held.round):
             return []
         if held is None and len(self._newest) >= self._gossip.logs_max:
-            return [Report("peer_refused", {"peer": peer, "reason": "too many corrections"})]
+            return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
-            return [Report("peer_refused", {"peer": peer, "reason": "correction without its leader's signature"})]
+            return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
@@ -150,10 +153,10 @@ class Corrections:
         published: list[LogCorrection] = []
         for component, log in solved:
             try:
-                message = correction_of(component, log, term, round_number, self._rounds.correction_keyframes_max)
+                message = correction_of(component, log, term, round_number, LISTED_MAX)
             except ValueError as error:
-                facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
-                effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
+                reason = f"robot {log.robot}: {error}"
+                effects.append(Report(RoundFailed(term=term, round=round_number, reason=reason)))
                 continue
             if self._changed(message):
                 message = self._signed(message)
@@ -175,27 +178,27 @@ class Corrections:
         if len(old) > len(new):
             return True
         shift = np.abs(new[: len(old)] - old)
-        moved = shift[:, :3].max(initial=0.0) > self._rounds.translation_tolerance_m
-        turned = shift[:, 3:].max(initial=0.0) > self._rounds.rotation_tolerance_rad
+        moved = shift[:, :3].max(initial=0.0) > TRANSLATION_TOLERANCE_M
+        turned = shift[:, 3:].max(initial=0.0) > ROTATION_TOLERANCE_RAD
         return bool(moved or turned) or self._odom_moved(held, message)
 
     def _odom_moved(self, held: LogCorrection, message: LogCorrection) -> bool:
         shift = np.abs(np.array(held.T_map_odom) - np.array(message.T_map_odom))
-        return bool(shift.max() > self._rounds.translation_tolerance_m)
+        return bool(shift.max() > TRANSLATION_TOLERANCE_M)
 
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
         correction = delivered(message, changed)
-        facts = {
-            "term": message.term.counter,
-            "leader": message.term.leader.robot,
-            "round": message.round,
-            "map_frame": correction.map_frame,
-            "frame_changed": correction.frame_changed,
-            "T_map_odom": [float(x) for x in message.T_map_odom],
-        }
-        return [PersistCorrection(message, changed), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
+        fact = CorrectionApplied(
+            term=message.term.counter,
+            leader=message.term.leader.robot,
+            round=message.round,
+            map_frame=correction.map_frame,
+            frame_changed=correction.frame_changed,
+            T_map_odom=message.T_map_odom,
+        )
+        return [PersistCorrection(message, changed), Deliver(correction), Report(fact)]
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:

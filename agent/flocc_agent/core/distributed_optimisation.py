@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
-from flocc_agent.core.parameters import DistributedParameters, RoundParameters
+from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.reports import BlockMoved, RoundFailed
+from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
 from flocc_agent.geometry import inverse
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
@@ -25,6 +27,8 @@ Float = NDArray[np.float64]
 
 ITERATIONS_AFTER_RESTART = 1000
 """A restarted robot counts on from its last correction and this: above whatever it said before."""
+DELIVER_PERIOD_S = 2.0
+"""Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
 FAILURES_MAX = 6
 
@@ -73,7 +77,6 @@ class DistributedOptimisation:
         own: LogId,
         source: GraphSource,
         parameters: DistributedParameters,
-        rounds: RoundParameters,
         iteration: int = 0,
     ) -> None:
         self.anchor = own
@@ -82,7 +85,6 @@ class DistributedOptimisation:
         self._own = own
         self._source = source
         self._parameters = parameters
-        self._rounds = rounds
         self._neighbours: dict[LogId, _Neighbour] = {}
         self._heard: dict[CandidatePair, float] = {}
         self._epoch = 0
@@ -160,7 +162,7 @@ class DistributedOptimisation:
         self._failures = min(self._failures + 1, FAILURES_MAX)
         self._next_s = now + self._parameters.period_s * 2**self._failures
         self._has_news = True
-        return [Report("optimisation_failed", {"term": str(Term(0, self._own)), "round": number, "reason": reason})]
+        return [Report(RoundFailed(term=Term(0, self._own), round=number, reason=reason))]
 
     # Time
 
@@ -190,7 +192,7 @@ class DistributedOptimisation:
         if self._step is None or not self._undelivered or self._deliver_at_s > now:
             return None
         self._undelivered = False
-        self._deliver_at_s = now + self._parameters.deliver_period_s
+        self._deliver_at_s = now + DELIVER_PERIOD_S
         T = self._step.T_map_keyframe
         T_map_odom = T[-1] @ inverse(self._trajectory.T_odom_keyframe[len(T) - 1])
         logs = (self._own,) if self.anchor == self._own else (self.anchor, self._own)
@@ -199,18 +201,18 @@ class DistributedOptimisation:
     def report(self) -> Report:
         """Where this robot's block stands, for people."""
         step, state = self._step, self._state
-        facts = {
-            "iteration": self.iteration,
-            "anchor": str(self.anchor),
-            "neighbours": len(self._sharing()),
-            "separators": len(self._separators),
-            "cost": None if step is None else step.cost,
-            "moved": None if step is None else step.moved,
-            "closures_rejected": 0 if step is None else step.rejected,
-            "weights_final": step is not None and step.finished,
-            "keyframes": 0 if state is None else len(state.X),
-        }
-        return Report("block", facts)  # type: ignore[arg-type]
+        fact = BlockMoved(
+            iteration=self.iteration,
+            anchor=self.anchor,
+            neighbours=len(self._sharing()),
+            separators=len(self._separators),
+            cost=None if step is None else step.cost,
+            moved=None if step is None else step.moved,
+            closures_rejected=0 if step is None else step.rejected,
+            weights_final=step is not None and step.finished,
+            keyframes=0 if state is None else len(state.X),
+        )
+        return Report(fact)
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -225,7 +227,7 @@ class DistributedOptimisation:
             return
         if self._seen is not None:
             grown = keyframes - self._seen[1]
-            if revision == self._seen[0] and grown < self._rounds.keyframes_per_round:
+            if revision == self._seen[0] and grown < KEYFRAMES_PER_ROUND:
                 return
         self._seen = (revision, keyframes)
         graph = self._source.graph()

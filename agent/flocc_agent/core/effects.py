@@ -1,19 +1,18 @@
 """What a robot wants done. The driver carries effects out in order: what is persisted comes before what is sent."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.blocks import BlockProblem
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
+from flocc_agent.core.reports import Fact
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import CandidatePair, LogCorrection, Message
 
 Float = NDArray[np.float64]
-Fact = str | int | float | bool | None | list["Fact"] | dict[str, "Fact"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,10 +149,9 @@ class PersistCorrection:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A fact for people and files: the run's events."""
+    """Tell people and files a fact."""
 
-    event: str
-    fields: Mapping[str, Fact] = field(default_factory=dict)
+    fact: Fact
 
 
 Effect = (

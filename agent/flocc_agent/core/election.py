@@ -13,6 +13,7 @@ from enum import Enum
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
 from flocc_agent.core.parameters import ElectionParameters
+from flocc_agent.core.reports import LeaderFollowed, LeaderLost, PeerRefused
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
 from flocc_protocol.messages import (
     COUNTER_MAX,
@@ -26,6 +27,10 @@ from flocc_protocol.messages import (
 
 Rank = tuple[int, LogId]
 
+ANSWER_TIMEOUT_S = 0.6
+"""Without an ANSWER for this long the robot claims a term: more than a round trip with a lost message."""
+COORDINATOR_TIMEOUT_S = 2.0
+"""After an ANSWER the robot waits this long for a leader, then asks again: three times as long as that one asks."""
 COUNTER_JUMP_MAX = 2**20
 LOST_MAX = 64
 PEERS_MAX = 256
@@ -136,7 +141,7 @@ class LeaderElection:
         peer = self._peers.get(sender.robot)
         if self._role is Role.ELECTING and peer is not None and peer.rank < self._rank:
             self._role = Role.WAITING
-            self._due_s = now + self._parameters.coordinator_timeout_s
+            self._due_s = now + COORDINATOR_TIMEOUT_S
         return []
 
     def on_coordinator(self, sender: LogId, message: Coordinator, now: float) -> list[Effect]:
@@ -239,7 +244,7 @@ class LeaderElection:
         self._lost[self._leader.term] = self._leader.beat if beat is None else beat
         while len(self._lost) > LOST_MAX:
             del self._lost[min(self._lost)]
-        report = Report("leader_lost", {"term": str(self._leader.term), "reason": why})
+        report = Report(LeaderLost(term=self._leader.term, reason=why))
         self._leader = None
         return [report, *self._start(now)]
 
@@ -253,7 +258,7 @@ class LeaderElection:
         if not better:
             return self._claim()
         self._role = Role.ELECTING
-        self._due_s = now + self._parameters.answer_timeout_s
+        self._due_s = now + ANSWER_TIMEOUT_S
         return [Unicast(peer.name, Election(self._counter_max)) for peer in better]
 
     def _claim(self) -> list[Effect]:
@@ -286,8 +291,8 @@ class LeaderElection:
 
 
 def _leader_report(term: Term) -> Report:
-    return Report("leader", {"term": term.counter, "leader": term.leader.robot, "leader_log": str(term.leader)})
+    return Report(LeaderFollowed(term=term.counter, leader=term.leader.robot, leader_log=term.leader))
 
 
 def _refused(sender: LogId, reason: str) -> Report:
-    return Report("peer_refused", {"peer": sender.robot, "reason": reason})
+    return Report(PeerRefused(peer=sender.robot, reason=reason))

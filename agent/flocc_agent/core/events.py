@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from flocc_agent.core.blocks import BlockStep
+from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_protocol.arrays import Array
@@ -119,12 +120,17 @@ class BlockIterationFailed:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class FixMeasured:
-    """An absolute position of the last keyframe's camera in a world frame."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Something was measured at one of the robot's own keyframes, given before or being encoded still.
 
-    position_m: tuple[float, float, float]
-    covariance_m2: tuple[float, ...]
+    Attributes:
+        measurement: It, of the camera.
+        index: Number of the keyframe; a known start's is 0, given or not.
+    """
+
+    measurement: Measurement
+    index: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +151,6 @@ Event = (
     | GraphOptimisationFailed
     | BlockIterated
     | BlockIterationFailed
-    | FixMeasured
+    | Measured
     | Leaving
 )

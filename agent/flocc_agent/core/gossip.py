@@ -3,6 +3,8 @@
 Rules: a log only grows, at its end, by its owner. Copies are prefixes. Heartbeats carry how long each copy is and
 its chained checksum; whoever has less asks for the rest, of whomever it heard that from. There is no state per
 neighbour about what was sent, so a lost, doubled, late or reordered message can do no lasting harm.
+What is said of this robot's own log is only a reason to ask for the records; a record that this robot did not write
+is what shows that somebody else writes its log.
 """
 
 from collections.abc import Callable
@@ -13,20 +15,32 @@ from typing import NamedTuple, Protocol
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.parameters import GossipParameters
-from flocc_agent.core.pulls import REMEMBERED_MAX, Pulls, remember
+from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, Pulls, remember
+from flocc_agent.core.reports import LogForked, PeerRefused
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import (
     RECORDS_BATCH_BYTES_MAX,
     RECORDS_BATCH_MAX,
     LogDigest,
+    LogPosition,
     RecordBatch,
     RecordRequest,
     Records,
 )
-from flocc_protocol.records import KeyframeRecord, Record, chain, decode_record, encode_record
+from flocc_protocol.records import (
+    KEYFRAME_CODE,
+    KeyframeRecord,
+    Record,
+    UnknownRecord,
+    chain,
+    decode_record,
+    encode_record,
+)
 
 DECODED_MAX = 1024
+RECORDS_MAX = 200_000
+"""Records that are kept of one log: a keyframe and a closure each second for a day. Further ones are refused."""
 
 
 class Sealer(Protocol):
@@ -77,7 +91,7 @@ class LogCopy:
         self.records.append(record)
         self.encoded.append(data)
         self.checksums.append(chain(self.checksums[-1], data))
-        self.keyframes += isinstance(record, KeyframeRecord)
+        self.keyframes += isinstance(record, KeyframeRecord) or _is_later_keyframe(record)
 
     def continues(self, batch: RecordBatch) -> bool:
         """Whether a batch that starts within this copy agrees with it, as far as both go."""
@@ -125,6 +139,7 @@ class Gossip:
         self._agreed: dict[LogId, LogDigest] = {}
         self._told: dict[tuple[str, str], None] = {}
         self._announcer: Announcer[LogDigest] = Announcer()
+        self._doubted_until_s: dict[str, float] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -134,6 +149,7 @@ class Gossip:
             "forked": (len(self._forked), REMEMBERED_MAX),
             "refused": (len(self._told), REMEMBERED_MAX),
             "agreed": (len(self._agreed), REMEMBERED_MAX),
+            "doubted": (len(self._doubted_until_s), REMEMBERED_MAX),
         }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
@@ -177,24 +193,24 @@ class Gossip:
         """Ask for what others have more of."""
         agreed = self._agreed
         news = [digest for digest in digests if digest is not agreed.get(digest.log)]
-        effects = [effect for digest in news for effect in self._on_digest(sender.robot, digest)]
+        effects = [effect for digest in news for effect in self._on_digest(sender.robot, digest, now)]
         return effects + self._pulls.ask(now)
 
-    def _on_digest(self, peer: str, digest: LogDigest) -> list[Effect]:
+    def _on_digest(self, peer: str, digest: LogDigest, now: float) -> list[Effect]:
         log, count, checksum = digest
         copy = self.logs.get(log)
         if copy is None or count > len(copy.encoded):
             return self._behind(peer, log, count) if count else []
         self._pulls.on_level(peer, log)
         if copy.checksums[count] != checksum:
+            if log == self._own:
+                return self._doubt(peer, count, now)
             return self._fork(peer, log, "two writers of one log")
         remember(self._agreed, log, digest)
         return []
 
     def _behind(self, peer: str, log: LogId, count: int) -> list[Effect]:
-        """Another robot has more of a log: note it, unless only this robot can have written it."""
-        if log == self._own:
-            return self._fork(peer, log, "others hold more of this robot's own log")
+        """Another robot has more of a log, or says so: note whom to ask."""
         if log not in self.logs and len(self.logs) >= self._parameters.logs_max:
             return self._refused(peer, "too many logs")
         if (log, peer) not in self._forked:
@@ -222,7 +238,7 @@ class Gossip:
         new: list[NewRecord] = []
         effects: list[Effect] = []
         for batch in message.batches:
-            news, more = self._on_batch(sender, batch)
+            news, more = self._on_batch(sender, batch, now)
             new += news
             effects += more
         gap = any(batch.first > self._held(batch.log) for batch in message.batches)
@@ -230,10 +246,10 @@ class Gossip:
             effects += self._pulls.ask_on(sender.robot, now)
         return new, effects
 
-    def _on_batch(self, sender: LogId, batch: RecordBatch) -> tuple[list[NewRecord], list[Effect]]:
+    def _on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
         peer = sender.robot
         if batch.log == self._own:
-            return [], self._own_log_elsewhere(sender, batch)
+            return [], self._own_log_elsewhere(peer, batch, now)
         copy = self.logs.get(batch.log)
         if copy is None:
             copy = LogCopy()
@@ -259,7 +275,7 @@ class Gossip:
                 record, record_kept = decoded(self._opened(batch.log, len(copy), data))
             except DecodeError as error:
                 return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
-            if not copy.accepts(record) or len(copy) >= self._parameters.records_max:
+            if not copy.accepts(record) or len(copy) >= RECORDS_MAX:
                 return new, [*effects, *self._refused(peer, f"record of {batch.log} out of place")]
             number = len(copy)
             copy.append(record_kept, data)
@@ -277,27 +293,42 @@ class Gossip:
     def _opened(self, log: LogId, number: int, data: bytes) -> bytes:
         return data if self._sealer is None else self._sealer.opened(log, number, data)
 
-    def _own_log_elsewhere(self, sender: LogId, batch: RecordBatch) -> list[Effect]:
-        """Only this robot writes its log; a copy that differs means a second writer."""
-        own = self.logs[self._own]
-        end = batch.first + len(batch.records)
-        if end <= len(own) and tuple(own.encoded[batch.first : end]) == batch.records:
+    def _doubt(self, peer: str, end: int, now: float) -> list[Effect]:
+        """Ask for a peer's copy of the own log before this number, which it says is another one."""
+        if self._doubted_until_s.get(peer, now) > now or (self._own, peer) in self._forked:
             return []
-        return self._fork(sender.robot, batch.log, "others hold more of this robot's own log")
+        remember(self._doubted_until_s, peer, now + REQUEST_TIMEOUT_S)
+        return [Unicast(peer, RecordRequest((LogPosition(self._own, max(0, end - RECORDS_BATCH_MAX)),)))]
+
+    def _own_log_elsewhere(self, peer: str, batch: RecordBatch, now: float) -> list[Effect]:
+        """Only this robot writes its log; a record that it did not write, and that is sound, means a second writer."""
+        own = self.logs[self._own]
+        for number, data in enumerate(batch.records, batch.first):
+            if number < len(own) and own.encoded[number] == data:
+                continue
+            try:
+                decode_record(self._opened(self._own, number, data))
+            except DecodeError as error:
+                return self._refused(peer, f"bad record of {self._own}: {error}")
+            return self._fork(peer, self._own, "others hold records of this robot's log that it did not write")
+        if 0 < batch.first <= len(own) and own.checksums[batch.first] != batch.checksum_before:
+            self._doubted_until_s.pop(peer, None)
+            return self._doubt(peer, batch.first, now)
+        return []
 
     def _fork(self, peer: str, log: LogId, reason: str) -> list[Effect]:
         """A copy that contradicts this one: keep this one, take nothing of it from that peer, say so once."""
         if (log, peer) in self._forked:
             return []
         remember(self._forked, (log, peer), None)
-        return [Report("log_forked", {"peer": peer, "log": str(log), "reason": reason})]
+        return [Report(LogForked(peer=peer, log=log, reason=reason))]
 
     def _refused(self, peer: str, reason: str) -> list[Effect]:
         """Say once per peer and reason what was refused."""
         if (peer, reason) in self._told:
             return []
         remember(self._told, (peer, reason), None)
-        return [Report("peer_refused", {"peer": peer, "reason": reason})]
+        return [Report(PeerRefused(peer=peer, reason=reason))]
 
 
 def _is_full(message: Records) -> bool:
@@ -305,6 +336,11 @@ def _is_full(message: Records) -> bool:
     sizes = [batch.size_bytes for batch in message.batches]
     many = any(len(batch.records) == RECORDS_BATCH_MAX for batch in message.batches)
     return many or sum(sizes) >= RECORDS_BATCH_BYTES_MAX // 2
+
+
+def _is_later_keyframe(record: Record) -> bool:
+    """Whether a later version wrote a keyframe that this one cannot read: it has a number all the same."""
+    return isinstance(record, UnknownRecord) and record.code == KEYFRAME_CODE
 
 
 @lru_cache(maxsize=DECODED_MAX)
@@ -315,5 +351,11 @@ def decoded(data: bytes) -> tuple[Record, Record]:
 
 
 def kept(record: Record) -> Record:
-    """A record without its descriptor: place recognition has that, and the record's bytes."""
-    return replace(record, descriptor=None) if isinstance(record, KeyframeRecord) else record
+    """A record without what is held elsewhere: place recognition has the descriptor, the log the record's bytes."""
+    match record:
+        case KeyframeRecord():
+            return replace(record, descriptor=None)
+        case UnknownRecord(code):
+            return UnknownRecord(code, b"")
+        case _:
+            return record

@@ -1,9 +1,9 @@
 """Judgement: whether a registration becomes a loop closure, by the ratio of Eq. (1) (Sec. III-B)."""
 
 from flocc_agent.core.corrections import pose7, upper_triangle
-from flocc_agent.core.effects import Report
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected
 from flocc_agent.geometry import is_rigid
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
@@ -18,14 +18,14 @@ from flocc_protocol.records import (
 def judged(
     query: KeyframeId, match: KeyframeId, result: Registration | RegistrationFailed, limits: LoopClosingParameters
 ) -> ClosureRecord | RejectionRecord:
-    """Accept a registration whose match ratio reaches R_thr, or refuse it with a reason."""
+    """Accept a registration whose match ratio reaches R_thr, or that its front end judged; else say why not."""
     counts = (result.correspondences, result.odometry_correspondences)
     if isinstance(result, RegistrationFailed):
         return RejectionRecord(query, match, result.failure.value, *counts)
     ratio = match_ratio(*counts)
-    if result.correspondences < limits.correspondences_min:
+    if not result.is_judged and result.correspondences < limits.correspondences_min:
         return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
-    if ratio < limits.match_ratio_threshold:
+    if not result.is_judged and ratio < limits.match_ratio_threshold:
         return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
     try:
         return _closure(query, match, result, ratio)
@@ -51,16 +51,25 @@ def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: 
     return record
 
 
-def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
-    """An accepted or refused registration, for people."""
-    facts = {
-        "query": str(record.query),
-        "match": str(record.match),
-        "correspondences": record.correspondences,
-        "odometry_correspondences": record.odometry_correspondences,
-        "ratio": round(match_ratio(record.correspondences, record.odometry_correspondences), 4),
-        "by": by.robot,
-    }
+def told(record: ClosureRecord | RejectionRecord, by: LogId) -> ClosureAccepted | ClosureRejected:
+    """An accepted or refused registration, for people; `by` is the log that its record stands in."""
+    ratio = round(match_ratio(record.correspondences, record.odometry_correspondences), 4)
     if isinstance(record, RejectionRecord):
-        return Report("closure_rejected", {**facts, "reason": record.reason})  # type: ignore[dict-item]
-    return Report("closure_accepted", {**facts, "scale_initial": record.scale_initial})  # type: ignore[dict-item]
+        return ClosureRejected(
+            query=record.query,
+            match=record.match,
+            correspondences=record.correspondences,
+            odometry_correspondences=record.odometry_correspondences,
+            ratio=ratio,
+            by=by.robot,
+            reason=record.reason,
+        )
+    return ClosureAccepted(
+        query=record.query,
+        match=record.match,
+        correspondences=record.correspondences,
+        odometry_correspondences=record.odometry_correspondences,
+        ratio=ratio,
+        by=by.robot,
+        scale_initial=record.scale_initial,
+    )

@@ -18,6 +18,14 @@ PAUSED_MAX = 1024
 LOST_S = 30.0
 """A lost latent is told for this long after somebody wanted it last."""
 WANTS_TURN_S = 10.0
+WANTS_MAX = 8
+"""Latents out of reach that are asked of relays at one time; a message carries 16."""
+RELAYS_MAX = 16
+"""Latents kept for others at one time: the wants of two robots."""
+RETRY_S = 1.0
+"""First pause after a failed fetch; it doubles up to `RETRY_MAX_S`."""
+RETRY_MAX_S = 16.0
+"""Longest pause between fetches of one latent: a robot that comes back is asked soon after."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,11 +140,10 @@ class Latents:
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        limits = self._parameters
         return {
-            "relayed": (len(self._relayed), limits.relays_max),
-            "lost": (len(self._lost_until_s), limits.relays_max),
-            "fetches": (len(self._fetches), PAUSED_MAX + limits.fetches_max),
+            "relayed": (len(self._relayed), RELAYS_MAX),
+            "lost": (len(self._lost_until_s), RELAYS_MAX),
+            "fetches": (len(self._fetches), PAUSED_MAX + self._parameters.fetches_max),
         }
 
     def add(self, keyframe: KeyframeId) -> None:
@@ -153,8 +160,8 @@ class Latents:
         fetch = self._fetches.get(keyframe)
         if fetch is not None:
             fetch.in_flight_until_s = None
-            doubled = max(2 * fetch.pause_s, self._parameters.retry_s)
-            fetch.pause_s = min(doubled, self._parameters.retry_max_s)
+            doubled = max(2 * fetch.pause_s, RETRY_S)
+            fetch.pause_s = min(doubled, RETRY_MAX_S)
             fetch.not_before_s = now + fetch.pause_s
 
     def on_reached(self, name: str) -> None:
@@ -173,7 +180,7 @@ class Latents:
         """A latent exists no more, its owner or a robot nearer to it says: whoever wanted it here is told."""
         if keyframe in self._relayed:
             del self._relayed[keyframe]
-            remember(self._lost_until_s, keyframe, now + LOST_S, self._parameters.relays_max)
+            remember(self._lost_until_s, keyframe, now + LOST_S, RELAYS_MAX)
 
     def lost(self, now: float) -> tuple[KeyframeId, ...]:
         """Latents that neighbours want and that exist no more."""
@@ -191,7 +198,7 @@ class Latents:
                 new |= keyframe not in self._relayed
                 self._relayed.pop(keyframe, None)
                 self._relayed[keyframe] = None
-        while len(self._relayed) > self._parameters.relays_max:
+        while len(self._relayed) > RELAYS_MAX:
             del self._relayed[next(iter(self._relayed))]
         return new
 
@@ -201,7 +208,7 @@ class Latents:
         Others have their turn every `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
         """
         wanted = dict.fromkeys(k for k in (*needed, *self._relayed) if self.is_out_of_reach(k, reach))
-        count = self._parameters.wants_max
+        count = WANTS_MAX
         turns = -(-len(wanted) // count)
         first = count * (int(now // WANTS_TURN_S) % turns) if turns else 0
         return tuple(wanted)[first : first + count]

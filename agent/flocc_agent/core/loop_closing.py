@@ -3,7 +3,7 @@
 Who registers a pair: one of its two owners, by a checksum of the pair, so that both agree without talking and the
 work is halved between them. A robot that has a neighbour of a higher compute class hands its pairs to it. Whoever
 found a pair that is another's to register tells it so until the record shows. When the other is out of range for
-`takeover_s`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
+`TAKEOVER_S`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
 exists no more is rejected, by a record like any other.
 """
 
@@ -12,13 +12,17 @@ from collections.abc import Iterable
 
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
-from flocc_agent.core.latents import WANTS_TURN_S, Latents, Peer, Reach
+from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.work import OdometryPairOf, WorkTable
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
+
+REGISTRATION_TIMEOUT_S = 120.0
+"""A registration that gave no answer for this long is tried again; networks on a CPU need much of it."""
 
 
 def registrar_of(pair: CandidatePair) -> LogId:
@@ -53,7 +57,7 @@ class LoopClosing:
         self._parameters = parameters
         self._reach = Reach()
         self._work = WorkTable(own, self.latents, odometry_pair)
-        self._offers = Offers(self.latents, parameters)
+        self._offers = Offers(self.latents)
         self._spectral = spectral
         self._chosen: list[CandidatePair] | None = None
         self._resolved: set[CandidatePair] = set()
@@ -88,12 +92,9 @@ class LoopClosing:
         for candidate in candidates:
             if self._knows(candidate.pair):
                 continue
-            facts = {
-                "query": str(candidate.pair.low),
-                "match": str(candidate.pair.high),
-                "similarity": round(candidate.similarity, 4),
-            }
-            effects.append(Report("candidate", facts))  # type: ignore[arg-type]
+            similarity = round(candidate.similarity, 4)
+            fact = CandidateFound(query=candidate.pair.low, match=candidate.pair.high, similarity=similarity)
+            effects.append(Report(fact))
             self._assign(candidate, now)
         return effects
 
@@ -170,7 +171,7 @@ class LoopClosing:
         """Latents this robot needs, or relays, and cannot reach; looked for anew when some were got."""
         turn = int(now // WANTS_TURN_S)
         still = tuple(k for k in self._wanted if self.latents.is_out_of_reach(k, self._reach))
-        if turn != self._turn or len(still) < self._parameters.wants_max:
+        if turn != self._turn or len(still) < WANTS_MAX:
             self._turn = turn
             still = self.latents.wants(self._out_of_reach(), self._reach, now)
         self._wanted = still
@@ -195,7 +196,7 @@ class LoopClosing:
             self._chosen, self._changed = None, True
 
     def on_lost(self, name: str, now: float) -> None:
-        """A robot is out of range; the pairs that it was to register wait for `takeover_s`."""
+        """A robot is out of range; the pairs that it was to register wait for `TAKEOVER_S`."""
         self._reach.remove(name)
         self.latents.on_lost(name)
         self._offers.on_lost(name, now)
@@ -257,7 +258,7 @@ class LoopClosing:
     def _register(self, now: float) -> list[Effect]:
         effects: list[Effect] = []
         while self._work.registering < self._parameters.registrations_max:
-            work = self._work.start_next(now + self._parameters.registration_timeout_s, self._choice())
+            work = self._work.start_next(now + REGISTRATION_TIMEOUT_S, self._choice())
             if work is None:
                 break
             assert work.odometry is not None

@@ -8,12 +8,16 @@ from dataclasses import dataclass, field
 
 from flocc_agent.core.effects import Effect, Unicast
 from flocc_agent.core.latents import Latents, Reach
-from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import OFFERS_MAX, CandidateOffer, CandidatePair
 
 FAR_TAKEOVERS = 2
+OFFER_PERIOD_S = 2.0
+"""Candidates that another robot is to register are told to it this often until its record shows."""
+TAKEOVER_S = 15.0
+"""A robot that was silent for this long loses the pairs it was to register, where the latents are at hand: five times
+the silence after which it is out of range, so that a short cut makes no work twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +57,8 @@ class _Group:
 class Offers:
     """All such pairs."""
 
-    def __init__(self, latents: Latents, parameters: LoopClosingParameters) -> None:
+    def __init__(self, latents: Latents) -> None:
         self._latents = latents
-        self._parameters = parameters
         self._recipients: dict[CandidatePair, Recipient] = {}
         self._groups: dict[Recipient, _Group] = {}
 
@@ -106,7 +109,7 @@ class Offers:
                 group.due_s = float("-inf")
 
     def on_lost(self, robot: str, now: float) -> None:
-        """A robot is out of range; the pairs that it was to register wait for `takeover_s`."""
+        """A robot is out of range; the pairs that it was to register wait for `TAKEOVER_S`."""
         for recipient, group in self._groups.items():
             if recipient.robot == robot:
                 group.due_s = float("-inf")
@@ -126,9 +129,9 @@ class Offers:
                 continue
             pairs = [pair for pair in sorted(group.offers) if group.offers[pair].next_s <= now][:OFFERS_MAX]
             for pair in pairs:
-                group.offers[pair].next_s = now + self._parameters.offer_period_s
+                group.offers[pair].next_s = now + OFFER_PERIOD_S
             next_s = min(offer.next_s for offer in group.offers.values())
-            group.due_s = max(next_s, now + self._parameters.offer_period_s / 8)  # sooner where some are left over
+            group.due_s = max(next_s, now + OFFER_PERIOD_S / 8)  # sooner where some are left over
             if pairs:
                 offer = CandidateOffer(tuple(pairs), transferred=recipient.log is None)
                 effects.append(Unicast(recipient.robot, offer))
@@ -158,4 +161,4 @@ class Offers:
             return offer.since_s
         pair = offer.candidate.pair
         at_hand = recipient.log is None or (pair.low in self._latents and pair.high in self._latents)
-        return offer.since_s + self._parameters.takeover_s * (1 if at_hand else FAR_TAKEOVERS)
+        return offer.since_s + TAKEOVER_S * (1 if at_hand else FAR_TAKEOVERS)

@@ -1,12 +1,20 @@
 """The core's parameters: unit in the name, default, and what turning it does.
 
-They are plain dataclasses so that the core stays free of frameworks; `config.py` checks them with pydantic.
+They are plain dataclasses so that the core stays free of frameworks; `flocc_agent.config` checks them with pydantic.
+What is `_inner` a program may give, a test above all, but no file: it is no key (`flocc_agent/config/removed.py`).
 """
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 _FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
+
+
+INNER = "inner"
+
+
+def _inner(default: Any) -> Any:
+    return field(default=default, metadata={INNER: True})
 
 
 def _require(condition: bool, sentence: str) -> None:
@@ -24,7 +32,7 @@ class NeighbourParameters:
     """Time between heartbeats; shorter notices a lost robot sooner and costs more bytes."""
     timeout_s: float = 3.0
     """A robot that was silent for this long is out of range; six periods ride through 30 % loss."""
-    neighbours_max: int = 64
+    neighbours_max: int = _inner(64)
     """Robots heard at once; further ones are refused and counted."""
 
     def __post_init__(self) -> None:
@@ -39,20 +47,15 @@ class ElectionParameters:
 
     __pydantic_config__ = _FORBID
 
-    startup_s: float = 1.5
+    startup_s: float = _inner(1.5)
     """A robot listens this long after its start before it asks for an election."""
-    answer_timeout_s: float = 0.6
-    """Without an ANSWER for this long the robot claims a term; more than a round trip with loss."""
-    coordinator_timeout_s: float = 2.0
-    """After an ANSWER the robot waits this long for a leader, then asks again."""
     leader_timeout_s: float = 3.0
     """A leader whose own counter stood still for this long is lost."""
-    hops_max: int = 8
+    hops_max: int = _inner(8)
     """A leader is followed over at most this many robots; those further off follow nobody, yet get its corrections."""
 
     def __post_init__(self) -> None:
-        positive = min(self.startup_s, self.answer_timeout_s, self.coordinator_timeout_s, self.leader_timeout_s)
-        _require(positive > 0, "election times must be positive")
+        _require(min(self.startup_s, self.leader_timeout_s) > 0, "election times must be positive")
         _require(1 <= self.hops_max <= 64, "hops_max must be in [1, 64]")
 
 
@@ -62,20 +65,10 @@ class GossipParameters:
 
     __pydantic_config__ = _FORBID
 
-    request_period_s: float = 0.4
-    """Least pause between requests for news that heartbeats tell of; longer fetches more at once, and later."""
-    request_timeout_s: float = 1.0
-    """A missing range is asked for again, of anybody, after this time."""
-    backoff_max_s: float = 8.0
-    """A peer that does not deliver what it claims is asked at most this rarely."""
-    logs_max: int = 128
+    logs_max: int = _inner(128)
     """Logs that are kept; further ones are refused and counted."""
-    records_max: int = 200_000
-    """Records that are kept of one log; further ones are refused and counted."""
 
     def __post_init__(self) -> None:
-        _require(self.request_period_s >= 0, "request_period_s must not be negative")
-        _require(0 < self.request_timeout_s <= self.backoff_max_s, "request_timeout_s must be in (0, backoff_max_s]")
         _require(1 <= self.logs_max <= 256, "logs_max must be in [1, 256]")
 
 
@@ -117,36 +110,19 @@ class LoopClosingParameters:
     """R_thr: a registration with a lower match ratio, Eq. (1), is refused."""
     correspondences_min: int = 20
     """A registration with fewer correspondences is refused whatever its ratio."""
-    fetches_max: int = 2
+    fetches_max: int = _inner(2)
     """Latents fetched at one time."""
     fetch_timeout_s: float = 10.0
     """A fetch that takes longer has failed and is tried again."""
-    retry_s: float = 1.0
-    """First pause after a failed fetch; doubles up to `retry_max_s`."""
-    retry_max_s: float = 16.0
-    """Longest pause between fetches of one latent."""
-    registrations_max: int = 1
+    registrations_max: int = _inner(1)
     """Pairs registered at one time; more than workers only fills their queue."""
-    registration_timeout_s: float = 120.0
-    """A registration that gave no answer for this long is tried again."""
-    offer_period_s: float = 2.0
-    """Candidates that another robot is to register are told to it this often until its record shows."""
-    takeover_s: float = 15.0
-    """A robot that was silent for this long loses the pairs it was to register, where the latents are at hand."""
-    candidates_max: int = 4000
+    candidates_max: int = _inner(4000)
     """Open candidates; the least similar ones are dropped beyond this."""
-    wants_max: int = 8
-    """Latents out of reach that are asked of relays at one time."""
-    relays_max: int = 16
-    """Latents kept for others at one time."""
 
     def __post_init__(self) -> None:
         _require(self.match_ratio_threshold >= 0, "match_ratio_threshold must not be negative")
         _require(self.fetches_max >= 1, "fetches_max must be at least 1")
         _require(self.registrations_max >= 1, "registrations_max must be at least 1")
-        _require(0 < self.retry_s <= self.retry_max_s, "retry_s must be in (0, retry_max_s]")
-        _require(1 <= self.wants_max <= 16, "wants_max must be in [1, 16]")
-        _require(1 <= self.relays_max <= 16, "relays_max must be in [1, 16]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,51 +133,34 @@ class RoundParameters:
 
     period_s: float = 2.0
     """Shortest time between two rounds."""
-    period_per_keyframe_s: float = 1e-3
-    """Shortest time between two rounds for each keyframe of the swarm, where that is longer: a large correction costs
-    everybody something."""
-    timeout_s: float = 60.0
-    """A round without a result by then is given up and the next one may start; each in a row gets twice the time."""
-    keyframes_per_round: int = 20
-    """New keyframes that call for a round even without a new closure."""
-    correction_keyframes_max: int = 400
-    """Keyframes listed in a correction; a longer trajectory is thinned and interpolated."""
-    translation_tolerance_m: float = 1e-3
-    """A correction that moves no keyframe further than this is not sent again in one term."""
-    rotation_tolerance_rad: float = 1e-4
-    """The same for rotation."""
 
     def __post_init__(self) -> None:
-        _require(self.period_s > 0 and self.timeout_s > 0, "round times must be positive")
-        _require(self.period_per_keyframe_s >= 0, "period_per_keyframe_s must not be negative")
-        _require(2 <= self.correction_keyframes_max <= 1500, "correction_keyframes_max must be in [2, 1500]")
+        _require(self.period_s > 0, "period_s must be positive")
 
 
 @dataclass(frozen=True, slots=True)
 class DistributedParameters:
-    """Distributed optimisation, where `backend.mode` chooses it."""
+    """Distributed optimisation, where `backend.mode` chooses it: for experiments, no key of a file."""
 
     __pydantic_config__ = _FORBID
 
-    period_s: float = 0.2
+    period_s: float = _inner(0.2)
     """Shortest time between two iterations of a robot; shorter converges sooner and sends more."""
-    wait_s: float = 1.0
+    wait_s: float = _inner(1.0)
     """A robot waits this long for news of a neighbour before it iterates on old ones; longer rides out more loss."""
-    repeat_s: float = 0.5
+    repeat_s: float = _inner(0.5)
     """First pause after which a robot at rest says its separators again; doubles up to `repeat_max_s`."""
-    repeat_max_s: float = 16.0
+    repeat_max_s: float = _inner(16.0)
     """Longest pause between repetitions, for robots that come into range later."""
-    timeout_s: float = 60.0
+    timeout_s: float = _inner(60.0)
     """An iteration without a result by then is given up."""
-    deliver_period_s: float = 2.0
-    """Shortest time between two corrections that a robot gives itself."""
-    tolerance: float = 1e-3
+    tolerance: float = _inner(1e-3)
     """A block whose poses moved less (metres, or entries of a rotation) rests until it hears something new."""
 
     def __post_init__(self) -> None:
         _require(0 < self.period_s <= self.wait_s, "period_s must be in (0, wait_s]")
         _require(0 < self.repeat_s <= self.repeat_max_s, "repeat_s must be in (0, repeat_max_s]")
-        _require(min(self.timeout_s, self.deliver_period_s) > 0, "distributed times must be positive")
+        _require(self.timeout_s > 0, "timeout_s must be positive")
         _require(self.tolerance > 0, "tolerance must be positive")
 
 
@@ -213,11 +172,11 @@ class CoreParameters:
 
     neighbours: NeighbourParameters = field(default_factory=NeighbourParameters)
     election: ElectionParameters = field(default_factory=ElectionParameters)
-    gossip: GossipParameters = field(default_factory=GossipParameters)
+    gossip: GossipParameters = field(default_factory=GossipParameters, metadata={INNER: True})
     place_recognition: PlaceRecognitionParameters = field(default_factory=PlaceRecognitionParameters)
     loop_closing: LoopClosingParameters = field(default_factory=LoopClosingParameters)
     rounds: RoundParameters = field(default_factory=RoundParameters)
-    distributed: DistributedParameters = field(default_factory=DistributedParameters)
+    distributed: DistributedParameters = field(default_factory=DistributedParameters, metadata={INNER: True})
 
     def under(self, bandwidth_bytes_s: float | None) -> "CoreParameters":
         """With the order of candidates that a budget, or none, calls for."""

@@ -11,9 +11,15 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.geodesy import Place
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
+
+LANDMARK = "~"
+"""Begins the names of landmarks: no robot's does, and it sorts after all of them."""
+WORLD, EARTH = "world", "earth"
+"""The landmarks that fixes tell of: the origin of a local frame, and of east, north and up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +29,7 @@ class Trajectory:
     Attributes:
         T_odom_keyframe: (N, 4, 4) camera poses in the log's odom frame, metric.
         edge_covariances: (N-1, 6, 6) covariance of each consecutive edge (tangent of the later pose, rotation
-            first), or None for the back end's configured model.
+            first), NaN where an edge has none, or None: the back end's configured model stands for it.
     """
 
     T_odom_keyframe: Float
@@ -45,6 +51,7 @@ class LoopClosure:
         scale_initial: Metres per network unit by Eq. (6), None if unknown.
         covariance: (6, 6) of the measurement in its own units, or None for the back end's configured model.
         metric: The translation is in metres and no scale is estimated.
+        support: How many closures it counts as where maps are joined; a single visual one may be wrong.
     """
 
     query: KeyframeId
@@ -54,6 +61,7 @@ class LoopClosure:
     scale_initial: float | None = None
     covariance: Float | None = None
     metric: bool = False
+    support: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,12 +84,48 @@ class AbsoluteFix:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MeasuredFactor:
+    """Something measured at a keyframe besides odometry and images: a relative pose, or a relative position alone.
+
+    Attributes:
+        kind: Of the measurement, as users name it.
+        at: The keyframe at which it was measured.
+        query: From where it is told: a keyframe, or a landmark (`landmark`).
+        match: What it tells of: a keyframe, or a landmark.
+        T_query_match: (4, 4), metric; the rotation is the identity where only the position is known.
+        covariance: (6, 6) in the tangent of that pose, rotation first; or (3, 3) of the position, in the query's frame.
+        place: Of a geodetic fix, whose position is measured from there; None for all others.
+    """
+
+    kind: str
+    at: KeyframeId
+    query: KeyframeId
+    match: KeyframeId
+    T_query_match: Float
+    covariance: Float
+    place: Place | None = None
+
+    @property
+    def has_rotation(self) -> bool:
+        """Whether the whole pose is measured."""
+        return self.covariance.shape == (6, 6)
+
+    def __str__(self) -> str:
+        other = self.match if self.query == self.at else self.query
+        if not is_landmark(other.log):
+            return f"{self.kind} of {other} at {self.at}"
+        _, _, name = other.log.robot.partition("/")
+        return f"{self.kind} {name} at {self.at}" if name else f"{self.kind} at {self.at}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseGraph:
     """Everything the optimiser needs, for all components at once."""
 
     trajectories: Mapping[LogId, Trajectory]
     closures: Sequence[LoopClosure] = ()
     fixes: Sequence[AbsoluteFix] = ()
+    measured: Sequence[MeasuredFactor] = ()
 
 
 class ClosureState(Enum):
@@ -116,6 +160,17 @@ class ClosureResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FactorResult:
+    """One measured factor after optimisation; its fields are those of a closure's result."""
+
+    factor: MeasuredFactor
+    state: ClosureState
+    weight: float
+    residual: float
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Component:
     """One connected part of the graph, solved in one map frame.
 
@@ -128,6 +183,7 @@ class Component:
         cost_initial: The same where the solver started.
         covariance_keyframe: (6, 6) marginal covariance of keyframes that were asked for, in their own tangent spaces.
         T_map_world: (4, 4) pose of the fixes' world frame, or None without fixes.
+        T_map_landmark: (4, 4) pose of each landmark, by name: `tag/NAME`, `world`, `earth` (east, north, up).
     """
 
     logs: tuple[LogId, ...]
@@ -138,6 +194,7 @@ class Component:
     cost_initial: float = 0.0
     covariance_keyframe: Mapping[KeyframeId, Float] = field(default_factory=dict)
     T_map_world: Float | None = None
+    T_map_landmark: Mapping[str, Float] = field(default_factory=dict)
 
     @property
     def anchor(self) -> LogId:
@@ -160,6 +217,7 @@ class GraphSolution:
         warnings: Sentences: scale unobservable or collapsed, exclusions, ill-conditioned parts.
         iterations: Linear solves that were done.
         solve_s: Wall time of the solve (0 on virtual time).
+        measured: One result per measured factor of the graph, in its order.
     """
 
     components: tuple[Component, ...]
@@ -168,6 +226,7 @@ class GraphSolution:
     iterations: int = 0
     solve_s: float = 0.0
     timings_s: Mapping[str, float] = field(default_factory=dict)
+    measured: tuple[FactorResult, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +234,26 @@ class OptimisationFailed:
     """The back end could not solve; the last good solution stands."""
 
     reason: str
+
+
+class LandmarkLog(LogId):
+    """What stands for a log where a landmark is: its name is none that a robot may have."""
+
+    __slots__ = ()
+
+    def __new__(cls, robot: str, incarnation: int = 0) -> "LandmarkLog":
+        """Take any name."""
+        return tuple.__new__(cls, (robot, incarnation))
+
+
+def landmark(name: str) -> KeyframeId:
+    """A landmark, which is in the graph what a robot with one keyframe would be."""
+    return KeyframeId(LandmarkLog(LANDMARK + name), 0)
+
+
+def is_landmark(log: LogId) -> bool:
+    """Whether this is no robot's log."""
+    return log.robot.startswith(LANDMARK)
 
 
 def map_frame(anchor: LogId) -> str:

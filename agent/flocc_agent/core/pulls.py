@@ -25,6 +25,12 @@ BROADCAST_RECORDS = 3
 BROADCAST_S = 0.2
 """A robot in range sends its last few records itself; others who heard them sooner are asked only after this time."""
 FIRST_PAUSE_S = 0.25
+BACKOFF_MAX_S = 8.0
+"""A peer that does not deliver what it claims is asked at most this rarely, so that it costs nobody else's news."""
+REQUEST_PERIOD_S = 0.4
+"""Least pause between requests for news that heartbeats tell of; below a heartbeat's period, so none waits for two."""
+REQUEST_TIMEOUT_S = 1.0
+"""A missing range is asked for again, of anybody, after this time: a round trip under load and one lost message."""
 
 
 @dataclass(slots=True)
@@ -102,7 +108,7 @@ class Pulls:
         for peer in sorted(self._ahead, key=lambda peer: (-len(self._ahead[peer]), peer)):
             effects += self._request(peer, now, again=False)
         if effects:
-            self._next_s = now + self._parameters.request_period_s
+            self._next_s = now + REQUEST_PERIOD_S
         return effects
 
     def ask_on(self, peer: str, now: float) -> list[Effect]:
@@ -118,7 +124,7 @@ class Pulls:
             elif not again and self._is_on_its_way(log, held, count, now):
                 continue
             elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again):
-                remember(self._asked, log, _Asked(peer, now + self._parameters.request_timeout_s))
+                remember(self._asked, log, _Asked(peer, now + REQUEST_TIMEOUT_S))
                 positions.append(LogPosition(log, held))
         return [Unicast(peer, RecordRequest(tuple(positions)))] if positions else []
 
@@ -143,7 +149,7 @@ class Pulls:
 
     def _did_not_deliver(self, log: LogId, peer: str, now: float) -> None:
         del self._asked[log]
-        pause_s = min(2 * self._pauses_s.get((log, peer), FIRST_PAUSE_S / 2), self._parameters.backoff_max_s)
+        pause_s = min(2 * self._pauses_s.get((log, peer), FIRST_PAUSE_S / 2), BACKOFF_MAX_S)
         remember(self._pauses_s, (log, peer), pause_s)
         remember(self._not_before_s, (log, peer), now + pause_s)
 

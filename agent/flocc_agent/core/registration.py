@@ -10,31 +10,29 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 ODOMETRY_CORRESPONDENCES_MIN = 20
+"""Least denominator of Eq. (1): else a blurred odometry pair would make every loop look certain."""
 ODOMETRY_TRANSLATION_UNSCALED_MIN = 1e-6
 
 
-def match_ratio(
-    loop_correspondences: int,
-    odometry_correspondences: int,
-    denominator_min: int = ODOMETRY_CORRESPONDENCES_MIN,
-) -> float:
+def match_ratio(loop_correspondences: int, odometry_correspondences: int) -> float:
     """Correspondences of the loop pair over those of the odometry pair, Eq. (1).
+
+    A smaller denominator than `ODOMETRY_CORRESPONDENCES_MIN` is raised to it. Whoever shows or weighs a ratio takes it
+    from here, so that a person reads the number that was compared with R_thr.
 
     Args:
         loop_correspondences: Count for (query i, match j); >= 0.
         odometry_correspondences: Count for (query i-1, query i); >= 0.
-        denominator_min: A smaller odometry count is raised to this, so that a blurred odometry pair does not
-            make every loop look certain.
 
     Returns:
         The ratio, >= 0.
 
     Raises:
-        ValueError: A count is negative or the minimum is not positive.
+        ValueError: A count is negative.
     """
-    if loop_correspondences < 0 or odometry_correspondences < 0 or denominator_min <= 0:
-        raise ValueError("counts must not be negative and the denominator's minimum must be positive")
-    return loop_correspondences / max(odometry_correspondences, denominator_min)
+    if loop_correspondences < 0 or odometry_correspondences < 0:
+        raise ValueError("counts of correspondences must not be negative")
+    return loop_correspondences / max(odometry_correspondences, ODOMETRY_CORRESPONDENCES_MIN)
 
 
 def closure_probability(ratio: float, steepness: float) -> float:
@@ -81,6 +79,7 @@ class RegistrationFailure(Enum):
     FEW_CORRESPONDENCES = "few correspondences"
     NO_MODEL = "no relative pose fits the correspondences"
     DEGENERATE = "the correspondences do not fix a relative pose"
+    UNCONVINCING = "less evidence than the front end's wrong pairs may have"
     BAD_LATENT = "a latent is damaged or of another model"
     OUT_OF_MEMORY = "out of memory"
     CRASHED = "the registration failed with an internal error"
@@ -100,6 +99,7 @@ class Registration:
             match, or None where the method gives none.
         confidence: Mean confidence that the network gives the loop pair's points; None of other methods.
         odometry_confidence: The same of the odometry pair.
+        is_judged: Whether the front end accepted it by a rule of its own, so that R_thr does not decide.
     """
 
     T_query_match_unscaled: Float
@@ -109,6 +109,7 @@ class Registration:
     covariance: Float | None = None
     confidence: float | None = None
     odometry_confidence: float | None = None
+    is_judged: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,7 @@ order. Same seed and same events give the same effects, on virtual time and on a
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-
-import numpy as np
+from dataclasses import dataclass
 
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
@@ -20,7 +18,6 @@ from flocc_agent.core.events import (
     BlockIterated,
     BlockIterationFailed,
     Event,
-    FixMeasured,
     GraphOptimisationFailed,
     GraphOptimised,
     KeyframeCaptured,
@@ -30,17 +27,35 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
     Leaving,
+    Measured,
     MessageReceived,
     PairRegistered,
 )
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
-from flocc_agent.core.judgement import judged, judgement_report
+from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
+from flocc_agent.core.measurements import (
+    WAITING_MAX,
+    Measurement,
+    belongs_to,
+    measurement_refused,
+    measurement_report,
+)
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import (
+    EncodingFailed,
+    KeyframeTaken,
+    LatentArrived,
+    LatentFailed,
+    LatentLost,
+    NeighbourDown,
+    RoundFailed,
+    SolutionIgnored,
+)
 from flocc_agent.core.rounds import Rounds, solution_report
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
@@ -64,10 +79,10 @@ from flocc_protocol.messages import (
 )
 from flocc_protocol.records import (
     ClosureRecord,
-    FixRecord,
     KeyframeRecord,
     Record,
     RejectionRecord,
+    encode_record,
 )
 
 NOBODY = -1
@@ -108,7 +123,6 @@ class _Pending:
     T_odom_camera: Pose7
     encoded: bool = False
     descriptor: Array | None = None
-    fixes: list[FixMeasured] = field(default_factory=list)
 
 
 class Robot:
@@ -134,6 +148,7 @@ class Robot:
         self._heartbeat_due_s = now
         self._heartbeat_s = float("-inf")
         self._pending: list[_Pending] = []
+        self._waiting: dict[int, list[Measurement]] = {}
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.__contains__)
@@ -141,7 +156,7 @@ class Robot:
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
         self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
-        self.corrections = Corrections(log, parameters.gossip, parameters.rounds, sealer)
+        self.corrections = Corrections(log, parameters.gossip, sealer)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -172,11 +187,16 @@ class Robot:
             self.rounds.deadline() if self.distributed is None else self.distributed.deadline(),
         )
 
+    def keyframes_given(self) -> int:
+        """Own keyframes that were captured, recorded or not: the next one's number."""
+        return self.gossip.logs[self.log].keyframes + len(self._pending)
+
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Every queue, table and cache: how much is in it, and its maximum."""
         neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
         return {
             "neighbours": neighbours,
+            "measurements": (sum(map(len, self._waiting.values())), WAITING_MAX * max(len(self._pending), 1)),
             **self.gossip.sizes(),
             **self.closing.sizes(),
             **self.corrections.sizes(),
@@ -196,11 +216,11 @@ class Robot:
                 self.closing.on_held(keyframe)
                 return self._on_encoded(keyframe, descriptor, now)
             case KeyframeEncodingFailed(keyframe, reason):
-                report = Report("encoding_failed", {"keyframe": str(keyframe), "reason": reason})
+                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
                 return [report, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
-                return [Report("latent_fetched", {"keyframe": str(keyframe), "holder": holder})]
+                return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
             case LatentFetchFailed(keyframe, holder, reason):
                 return self._on_fetch_failed(keyframe, holder, reason, now)
             case PairRegistered(pair, result):
@@ -211,13 +231,13 @@ class Robot:
                 return self._on_optimised(event, now)
             case GraphOptimisationFailed(term, round_number, reason):
                 self.rounds.on_failed(term, round_number, now)
-                return [Report("optimisation_failed", {"term": str(term), "round": round_number, "reason": reason})]
+                return [Report(RoundFailed(term=term, round=round_number, reason=reason))]
             case BlockIterated(number, step):
                 return [] if self.distributed is None else self.distributed.on_step(number, step, now)
             case BlockIterationFailed(number, reason):
                 return [] if self.distributed is None else self.distributed.on_failed(number, reason, now)
-            case FixMeasured():
-                return self._on_fix(event, now)
+            case Measured(measurement, index):
+                return self._on_measured(measurement, index, now)
             case Leaving():
                 return self.election.leave()
 
@@ -286,25 +306,28 @@ class Robot:
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""
         self.closing.on_fetch_failed(keyframe, now)
-        report = Report("latent_failed", {"keyframe": str(keyframe), "holder": holder, "reason": reason})
+        report = Report(LatentFailed(keyframe=keyframe, holder=holder, reason=reason))
         lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
         return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now)]
 
     def _reject_lost(self, pairs: list[CandidatePair], keyframe: KeyframeId, now: float) -> list[Effect]:
         """Pairs whose latent exists no more are rejected, so that nobody waits for them."""
-        effects: list[Effect] = [Report("latent_lost", {"keyframe": str(keyframe)})] if pairs else []
+        effects: list[Effect] = [Report(LatentLost(keyframe=keyframe))] if pairs else []
         for pair in pairs:
             record = RejectionRecord(pair.low, pair.high, "a latent was lost", 0, 0)
-            effects += [*self._append(record, now), judgement_report(record, self.log)]
+            effects += [*self._append(record, now), Report(told(record, self.log))]
         return effects
 
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
-        index = self.gossip.logs[self.log].keyframes + len(self._pending)
+        index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
         return [Encode(KeyframeId(self.log, index), event.image)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
-        """Append the records of all keyframes that are ready, in the order of capture."""
+        """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
+
+        A keyframe that failed to encode has a record all the same, with its odometry: measurements need no more.
+        """
         for pending in self._pending:
             if pending.index == keyframe.index:
                 pending.encoded, pending.descriptor = True, descriptor
@@ -314,14 +337,31 @@ class Robot:
             record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
             effects += self._append(record, now)
             effects.append(_keyframe_report(self.log, record))
+            for measurement in self._waiting.pop(ready.index, ()):
+                effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
         return effects
 
-    def _on_fix(self, event: FixMeasured, now: float) -> list[Effect]:
-        keyframes = self.gossip.logs[self.log].keyframes
-        if keyframes == 0:
-            return []
-        position = Array.of(np.array(event.position_m), "f8")
-        return self._append(FixRecord(keyframes - 1, position, Array.of(np.array(event.covariance_m2), "f8")), now)
+    def _on_measured(self, measurement: Measurement, index: int, now: float) -> list[Effect]:
+        """Append what was measured at a recorded keyframe; what belongs to a later one waits for its record."""
+        keyframe = belongs_to(measurement, self.log, index)
+        recorded = self.gossip.logs[self.log].keyframes
+        if keyframe.index < recorded:
+            return self._append_measurement(measurement, keyframe, now)
+        if keyframe.index >= max(self.keyframes_given(), 1):
+            return [measurement_refused(measurement, keyframe, "there is no such keyframe")]
+        waiting = self._waiting.setdefault(keyframe.index, [])
+        if len(waiting) >= WAITING_MAX:
+            return [measurement_refused(measurement, keyframe, f"{WAITING_MAX} others wait for this keyframe")]
+        waiting.append(measurement)
+        return []
+
+    def _append_measurement(self, measurement: Measurement, keyframe: KeyframeId, now: float) -> list[Effect]:
+        try:
+            record = measurement.record(keyframe)
+            encode_record(record)
+        except ValueError as error:
+            return [measurement_refused(measurement, keyframe, str(error))]
+        return [*self._append(record, now), measurement_report(measurement, keyframe)]
 
     def _on_registered(
         self, pair: CandidatePair, result: Registration | RegistrationFailed, now: float
@@ -334,11 +374,11 @@ class Robot:
         if roles is None:
             return []
         record = judged(*roles, result, self._parameters.loop_closing)
-        return [*self._append(record, now), judgement_report(record, self.log)]
+        return [*self._append(record, now), Report(told(record, self.log))]
 
     def _on_optimised(self, event: GraphOptimised, now: float) -> list[Effect]:
         if not self.rounds.on_solution(event.term, event.round, event.solution, now):
-            return [Report("stale_solution", {"term": str(event.term), "round": event.round})]
+            return [Report(SolutionIgnored(term=event.term, round=event.round))]
         report = solution_report(event.term, event.round, event.solution)
         return [report, *self.corrections.publish(event.term, event.round, event.solution)]
 
@@ -376,9 +416,7 @@ class Robot:
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
         iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
-        return DistributedOptimisation(
-            self.log, self.assembly, self._parameters.distributed, self._parameters.rounds, iteration
-        )
+        return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, iteration)
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
@@ -439,7 +477,7 @@ class Robot:
             self.election.on_lost(name)
             self.gossip.on_lost(name)
             self.closing.on_lost(name, now)
-        return [Report("neighbour_down", {"peer": name}) for name in gone]
+        return [Report(NeighbourDown(peer=name)) for name in gone]
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
@@ -458,9 +496,5 @@ class Robot:
 
 
 def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:
-    keyframe = str(KeyframeId(log, record.index))
-    pose_facts = [float(x) for x in record.T_odom_camera]
-    return Report(
-        "keyframe",
-        {"keyframe": keyframe, "stamp_s": record.stamp_s, "T_odom_camera": pose_facts},  # type: ignore[dict-item]
-    )
+    keyframe = KeyframeId(log, record.index)
+    return Report(KeyframeTaken(keyframe=keyframe, stamp_s=record.stamp_s, T_odom_body=record.T_odom_camera))

@@ -4,9 +4,17 @@ from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.effects import Effect, Optimise, Report
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
+from flocc_agent.core.reports import RoundSolved, RoundTimedOut
 from flocc_protocol.ids import Term
 
 FAILURES_MAX = 6
+TIMEOUT_S = 60.0
+"""A round without a result by then is given up and the next one may start; each in a row gets twice the time."""
+PERIOD_PER_KEYFRAME_S = 1e-3
+"""Shortest time between two rounds for each keyframe of the swarm, where that is longer than the period: a large
+correction costs everybody something."""
+KEYFRAMES_PER_ROUND = 20
+"""New keyframes that call for a round even without a new closure, so that a trajectory's end is corrected, too."""
 HURRIED_PERIOD_S = 0.5
 """Least pause between rounds while groups meet."""
 HURRY_MAX_S = 2.0
@@ -68,11 +76,13 @@ class Rounds:
 
     def tick(self, now: float) -> list[Effect]:
         """Give up a round that is overdue, start one that is wanted."""
+        if self._term is None:
+            return []
         effects: list[Effect] = []
         if self._running_until_s is not None and self._running_until_s <= now:
             self._try_again(now)
-            effects.append(Report("round_timeout", {"term": str(self._term), "round": self._round}))
-        if self._term is None or self._running_until_s is not None or self._next_s > now or not self._stale():
+            effects.append(Report(RoundTimedOut(term=self._term, round=self._round)))
+        if self._running_until_s is not None or self._next_s > now or not self._stale():
             return effects
         return [*effects, self._start(self._term, now)]
 
@@ -86,14 +96,14 @@ class Rounds:
 
     def _start(self, term: Term, now: float) -> Effect:
         self._round += 1
-        self._running_until_s = now + self._parameters.timeout_s * 2**self._failures
+        self._running_until_s = now + TIMEOUT_S * 2**self._failures
         self._started_s = now
         self._next_s = now + (HURRIED_PERIOD_S if now < self._hurried_until_s else self._period_s())
         self._started = (self._assembly.revision, self._assembly.keyframes)
         return Optimise(term, self._round, self._assembly.graph(), self._solution)
 
     def _period_s(self) -> float:
-        return max(self._parameters.period_s, self._parameters.period_per_keyframe_s * self._assembly.keyframes)
+        return max(self._parameters.period_s, PERIOD_PER_KEYFRAME_S * self._assembly.keyframes)
 
     def _try_again(self, now: float) -> None:
         self._running_until_s = None
@@ -109,23 +119,25 @@ class Rounds:
             return True
         revision, keyframes = self._started
         grown = self._assembly.keyframes - keyframes
-        return revision != self._assembly.revision or grown >= self._parameters.keyframes_per_round
+        return revision != self._assembly.revision or grown >= KEYFRAMES_PER_ROUND
 
 
 def solution_report(term: Term, round_number: int, solution: GraphSolution) -> Report:
     """What a round did, for people."""
     states = [result.state for result in solution.closures]
-    facts = {
-        "term": term.counter,
-        "leader": term.leader.robot,
-        "round": round_number,
-        "components": [[str(log) for log in component.logs] for component in solution.components],
-        "keyframes": sum(len(p) for c in solution.components for p in c.T_map_keyframe.values()),
-        "closures_used": states.count(ClosureState.USED),
-        "closures_rejected": states.count(ClosureState.REJECTED),
-        "closures_excluded": states.count(ClosureState.EXCLUDED),
-        "cost": sum(component.cost for component in solution.components),
-        "solve_s": solution.solve_s,
-        "warnings": list(solution.warnings),
-    }
-    return Report("optimised", facts)  # type: ignore[arg-type]
+    fact = RoundSolved(
+        term=term.counter,
+        leader=term.leader.robot,
+        round=round_number,
+        components=tuple(component.logs for component in solution.components),
+        keyframes=sum(len(p) for c in solution.components for p in c.T_map_keyframe.values()),
+        closures_used=states.count(ClosureState.USED),
+        closures_rejected=states.count(ClosureState.REJECTED),
+        closures_excluded=states.count(ClosureState.EXCLUDED),
+        measured_used=sum(result.state is ClosureState.USED for result in solution.measured),
+        measured_not_used=sum(result.state is not ClosureState.USED for result in solution.measured),
+        cost=sum(component.cost for component in solution.components),
+        solve_s=solution.solve_s,
+        warnings=solution.warnings,
+    )
+    return Report(fact)

@@ -31,6 +31,20 @@ KEY_BYTES_MAX = 255
 HEAD = struct.Struct("<4sIB")
 POSE = struct.Struct("<12d")
 IMAGE_WIDTH = 128
+PLACE_DISTANCE_M = 3.0
+PLACE_ANGLE_RAD = 0.7
+"""Distance, and angle between viewing directions, at which the similarity of two descriptors has fallen to 0.6."""
+ALIAS_CELL_M = 10.0
+"""Edge of the cubes that are aliased as a whole: a room."""
+VISIBILITY_DISTANCE_M = 4.0
+VISIBILITY_ANGLE_RAD = 0.6
+"""Distance, and angle, at which the correspondences have fallen to 0.6 of the typical number."""
+CORRESPONDENCES_TYPICAL = 400
+"""Correspondences of two images of one place: about what the classical front end finds."""
+CORRESPONDENCES_MIN = 20
+"""Fewer correspondences are no registration, as for the core."""
+OUTLIER_DISTANCE_M = 10.0
+"""Typical length of a wrong translation: another room."""
 SIGMA_ROTATION_MIN_RAD = 1e-4
 SIGMA_TRANSLATION_MIN_RATIO = 1e-3
 
@@ -71,7 +85,7 @@ class SyntheticPerception:
         """
         config = self._config
         position = self._apparent_position(T_world_camera[:3, 3])
-        place = np.concatenate([position / config.place_distance_m, T_world_camera[:3, 2] / config.place_angle_rad])
+        place = np.concatenate([position / PLACE_DISTANCE_M, T_world_camera[:3, 2] / PLACE_ANGLE_RAD])
         signature = np.cos(self._frequencies @ place + self._phases)
         noise = self._generator("describe", keyframe_key).standard_normal(config.dimension)
         vector = signature + noise * (config.descriptor_noise_ratio * math.sqrt(0.5))
@@ -100,8 +114,8 @@ class SyntheticPerception:
         outlier = rng.uniform() < self._config.outlier_probability
         if outlier:
             T_query_match, count = self._outlier(rng)
-        if count < self._config.correspondences_min:
-            detail = f"{count} correspondences, {self._config.correspondences_min} needed"
+        if count < CORRESPONDENCES_MIN:
+            detail = f"{count} correspondences, {CORRESPONDENCES_MIN} needed"
             return RegistrationFailed(RegistrationFailure.FEW_CORRESPONDENCES, detail, count, odometry_count)
         noisy, covariance_m = self._noisy(T_query_match, count, rng)
         unit_m = math.exp(self._config.scale_sigma_ratio * rng.standard_normal())
@@ -121,29 +135,29 @@ class SyntheticPerception:
 
     def _apparent_position(self, position_m: Float) -> Float:
         """Where a place seems to be: elsewhere for aliased cubes, which share a few looks."""
-        cell = np.floor(position_m / self._config.alias_cell_m)
+        cell = np.floor(position_m / ALIAS_CELL_M)
         rng = self._generator("alias", *(str(int(index)) for index in cell))
         if rng.uniform() >= self._config.alias_probability:
             return position_m
         look = int(rng.integers(self._config.alias_places))
-        inside = position_m - cell * self._config.alias_cell_m
+        inside = position_m - cell * ALIAS_CELL_M
         return np.asarray(inside + np.array([1e4 * (look + 1), 0.0, 0.0]))
 
     def _correspondences(self, T_a_b: Float, rng: np.random.Generator) -> int:
         """Correspondences of two images; fewer with distance and with the angle between viewing directions."""
-        distance = math.sqrt(float(T_a_b[:3, 3] @ T_a_b[:3, 3])) / self._config.visibility_distance_m
-        angle = math.acos(min(max(float(T_a_b[2, 2]), -1.0), 1.0)) / self._config.visibility_angle_rad
-        expected = self._config.correspondences_typical * math.exp(-0.5 * (distance**2 + angle**2))
+        distance = math.sqrt(float(T_a_b[:3, 3] @ T_a_b[:3, 3])) / VISIBILITY_DISTANCE_M
+        angle = math.acos(min(max(float(T_a_b[2, 2]), -1.0), 1.0)) / VISIBILITY_ANGLE_RAD
+        expected = CORRESPONDENCES_TYPICAL * math.exp(-0.5 * (distance**2 + angle**2))
         return int(rng.poisson(expected))
 
     def _outlier(self, rng: np.random.Generator) -> tuple[Float, int]:
         """A wrong pose, and the correspondences that support it: a tenth to a half of the typical number."""
-        T = pose(so3_exp(rng.standard_normal(3)), rng.standard_normal(3) * self._config.outlier_distance_m)
-        return T, int(self._config.correspondences_typical * rng.uniform(0.1, 0.5))
+        T = pose(so3_exp(rng.standard_normal(3)), rng.standard_normal(3) * OUTLIER_DISTANCE_M)
+        return T, int(CORRESPONDENCES_TYPICAL * rng.uniform(0.1, 0.5))
 
     def _noisy(self, T_query_match: Float, count: int, rng: np.random.Generator) -> tuple[Float, Float]:
         """Disturb a pose in the match's tangent space; with the covariance (6, 6) of the disturbance, metres."""
-        weakness = math.sqrt(self._config.correspondences_typical / max(count, 1))
+        weakness = math.sqrt(CORRESPONDENCES_TYPICAL / max(count, 1))
         distance = max(math.sqrt(float(T_query_match[:3, 3] @ T_query_match[:3, 3])), 0.1)
         sigma_rotation = max(self._config.rotation_sigma_rad * weakness, SIGMA_ROTATION_MIN_RAD)
         ratio = max(self._config.translation_sigma_ratio * weakness, SIGMA_TRANSLATION_MIN_RATIO)

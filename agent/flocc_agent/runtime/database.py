@@ -19,10 +19,15 @@ BUSY_TIMEOUT_S = 5.0
 WAL_BYTES_MAX = 16 * 1024 * 1024
 
 Row = tuple[Any, ...]
+Migration = Callable[[sqlite3.Connection], None]
 
 
 class StoreError(FloccError):
     """A store that must not be used: another robot's, or one in use by another process."""
+
+
+class LaterSchema(StoreError):
+    """A store of a later version of flocc, whose tables this one does not know."""
 
 
 class StoreFailed(FloccError):
@@ -37,14 +42,25 @@ class Database:
         was_damaged: Whether the file was found damaged and a fresh one begun.
     """
 
-    def __init__(self, path: Path | None, schema: str, is_checked: bool, on_failed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        path: Path | None,
+        schema: str,
+        is_checked: bool,
+        on_failed: Callable[[], None],
+        migrations: Sequence[Migration] = (),
+    ) -> None:
         """Open or begin the file.
 
         Args:
             path: The file; None keeps everything in memory.
-            schema: Statements that make the tables where they do not exist.
+            schema: Statements that make the tables where they do not exist, as they are after all migrations.
             is_checked: Whether to read all of it now and look for damage; takes seconds per gigabyte.
             on_failed: Called once when the disk fails.
+            migrations: Each brings a file from the schema version of its place here to the next one.
+
+        Raises:
+            LaterSchema: The file's schema version is above the number of migrations.
         """
         self.failure: StoreFailed | None = None
         self.was_damaged = False
@@ -52,13 +68,14 @@ class Database:
         self._schema = schema
         self._is_checked = is_checked
         self._on_failed = on_failed
+        self._migrations = migrations
         self._lock = threading.RLock()
         self._connections: list[sqlite3.Connection] = []
         self._open()
 
     def _open(self) -> None:
         if self._path is None:
-            self._connections = [_connect(MEMORY, self._schema, False)]
+            self._connections = [_connect(MEMORY, self._schema, False, self._migrations)]
             return
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,14 +85,14 @@ class Database:
 
     def _open_file(self, path: Path) -> sqlite3.Connection:
         try:
-            return _connect(path, self._schema, self._is_checked)
+            return _connect(path, self._schema, self._is_checked, self._migrations)
         except sqlite3.DatabaseError as error:
             if not _is_damage(error):
                 raise
             self.was_damaged = True
             aside = _keep_aside(path)
             logger.warning("%s: is damaged (%s); it is kept as %s and a fresh one begun", path, error, aside.name)
-            return _connect(path, self._schema, False)
+            return _connect(path, self._schema, False, self._migrations)
 
     def write(self, statement: str, rows: Sequence[Row], durable: bool = False) -> int:
         """Execute a statement for all rows in one transaction, and give the count of changed rows.
@@ -117,7 +134,7 @@ class Database:
         """Say so once, and put memory before the file."""
         self.failure = StoreFailed(f"{self._path}: the disk failed ({error}); the robot goes on in memory")
         logger.error("%s", self.failure)
-        self._connections.insert(0, _connect(MEMORY, self._schema, False))
+        self._connections.insert(0, _connect(MEMORY, self._schema, False, self._migrations))
         self._on_failed()
 
     def close(self) -> None:
@@ -127,20 +144,36 @@ class Database:
                 connection.close()
 
 
-def _connect(path: Path | str, schema: str, is_checked: bool) -> sqlite3.Connection:
-    """Open a database, make its tables, perhaps check all of it."""
+def _connect(path: Path | str, schema: str, is_checked: bool, migrations: Sequence[Migration]) -> sqlite3.Connection:
+    """Open a database, perhaps check all of it, make its tables or bring them up to date."""
     connection = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, check_same_thread=False)
     try:
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute(f"PRAGMA journal_size_limit={WAL_BYTES_MAX}")
-        connection.executescript(schema)
         verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0] if is_checked else "ok"
         if verdict != "ok":
             raise sqlite3.DatabaseError(verdict)
-    except sqlite3.Error:
+        _migrate(path, connection, migrations)
+        connection.executescript(schema)
+    except (sqlite3.Error, StoreError):
         connection.close()
         raise
     return connection
+
+
+def _migrate(path: Path | str, connection: sqlite3.Connection, migrations: Sequence[Migration]) -> None:
+    """Bring a file's tables to the schema version of today, each step whole or not at all; a fresh file is there."""
+    is_fresh = connection.execute("SELECT COUNT(*) FROM sqlite_schema").fetchone()[0] == 0
+    version = len(migrations) if is_fresh else connection.execute("PRAGMA user_version").fetchone()[0]
+    if version > len(migrations):
+        raise LaterSchema(f"{path}: is of schema {version}, a later flocc's; this one reads up to {len(migrations)}")
+    for number, migration in enumerate(migrations[version:], start=version + 1):
+        with connection:
+            connection.execute("BEGIN")
+            migration(connection)
+            connection.execute(f"PRAGMA user_version={number}")
+    if is_fresh:
+        connection.execute(f"PRAGMA user_version={len(migrations)}")
 
 
 def _is_damage(error: sqlite3.DatabaseError) -> bool:

@@ -37,7 +37,6 @@ from flocc_agent.core.events import (
     BlockIterated,
     BlockIterationFailed,
     Event,
-    FixMeasured,
     GraphOptimisationFailed,
     GraphOptimised,
     KeyframeCaptured,
@@ -47,14 +46,35 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
     Leaving,
+    Measured,
     MessageReceived,
     PairRegistered,
 )
 from flocc_agent.core.interfaces import Image, OdometryPair
+from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph, map_frame
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.reports import (
+    ClosureAccepted,
+    CorrectionApplied,
+    Fact,
+    LatentLost,
+    LeaderFollowed,
+    LeaderLost,
+    LogForked,
+    NameTaken,
+    NeighbourDown,
+    NeighbourUp,
+    PeerRefused,
+    RoundFailed,
+    RoundSolved,
+    name_of,
+)
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.event_lines import Reported, values_of
+from flocc_agent.runtime.facts import AccountKept, BytesCounted
+from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.outbox import Outbox
 from flocc_agent.runtime.persistence import Persist, write
@@ -63,7 +83,7 @@ from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, Transport, TransportCounters
 from flocc_agent.runtime.workers import Workers, WorkFailed
-from flocc_agent.stages import brief_of, fields_of
+from flocc_agent.stages import brief_of, counts_of
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import KeyframeId
@@ -144,7 +164,7 @@ class Driver:
         workers: Workers,
         skills: Skills,
         reporter: Reporter,
-        on_line: Callable[[dict[str, Any]], None],
+        on_report: Callable[[Reported[Fact]], None],
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Prepare; `run` does the rest.
@@ -155,8 +175,8 @@ class Driver:
             store: Disk or memory.
             workers: Pools off the loop.
             skills: What the workers compute.
-            reporter: Turns the core's reports into lines.
-            on_line: Takes each line of `events.jsonl`; must not block.
+            reporter: Says when and where facts happened.
+            on_report: Takes each fact; must not block.
             clock_s: Seconds since the start of the run; the core's only clock.
         """
         self.robot = robot
@@ -165,13 +185,14 @@ class Driver:
         self._workers = workers
         self._skills = skills
         self._reporter = reporter
-        self._on_line = on_line
+        self._on_report = on_report
         self._clock_s = clock_s
         self._inbox: deque[tuple[float, Event]] = deque()
         self._wake = asyncio.Event()
         self._opened = asyncio.Event()
         self._images: dict[int, Image] = {}
         self._image_count = 0
+        self._given = GivenKeyframes.of(robot)
         self._image_slots = asyncio.Semaphore(IMAGES_MAX)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stopping = False
@@ -203,12 +224,25 @@ class Driver:
         await self._image_slots.acquire()
         self._image_count += 1
         self._images[self._image_count] = image
+        self._given.add(stamp_s)
         self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), self._image_count))
 
-    def add_fix(self, position_m: Float, covariance_m2: Float) -> None:
-        """Take in an absolute position of the last keyframe's camera."""
-        x, y, z = (float(v) for v in position_m)
-        self.put(FixMeasured((x, y, z), tuple(float(v) for v in covariance_m2.ravel())))
+    def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
+        """Take in what was measured at the keyframe that was given last, or at the one with this stamp.
+
+        Raises:
+            BadMeasurement: There is no such keyframe.
+        """
+        index = self._given.index_of(measurement, stamp_s)
+        self.put(Measured(measurement, index))
+
+    def keyframe_at(self, stamp_s: float) -> KeyframeId:
+        """The own keyframe with this stamp.
+
+        Raises:
+            BadMeasurement: There is none.
+        """
+        return KeyframeId(self.robot.log, self._given.at("closure", stamp_s))
 
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""
@@ -405,7 +439,7 @@ class Driver:
             peer, reason = "others", "for more reasons than are kept"
         self._refused[peer, reason] += 1
         if self._refused[peer, reason] == 1:
-            self._report(Report("peer_refused", {"peer": peer, "reason": detail or reason}))
+            self._report(PeerRefused(peer=peer, reason=detail or reason))
 
     def _send(self, message: Message, to: str | None) -> None:
         payload, kind = encode(Envelope(self.robot.log, message)), kind_of(message)
@@ -445,23 +479,26 @@ class Driver:
                 case PersistRecord() | PersistTerm() | PersistCorrection():
                     written.append(effect)
                     continue
-                case Report("peer_refused", fields):
-                    self._refuse(str(fields["peer"]), str(fields["reason"]))
-                    continue
-                case Report("log_forked", fields) if fields["log"] == str(self.robot.log):
-                    self._end_log(str(fields["peer"]))
-                    self._report(effect)
-                    continue
-                case Report():
-                    if effect.event == "neighbour_down":
-                        self._gaps["heard"].forget(str(effect.fields["peer"]))
-                    self._report(effect)
+                case Report(fact):
+                    self._tell(fact)
                     continue
             await self._write(written)
             self._do(effect)
         await self._write(written)
         if len(self._copied) >= COPIES_MAX:
             await self._flush()
+
+    def _tell(self, fact: Fact) -> None:
+        """Report what the core tells, and act on what concerns the driver."""
+        match fact:
+            case PeerRefused():
+                self._refuse(fact.peer, fact.reason)
+                return
+            case LogForked() if fact.log == self.robot.log:
+                self._end_log(fact.peer)
+            case NeighbourDown():
+                self._gaps["heard"].forget(fact.peer)
+        self._report(fact)
 
     def _end_log(self, peer: str) -> None:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
@@ -589,11 +626,10 @@ class Driver:
 
     # Reports
 
-    def _report(self, report: Report) -> None:
-        line = self._reporter.line(report, self._clock_s())
-        if logger.isEnabledFor(level := _level(report)):
-            logger.log(level, "%s: %s %s", self.robot.log, report.event, _brief(report.fields))
-        self._on_line(line)
+    def _report(self, fact: Fact) -> None:
+        if logger.isEnabledFor(level := _level(fact)):
+            logger.log(level, "%s: %s %s", self.robot.log, name_of(fact), _brief(fact))
+        self._on_report(self._reporter.reported(fact, self._clock_s()))
 
     def _count_bytes(self, last: bool = False) -> None:
         now = self._clock_s()
@@ -603,11 +639,11 @@ class Driver:
         counters = self._transport.counters()
         sent = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.sent.items())}
         received = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.received.items())}
-        facts = {"sent": sent, "received": received, "loss": self._losses(), "queues": self._queues()}
-        self._on_line(self._reporter.line(Report("bytes", facts), now))  # type: ignore[arg-type]
+        counted = BytesCounted(sent=sent, received=received, loss=self._losses(), queues=self._queues())
+        self._on_report(self._reporter.reported(counted, now))
         if now >= self._account_due_s or last:
             self._account_due_s = now + ACCOUNT_PERIOD_S
-            self._on_line(self._account(counters, now))
+            self._on_report(self._reporter.reported(self._account(counters), now))
 
     def _losses(self) -> dict[str, float]:
         """Share of each neighbour's last heartbeats that did not arrive."""
@@ -627,22 +663,14 @@ class Driver:
             **self.robot.sizes(),
         }
 
-    def _account(self, counters: TransportCounters, now: float) -> dict[str, Any]:
+    def _account(self, counters: TransportCounters) -> AccountKept:
         """Bytes by link and kind, and time by stage, since this start of the agent."""
-        return {
-            "t": round(now, 6),
-            "robot": self.robot.log.robot,
-            "event": "account",
-            "since_s": round(self._began_s, 6),
-            **counters.links(),
-            "stages": fields_of(self._workers.stages.snapshot()),
-        }
+        stages = counts_of(self._workers.stages.snapshot())
+        return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = frozenset({"peer_refused", "duplicate_name", "log_forked", "latent_lost", "optimisation_failed"})
-_INFOS = frozenset(
-    {"leader", "leader_lost", "neighbour_up", "neighbour_down", "closure_accepted", "correction", "optimised"}
-)
+_WARNINGS = (PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 
 def totals(peers: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
@@ -650,14 +678,14 @@ def totals(peers: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
     return {peer: sum(kinds.values()) for peer, kinds in peers.items()}
 
 
-def _level(report: Report) -> int:
-    if report.event in _WARNINGS:
+def _level(fact: Fact) -> int:
+    if isinstance(fact, _WARNINGS):
         return logging.WARNING
-    return logging.INFO if report.event in _INFOS else logging.DEBUG
+    return logging.INFO if isinstance(fact, _INFOS) else logging.DEBUG
 
 
-def _brief(fields: Mapping[str, Any]) -> str:
-    return " ".join(f"{key}={value}" for key, value in fields.items() if not isinstance(value, (list, dict)))
+def _brief(fact: Fact) -> str:
+    return " ".join(f"{key}={value}" for key, value in values_of(fact).items() if not isinstance(value, (list, dict)))
 
 
 def _put_newest(queue: "asyncio.Queue[Correction | None]", item: Correction | None) -> None:

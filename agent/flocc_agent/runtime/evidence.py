@@ -6,6 +6,7 @@ from typing import Any
 
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
+from flocc_agent.core.registration import match_ratio
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.reporting import best_similarities
 from flocc_protocol.records import ClosureRecord, RejectionRecord
@@ -32,8 +33,7 @@ class PairEvidence:
 
     def reject(self, record: RejectionRecord) -> None:
         """Count a refused pair."""
-        expected = record.odometry_correspondences
-        ratio = record.correspondences / expected if expected else 0.0
+        ratio = match_ratio(record.correspondences, record.odometry_correspondences)
         self.rejected += 1
         if self.best_ratio is None or ratio > self.best_ratio:
             self.best_ratio, self.reason = ratio, record.reason

@@ -5,8 +5,9 @@ from collections.abc import Iterable
 from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.robot import Restored
 from flocc_agent.runtime.store import Store, StoredRecord
+from flocc_agent.runtime.stored_correction import correction_in, stored
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import CorrectionBatch, Envelope, LogCorrection, UnknownVersion, decode, encode
+from flocc_protocol.messages import LogCorrection
 
 Persist = PersistRecord | PersistTerm | PersistCorrection
 
@@ -27,8 +28,7 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
             case PersistCorrection(correction, frame_changed):
                 if frame_changed:
                     store.put_fact(FRAME_CHANGED, b"1")
-                envelope = Envelope(store.identity.log, CorrectionBatch((correction,)))
-                store.put_correction(correction.log.robot, encode(envelope))
+                store.put_correction(correction.log.robot, stored(correction))
                 if not frame_changed and store.fact(FRAME_CHANGED) == b"1":
                     store.put_fact(FRAME_CHANGED, b"0")
             case PersistRecord():
@@ -48,14 +48,10 @@ def restore(store: Store) -> Restored:
 
 
 def _correction(store: Store, own: LogId) -> LogCorrection | None:
-    """The correction that was applied last, unless another version of flocc, or an earlier incarnation, wrote it."""
+    """The correction that was applied last, unless an earlier incarnation wrote it."""
     kept = store.correction(own.robot)
-    try:
-        message = None if kept is None else decode(kept).message
-    except UnknownVersion:
-        return None
-    assert message is None or isinstance(message, CorrectionBatch)
-    return next((c for c in message.corrections if c.log == own), None) if message else None
+    correction = None if kept is None else correction_in(kept)
+    return correction if correction is not None and correction.log == own else None
 
 
 def _prefix(store: Store, log: LogId) -> tuple[bytes, ...]:

@@ -1,6 +1,7 @@
 """Playing a recording into an agent by its stamps, as if the robot were moving now."""
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 
 import numpy as np
@@ -9,10 +10,14 @@ from numpy.typing import NDArray
 from flocc_agent.config import SourceConfig
 from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.measurement_file import Stamped
+from flocc_agent.runtime.recording import Recording, RecordingError
+
+logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 AddKeyframe = Callable[[Image, Float, float], Awaitable[None]]
+AddMeasurement = Callable[[Stamped, float], None]
 
 READY_S = 1.0
 """Frames due before this are played at once: an agent needs a moment to start."""
@@ -28,23 +33,22 @@ async def play(
     config: SourceConfig,
     selector: KeyframeSelector,
     add_keyframe: AddKeyframe,
+    add_measurement: AddMeasurement,
     clock_s: Callable[[], float],
     on_position: Callable[[Float], None],
     resumed: bool = False,
 ) -> None:
-    """Play frames when they are due; late ones are played at once, none is skipped.
+    """Play frames when they are due; late ones are played at once, none is skipped but what cannot be read.
 
     Args:
         recording: What to play.
         config: Speed and start.
         selector: Decides which frames become keyframes.
         add_keyframe: Takes (image, T_odom_body, stamp_s); may wait.
+        add_measurement: Takes what was measured at the keyframe with this stamp.
         clock_s: Seconds since the start of the run.
         on_position: Takes the true position (3,) of each frame, where it is known, for emulated range.
         resumed: The agent was restarted: frames that were due before now are skipped.
-
-    Raises:
-        RecordingError: An image cannot be read.
     """
     first_s = recording.frames[0].stamp_s
     started_s = clock_s()
@@ -56,7 +60,13 @@ async def play(
         truth = recording.ground_truth(frame.stamp_s)
         if truth is not None:
             on_position(truth[:3, 3])
-        if selector.wants(frame.T_odom_body):
+        if selector.wants(frame.T_odom_body) or recording.measurements.keeps(frame.stamp_s):
+            try:
+                image = await asyncio.to_thread(recording.load_image, frame)
+            except RecordingError as error:
+                logger.warning("%s; left out", error)
+                continue
             selector.took(frame.T_odom_body)
-            image = await asyncio.to_thread(recording.load_image, frame)
             await add_keyframe(image, frame.T_odom_body, frame.stamp_s)
+            for measured in recording.measurements.at(frame.stamp_s):
+                add_measurement(measured, frame.stamp_s)

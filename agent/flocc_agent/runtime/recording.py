@@ -5,6 +5,7 @@
     RECORDING/odometry.tum      T_odom_body at the images' stamps or denser
     RECORDING/groundtruth.tum   T_world_body, optional
     RECORDING/camera.toml       [camera] width height fx fy cx cy distortion T_body_camera
+    RECORDING/measurements.jsonl  what else was measured, optional (`measurement_file`)
 
 Odometry is interpolated to the images' stamps. Images outside of the odometry's time are left out. Pixels are read
 when they are asked for.
@@ -19,6 +20,9 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import ConfigError, read_toml
 from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
+from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, read_measurements
+from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_tum
@@ -55,6 +59,8 @@ class Recording:
         T_body_camera: (4, 4) pose of the camera in the body, metres.
         frames: Images that odometry covers, in order of time; at least one.
         truth: Ground truth `T_world_body` where the recording has one.
+        levels: How images of 16 bits are brought to 8.
+        measurements: What else was measured.
     """
 
     path: Path
@@ -62,14 +68,16 @@ class Recording:
     T_body_camera: Float
     frames: tuple[Frame, ...]
     truth: Trajectory | None
+    levels: Levels = FULL
+    measurements: RecordedMeasurements = NOTHING
 
     @classmethod
     def open(cls, path: Path) -> "Recording":
-        """Read everything but the pixels, of which only the first image's are checked.
+        """Read everything but the pixels; an image that is cut off, or of another size, is left out and said.
 
         Raises:
-            RecordingError: A file is missing or broken, an image does not exist or has another size than the
-                intrinsics, or no image lies within the odometry's time.
+            RecordingError: A file is missing or broken, many images cannot be used, or none lies within the odometry's
+                time.
         """
         if not path.is_dir():
             raise RecordingError(f"{path}: is not a folder")
@@ -77,9 +85,15 @@ class Recording:
         frames = _frames(path, read_tum(path / "odometry.tum"))
         truth_path = path / "groundtruth.tum"
         truth = read_tum(truth_path) if truth_path.exists() else None
-        recording = cls(path, camera, T_body_camera, frames, truth)
-        recording.load_image(frames[0])
-        return recording
+        try:
+            looked = good_pictures([frame.image_path for frame in frames], (camera.width, camera.height))
+        except PictureError as error:
+            raise RecordingError(f"{error}; the intrinsics are in {path / 'camera.toml'}") from error
+        if looked.fault is not None:
+            logger.warning("%s", looked.fault)
+        good = tuple(frames[k] for k in looked.good)
+        measurements = read_measurements(path / MEASUREMENTS, [frame.stamp_s for frame in good])
+        return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements)
 
     def ground_truth(self, stamp_s: float) -> Float | None:
         """True (4, 4) pose `T_world_body` at a time, or None where there is none."""
@@ -91,13 +105,13 @@ class Recording:
         Raises:
             RecordingError: The image cannot be read, or its size is not that of the intrinsics.
         """
-        pixels = _read_rgb(frame.image_path)
-        height, width = pixels.shape[:2]
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise RecordingError(
-                f"{frame.image_path}: the image is {width}x{height}, but the intrinsics in "
-                f"{self.path / 'camera.toml'} are for {self.camera.width}x{self.camera.height}"
-            )
+        try:
+            encoded = frame.image_path.read_bytes()
+            pixels = read_picture(encoded, (self.camera.width, self.camera.height), self.levels)
+        except OSError as error:
+            raise RecordingError(f"{frame.image_path}: cannot be read: {error.strerror or error}") from error
+        except PictureError as error:
+            raise RecordingError(f"{frame.image_path}: {error}") from error
         return Image(pixels, self.camera)
 
 
@@ -211,16 +225,3 @@ def _extrinsics(rows: object, path: Path) -> Float:
     if T.shape != (4, 4):
         raise RecordingError(f"{path}: camera.T_body_camera must be four rows of four numbers")
     return checked_pose(T, f"{path}: camera.T_body_camera")
-
-
-def _read_rgb(path: Path) -> NDArray[np.uint8]:
-    import cv2
-
-    try:
-        encoded = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise RecordingError(f"{path}: the image cannot be read: {error.strerror or error}") from error
-    bgr = cv2.imdecode(encoded, cv2.IMREAD_COLOR) if encoded.size else None
-    if bgr is None:
-        raise RecordingError(f"{path}: the image cannot be read: it is damaged or of an unknown format")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)

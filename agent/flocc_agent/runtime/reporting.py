@@ -1,21 +1,21 @@
-"""What a robot's run leaves for people: lines of `events.jsonl` and `result.json`. The same for every driver.
+"""What a robot's run leaves for people: facts and `result.json`. The same for every driver.
 
-The core knows camera poses only; users know the body. Both files speak of the body.
+The core knows camera poses only; users know the body. Both speak of the body.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.corrections import pose7
-from flocc_agent.core.effects import Report
 from flocc_agent.core.pose_graph import GraphSolution, map_frame
 from flocc_agent.core.registration import closure_probability
+from flocc_agent.core.reports import ClosureAccepted, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse, pose_from_tq, se3_exp, se3_log
+from flocc_agent.runtime.event_lines import Reported
 from flocc_protocol.messages import CandidatePair, LogCorrection
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reporter:
-    """Turns the core's reports into lines of `events.jsonl`.
+    """Says when and where facts happened, and adds to the core's what it cannot know.
 
     Attributes:
         robot: Name of the robot.
@@ -36,20 +36,18 @@ class Reporter:
     T_body_camera: Float
     steepness: float
 
-    def line(self, report: Report, t: float) -> dict[str, Any]:
-        """One event: time since the start of the run (s), robot, kind and facts."""
-        fields = dict(report.fields)
-        if report.event == "keyframe":
-            fields = self._with_body_pose(fields)
-        if report.event == "closure_accepted":
-            fields["probability"] = round(closure_probability(float(fields["ratio"]), self.steepness), 6)  # type: ignore[arg-type]
-        return {"t": round(t, 6), "robot": self.robot, "event": report.event, **fields}
+    def reported(self, fact: Fact, t: float) -> Reported[Fact]:
+        """A fact at a time since the start of the run (s)."""
+        return Reported(t, self.robot, self._completed(fact))
 
-    def _with_body_pose(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        T_odom_camera = pose_from_tq(np.array(fields["T_odom_camera"]))
-        T_odom_body = T_odom_camera @ inverse(self.T_body_camera)
-        rest = {key: value for key, value in fields.items() if key != "T_odom_camera"}
-        return {**rest, "T_odom_body": list(pose7(T_odom_body))}
+    def _completed(self, fact: Fact) -> Fact:
+        match fact:
+            case KeyframeTaken():
+                T_odom_body = pose_from_tq(np.array(fact.T_odom_body)) @ inverse(self.T_body_camera)
+                return replace(fact, T_odom_body=pose7(T_odom_body))
+            case ClosureAccepted():
+                return replace(fact, probability=round(closure_probability(fact.ratio, self.steepness), 6))
+        return fact
 
 
 def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None = None) -> dict[str, Any]:

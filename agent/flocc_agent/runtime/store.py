@@ -11,6 +11,7 @@ no number of its log is ever used twice. Methods are synchronous; any thread may
 
 import hashlib
 import logging
+import sqlite3
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flocc_agent.runtime.database import Database, StoreError, StoreFailed, hold_lock
+from flocc_agent.runtime.stored_correction import from_envelope
 from flocc_protocol.ids import KeyframeId, LogId
 
 if TYPE_CHECKING:
@@ -38,6 +40,19 @@ CREATE TABLE IF NOT EXISTS latents(
     age INTEGER PRIMARY KEY AUTOINCREMENT, keyframe TEXT UNIQUE, sha256 BLOB NOT NULL, bytes INTEGER NOT NULL,
     data BLOB NOT NULL);
 """
+
+
+def _free_corrections_of_messages(connection: sqlite3.Connection) -> None:
+    """Schema 0 kept corrections as messages of protocol version 2."""
+    kept = connection.execute("SELECT robot, data FROM corrections").fetchall()
+    for robot, data in kept:
+        connection.execute(
+            "UPDATE corrections SET data = ? WHERE robot = ?", (from_envelope(robot, data) or b"", robot)
+        )
+
+
+MIGRATIONS = (_free_corrections_of_messages,)
+"""Each brings `robot.sqlite` one schema version up; never changed once released, only added to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +81,7 @@ class Store:
         self._config = config
         self._lock = threading.RLock()
         self._lock_file = hold_lock(folder / "lock") if folder is not None else None
-        self._records = Database(self._path("robot.sqlite"), RECORD_SCHEMA, True, self._forget_intact)
+        self._records = Database(self._path("robot.sqlite"), RECORD_SCHEMA, True, self._forget_intact, MIGRATIONS)
         self._latents = Database(self._path("latents.sqlite"), LATENT_SCHEMA, False, self._forget_latents)
         self._others_bytes = self._latent_bytes = 0
 

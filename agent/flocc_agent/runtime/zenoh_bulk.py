@@ -30,6 +30,10 @@ SERVERS = 2
 SERVE_PENDING_MAX = 64
 TRIES_MAX = 5
 PAUSE_S = 0.1
+FETCHES_MAX = 2
+"""Latents in flight at once, as many as the core asks for; more share the same link and make each later."""
+CHUNK_TIMEOUT_S = 5.0
+"""One piece of 256 KiB that takes longer is asked for again: 50 kB/s is the slowest link that gets on."""
 REQUEST_BYTES = 100
 
 
@@ -53,8 +57,8 @@ class BulkService:
         self._server: Server | None = None
         self._pending = BoundedSemaphore(SERVE_PENDING_MAX)
         self._servers = ThreadPoolExecutor(SERVERS, thread_name_prefix=f"{robot}-serve")
-        self._fetchers = ThreadPoolExecutor(config.fetches_max, thread_name_prefix=f"{robot}-fetch")
-        self._slots = asyncio.Semaphore(config.fetches_max)
+        self._fetchers = ThreadPoolExecutor(FETCHES_MAX, thread_name_prefix=f"{robot}-fetch")
+        self._slots = asyncio.Semaphore(FETCHES_MAX)
         self._partials = Partials(config.chunk_bytes)
         self._rates = LinkRates()
         self._in_flight: set[zenoh.CancellationToken] = set()
@@ -201,7 +205,7 @@ class BulkService:
             replies = session.get(
                 selector,
                 zenoh.handlers.FifoChannel(4),
-                timeout=self._config.chunk_timeout_s,
+                timeout=CHUNK_TIMEOUT_S,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.DATA_LOW,
                 consolidation=zenoh.ConsolidationMode.NONE,

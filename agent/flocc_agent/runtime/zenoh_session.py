@@ -20,6 +20,10 @@ from flocc_agent.runtime.transport import TransportError
 
 RX_MESSAGE_MARGIN_BYTES = 64 * 1024
 BULK_LEASE_FACTOR = 4
+OPEN_TIMEOUT_S = 2.0
+"""Time for one attempt to open a link; a longer one leaves pairs apart for longer under heavy loss."""
+RETRY_MAX_S = 1.0
+"""Longest pause between two attempts to dial a robot of the roster: robots meet for seconds."""
 """Bulk links are idle most of the time, and each sends four signs of life per lease: with 30 robots that is as many
 messages as their heartbeats. Control links are never idle."""
 RUNTIME = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
@@ -55,11 +59,11 @@ def session_settings(
         "connect/endpoints": dialled,
         "connect/retry": {
             "period_init_ms": 100,
-            "period_max_ms": round(config.retry_max_s * 1000),
+            "period_max_ms": round(RETRY_MAX_S * 1000),
             "period_increase_factor": 1.5,
         },
         "scouting/multicast/enabled": config.multicast,
-        "scouting/multicast/address": config.multicast_control if control else config.multicast_bulk,
+        "scouting/multicast/address": config.multicast_group(control),
         "scouting/multicast/interface": config.interface,
         "scouting/multicast/autoconnect_strategy": strategy,
         "scouting/gossip/enabled": config.gossip,
@@ -67,8 +71,8 @@ def session_settings(
         "adminspace/enabled": False,
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_links": 1,
-        "transport/unicast/open_timeout": round(config.open_timeout_s * 1000),
-        "transport/unicast/accept_timeout": round(config.open_timeout_s * 1000),
+        "transport/unicast/open_timeout": round(OPEN_TIMEOUT_S * 1000),
+        "transport/unicast/accept_timeout": round(OPEN_TIMEOUT_S * 1000),
         "transport/link/tx/lease": round(config.lease_s * 1000) * (1 if control else BULK_LEASE_FACTOR),
         "transport/link/rx/max_message_size": message_bytes_max + RX_MESSAGE_MARGIN_BYTES,
     }

@@ -47,6 +47,8 @@ FRAGMENT_BYTES = 60_000
 SLOW_PUTS_MAX = 16
 ADDRESSES_MAX = 4096
 DELAYED_MAX = 20_000
+INBOX_BYTES_MAX = 32 * 1024 * 1024
+"""Bytes of one kind of message that wait for the robot; the oldest is dropped for a new one."""
 
 PRIORITY = {
     keys.Kind.HEARTBEAT.value: zenoh.Priority.REAL_TIME,
@@ -159,7 +161,7 @@ class ZenohTransport:
         if self._session is not None:
             raise TransportError(f"robot {self.robot}: the transport is open already")
         self._loop = asyncio.get_running_loop()
-        limits = (self._config.inbox_messages_max, self._config.inbox_bytes_max)
+        limits = (self._config.inbox_messages_max, INBOX_BYTES_MAX)
         self._inbox = Inbox(self._loop, self._arrived, self._counter, *limits)
         try:
             await asyncio.to_thread(self._open_blocking)

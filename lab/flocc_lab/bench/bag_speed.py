@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.source import Lens
 
@@ -81,7 +81,7 @@ def read_all(path: Path) -> int:
 def measure(folder: Path, rounds: int = ROUNDS) -> dict[str, Any]:
     """Ratios of conversion speed to reading speed, one per round."""
     bag = write_bag(folder / "bag")
-    options = BagOptions(camera=Lens(Camera(640, 480, 500.0, 500.0, 319.5, 239.5)))
+    options = BagOptions(camera=Lens(CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5)))
     ratios = []
     for k in range(rounds):
         read_s = _seconds(lambda: read_all(bag))

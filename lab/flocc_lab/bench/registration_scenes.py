@@ -4,7 +4,7 @@ Recordings of several robots, and the research sets of `../shared/data`, which a
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.recording import Recording
 from flocc_launch.datasets.detect import read_source
 from flocc_launch.datasets.intrinsics import read_lens
-from flocc_launch.datasets.pixels import decoded, read_bytes
+from flocc_launch.datasets.pixels import agents_camera, decoded, read_bytes
 from flocc_launch.datasets.source import DatasetError
 
 Float = NDArray[np.float64]
@@ -102,7 +102,7 @@ def sevenscenes(folder: Path, robots: int = 3) -> Scene:
             selector.took(T)
             kept.append((file, T))
     names = [f"r{1 + k * robots // len(kept)}" for k in range(len(kept))]
-    camera = source.lens.camera
+    camera = agents_camera(source.lens)
     views = tuple(View(name, file, camera, T, T) for name, (file, T) in zip(names, kept, strict=True))
     return Scene(folder.name, views, 0.4, float(np.radians(30.0)), 0.2)
 
@@ -120,6 +120,30 @@ def fountain(folder: Path) -> Scene:
     return Scene(folder.name, tuple(views), 4.0, float(np.radians(30.0)), 1.0)
 
 
+def robots_beside(folder: Path, place_distance_m: float) -> Scene:
+    """A folder with a plain data set per robot, such as street or herz_jesu."""
+    views = [view for robot in sorted(folder.iterdir()) if robot.is_dir() for view in _plain_views(robot)]
+    return Scene(folder.name, tuple(views), place_distance_m, float(np.radians(40.0)), 1.0)
+
+
+def _plain_views(folder: Path) -> Iterator[View]:
+    """A robot's images that have a true pose."""
+    source = read_source(folder)
+    if source.lens is None or source.truth is None:
+        raise DatasetError(f"{folder}: has no intrinsics or no ground truth")
+    for stamp_s, file in source.images:
+        T = source.truth.at(stamp_s)
+        T_odom = T if source.odometry is None else source.odometry.at(stamp_s)
+        if T is not None and T_odom is not None:
+            yield View(folder.name, file, agents_camera(source.lens), T, T_odom)
+
+
+def kitti(folder: Path) -> Scene:
+    """A drive as two robots that took turns, four images (5 m) each."""
+    views = [replace(view, robot=f"r{1 + k // 4 % 2}") for k, view in enumerate(_plain_views(folder))]
+    return Scene(folder.parent.name, tuple(views), 10.0, float(np.radians(40.0)), 1.0)
+
+
 def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Four stereo pairs of EuRoC: the left views, and the right ones, which stand in for odometry's neighbours."""
     sides = []
@@ -130,7 +154,7 @@ def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:
             q_and_t = np.array(numbers.split(), np.float64)
             T_world_body = pose_from_tq(np.concatenate([q_and_t[4:], q_and_t[:4]]))
             T = T_world_body @ lens.T_body_camera
-            views.append(View(f"r{k}", folder / f"{side}_img_{k}.png", lens.camera, T, T))
+            views.append(View(f"r{k}", folder / f"{side}_img_{k}.png", agents_camera(lens), T, T))
         sides.append(tuple(views))
     return sides[0], sides[1]
 

@@ -3,7 +3,7 @@
 import typer
 
 from flocc_lab.commands.bench import bench
-from flocc_lab.commands.experiment import experiment
+from flocc_lab.commands.experiments import experiment
 
 
 def add_commands(app: typer.Typer) -> None:

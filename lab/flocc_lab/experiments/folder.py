@@ -16,8 +16,8 @@ from typing import Any
 
 from flocc_agent.config import read_json
 from flocc_lab.experiments.experiment import ExperimentError, Row
-from flocc_launch.report.build import flocc_version
 from flocc_launch.runs.run_folder import write_json
+from flocc_launch.runs.version import flocc_version
 
 Json = dict[str, Any]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flocc_lab.experiments.experiment import ExperimentError
-from flocc_launch.simulation.playback import Playback
+from flocc_launch.simulation.virtual_playback import Playback
 from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]

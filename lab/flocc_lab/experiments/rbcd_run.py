@@ -17,7 +17,7 @@ from flocc_agent.config import BackendConfig
 from flocc_agent.core.blocks import BlockStep
 from flocc_agent.core.distributed_optimisation import DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock
-from flocc_agent.core.parameters import DistributedParameters, RoundParameters
+from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import between, inverse
 from flocc_launch.simulation.agenda import Agenda
@@ -114,10 +114,8 @@ class _Air:
     def __init__(
         self, graph: PoseGraph, config: BackendConfig, parameters: DistributedParameters, loss_ratio: float, seed: int
     ) -> None:
-        source, rounds = WholeGraph(graph), RoundParameters()
-        self._machines = {
-            log: DistributedOptimisation(log, source, parameters, rounds) for log in sorted(graph.trajectories)
-        }
+        source = WholeGraph(graph)
+        self._machines = {log: DistributedOptimisation(log, source, parameters) for log in sorted(graph.trajectories)}
         self._config = config
         self._loss_ratio = loss_ratio
         self._rng = np.random.default_rng(seed)

@@ -3,12 +3,12 @@
 from typing import Any
 
 from flocc_lab.experiments.bandwidth import BANDWIDTH
-from flocc_lab.experiments.candidate_order import CANDIDATE_ORDER
+from flocc_lab.experiments.candidate_orders import CANDIDATE_ORDER
 from flocc_lab.experiments.distributed import DISTRIBUTED
 from flocc_lab.experiments.experiment import Experiment, ExperimentError
 from flocc_lab.experiments.faults import FAULTS
 from flocc_lab.experiments.full_system import FULL_SYSTEM
-from flocc_lab.experiments.registration import REGISTRATION
+from flocc_lab.experiments.registration_quality import REGISTRATION
 from flocc_lab.experiments.scale import SCALE
 from flocc_lab.experiments.sparse_keyframes import SPARSE_KEYFRAMES
 from flocc_lab.experiments.split_compute import SPLIT_COMPUTE

@@ -10,7 +10,7 @@ from flocc_agent.config import ConfigError, read_json, read_toml
 from flocc_lab.experiments.experiment import ExperimentError
 from flocc_lab.experiments.folder import ExperimentFolder
 from flocc_lab.experiments.logistic import LogisticFit
-from flocc_lab.experiments.registration import REGISTRATION, fit_of
+from flocc_lab.experiments.registration_quality import REGISTRATION, fit_of
 
 TABLE = re.compile(r"^\s*\[")
 BACKEND = re.compile(r"^\s*\[\s*backend\s*\]\s*(#.*)?$")

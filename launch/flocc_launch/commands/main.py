@@ -10,7 +10,7 @@ import typer
 from flocc_launch.commands.common import EXIT_BAD_INPUT, progress_bar, show_report
 from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
-from flocc_launch.commands.measure import add_measures, run_campaign
+from flocc_launch.commands.offline import add_offline, run_campaign
 from flocc_launch.commands.tools import add_tools
 from flocc_protocol.errors import FloccError
 
@@ -22,24 +22,44 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="flocc",
-    help="Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots.",
     epilog="Start with 'flocc demo', or 'flocc launch FOLDER' with images and a trajectory of your own.",
     context_settings={"max_content_width": 110},
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    add_completion=True,
 )
+
+
+def _show_version(wanted: bool) -> None:
+    """Print the version of the installed distribution, and of the wire."""
+    if wanted:
+        from flocc_launch.runs.version import flocc_version
+        from flocc_protocol.messages import PROTOCOL_VERSION
+
+        typer.echo(f"flocc {flocc_version()} (protocol {PROTOCOL_VERSION})")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    """Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots."""
+
 
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
-Loss = Annotated[float | None, typer.Option(help="Share of messages lost on every link, 0 to 1.")]
-Latency = Annotated[float | None, typer.Option(help="Delay on every link, seconds.")]
-Bandwidth = Annotated[float | None, typer.Option(help="Capacity of every link, and budget of every robot, kB/s.")]
-Range = Annotated[float | None, typer.Option("--range", help="Communication range by true position, metres.")]
-Duration = Annotated[float | None, typer.Option(help="End after this many seconds instead of when all is settled.")]
+Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
+Latency = Annotated[float | None, typer.Option(min=0.0, help="Delay on every link, seconds.")]
+Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a link and budget of a robot, kB/s.")]
+Range = Annotated[float | None, typer.Option("--range", min=0.0, help="Communication range by true position, metres.")]
+Duration = Annotated[float | None, typer.Option(min=0.0, help="End after so many seconds, not when all is settled.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Another value for a key, such as radio.loss_ratio=0.3.")]
 
 
 def main() -> None:
@@ -84,6 +104,7 @@ def launch(
     range_m: Range = None,
     duration: Duration = None,
     seed: Seed = None,
+    sets: Set = None,
     rate: Annotated[float | None, typer.Option(help="Playback speed of recordings.")] = None,
     dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
@@ -91,8 +112,8 @@ def launch(
 ) -> None:
     """Run a scenario with one process per robot on this machine, over real zenoh."""
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
-    if rate is not None:
-        changes["rate"] = rate
+    changes |= {} if rate is None else {"rate": rate}
+    changes |= _parsed(sets)
     _launch(_read(scenario, changes, agents), out, secure, dashboard, metrics)
 
 
@@ -107,10 +128,13 @@ def simulate(
     bandwidth: Bandwidth = None,
     range_m: Range = None,
     duration: Duration = None,
+    sets: Set = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
     shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
 ) -> None:
     """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
+    if seeds is not None and sets:
+        fail("a campaign draws its scenarios; --set changes one, without --seeds")
     if seeds is not None:
         run_campaign(seeds, seed or 0, shrink, out)
         return
@@ -122,7 +146,7 @@ def simulate(
     from flocc_launch.swarm.launching import fresh_folder
 
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
-    read = _read(scenario, changes, agents)
+    read = _read(scenario, changes | _parsed(sets), agents)
     with progress_bar("preparing data") as progress:
         paths = recordings(read, progress)
     check_measurable(read, paths)
@@ -133,9 +157,7 @@ def simulate(
 @app.command()
 def agent(
     config: Annotated[Path, typer.Option(help="Configuration of the agent (TOML); see docs/configuration.md.")],
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", help="Another value for a key: name=r2, radio.loss_ratio=0.3.")
-    ] = None,
+    changes: Set = None,
     dashboard: Annotated[str | None, typer.Option(help="Serve this agent's view of the swarm at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics for Prometheus at [HOST:]PORT.")] = None,
     bandwidth: Annotated[
@@ -199,6 +221,13 @@ def _changes(
     return {key: value for key, value in given.items() if value is not None}
 
 
+def _parsed(sets: list[str] | None) -> dict[str, Any]:
+    """Keys and values of `--set`."""
+    from flocc_agent.config import parsed_change
+
+    return dict(parsed_change(text) for text in sets or ())
+
+
 def _launch(
     scenario: "Scenario", out: Path, secure: bool = False, dashboard: str | None = None, metrics: str | None = None
 ) -> None:
@@ -232,7 +261,7 @@ def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWat
 
 add_tools(app)
 add_data(app)
-add_measures(app)
+add_offline(app)
 add_lab(app)
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from importlib.resources import files
 from types import TracebackType
 from typing import Any, TypeVar
 
-from flocc_launch.dashboard.source import RunSource, SnapshotSource
+from flocc_launch.dashboard.page_source import RunSource, SnapshotSource
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 

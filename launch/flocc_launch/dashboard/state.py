@@ -8,25 +8,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import pose_from_tq
-from flocc_launch.dashboard.words import sentence_of
-from flocc_launch.runs.run_records import (
-    AccountKept,
-    AgentDied,
-    AgentStopped,
-    BytesCounted,
+from flocc_agent.core.reports import (
     CandidateFound,
     ClosureAccepted,
     ClosureRejected,
     CorrectionApplied,
-    Event,
-    GraphOptimised,
-    KeyframeCaptured,
+    Fact,
+    KeyframeTaken,
     LeaderFollowed,
     LeaderLost,
     NeighbourDown,
     NeighbourUp,
+    RoundSolved,
 )
+from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.event_lines import Reported, is_of
+from flocc_agent.runtime.facts import AccountKept, AgentDied, AgentStopped, BytesCounted
+from flocc_launch.dashboard.words import sentence_of
 from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
@@ -43,7 +41,7 @@ class RobotState:
     """One robot as its own events tell it."""
 
     leader: str | None = None
-    term: int | str | None = None
+    term: int | None = None
     neighbours: set[str] = field(default_factory=set)
     map_frame: str | None = None
     T_map_odom: Float = field(default_factory=lambda: np.eye(4))
@@ -53,12 +51,12 @@ class RobotState:
     candidates: int = 0
     accepted: int = 0
     rejected: int = 0
-    sent: dict[str, int] = field(default_factory=dict)
-    received: dict[str, int] = field(default_factory=dict)
+    sent: Mapping[str, int] = field(default_factory=dict)
+    received: Mapping[str, int] = field(default_factory=dict)
     sent_to: dict[str, int] = field(default_factory=dict)
     received_from: dict[str, int] = field(default_factory=dict)
-    loss: dict[str, float] = field(default_factory=dict)
-    queues: dict[str, int] = field(default_factory=dict)
+    loss: Mapping[str, float] = field(default_factory=dict)
+    queues: Mapping[str, int] = field(default_factory=dict)
     last_s: float = 0.0
     end: str | None = None
 
@@ -79,15 +77,15 @@ class RobotState:
         odom_m = self.positions_odom_m.get(index)
         return None if odom_m is None else np.asarray(self.T_map_odom[:3, :3] @ odom_m + self.T_map_odom[:3, 3])
 
-    def take(self, event: KeyframeCaptured) -> None:
+    def take(self, taken: KeyframeTaken) -> None:
         """One more keyframe; a robot that lost its disk begins anew."""
-        keyframe = KeyframeId.parse(event.keyframe)
+        keyframe = taken.keyframe
         if keyframe.log.incarnation != self.incarnation:
             self.positions_odom_m.clear()
             self.corrected_m.clear()
             self.incarnation = keyframe.log.incarnation
         if len(self.positions_odom_m) < KEYFRAMES_MAX:
-            self.positions_odom_m[keyframe.index] = pose_from_tq(np.array(event.T_odom_body))[:3, 3]
+            self.positions_odom_m[keyframe.index] = pose_from_tq(np.array(taken.T_odom_body))[:3, 3]
         self.end = None
 
 
@@ -103,19 +101,19 @@ class SwarmState:
         """
         self.robots = {robot: RobotState() for robot in sorted(robots)}
         self.servers = frozenset(servers)
-        self.closures: dict[tuple[str, str], float] = {}
+        self.closures: dict[tuple[KeyframeId, KeyframeId], float | None] = {}
         self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT_MAX)
-        self.optimised: GraphOptimised | None = None
+        self.optimised: Reported[RoundSolved] | None = None
         self.t = 0.0
 
-    def apply(self, event: Event) -> None:
+    def apply(self, event: Reported[Fact]) -> None:
         """Take one event; those of one robot come in order."""
         robot = self.robots.setdefault(event.robot, RobotState())
         self.t, robot.last_s = max(self.t, event.t), event.t
-        apply_to(robot, event)
-        if isinstance(event, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
-            self.closures[event.query, event.match] = event.probability
-        if isinstance(event, GraphOptimised):
+        apply_to(robot, event.fact)
+        if isinstance(event.fact, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
+            self.closures[event.fact.query, event.fact.match] = event.fact.probability
+        if is_of(event, RoundSolved):
             self.optimised = event
         said = sentence_of(event)
         if said is not None:
@@ -151,22 +149,22 @@ class SwarmState:
         }
 
 
-def apply_to(robot: RobotState, event: Event) -> None:
-    """What an event changes of its robot."""
-    match event:
-        case KeyframeCaptured():
-            robot.take(event)
+def apply_to(robot: RobotState, fact: Fact) -> None:
+    """What a fact changes of its robot."""
+    match fact:
+        case KeyframeTaken():
+            robot.take(fact)
         case CorrectionApplied():
-            robot.map_frame, robot.T_map_odom = event.map_frame, pose_from_tq(np.array(event.T_map_odom))
+            robot.map_frame, robot.T_map_odom = fact.map_frame, pose_from_tq(np.array(fact.T_map_odom))
             robot.corrected_m = {}
         case LeaderFollowed():
-            robot.leader, robot.term = event.leader, event.term
+            robot.leader, robot.term = fact.leader, fact.term
         case LeaderLost():
             robot.leader = None
         case NeighbourUp():
-            robot.neighbours.add(event.peer)
+            robot.neighbours.add(fact.peer)
         case NeighbourDown():
-            robot.neighbours.discard(event.peer)
+            robot.neighbours.discard(fact.peer)
         case CandidateFound():
             robot.candidates += 1
         case ClosureAccepted():
@@ -174,14 +172,14 @@ def apply_to(robot: RobotState, event: Event) -> None:
         case ClosureRejected():
             robot.rejected += 1
         case BytesCounted():
-            robot.sent, robot.received = event.sent, event.received
-            robot.loss, robot.queues = event.loss, event.queues
+            robot.sent, robot.received = fact.sent, fact.received
+            robot.loss, robot.queues = fact.loss, fact.queues
         case AccountKept():
-            robot.sent_to, robot.received_from = totals(event.sent_to), totals(event.received_from)
-        case AgentDied() | AgentStopped():
-            robot.end = "died" if isinstance(event, AgentDied) else "stopped"
-            if robot.end == "died":
-                robot.leader, robot.neighbours = None, set()
+            robot.sent_to, robot.received_from = totals(fact.sent_to), totals(fact.received_from)
+        case AgentDied():
+            robot.end, robot.leader, robot.neighbours = "died", None, set()
+        case AgentStopped():
+            robot.end = "stopped"
 
 
 def totals(links: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
@@ -210,7 +208,7 @@ def robot_json(name: str, robot: RobotState, now_s: float | None) -> dict[str, A
         "term": robot.term,
         "neighbours": sorted(robot.neighbours),
         "links": links_json(robot),
-        "queues": robot.queues,
+        "queues": dict(robot.queues),
         "map_frame": robot.map_frame,
         "keyframes": len(robot.positions_odom_m),
         "candidates": robot.candidates,
@@ -238,10 +236,11 @@ def links_json(robot: RobotState) -> dict[str, dict[str, Any]]:
     }
 
 
-def closure_json(state: SwarmState, query: str, match: str) -> dict[str, Any]:
+def closure_json(state: SwarmState, query: KeyframeId, match: KeyframeId) -> dict[str, Any]:
     """A closure with the places of its ends, null where they are not known."""
-    ends = [place_of(state, KeyframeId.parse(keyframe)) for keyframe in (query, match)]
-    return {"query": query, "match": match, "probability": state.closures[query, match], "ends_m": ends}
+    ends = [place_of(state, keyframe) for keyframe in (query, match)]
+    probability = state.closures[query, match]
+    return {"query": str(query), "match": str(match), "probability": probability, "ends_m": ends}
 
 
 def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
@@ -274,17 +273,17 @@ def ranges(robots: dict[str, RobotState]) -> list[list[str]]:
     return found
 
 
-def optimised_json(event: GraphOptimised | None) -> dict[str, Any] | None:
+def optimised_json(event: Reported[RoundSolved] | None) -> dict[str, Any] | None:
     """The last optimisation."""
     if event is None:
         return None
     return {
         "t": event.t,
         "leader": event.robot,
-        "round": event.round,
-        "cost": event.cost,
-        "solve_s": event.solve_s,
-        "closures_used": event.closures_used,
-        "closures_rejected": event.closures_rejected,
-        "warnings": event.warnings,
+        "round": event.fact.round,
+        "cost": event.fact.cost,
+        "solve_s": event.fact.solve_s,
+        "closures_used": event.fact.closures_used,
+        "closures_rejected": event.fact.closures_rejected,
+        "warnings": list(event.fact.warnings),
     }

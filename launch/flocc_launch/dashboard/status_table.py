@@ -14,7 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from flocc_agent.config import TransportConfig
-from flocc_launch.dashboard.source import RunSource
+from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 

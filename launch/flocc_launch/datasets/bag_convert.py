@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flocc_agent.runtime.pictures import PictureError
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_clock import ClockChoice, choose_clock
@@ -18,7 +19,7 @@ from flocc_launch.datasets.bag_reader import Bag, Topic
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
-from flocc_launch.datasets.pixels import decoded, undistorted, written_lens
+from flocc_launch.datasets.pixels import ImageWriter
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
@@ -211,7 +212,7 @@ class _Conversion:
     _writer: RecordingWriter = field(init=False)
     _log: PoseWriter = field(init=False)
     _done_s: float | None = field(init=False, default=None)
-    _size_is_checked: bool = False
+    _pictures: ImageWriter = field(init=False)
     _image_span_s: tuple[float, float] | None = None
     _pose_span_s: tuple[float, float] | None = None
 
@@ -245,8 +246,8 @@ class _Conversion:
         self._writer = RecordingWriter(out, f"{self.identity}{f' journey {self.journey + 1}' if self.journey else ''}")
         self._log = PoseWriter(out / "odometry.tum", self.robot.poses is not None)
         self._log.__enter__()
-        kept = written_lens(self.lens)
-        self._writer.write_camera(kept.camera, kept.T_body_camera)
+        self._pictures = ImageWriter(self.lens)
+        self._writer.write_lens(self._pictures.lens)
         self._done_s = self._writer.last_stamp_s
 
     def _leave(self) -> None:
@@ -319,22 +320,10 @@ class _Conversion:
             tally.damage(_bare(error, topic))
 
     def _encoded(self, message: Any) -> tuple[bytes, str]:
-        encoded, suffix = image_file(message, self.robot.image, self.options.jpeg)
-        if not self._size_is_checked:
-            self._check_size(encoded)
-        if self.lens.k3 != 0.0:
-            return undistorted(encoded, f"topic {self.robot.image.name}", self.lens)
-        return encoded, suffix
-
-    def _check_size(self, encoded: bytes) -> None:
-        height, width = decoded(encoded, f"{self.bag.path}: topic {self.robot.image.name}").shape[:2]
-        camera = self.lens.camera
-        if (width, height) != (camera.width, camera.height):
-            raise DatasetError(
-                f"topic {self.robot.image.name}: images are {width}x{height}, "
-                f"but the intrinsics are for {camera.width}x{camera.height}"
-            )
-        self._size_is_checked = True
+        try:
+            return self._pictures.written(*image_file(message, self.robot.image, self.options.jpeg))
+        except PictureError as error:
+            raise DatasetError(str(error)) from error
 
     def _restored(self) -> int | None:
         """Bag time to go on from, or None at the start."""

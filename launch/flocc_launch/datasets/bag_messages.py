@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.runtime.ros2.pixels import camera_of, raw_pixels
+from flocc_agent.runtime.picture_heads import SUFFIXES, PictureError, head_of
+from flocc_agent.runtime.ros2.pixels import camera_of, raw_pixels, refuse_depth
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
 from flocc_launch.datasets.bag_reader import Topic
-from flocc_launch.datasets.pixels import JPEG_QUALITY
+from flocc_launch.datasets.pixels import encoded_image
 from flocc_launch.datasets.source import DatasetError, Lens
 
 RAW_IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -25,8 +26,6 @@ TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS_TYPES = (TRANSFORMS_TYPE, "tf/msg/tfMessage")
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 
-_MAGIC = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"))
-
 
 def stamp_ns(header: Any) -> int:
     """Time of a header, nanoseconds."""
@@ -37,35 +36,30 @@ def stamp_ns(header: Any) -> int:
 def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
     """Bytes and suffix of an image message.
 
-    A compressed image is passed on as it is; a raw one becomes PNM (fast, lossless) or JPEG (small).
+    A compressed image is passed on as it is; a raw one becomes PNM (fast, lossless) or JPEG (small), of 16 bits PNG.
 
     Raises:
         DatasetError: An encoding or compression that flocc does not read.
     """
     if topic.type == COMPRESSED_IMAGE:
         encoded = message.data.tobytes()
-        for magic, suffix in _MAGIC:
-            if encoded.startswith(magic):
-                return encoded, suffix
-        raise DatasetError(f"topic {topic.name}: images are compressed as {message.format!r}; flocc reads JPEG and PNG")
-    pixels = _pixels(message, topic)
-    if not jpeg:
-        height, width = pixels.shape[:2]
-        kind = b"P6" if pixels.ndim == 3 else b"P5"
-        return b"%s\n%d %d\n255\n%s" % (kind, width, height, pixels.tobytes()), ".ppm" if pixels.ndim == 3 else ".pgm"
-    import cv2
-
-    bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-    encoded_ok = cv2.imencode(".jpg", np.ascontiguousarray(bgr), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return encoded_ok[1].tobytes(), ".jpg"
-
-
-def _pixels(message: Any, topic: Topic) -> Any:
-    """RGB (H, W, 3) or grey (H, W) uint8 pixels of a raw image."""
+        try:
+            refuse_depth(message)
+            return encoded, SUFFIXES[head_of(encoded).format]
+        except PictureError as error:
+            raise DatasetError(
+                f"topic {topic.name}: an image compressed as {message.format!r} cannot be read: {error}"
+            ) from error
     try:
-        return raw_pixels(message)
+        pixels = raw_pixels(message)
     except ValueError as error:
         raise DatasetError(f"topic {topic.name}: {error}") from error
+    if jpeg:
+        return encoded_image(pixels, lossless=pixels.dtype != np.uint8)
+    height, width = pixels.shape[:2]
+    kind, suffix = (b"P6", ".ppm") if pixels.ndim == 3 else (b"P5", ".pgm")
+    largest, values = (255, pixels) if pixels.dtype == np.uint8 else (65535, pixels.astype(">u2"))
+    return b"%s\n%d %d\n%d\n%s" % (kind, width, height, largest, values.tobytes()), suffix
 
 
 def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]:
@@ -121,10 +115,9 @@ def lens_of(message: Any, topic: Topic) -> Lens:
     """Intrinsics of a CameraInfo message; the camera is taken as the body.
 
     Raises:
-        DatasetError: The camera is not calibrated, or of another model than pinhole with radtan.
+        DatasetError: The camera is not calibrated, or of a model that flocc does not read.
     """
     try:
-        camera, k3 = camera_of(message)
+        return Lens(camera_of(message))
     except ValueError as error:
         raise DatasetError(f"topic {topic.name}: {error}") from error
-    return Lens(camera, k3=k3)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
@@ -63,7 +63,7 @@ class Info:
     posed: int | None
     from_s: float
     to_s: float
-    camera: Camera | None
+    camera: CameraModel | None
     odometry_poses: int | None
     truth_poses: int | None
     length_m: float | None
@@ -131,12 +131,16 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
         yield from (("topic", topic) for topic in found.topics)
         yield from (("robot", robot) for robot in found.robots)
     else:
-        size = None if camera is None else f"{camera.width}x{camera.height}, fx {camera.fx:g} fy {camera.fy:g}"
-        yield "camera", size or "none"
+        yield "camera", "none" if camera is None else _told(camera)
         yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
         yield "length", "not known" if found.length_m is None else f"{found.length_m:.1f} m"
     yield from (("note", note) for note in found.notes)
     yield from (("fault", fault) for fault in found.faults)
+
+
+def _told(camera: CameraModel) -> str:
+    kind = "" if camera.kind is LensKind.PINHOLE else f"{camera.kind}, "
+    return f"{kind}{camera.width}x{camera.height}, fx {camera.fx:g} fy {camera.fy:g}"
 
 
 def _bag_info(path: Path) -> Info:

@@ -19,7 +19,7 @@ from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder
-from flocc_launch.datasets.pixels import is_image
+from flocc_launch.datasets.pixels import size_of, usable_images
 from flocc_launch.datasets.plain import is_plain, read_plain
 from flocc_launch.datasets.reconstructions import (
     colmap_folder,
@@ -139,11 +139,21 @@ def read_source(
     name = format_name or detect_format(path)
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
-    source = _images_only(_read(path, name, form))
+    source = _read(path, name, form)
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None:
             check_times(source, trajectory)
-    return source if camera is None else replace(source, lens=read_lens(camera))
+    lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
+    return _usable(replace(source, lens=lens))
+
+
+def _usable(source: Source) -> Source:
+    """The source without images that cannot be used, which are counted in a note."""
+    lens = source.lens
+    size = None if lens is None else (lens.camera.width, lens.camera.height)
+    images, notes, levels = usable_images(source.images, size)
+    told = (*source.notes, *(lens.notes if lens else ()), *notes)
+    return replace(source, images=images, notes=told, levels=levels)
 
 
 def _read(path: Path, name: str, form: str | None) -> Source:
@@ -154,18 +164,6 @@ def _read(path: Path, name: str, form: str | None) -> Source:
         raise DatasetError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise DatasetError(f"{path}: cannot be read as {name}: {error}") from error
-
-
-def _images_only(source: Source) -> Source:
-    """The source without files that are no images, with a fault where there are any."""
-    good = tuple((stamp_s, file) for stamp_s, file in source.images if is_image(file))
-    broken = [file for _, file in source.images if not is_image(file)] if len(good) < len(source.images) else []
-    if not broken:
-        return source
-    fault = f"{broken[0]}: is no image" + (f" (and {len(broken) - 1} others)" if len(broken) > 1 else "")
-    if not good:
-        raise DatasetError(fault)
-    return replace(source, images=good, faults=(*source.faults, f"{fault} of a known kind, and was left out"))
 
 
 def check_times(source: Source, trajectory: Trajectory, where: Path | None = None) -> None:

@@ -1,6 +1,7 @@
 """What the readers of folders share: lists of images, the files in a folder, a camera beside them."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -8,6 +9,7 @@ from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.stamp_units import since_1970
 from flocc_agent.runtime.text_tables import number_lines, text_lines
 from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens
 
 T = TypeVar("T")
@@ -90,7 +92,9 @@ def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
     return images
 
 
-def camera_file(path: Path) -> Lens | None:
-    """The camera that a file in a folder describes, or None."""
+def camera_file(
+    path: Path, images: Sequence[tuple[float, Path]] = (), size: tuple[int, int] | None = None
+) -> Lens | None:
+    """The camera that a file in a folder describes, or None; a file without a size takes that of the images."""
     file = next((path / name for name in CAMERA_FILES if (path / name).exists()), None)
-    return read_lens(file) if file is not None else None
+    return None if file is None else read_lens(file, size_of(images) if images else size)

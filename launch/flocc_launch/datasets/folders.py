@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.text_tables import RecordingError, number_lines
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
@@ -21,7 +21,7 @@ from flocc_launch.datasets.files import (
     unequal,
 )
 from flocc_launch.datasets.intrinsics import read_lens
-from flocc_launch.datasets.kitti_raw import calibration_rows
+from flocc_launch.datasets.kitti_raw import rectified_lens
 from flocc_launch.datasets.pixels import image_size
 from flocc_launch.datasets.plain import trajectories_beside
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -44,10 +44,10 @@ TUM_CAMERAS = {
 def read_tum_rgbd(path: Path) -> Source:
     """Read a TUM RGB-D sequence: `rgb.txt`, `groundtruth.txt`; the body is the colour camera."""
     images, faults = listed_images(path / "rgb.txt")
-    lens = camera_file(path)
+    lens = camera_file(path, images)
     for name, ((fx, fy, cx, cy), distortion, k3) in TUM_CAMERAS.items():
         if lens is None and name in path.resolve().name:
-            lens = Lens(Camera(640, 480, fx, fy, cx, cy, distortion), k3=k3)
+            lens = Lens(CameraModel(640, 480, fx, fy, cx, cy, (*distortion, k3)))
     truth, notes = read_trajectory(path / "groundtruth.txt", otherwise="tum")
     return Source(path, "tum", images, lens, truth=truth, faults=faults, notes=notes)
 
@@ -57,7 +57,11 @@ def read_euroc(path: Path) -> Source:
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     folder = mav / "cam0" / "data"
     images = tuple((int(file.stem) * 1e-9, file) for file in image_files(folder) if file.stem.isdecimal())
-    lens = read_lens(mav / "cam0" / "sensor.yaml") if (mav / "cam0" / "sensor.yaml").exists() else camera_file(path)
+    lens = (
+        read_lens(mav / "cam0" / "sensor.yaml")
+        if (mav / "cam0" / "sensor.yaml").exists()
+        else camera_file(path, images)
+    )
     odometry, truth, notes = trajectories_beside(path)
     file = next((mav / name / "data.csv" for name in EUROC_TRUTHS if (mav / name / "data.csv").exists()), None)
     if file is not None:
@@ -79,7 +83,10 @@ def read_kitti(path: Path) -> Source:
     count = len(files) if truth is None else len(truth)
     faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, len(stamps_s), count))
     images = tuple(zip(stamps_s, files, strict=False))
-    lens = camera_file(path) or _kitti_lens(path / "calib.txt", "P2" if folder.name == "image_2" else "P0", files)
+    calibration, number = path / "calib.txt", "2" if folder.name == "image_2" else "0"
+    lens = camera_file(path, images)
+    if lens is None and calibration.exists() and files:
+        lens = rectified_lens(calibration, number, files[0])
     return Source(path, "kitti", some(images, folder), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
 
 
@@ -96,17 +103,6 @@ def _kitti_truth(path: Path, stamps_s: list[float]) -> tuple[Trajectory | None, 
     fault = f"{file}: has {len(poses)} poses, but the sequence has {len(stamps_s)} images or stamps"
     truth = Trajectory(np.array(stamps_s[:count]), np.array(poses[:count])) if count else None
     return truth, (fault,) if len(poses) != len(stamps_s) else ()
-
-
-def _kitti_lens(path: Path, name: str, files: list[Path]) -> Lens | None:
-    if not path.exists() or not files:
-        return None
-    rows = calibration_rows(path)
-    P = rows.get(name) or rows.get(f"P_rect_{int(name[1:]):02d}")
-    if P is None or len(P) != 12:
-        raise DatasetError(f"{path}: has no row {name} of 12 numbers")
-    width, height = image_size(files[0])
-    return Lens(Camera(width, height, P[0], P[5], P[2], P[6]))
 
 
 def read_sevenscenes(path: Path) -> Source:
@@ -128,7 +124,7 @@ def read_sevenscenes(path: Path) -> Source:
     if orphans > 0:
         faults = (*faults, f"{path}: has {orphans} poses more than images")
     truth = Trajectory(np.array([stamp_s for stamp_s, _ in images]), np.array(poses))
-    lens = camera_file(path) or _sevenscenes_lens(path, images[0][1])
+    lens = camera_file(path, images) or _sevenscenes_lens(path, images[0][1])
     return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
 
 
@@ -143,6 +139,5 @@ def _sevenscenes_lens(path: Path, image: Path) -> Lens:
     width, height = image_size(image)
     file = path / "camera-intrinsics.txt"
     if not file.exists():
-        return Lens(Camera(width, height, 585.0, 585.0, width / 2, height / 2))
-    K = [values for _, values in number_lines(file, 3)]
-    return Lens(Camera(width, height, K[0][0], K[1][1], K[0][2], K[1][2]))
+        return Lens(CameraModel(width, height, 585.0, 585.0, width / 2, height / 2))
+    return read_lens(file, (width, height))

@@ -1,135 +1,125 @@
-"""Intrinsics from the files people have: flocc's TOML, and YAML of EuRoC, Kalibr, ROS camera_info or flat keys.
+"""The one reader of calibrations: whatever tool wrote one, it becomes a lens, or is refused by the name of its form."""
 
-Of YAML, only what such files use is read: maps by indentation, scalars, and lists in brackets over several lines.
-"""
-
-import re
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from flocc_agent.core.interfaces import Camera
-from flocc_agent.geometry import inverse
+from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import read_camera
-from flocc_agent.runtime.ros2.pixels import PINHOLE_MODELS
 from flocc_agent.runtime.text_tables import RecordingError
-from flocc_agent.runtime.trajectory import checked_pose
+from flocc_launch.datasets.calibrations.document import parsed_json, parsed_xml, parsed_yaml, read_text
+from flocc_launch.datasets.calibrations.fields import lens_of_keys
+from flocc_launch.datasets.calibrations.keys import Keys, plain
+from flocc_launch.datasets.calibrations.maps import FORMS, REFUSED_MAPS, Cameras, form_of
+from flocc_launch.datasets.calibrations.texts import REFUSED_TEXTS, TEXT_FORMS, text_form
 from flocc_launch.datasets.source import DatasetError, Lens
 
-Float = NDArray[np.float64]
+Size = tuple[int, int]
+FOLLOWED = (("cam0_calib", "body_T_cam0"), ("relative_config_imucam", None))
+"""Keys of VINS-Fusion's and OpenVINS's settings that name the calibration, and where the mounting then is."""
 
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+def forms_read() -> list[str]:
+    """Names of the forms, for sentences and pages."""
+    maps, texts = [form.name for form in FORMS[:-1]], [form.name for form in TEXT_FORMS]
+    return ["flocc TOML", *maps, *texts, "EuRoC, Kimera, ROS and OpenCV YAML, flat keys"]
 
 
-def read_lens(path: Path) -> Lens:
-    """Read a camera file, TOML or YAML.
+def read_lens(path: Path, size: Size | None = None) -> Lens:
+    """Read a calibration file; `FILE#NAME` takes one camera of several.
+
+    Args:
+        path: The file.
+        size: Of the images, for forms that do not say it.
 
     Raises:
-        DatasetError: Unreadable, of no known form, or of a camera model other than pinhole with radtan distortion.
+        DatasetError: Unreadable, of no known form, of a camera model that flocc does not read, contradicting itself, or
+            with a key that may matter and is not understood.
     """
+    path, chosen = _file_and_camera(path)
     if path.suffix == ".toml":
         camera, T_body_camera = read_camera(path)
-        return Lens(camera, T_body_camera)
+        return Lens(CameraModel.of_camera(camera), T_body_camera)
+    text = read_text(path)
     try:
-        values = flat_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    try:
-        return _lens(_Leaves(values), path)
-    except RecordingError as error:
-        raise DatasetError(str(error)) from error
-    except ValueError as error:
-        raise DatasetError(f"{path}: {error}") from error
+        return _lens(path, text, chosen, size)
+    except (ValueError, RecordingError, TypeError, KeyError, IndexError) as error:
+        sentence = (
+            str(error) if isinstance(error, ValueError | RecordingError) else f"is not of the form it seems ({error!r})"
+        )
+        raise DatasetError(f"{path}: {sentence}") from error
 
 
-def flat_yaml(text: str) -> dict[str, str]:
-    """Read a YAML file's leaves: `{a: {b: 1}}` gives `a.b`; lists stay text."""
-    values: dict[str, str] = {}
-    stack: list[tuple[int, str]] = []
-    for line in _joined_lists(text):
-        found = re.match(r"^(\s*)(?:- )?([\w.]+)\s*:(?:\s+(.*))?$", line)
+def _file_and_camera(path: Path) -> tuple[Path, str | None]:
+    if path.exists() or "#" not in path.name:
+        return path, None
+    name, _, camera = path.name.rpartition("#")
+    return path.with_name(name), camera
+
+
+def _lens(path: Path, text: str, chosen: str | None, size: Size | None) -> Lens:
+    if not text.strip():
+        raise ValueError("is empty")
+    advice = next((advice for pattern, advice in REFUSED_TEXTS if pattern.search(text)), None)
+    if advice is not None:
+        raise ValueError(advice)
+    if (form := text_form(text)) is not None:
+        cameras = form.cameras(text)
+    else:
+        document = _document(text)
+        if (followed := _followed(path, document, size)) is not None:
+            return followed
+        cameras = form_of(document).cameras(document)
+    name, notes = _choice(cameras, chosen)
+    lens = lens_of_keys(Keys(cameras[name]), size)
+    return replace(lens, notes=tuple(f"{path}: {note}" for note in (*notes, *lens.notes)))
+
+
+def _document(text: str) -> dict[str, Any]:
+    start = text.lstrip("\ufeff \t\r\n")[:1]
+    value = parsed_json(text) if start == "{" else parsed_xml(text) if start == "<" else parsed_yaml(text)
+    if not isinstance(value, dict):
+        raise ValueError(f"is no calibration of a known form; flocc reads {'; '.join(forms_read())}")
+    refused = next(((name, advice) for name, fits, advice in REFUSED_MAPS if fits(value)), None)
+    if refused is not None:
+        raise ValueError(f"is {refused[0]}; {refused[1]}")
+    return value
+
+
+def _followed(path: Path, document: dict[str, Any], size: Size | None) -> Lens | None:
+    """The lens of the file that settings of VINS-Fusion or OpenVINS name."""
+    for key, mounting in FOLLOWED:
+        if isinstance(document.get(key), str) and "projection_parameters" not in document:
+            lens = read_lens(path.parent / document[key], size)
+            given = document.get(mounting) if mounting else None
+            note = f"{path}: the camera is of {document[key]}; of the rest, only {mounting or 'that name'} is used"
+            if given is None:
+                return replace(lens, notes=(*lens.notes, note))
+            of_body = lens_of_keys(
+                Keys({"T_body_camera": given, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "w": 2, "h": 2}), size
+            )
+            return replace(lens, T_body_camera=of_body.T_body_camera, notes=(*lens.notes, note))
+    return None
+
+
+def _choice(cameras: Cameras, chosen: str | None) -> tuple[str, tuple[str, ...]]:
+    """The camera to take, and a note on the others.
+
+    Raises:
+        ValueError: The wanted one is not there, or several are and none is the first one by its name.
+    """
+    names = list(cameras)
+    if chosen is not None:
+        found = next((name for name in names if plain(name) == plain(chosen)), None)
         if found is None:
-            continue
-        indent, key, value = len(found[1]), found[2], (found[3] or "").strip()
-        while stack and stack[-1][0] >= indent:
-            stack.pop()
-        if value and not value.startswith("!!"):
-            values[".".join([*(name for _, name in stack), key])] = value.strip("'\"")
-        else:
-            stack.append((indent, key))
-    return values
-
-
-def _joined_lists(text: str) -> list[str]:
-    lines: list[str] = []
-    for raw in text.splitlines():
-        line = raw.split("#", 1)[0].rstrip()
-        open_list = bool(lines) and lines[-1].count("[") > lines[-1].count("]")
-        if lines and (open_list or line.lstrip().startswith("- [")):
-            lines[-1] += " " + line.strip()
-        elif line and not line.startswith(("%", "---")):
-            lines.append(line)
-    return lines
-
-
-class _Leaves:
-    """A YAML file's leaves, found by the end of their names."""
-
-    def __init__(self, values: Mapping[str, str]) -> None:
-        self._values = values
-
-    def text(self, key: str) -> str | None:
-        return next((v for name, v in self._values.items() if name == key or name.endswith("." + key)), None)
-
-    def numbers(self, *keys: str) -> list[float] | None:
-        texts = [text for text in map(self.text, keys) if text is not None]
-        return [float(number) for number in _NUMBER.findall(texts[0])] if texts else None
-
-
-def _lens(leaves: _Leaves, path: Path) -> Lens:
-    model = leaves.text("distortion_model") or leaves.text("camera_model") or ""
-    if model not in PINHOLE_MODELS:
-        raise DatasetError(f"{path}: the distortion model is {model!r}; flocc takes pinhole with radtan")
-    width, height = _size(leaves)
-    fx, fy, cx, cy = _focal(leaves)
-    coefficients = leaves.numbers(
-        "distortion_coefficients.data", "distortion_coefficients", "distortion_coeffs", "distortion"
-    )
-    k1, k2, p1, p2, k3 = ([*(coefficients or []), 0.0, 0.0, 0.0, 0.0, 0.0])[:5]
-    return Lens(Camera(width, height, fx, fy, cx, cy, (k1, k2, p1, p2)), _mounting(leaves, path), k3)
-
-
-def _size(leaves: _Leaves) -> tuple[int, int]:
-    size = leaves.numbers("resolution")
-    width, height = leaves.numbers("image_width", "width"), leaves.numbers("image_height", "height")
-    if size is None and width and height:
-        size = [*width, *height]
-    if size is None or len(size) != 2:
-        raise ValueError("the image size is missing (width and height, or resolution)")
-    return int(size[0]), int(size[1])
-
-
-def _focal(leaves: _Leaves) -> tuple[float, float, float, float]:
-    listed = leaves.numbers("intrinsics")
-    matrix = leaves.numbers("camera_matrix.data")
-    single = [leaves.numbers(key) for key in ("fx", "fy", "cx", "cy")]
-    if listed is None and matrix is not None and len(matrix) == 9:
-        listed = [matrix[0], matrix[4], matrix[2], matrix[5]]
-    if listed is None and all(single):
-        listed = [value[0] for value in single if value]
-    if listed is None or len(listed) != 4:
-        raise ValueError("the intrinsics are missing (fx fy cx cy, intrinsics, or camera_matrix)")
-    fx, fy, cx, cy = listed
-    return fx, fy, cx, cy
-
-
-def _mounting(leaves: _Leaves, path: Path) -> Float:
-    T_body_camera = leaves.numbers("T_BS.data", "T_body_camera", "T_BS")
-    T_camera_body = leaves.numbers("T_cam_imu")
-    if T_body_camera is not None and len(T_body_camera) == 16:
-        return checked_pose(np.array(T_body_camera).reshape(4, 4), f"{path}: T_body_camera")
-    if T_camera_body is not None and len(T_camera_body) == 16:
-        return inverse(checked_pose(np.array(T_camera_body).reshape(4, 4), f"{path}: T_cam_imu"))
-    return np.eye(4)
+            raise ValueError(f"has no camera {chosen!r}; it has {', '.join(names)}")
+        return found, ()
+    if not names:
+        raise ValueError("holds no camera")
+    if len(names) == 1:
+        return names[0], ()
+    numbered = sorted(name for name in names if plain(name) in ("cam0", "camera0", "camera1", "left"))
+    if not numbered or "LEFT" in names:
+        raise ValueError(f"holds {len(names)} cameras, name one as FILE#NAME: {', '.join(names[:16])}")
+    others = ", ".join(name for name in names if name != numbered[0])
+    return numbered[0], (f"{numbered[0]} was taken; FILE#NAME takes another camera ({others})",)

@@ -5,9 +5,9 @@ The calibration stands in the drive's folder or in the one above.
 
 from pathlib import Path
 
-from flocc_agent.core.interfaces import Camera
-from flocc_agent.runtime.text_tables import is_number, numbered_lines
+from flocc_agent.runtime.text_tables import numbered_lines
 from flocc_launch.datasets.files import camera_file, image_files, some, unequal
+from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import image_size
 from flocc_launch.datasets.plain import trajectories_beside
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -64,25 +64,9 @@ def _lens(path: Path, camera: str, files: list[Path]) -> Lens | None:
 
 
 def rectified_lens(file: Path, number: str, image: Path) -> Lens:
-    """Intrinsics of row `P_rect_NN`.
+    """Intrinsics of row `P_rect_NN`, or `PN`, and where that camera is in camera 0.
 
     Raises:
         DatasetError: There is no such row of 12 numbers.
     """
-    rows = calibration_rows(file)
-    P = rows.get(f"P_rect_{number}")
-    if P is None or len(P) != 12:
-        raise DatasetError(f"{file}: has no row P_rect_{number} of 12 numbers")
-    width, height = image_size(image)
-    return Lens(Camera(width, height, P[0], P[5], P[2], P[6]))
-
-
-def calibration_rows(file: Path) -> dict[str, list[float]]:
-    """Rows `NAME: numbers` of a KITTI calibration, without dates; rows without a name are P0, P1 ..."""
-    rows: dict[str, list[float]] = {}
-    for _, text in numbered_lines(file):
-        key, _, rest = text.partition(":") if ":" in text else ("", "", text)
-        words = rest.split()
-        if words and all(is_number(word) for word in words):
-            rows[key or f"P{len(rows)}"] = [float(word) for word in words]
-    return rows
+    return read_lens(file.with_name(f"{file.name}#P{int(number)}"), image_size(image))

@@ -1,15 +1,22 @@
-"""Image files on their way into a recording: their size, and undistortion of what an agent's camera cannot say."""
+"""Image files on their way into a recording: which can be used, and remapping of what an agent's camera cannot say."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel
+from flocc_agent.runtime import pictures
+from flocc_agent.runtime.picture_heads import SUFFIXES, head_of
+from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, picture_head
+from flocc_agent.runtime.straightening import Straightener
 from flocc_launch.datasets.source import DatasetError, Lens
 
 JPEG_QUALITY = 95
-MAGIC = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"P5", b"P6", b"BM", b"II*\0", b"MM\0*")
+Stamped = tuple[tuple[float, Path], ...]
 
 
 def read_bytes(file: Path) -> bytes:
@@ -25,65 +32,119 @@ def read_bytes(file: Path) -> bytes:
 
 
 def decoded(encoded: bytes, where: str) -> NDArray[np.uint8]:
-    """Pixels of an encoded image, as they are in it.
+    """Pixels of an encoded image, (H, W, 3) RGB.
 
     Raises:
         DatasetError: The image is damaged.
     """
-    import cv2
-
-    pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if encoded else None
-    if pixels is None:
-        raise DatasetError(f"{where}: the image cannot be read: it is damaged or of an unknown format")
-    return np.asarray(pixels, dtype=np.uint8)
-
-
-def is_image(file: Path) -> bool:
-    """Whether a file begins as an image does; one that is cut off further on is not noticed."""
     try:
-        with file.open("rb") as opened:
-            return opened.read(8).startswith(MAGIC)
-    except OSError:
-        return False
+        return pictures.read_picture(encoded)
+    except PictureError as error:
+        raise DatasetError(f"{where}: {error}") from error
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """Width and height of an image file.
+    """Width and height of an image file, as it is stored.
 
     Raises:
         DatasetError: It cannot be read.
     """
-    pixels = decoded(read_bytes(file), str(file))
-    return int(pixels.shape[1]), int(pixels.shape[0])
+    try:
+        head = picture_head(file)
+    except PictureError as error:
+        raise DatasetError(f"{file}: {error}") from error
+    return head.width, head.height
 
 
-def written_lens(lens: Lens) -> Lens:
-    """The lens of the images in a recording: without distortion where theirs has a third radial coefficient."""
-    if lens.k3 == 0.0:
-        return lens
-    c = lens.camera
-    return Lens(Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy), lens.T_body_camera)
-
-
-def written_image(file: Path, lens: Lens) -> tuple[bytes, str]:
-    """Bytes and suffix of an image in a recording; the file's own, unless it has to be undistorted.
+def usable_images(images: Stamped, size: tuple[int, int] | None) -> tuple[Stamped, tuple[str, ...], Levels]:
+    """The images that can be used, a note that counts the others, and levels of those of 16 bits.
 
     Raises:
-        DatasetError: It cannot be read.
+        DatasetError: Too many cannot be used.
     """
-    encoded = read_bytes(file)
-    if lens.k3 == 0.0:
-        return encoded, file.suffix.lower()
-    return undistorted(encoded, str(file), lens)
+    try:
+        looked = good_pictures([file for _, file in images], size)
+    except PictureError as error:
+        raise DatasetError(str(error)) from error
+    notes = [] if looked.fault is None else [looked.fault]
+    if looked.levels != FULL:
+        notes.append(f"images of 16 bits use {looked.levels.black} to {looked.levels.white}, which become 0 to 255")
+    return tuple(images[k] for k in looked.good), tuple(notes), looked.levels
 
 
-def undistorted(encoded: bytes, where: str, lens: Lens) -> tuple[bytes, str]:
-    """Bytes and suffix of an image without its distortion, as JPEG.
+def agents_camera(lens: Lens) -> Camera:
+    """The camera of images that are read as they are.
 
     Raises:
-        DatasetError: The image is damaged.
+        DatasetError: They would have to be remapped.
     """
+    camera = lens.camera.agent_camera()
+    if camera is None:
+        raise DatasetError(f"a camera of the {lens.camera.kind} model is read by flocc dataset convert only")
+    return camera
+
+
+class ImageWriter:
+    """Brings images to what a recording holds: their own bytes, unless they are remapped or brought to 8 bits.
+
+    Attributes:
+        lens: Of the images in the recording.
+    """
+
+    def __init__(self, lens: Lens, levels: Levels = FULL) -> None:
+        """Prepare.
+
+        Raises:
+            DatasetError: The lens does not see as much as is wanted of it.
+        """
+        self._size = (lens.camera.width, lens.camera.height)
+        self._levels = levels
+        try:
+            self._straightener = Straightener(lens.camera, lens.view_rad)
+        except ValueError as error:
+            raise DatasetError(str(error)) from error
+        self.lens = Lens(CameraModel.of_camera(self._straightener.camera), lens.T_body_camera)
+
+    def written(self, encoded: bytes, suffix: str | None = None) -> tuple[bytes, str]:
+        """Bytes and suffix of an image in the recording.
+
+        Args:
+            encoded: As it was found.
+            suffix: Of its name; None takes that of its format.
+
+        Raises:
+            PictureError: It is damaged, or of another size than the intrinsics.
+        """
+        head = head_of(encoded)
+        if (fault := pictures.size_fault(head, self._size)) is not None:
+            raise PictureError(fault)
+        if not self._straightener.is_needed and (head.bits == 8 or self._levels == FULL):
+            return encoded, suffix or SUFFIXES[head.format]
+        pixels = pictures.decoded(encoded, self._size)
+        if pixels.dtype == np.uint16 and self._levels != FULL:
+            pixels = self._levels.eight_bits(pixels)
+        return encoded_image(self._straightener.apply(pixels), lossless=head.bits > 8)
+
+
+def encoded_image(pixels: NDArray[Any], lossless: bool) -> tuple[bytes, str]:
+    """Bytes and suffix of RGB or grey pixels: PNG, or JPEG of quality 95."""
     import cv2
 
-    straight = cv2.undistort(decoded(encoded, where), lens.camera.K(), np.array([*lens.camera.distortion, lens.k3]))
-    return cv2.imencode(".jpg", straight, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes(), ".jpg"
+    bgr: NDArray[Any] = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    if lossless:
+        return cv2.imencode(".png", bgr)[1].tobytes(), ".png"
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes(), ".jpg"
+
+
+def size_of(images: Sequence[tuple[float, Path]]) -> tuple[int, int]:
+    """Size of the first image that can be read.
+
+    Raises:
+        DatasetError: None can.
+    """
+    for _, file in images:
+        try:
+            return image_size(file)
+        except DatasetError:
+            continue
+    raise DatasetError(f"{images[0][1].parent}: no image in it can be read")

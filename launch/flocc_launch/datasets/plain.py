@@ -48,7 +48,7 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     if images is None:
         images, faults = _stamped_by_order(path, odometry or truth)
     read_how = (f"{path}: the names of the images say their stamps as {how}",) if how in UNUSUAL else ()
-    lens = camera_file(path)
+    lens = camera_file(path, images)
     notes = (*read_how, *notes)
     return Source(path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
 

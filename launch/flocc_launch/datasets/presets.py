@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import Progress
 
 S3E_ALPHA = Lens(
-    Camera(
+    CameraModel(
         1224, 1024, 1172.771733, 1172.364006, 617.941546, 507.672727,
         (-0.0526283898, 0.1008326896, 0.0003951125, 0.0003620605),
     ),
@@ -31,7 +31,7 @@ S3E_ALPHA = Lens(
     ),
 )  # fmt: skip
 GRACO_GROUND = Lens(
-    Camera(
+    CameraModel(
         1600, 1100, 940.862826, 938.554924, 799.162698, 559.295407,
         (-0.10085041, 0.08905707, 0.00075170, -0.00119584),
     )

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import R_from_q_wxyz, inverse, pose
 from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.files import image_files
+from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 from flocc_launch.datasets.stamped_names import stamps_of_names
 
@@ -28,13 +29,6 @@ CAMERA_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera looks along -z with y up; ours along z with y down."""
 
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap_text")
-_COLMAP_MODELS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-}
 
 
 def colmap_folder(path: Path) -> Path | None:
@@ -62,7 +56,6 @@ def read_colmap(path: Path) -> Source:
             f"{path}: is a model of COLMAP in its binary form; write it as text: colmap model_converter --input_path "
             "FOLDER --output_path FOLDER --output_type TXT"
         )
-    cameras = _colmap_cameras(place / "cameras.txt")
     poses: dict[str, Float] = {}
     used: dict[str, int] = {}
     lines = [(line, text.split()) for line, text in numbered_lines(place / "images.txt") if not text.startswith("#")]
@@ -83,38 +76,8 @@ def read_colmap(path: Path) -> Source:
         )
     if len(set(used.values())) > 1:
         raise DatasetError(f"{place / 'images.txt'}: images are of {len(set(used.values()))} cameras; flocc takes one")
-    number = next(iter(used.values()))
-    if number not in cameras:
-        raise DatasetError(f"{place / 'cameras.txt'}: has no camera {number}, which images.txt names")
-    return _source(path, "colmap", _image_folder(path), poses, cameras[number])
-
-
-def _colmap_cameras(path: Path) -> dict[int, Lens]:
-    found = {}
-    for line, text in numbered_lines(path):
-        if text.startswith("#"):
-            continue
-        words = text.split()
-        where = f"{path}:{line}"
-        if len(words) < 5 or not all(is_number(word) for word in (words[0], *words[2:])):
-            raise DatasetError(f"{where}: must be 'CAMERA_ID MODEL WIDTH HEIGHT PARAMS', not {text[:80]!r}")
-        names = _COLMAP_MODELS.get(words[1])
-        if names is None:
-            raise DatasetError(
-                f"{where}: the camera model is {words[1]}; flocc reads {', '.join(_COLMAP_MODELS)}: "
-                "undistort the images with colmap image_undistorter"
-            )
-        if len(words) != 4 + len(names):
-            raise DatasetError(f"{where}: {words[1]} has {len(names)} parameters, not {len(words) - 4}")
-        values = dict(zip(names, map(float, words[4:]), strict=True))
-        found[int(words[0])] = _lens(int(words[2]), int(words[3]), values)
-    return found
-
-
-def _lens(width: int, height: int, values: dict[str, float]) -> Lens:
-    fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
-    k1, k2, p1, p2 = (values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2"))
-    return Lens(Camera(width, height, fx, fy, values["cx"], values["cy"], (k1, k2, p1, p2)))
+    lens = read_lens(place / f"cameras.txt#{next(iter(used.values()))}")
+    return _source(path, "colmap", _image_folder(path), poses, lens)
 
 
 def read_transforms(path: Path) -> Source:
@@ -136,34 +99,17 @@ def read_transforms(path: Path) -> Source:
     if wrong is not None:
         raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
     world = {name: checked_pose(T @ CAMERA_OF_OPENGL, f"{file}: {name}") for name, T in poses.items()}
-    return _source(path, "transforms", path, world, _transforms_lens(table, file))
-
-
-def _transforms_lens(table: dict[str, Any], file: Path) -> Lens:
-    model = table.get("camera_model", "OPENCV")
-    others = [key for key in ("k3", "k4", "k5", "k6") if table.get(key)]
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or others or table.get("is_fisheye"):
-        more = f" with {', '.join(others)}" if others else ""
-        raise DatasetError(f"{file}: the lens is {model}{more}; flocc reads OPENCV's k1 k2 p1 p2")
-    try:
-        width, height = int(table["w"]), int(table["h"])
-        fx = float(table["fl_x"]) if "fl_x" in table else width / 2 / np.tan(float(table["camera_angle_x"]) / 2)
-        fy = float(table.get("fl_y", fx))
-        cx, cy = float(table.get("cx", width / 2)), float(table.get("cy", height / 2))
-        values = {key: float(table.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2")}
-    except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"{file}: the intrinsics are missing ({error}): w, h, fl_x, fl_y, cx, cy for all frames"
-        ) from error
-    return _lens(width, height, {"fx": fx, "fy": fy, "cx": cx, "cy": cy, **values})
+    return _source(path, "transforms", path, world, None, file)
 
 
 def _image_folder(path: Path) -> Path:
     return next((path / name for name in ("images", "rgb", "input") if (path / name).is_dir()), path)
 
 
-def _source(path: Path, name: str, folder: Path, poses: dict[str, Float], lens: Lens) -> Source:
-    """Images with their poses in the order of their names."""
+def _source(
+    path: Path, name: str, folder: Path, poses: dict[str, Float], lens: Lens | None, calibration: Path | None = None
+) -> Source:
+    """Images with their poses in the order of their names, and a lens, or one of a file that may not say their size."""
     found = {key: file for key in sorted(poses) if (file := _file(folder, key)) is not None}
     if not found:
         raise DatasetError(f"{folder}: has none of the {len(poses)} images, of which the first is {next(iter(poses))}")
@@ -182,6 +128,8 @@ def _source(path: Path, name: str, folder: Path, poses: dict[str, Float], lens: 
     if missing:
         notes.append(f"{folder}: {missing} of {len(poses)} images do not exist and were left out")
     images = tuple(zip(stamps.tolist(), (found[key] for key in keys), strict=True))
+    if calibration is not None:
+        lens = read_lens(calibration, size_of(images))
     return Source(path, name, images, lens, truth=truth, notes=tuple(notes))
 
 
@@ -203,16 +151,7 @@ def read_replica(path: Path) -> Source:
     stamps_s = [k / REPLICA_RATE_HZ for k in range(len(files))]
     truth, notes = read_trajectory(path / "traj.txt", "kitti", stamps_s)
     place = next((p for p in (path / "cam_params.json", path.parent / "cam_params.json") if p.exists()), None)
-    lens = None if place is None else _replica_lens(place)
+    lens = None if place is None else read_lens(place)
     told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
     images = tuple(zip(stamps_s, files, strict=True))
     return Source(path, "replica", images, lens, truth=truth, notes=(told, *notes))
-
-
-def _replica_lens(path: Path) -> Lens:
-    try:
-        camera = json.loads(read_text(path))["camera"]
-        values = {key: float(camera[key]) for key in ("fx", "fy", "cx", "cy")}
-        return _lens(int(camera["w"]), int(camera["h"]), values)
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: has no camera with w, h, fx, fy, cx, cy ({error})") from error

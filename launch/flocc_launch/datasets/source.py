@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel
+from flocc_agent.runtime.pictures import FULL, Levels
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_protocol.errors import FloccError
 
@@ -19,17 +20,19 @@ class DatasetError(FloccError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
-    """A camera with its mounting; distortion may have more coefficients than an agent's camera takes.
+    """A camera with its mounting; images are remapped when they are written where an agent's camera cannot say it.
 
     Attributes:
         camera: Intrinsics.
         T_body_camera: (4, 4) pose of the camera in the body, metres.
-        k3: OpenCV's third radial coefficient; where it is not zero, images are undistorted when they are written.
+        view_rad: Horizontal field of view of a wide lens's remapped images; None takes as much as there is.
+        notes: What its file says that is not used, one sentence each.
     """
 
-    camera: Camera
+    camera: CameraModel
     T_body_camera: Float = field(default_factory=lambda: np.eye(4))
-    k3: float = 0.0
+    view_rad: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +49,7 @@ class Source:
         up_world: (3,) direction against gravity in the truth's world.
         faults: What is wrong with the rest, one sentence each; what is above is good.
         notes: What was left out, or concluded where nothing said it; one sentence each.
+        levels: How images of 16 bits are brought to 8.
     """
 
     path: Path
@@ -57,3 +61,4 @@ class Source:
     up_world: Float = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     faults: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    levels: Levels = FULL

@@ -14,7 +14,7 @@ from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.files import camera_file
 from flocc_launch.datasets.intrinsics import read_lens
-from flocc_launch.datasets.pixels import JPEG_QUALITY, undistorted, written_lens
+from flocc_launch.datasets.pixels import JPEG_QUALITY, ImageWriter
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRAJECTORY_SUFFIXES
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import Progress, RecordingWriter
@@ -86,10 +86,10 @@ def odometry_beside(path: Path) -> Path | None:
     return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
 
 
-def lens_beside(path: Path) -> Lens | None:
-    """The camera of a video: of its own name, or the folder's."""
+def lens_beside(path: Path, size: tuple[int, int] | None = None) -> Lens | None:
+    """The camera of a video: of its own name, or the folder's; `size` is that of the video."""
     own = next((path.with_suffix(s) for s in (".toml", ".yaml", ".yml") if path.with_suffix(s).is_file()), None)
-    return camera_file(path.parent) if own is None else read_lens(own)
+    return camera_file(path.parent, size=size) if own is None else read_lens(own, size)
 
 
 def convert_video(
@@ -121,11 +121,12 @@ def convert_video(
     file = odometry or odometry_beside(path)
     if file is None:
         raise DatasetError(f"{path}: {WHAT_ODOMETRY}")
-    lens = lens_beside(path) if camera is None else read_lens(camera)
+    head = read_head(path)
+    size = (head.width, head.height)
+    lens = lens_beside(path, size) if camera is None else read_lens(camera, size)
     if lens is None:
         raise DatasetError(f"{path}: intrinsics are missing; name a camera file with --camera")
     trajectory, notes = read_trajectory(file, form)
-    head = read_head(path)
     if (head.width, head.height) != (lens.camera.width, lens.camera.height):
         raise DatasetError(
             f"{path}: frames are {head.width}x{head.height}, but the intrinsics are for "
@@ -133,18 +134,18 @@ def convert_video(
         )
     _check_clock(path, file, trajectory, head)
     with RecordingWriter(out, f"video {path.resolve()} every={every} odometry={file}") as writer:
-        kept = written_lens(lens)
-        writer.write_camera(kept.camera, kept.T_body_camera)
+        images = ImageWriter(lens)
+        writer.write_lens(images.lens)
         writer.write_trajectories(trajectory.relative_to_first(), None)
         for number, (stamp_s, encoded) in enumerate(_frames(path, every), start=1):
             if writer.last_stamp_s is None or stamp_s > writer.last_stamp_s:
-                straight = (encoded, ".jpg") if lens.k3 == 0.0 else undistorted(encoded, str(path), lens)
-                writer.add(stamp_s, *straight)
+                writer.add(stamp_s, *images.written(encoded, ".jpg"))
             if progress is not None:
                 progress(number * every, max(head.frames, number * every))
         if writer.count == 0:
             raise DatasetError(f"{path}: no frame of it can be read")
         lost = head.frames // every - writer.count
+    notes = (*notes, *lens.notes)
     return (*notes, *([f"{path}: {lost} of {head.frames // every} frames could not be read"] if lost > 1 else []))
 
 

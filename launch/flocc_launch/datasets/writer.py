@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
+from flocc_agent.runtime.pictures import PictureError
 from flocc_agent.runtime.recording import write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
-from flocc_launch.datasets.pixels import image_size, written_image, written_lens
+from flocc_launch.datasets.pixels import ImageWriter, read_bytes
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
 Float = NDArray[np.float64]
@@ -98,6 +99,12 @@ class RecordingWriter:
         name = f"images/{self.count:06d}{suffix}"
         self._pending.append(self._thread.submit(self._write, name, encoded, f"{stamp_s:.9f} {name}\n"))
         self.count, self.last_stamp_s = self.count + 1, stamp_s
+
+    def write_lens(self, lens: Lens) -> None:
+        """Write `camera.toml` of a lens that an agent's camera can say."""
+        camera = lens.camera.agent_camera()
+        assert camera is not None
+        self.write_camera(camera, lens.T_body_camera)
 
     def write_camera(self, camera: Camera, T_body_camera: Float) -> None:
         """Write `camera.toml`."""
@@ -230,30 +237,29 @@ def write_source(
     Raises:
         DatasetError: Intrinsics are missing or of another size, or an image cannot be read.
     """
-    lens = _checked_lens(source)
-    kept = written_lens(lens)
+    images = ImageWriter(_lens(source), source.levels)
     with RecordingWriter(out, identity) as writer:
-        writer.write_camera(kept.camera, kept.T_body_camera)
+        writer.write_lens(images.lens)
         writer.write_trajectories(odometry, source.truth)
         done_s = writer.last_stamp_s
         for number, (stamp_s, file) in enumerate(source.images, start=1):
             if done_s is None or stamp_s > done_s + 1e-9:
-                writer.add(stamp_s, *written_image(file, lens))
+                writer.add(stamp_s, *_written(images, file))
             if progress is not None:
                 progress(number, len(source.images))
 
 
-def _checked_lens(source: Source) -> Lens:
+def _written(images: ImageWriter, file: Path) -> tuple[bytes, str]:
+    try:
+        return images.written(read_bytes(file), file.suffix.lower())
+    except PictureError as error:
+        raise DatasetError(f"{file}: {error}") from error
+
+
+def _lens(source: Source) -> Lens:
     if source.lens is None:
         raise DatasetError(
             f"{source.path}: intrinsics are missing; put a camera.toml or camera.yaml with width, height, fx, fy, cx, "
             "cy and distortion there, or name such a file with flocc dataset ... --camera"
-        )
-    camera = source.lens.camera
-    width, height = image_size(source.images[0][1])
-    if (width, height) != (camera.width, camera.height):
-        raise DatasetError(
-            f"{source.images[0][1]}: the image is {width}x{height}, "
-            f"but the intrinsics are for {camera.width}x{camera.height}"
         )
     return source.lens

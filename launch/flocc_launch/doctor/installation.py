@@ -10,7 +10,7 @@ from pathlib import Path
 
 from flocc_agent.config import Mast3rConfig, PerceptionConfig, TransportConfig
 from flocc_launch.doctor.finding import Finding, Severity, good
-from flocc_launch.doctor.network import discovery, ports
+from flocc_launch.doctor.network_check import discovery, ports
 from flocc_protocol.errors import FloccError
 
 DISK_FREE_BYTES_MIN = 2_000_000_000

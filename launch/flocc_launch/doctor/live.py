@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from flocc_launch.dashboard.status_table import RobotStatus
-from flocc_launch.doctor.evidence import named
 from flocc_launch.doctor.finding import Finding, Severity, blocked
 from flocc_launch.doctor.live_steps import apart, is_server
+from flocc_launch.doctor.merge_evidence import named
 
 
 def diagnose_live(rows: Sequence[RobotStatus]) -> list[Finding]:
@@ -85,7 +85,7 @@ def leaderless(rows: Sequence[RobotStatus]) -> list[Finding]:
     nobody = [row.robot for row in rows if row.leader is None]
     found = []
     if nobody:
-        advice = "An election takes a few seconds; if it does not end, heartbeats get lost: see core.election."
+        advice = "An election takes a few seconds; if it does not end, heartbeats get lost: see the loss of links."
         found.append(
             blocked("no-leader", f"{named(nobody)} follow{'s' * (len(nobody) == 1)} no leader.", advice, *nobody)
         )

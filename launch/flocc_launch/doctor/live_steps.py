@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 
 from flocc_launch.dashboard.status_table import PairStatus, RobotStatus
-from flocc_launch.doctor.evidence import held_records
 from flocc_launch.doctor.finding import Finding, Severity, blocked
+from flocc_launch.doctor.merge_evidence import held_records
 from flocc_launch.runs.plain_numbers import number
 
 Rows = Sequence[RobotStatus]

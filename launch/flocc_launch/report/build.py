@@ -2,12 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.reports import ClosureAccepted, PeerRefused, RoundSolved
+from flocc_agent.runtime.event_lines import UnknownFact, of_kind
+from flocc_agent.runtime.facts import AgentDied, BytesCounted
 from flocc_agent.stages import BOUNDS_S
 from flocc_launch.datasets.commands import ODOMETRY_MADE
 from flocc_launch.report.accounts import links_of, stages_by_robot, stages_of
@@ -22,10 +24,10 @@ from flocc_launch.report.model import (
     TrackError,
 )
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.run_records import AgentDied, BytesCounted, ClosureAccepted, GraphOptimised, PeerRefused, of_kind
 from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
 from flocc_launch.runs.tracks import Track
 from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
+from flocc_launch.runs.version import flocc_version
 
 Float = NDArray[np.float64]
 
@@ -80,14 +82,6 @@ def build(loaded: LoadedRun) -> Report:
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
 
 
-def flocc_version() -> str:
-    """Version of the installed distribution, or 'unknown' when run from a source tree alone."""
-    try:
-        return version("flocc")
-    except PackageNotFoundError:
-        return "unknown"
-
-
 def with_keyframes(tracks: Iterable[Track]) -> list[Track]:
     """The tracks that have keyframes at all."""
     return [track for track in tracks if len(track)]
@@ -136,7 +130,7 @@ def robot_part(loaded: LoadedRun, robot: str) -> Robot:
     return Robot(
         robot=robot,
         incarnation=None if result is None else result.incarnation,
-        end=None if end is None else "died" if isinstance(end, AgentDied) else "stopped",
+        end=None if end is None else "died" if isinstance(end.fact, AgentDied) else "stopped",
         ended_s=None if end is None else end.t,
         keyframes=len(track),
         keyframes_with_ground_truth=int(track.true.sum()),
@@ -144,7 +138,7 @@ def robot_part(loaded: LoadedRun, robot: str) -> Robot:
         map_frame=track.map_frame,
         server=robot in loaded.run.servers,
         corrections=len(corrections),
-        frame_changes=sum(correction.frame_changed for correction in corrections),
+        frame_changes=sum(correction.fact.frame_changed for correction in corrections),
         logs={} if result is None else dict(sorted(result.logs.items())),
         corrected=track_error(*track.corrected_and_true()),
         odometry=track_error(*track.odometry_and_true()),
@@ -155,7 +149,7 @@ def closures_part(loaded: LoadedRun) -> Closures:
     """Count pairs by what became of them."""
     pairs = loaded.pairs
     rejected = Counter(pair.reason for pair in pairs if pair.rejected and pair.reason is not None)
-    rounds = of_kind(loaded.events, GraphOptimised)
+    rounds = [event.fact for event in of_kind(loaded.events, RoundSolved)]
     return Closures(
         accepted=sum(pair.accepted for pair in pairs),
         rejected=sum(pair.rejected for pair in pairs),
@@ -169,8 +163,8 @@ def closures_part(loaded: LoadedRun) -> Closures:
 
 def optimisations_part(loaded: LoadedRun) -> Optimisations:
     """What the leaders' solvers did."""
-    rounds = of_kind(loaded.events, GraphOptimised)
-    times_s = [event.solve_s for event in rounds if event.solve_s is not None]
+    rounds = [event.fact for event in of_kind(loaded.events, RoundSolved)]
+    times_s = [solved.solve_s for solved in rounds if solved.solve_s is not None]
     return Optimisations(
         rounds=len(rounds), cost=rounds[-1].cost if rounds else None, solve_s_max=max(times_s, default=None)
     )
@@ -183,13 +177,13 @@ def bytes_by_robot(loaded: LoadedRun) -> dict[str, RobotBytes]:
     last: dict[str, BytesCounted] = {}
     for event in of_kind(loaded.events, BytesCounted):
         before = last.get(event.robot)
-        if before is not None and sum(event.sent.values()) < sum(before.sent.values()):
+        if before is not None and sum(event.fact.sent.values()) < sum(before.sent.values()):
             sent.setdefault(event.robot, Counter()).update(before.sent)
             received.setdefault(event.robot, Counter()).update(before.received)
-        last[event.robot] = event
-    for robot, event in last.items():
-        sent.setdefault(robot, Counter()).update(event.sent)
-        received.setdefault(robot, Counter()).update(event.received)
+        last[event.robot] = event.fact
+    for robot, counted in last.items():
+        sent.setdefault(robot, Counter()).update(counted.sent)
+        received.setdefault(robot, Counter()).update(counted.received)
     return {
         robot: RobotBytes(sent=dict(sorted(sent[robot].items())), received=dict(sorted(received[robot].items())))
         for robot in sorted(sent)
@@ -205,20 +199,23 @@ def total_bytes(by_robot: Mapping[str, RobotBytes]) -> dict[str, int]:
 
 
 def warnings_of(loaded: LoadedRun) -> list[str]:
-    """Sentences that a reader should see: deaths, refusals, missing results, what the solver said last."""
+    """Sentences that a reader should see: deaths, refusals, missing results, unknown events, the solver's last."""
     events = loaded.events
     found = [f"{e.robot} died after {e.t:.1f} s ({how_it_died(e)})." for e in of_kind(events, AgentDied)]
-    found += sorted({f"{e.robot} refused {e.peer}: {e.reason}." for e in of_kind(events, PeerRefused)})
+    found += sorted({f"{e.robot} refused {e.fact.peer}: {e.fact.reason}." for e in of_kind(events, PeerRefused)})
     for robot in loaded.robots:
         if robot not in loaded.results:
             found.append(f"{robot} left no result; its trajectory is odometry only.")
-    rounds = of_kind(events, GraphOptimised)
-    return found + ([f"Last optimisation: {text}" for text in rounds[-1].warnings] if rounds else [])
+    unknown = Counter(event.fact.name for event in of_kind(events, UnknownFact))
+    for name, count in sorted(unknown.items()):
+        found.append(f"This version does not know events of the kind {name} ({count} in this run).")
+    rounds = of_kind(events, RoundSolved)
+    return found + ([f"Last optimisation: {text}" for text in rounds[-1].fact.warnings] if rounds else [])
 
 
 def registered_by(loaded: LoadedRun) -> Counter[str]:
     """Accepted closures by the robot that registered them."""
-    return Counter(event.by or event.robot for event in of_kind(loaded.events, ClosureAccepted))
+    return Counter(event.fact.by or event.robot for event in of_kind(loaded.events, ClosureAccepted))
 
 
 def judged(

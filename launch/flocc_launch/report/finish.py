@@ -4,9 +4,9 @@ from pathlib import Path
 
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.report.build import build
-from flocc_launch.report.g2o import write_pose_graph
 from flocc_launch.report.html import write_html
 from flocc_launch.report.model import SCHEMA_VERSION, Report
+from flocc_launch.report.run_graph import write_pose_graph
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, read_record, write_json
 from flocc_launch.runs.tracks import Float, Mask

@@ -1,11 +1,11 @@
-"""What stands in a run folder, as types: `run.json`, the lines of `events.jsonl`, `result.json`.
+"""What stands in a run folder beside `events.jsonl`, as types: `run.json` and `result.json`.
 
 Unknown keys are ignored, so that a driver may write more than this version reads; numbers are finite, quaternions of
 unit length and keyframe identifiers well formed.
 """
 
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,217 +87,6 @@ def setting_number(settings: Mapping[str, Any], *names: str) -> float | None:
     return None
 
 
-class Event(Record):
-    """One line of `events.jsonl`; the subclasses are the kinds of event."""
-
-    t: float
-    """Seconds since the run started, on the run's clock (virtual or real)."""
-    robot: str
-    """The robot that it happened on."""
-    event: str
-    """Kind of event."""
-
-
-class KeyframeCaptured(Event):
-    """`keyframe`: a robot took a keyframe."""
-
-    keyframe: Keyframe
-    stamp_s: float
-    T_odom_body: Pose7
-
-
-class CandidateFound(Event):
-    """`candidate`: two keyframes look alike."""
-
-    query: Keyframe
-    match: Keyframe
-    similarity: float
-
-
-class ClosureAccepted(Event):
-    """`closure_accepted`: a candidate was registered and passed R_thr."""
-
-    query: Keyframe
-    match: Keyframe
-    ratio: float
-    probability: float
-    correspondences: int
-    odometry_correspondences: int
-    scale_initial: float | None = None
-    by: str | None = None
-
-
-class ClosureRejected(Event):
-    """`closure_rejected`: a candidate was not made a closure."""
-
-    query: Keyframe
-    match: Keyframe
-    ratio: float | None = None
-    reason: str
-
-
-class LeaderFollowed(Event):
-    """`leader`: this robot now follows (or is) the leader of a term; null when it follows none."""
-
-    term: int | str | None
-    leader: str | None
-
-
-class LeaderLost(Event):
-    """`leader_lost`: this robot's leader fell silent or left; it follows nobody until the next `leader`."""
-
-    term: int | str | None = None
-    reason: str | None = None
-
-
-class NeighbourUp(Event):
-    """`neighbour_up`: heartbeats of a peer arrive."""
-
-    peer: str
-
-
-class NeighbourDown(Event):
-    """`neighbour_down`: heartbeats of a peer stopped."""
-
-    peer: str
-
-
-class GraphOptimised(Event):
-    """`optimised`: this robot, as leader, solved the pose graph."""
-
-    term: int | str
-    round: int
-    components: Any = None
-    keyframes: int | None = None
-    closures_used: int | None = None
-    closures_rejected: int | None = None
-    cost: float | None = None
-    solve_s: float | None = None
-    warnings: list[str] = []
-
-
-class CorrectionApplied(Event):
-    """`correction`: this robot applied a correction."""
-
-    term: int | str
-    round: int
-    map_frame: str
-    T_map_odom: Pose7
-    frame_changed: bool = False
-
-
-class BytesCounted(Event):
-    """`bytes`: bytes by kind since the robot started; cumulative, the last one counts."""
-
-    sent: dict[str, int]
-    received: dict[str, int]
-    loss: dict[str, float] = {}
-    """Peer in range -> share of its last heartbeats that did not arrive."""
-    queues: dict[str, int] = {}
-    """What waits: events for the core, images for the encoder, candidates for their registration."""
-
-
-class StageCounts(Record):
-    """Histogram of how long a stage took; the buckets are those of `flocc_agent.stages`."""
-
-    counts: list[int]
-    total_s: float
-    max_s: float
-
-
-class AccountKept(Event):
-    """`account`: payload bytes by peer and kind, and time by stage, since this start; the last one counts."""
-
-    since_s: float
-    """When the robot was started, on the run's clock: names the start."""
-    sent_to: dict[str, dict[str, int]]
-    received_from: dict[str, dict[str, int]]
-    lost_from: dict[str, dict[str, int]]
-    """Arrived from a peer, but the emulated radio or a limit kept it away."""
-    repeated_from: dict[str, dict[str, int]]
-    """Of what was received, copies that the emulated radio made."""
-    stages: dict[str, StageCounts]
-
-
-class PeerRefused(Event):
-    """`peer_refused`: a peer that this robot does not talk to."""
-
-    peer: str
-    reason: str
-
-
-class NameTaken(Event):
-    """`duplicate_name`: two robots run with one name."""
-
-    peer: str
-    reason: str
-
-
-class LatentFetched(Event):
-    """`latent_fetched`: a latent that a candidate needs has arrived."""
-
-    keyframe: Keyframe
-    holder: str | None = None
-
-
-class LatentFailed(Event):
-    """`latent_failed`: a latent that a candidate needs could not be fetched this time."""
-
-    keyframe: Keyframe
-    holder: str | None = None
-    reason: str
-
-
-class EncodingFailed(Event):
-    """`encoding_failed`: a keyframe has no descriptor or latent."""
-
-    keyframe: Keyframe
-    reason: str
-
-
-class OptimisationFailed(Event):
-    """`optimisation_failed`: the solver gave nothing; the last good solution stands."""
-
-    term: int | str
-    round: int
-    reason: str
-
-
-class AgentDied(Event):
-    """`agent_died`: an agent ended without being asked to."""
-
-    signal: int | str | None = None
-    exit_code: int | None = None
-
-
-class AgentStopped(Event):
-    """`agent_stopped`: an agent ended in order."""
-
-
-EVENT_TYPES: Mapping[str, type[Event]] = {
-    "keyframe": KeyframeCaptured,
-    "candidate": CandidateFound,
-    "closure_accepted": ClosureAccepted,
-    "closure_rejected": ClosureRejected,
-    "leader": LeaderFollowed,
-    "leader_lost": LeaderLost,
-    "neighbour_up": NeighbourUp,
-    "neighbour_down": NeighbourDown,
-    "optimised": GraphOptimised,
-    "correction": CorrectionApplied,
-    "bytes": BytesCounted,
-    "account": AccountKept,
-    "peer_refused": PeerRefused,
-    "duplicate_name": NameTaken,
-    "latent_fetched": LatentFetched,
-    "latent_failed": LatentFailed,
-    "encoding_failed": EncodingFailed,
-    "optimisation_failed": OptimisationFailed,
-    "agent_died": AgentDied,
-    "agent_stopped": AgentStopped,
-}
-
-
 class KeyframeResult(Record):
     """One keyframe of a robot at the end of the run."""
 
@@ -342,15 +131,7 @@ class RobotResult(Record):
         return stacked_poses([keyframe.T_odom_body for keyframe in self.keyframes])
 
 
-def stacked_poses(rows: Iterable[list[float]]) -> Float:
+def stacked_poses(rows: Iterable[Sequence[float]]) -> Float:
     """Poses (N, 4, 4) of rows of seven numbers."""
     poses = [pose_from_tq(np.array(row)) for row in rows]
     return np.array(poses) if poses else np.zeros((0, 4, 4))
-
-
-E = TypeVar("E", bound=Event)
-
-
-def of_kind(events: Iterable[Event], kind: type[E]) -> list[E]:
-    """The events of one kind, in their order."""
-    return [event for event in events if isinstance(event, kind)]

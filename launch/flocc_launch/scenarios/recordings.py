@@ -1,12 +1,16 @@
 """A scenario's data: every robot's recording, generated or cut once and kept under the cache folder."""
 
 import hashlib
+import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, TracksScenario, WorldScenario
+from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
+from flocc_agent.runtime.trajectory_text import read_tum
+from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, SensorsScenario, TracksScenario, WorldScenario
+from flocc_launch.scenarios.sensors import sense
 
 if TYPE_CHECKING:
     from flocc_launch.scenarios.walks import Walk
@@ -40,7 +44,30 @@ def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str
         for seed, (name, robot) in enumerate(scenario.robots.items())
         if robot.recording is not None
     }
-    return {**found, **given}
+    made_of_all = {**found, **given}
+    return made_of_all if scenario.sensors is None else _sensed(scenario.sensors, made_of_all)
+
+
+def _sensed(sensors: SensorsScenario, paths: Mapping[str, Path]) -> dict[str, Path]:
+    """The same recordings with the measurements of simulated sensors beside them.
+
+    Raises:
+        FloccError: A recording has no ground truth to draw them from.
+    """
+    truths = {name: read_tum(path / "groundtruth.tum") for name, path in paths.items()}
+    key = hashlib.sha256(f"{sensors.model_dump_json()} {sorted(map(str, paths.values()))}".encode()).hexdigest()[:12]
+    made = {}
+    for name, rows in sense(sensors, truths).items():
+        made[name] = folder = cache_folder() / "sensed" / key / name
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in paths[name].iterdir():
+            link = folder / file.name
+            if not link.exists():
+                link.symlink_to(file.resolve())
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        (folder / MEASUREMENTS).unlink(missing_ok=True)
+        (folder / MEASUREMENTS).write_text(text, encoding="utf-8")
+    return made
 
 
 def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:

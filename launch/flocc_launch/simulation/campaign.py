@@ -15,15 +15,15 @@ from flocc_agent.composition import build_perception
 from flocc_agent.config import KeyframeConfig
 from flocc_launch.runs.run_folder import write_json
 from flocc_launch.scenarios.scenario import FaultKind, Scenario, TracksScenario
-from flocc_launch.simulation.alignment import Alignment
 from flocc_launch.simulation.eyes import ImageEyes
-from flocc_launch.simulation.faults import schedule
+from flocc_launch.simulation.fault_schedule import schedule
 from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
 from flocc_launch.simulation.invariants import Invariant, Violation, Watch
-from flocc_launch.simulation.playback import Playback
+from flocc_launch.simulation.rigid_alignment import Alignment
 from flocc_launch.simulation.safety import all_invariants
 from flocc_launch.simulation.simulate import playbacks_of
 from flocc_launch.simulation.swarm import Equipment, Swarm
+from flocc_launch.simulation.virtual_playback import Playback
 
 LIVENESS_S = 60.0
 LOOK_S = 2.5

@@ -17,7 +17,7 @@ from flocc_agent.composition import Perception
 from flocc_agent.config import PerceptionConfig
 from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
-from flocc_launch.simulation.playback import Capture
+from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]
@@ -29,7 +29,7 @@ class ImageEyes:
     def __init__(self, perception: Perception, config: PerceptionConfig, cache: Path | None) -> None:
         self._perception = perception
         self._cache = cache
-        self._config_key = b"" if cache is None else config.model_dump_json().encode() + _code_hash()
+        self._config_key = b"" if cache is None else repr(config).encode() + _code_hash()
 
     def encode(self, capture: Capture) -> tuple[Array, bytes]:
         """Descriptor and latent of a keyframe."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from flocc_agent.core.effects import Effect
 from flocc_agent.core.events import Event
 from flocc_agent.core.robot import Robot
-from flocc_launch.simulation.robot import Station
 from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.simulation.virtual_robot import Station
 
 
 @dataclass(frozen=True, slots=True)

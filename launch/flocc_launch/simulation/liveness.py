@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from flocc_agent.core.pose_graph import components_of, map_frame
 from flocc_launch.simulation.invariants import core, groups, names
-from flocc_launch.simulation.robot import Station
 from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import ClosureRecord
 

@@ -15,18 +15,18 @@ from flocc_agent.core.effects import (
     Unicast,
 )
 from flocc_agent.core.gossip import decoded
-from flocc_agent.core.offers import FAR_TAKEOVERS
-from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
+from flocc_agent.core.reports import NeighbourDown, NeighbourUp
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.invariants import Invariant, Step, core
-from flocc_launch.simulation.robot import Station
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, Records
 from flocc_protocol.records import ClosureRecord, Record, RejectionRecord
 
 SIZES_EVERY = 25
 TICKS_PER_S_MAX = 200
-APART_S = FAR_TAKEOVERS * LoopClosingParameters().takeover_s + 10.0
+APART_S = FAR_TAKEOVERS * TAKEOVER_S + 10.0
 """So long after two robots lost or found each other a pair may be taken over, and its latents be fetched."""
 
 
@@ -131,8 +131,8 @@ class Once:
             match effect:
                 case PersistRecord(log, number, data):
                     self._note_record(log, number, decoded(data)[0])
-                case Report("neighbour_up" | "neighbour_down", fields):
-                    self._changed_s[step.station.name, str(fields["peer"])] = step.at_s
+                case Report(NeighbourUp() | NeighbourDown() as changed):
+                    self._changed_s[step.station.name, changed.peer] = step.at_s
                 case Register(pair):
                     yield from self._registers(step, pair)
 

@@ -26,21 +26,51 @@ the text with what really happened, so a test compares it with the file, or rewr
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import assert_never
 
 import numpy as np
 
-from flocc_agent.core.effects import Broadcast, Deliver, Effect, Encode, FetchLatent, Optimise, Register, Report
+from flocc_agent.core.effects import (
+    Broadcast,
+    Deliver,
+    Effect,
+    Encode,
+    FetchLatent,
+    IterateBlock,
+    Optimise,
+    PersistCorrection,
+    PersistRecord,
+    PersistTerm,
+    Register,
+    Report,
+    Unicast,
+)
 from flocc_agent.core.events import Event, MessageReceived
 from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
+from flocc_agent.core.reports import (
+    Fact,
+    LatentFailed,
+    LatentLost,
+    LeaderFollowed,
+    LeaderLost,
+    LogForked,
+    NameTaken,
+    NeighbourDown,
+    NeighbourRestarted,
+    NeighbourUp,
+    PeerRefused,
+    SolutionIgnored,
+    name_of,
+)
 from flocc_agent.geometry import pose
 from flocc_agent.radio import LinkOverride, LinkParameters, Partition, RadioParameters
 from flocc_launch.scenarios.scenario import RobotScenario, Scenario, TracksScenario
-from flocc_launch.simulation.alignment import Alignment
-from flocc_launch.simulation.playback import Capture, Playback
-from flocc_launch.simulation.robot import Station
+from flocc_launch.simulation.rigid_alignment import Alignment
 from flocc_launch.simulation.swarm import Equipment, Swarm
+from flocc_launch.simulation.virtual_playback import Capture, Playback
+from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.messages import CorrectionBatch, Envelope, Handover, LogCorrection
@@ -179,29 +209,30 @@ def _told(effect: Effect) -> str | None:
             return "hands over" if isinstance(message, Handover) else None
         case Optimise(term, number):
             return f"optimises in {term} round {number}"
-        case _:
-            return _reported(effect)
-
-
-def _reported(effect: Effect) -> str | None:
-    if not isinstance(effect, Report):
-        return None
-    f = effect.fields
-    match effect.event:
-        case "leader":
-            return f"follows {f['term']}:{f['leader_log']}"
-        case "leader_lost":
-            return f"loses {f['term']}: {f['reason']}"
-        case "neighbour_up" | "neighbour_down" | "neighbour_restarted":
-            return f"{effect.event} {f['peer']}"
-        case "log_forked" | "duplicate_name" | "peer_refused":
-            return f"{effect.event} {f['peer']}: {f['reason']}"
-        case "latent_lost" | "latent_failed":
-            return f"{effect.event} {f['keyframe']}"
-        case "stale_solution":
-            return f"ignores a solution of {f['term']} round {f['round']}"
-        case _:
+        case Report(fact):
+            return _reported(fact)
+        case Unicast() | IterateBlock() | PersistRecord() | PersistTerm() | PersistCorrection():
             return None
+        case _:
+            assert_never(effect)
+
+
+def _reported(fact: Fact) -> str | None:
+    """A fact in a few words; None for what no story needs."""
+    match fact:
+        case LeaderFollowed():
+            return f"follows {fact.term}:{fact.leader_log}"
+        case LeaderLost():
+            return f"loses {fact.term}: {fact.reason}"
+        case NeighbourUp() | NeighbourDown() | NeighbourRestarted():
+            return f"{name_of(fact)} {fact.peer}"
+        case LogForked() | NameTaken() | PeerRefused():
+            return f"{name_of(fact)} {fact.peer}: {fact.reason}"
+        case LatentLost() | LatentFailed():
+            return f"{name_of(fact)} {fact.keyframe}"
+        case SolutionIgnored():
+            return f"ignores a solution of {fact.term} round {fact.round}"
+    return None
 
 
 def _status(station: Station) -> str:

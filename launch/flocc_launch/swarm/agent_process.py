@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from flocc_agent.config import AgentConfig, RadioConfig, validated
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported, line_of
+from flocc_agent.runtime.facts import AgentStopped
 from flocc_protocol.errors import FloccError
 
 if TYPE_CHECKING:
@@ -37,10 +40,10 @@ class Lines:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a", encoding="utf-8")
 
-    def write(self, line: dict[str, Any]) -> None:
+    def write(self, event: Reported[Fact]) -> None:
         """Append one event."""
         if self._file is not None:
-            self._file.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")
+            self._file.write(json.dumps(line_of(event), separators=(",", ":"), allow_nan=False) + "\n")
             self._file.flush()
 
     def close(self) -> None:
@@ -56,7 +59,7 @@ async def run_agent(
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
 ) -> None:
-    """Run one agent until it is told to stop (a signal, an order, or the end of its recording and `hold_s`).
+    """Run one agent until it is told to stop, by a signal or an order.
 
     Args:
         config: The agent's configuration; with `folder`, its events and result are written there.
@@ -83,12 +86,12 @@ async def _run(
 ) -> None:
     from flocc_agent.composition import Agent
 
-    def on_line(line: dict[str, Any]) -> None:
-        lines.write(line)
+    def on_report(event: Reported[Fact]) -> None:
+        lines.write(event)
         if source is not None:
-            source.line(line)
+            source.take(event)
 
-    agent = Agent(config, on_line=on_line, clock_s=lambda: time.monotonic() - epoch_s)
+    agent = Agent(config, on_report=on_report, clock_s=lambda: time.monotonic() - epoch_s)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, agent.stop)
@@ -105,7 +108,7 @@ async def _run(
         for task in background:
             task.cancel()
         _write_result(config.folder, agent.result())
-        lines.write({"t": round(time.monotonic() - epoch_s, 6), "robot": config.name, "event": "agent_stopped"})
+        lines.write(Reported(time.monotonic() - epoch_s, config.name, AgentStopped()))
         lines.close()
 
 

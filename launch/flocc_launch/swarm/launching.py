@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import Report
 from flocc_launch.runs.run_folder import Run, RunFolder
@@ -263,8 +265,8 @@ class _Launch:
                 continue
             agent.asked = True
             code = agent.exit_code
-            event = {"signal": -code, "exit_code": None} if code < 0 else {"signal": None, "exit_code": code}
-            self._lines.write(self._event(agent.name, "agent_died", event))
+            death = AgentDied(signal=-code) if code < 0 else AgentDied(exit_code=code)
+            self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
         died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.status]
@@ -301,9 +303,6 @@ class _Launch:
             duration_s=wall_s,
             wall_s=wall_s,
         )
-
-    def _event(self, robot: str, kind: str, fields: dict[str, Any]) -> dict[str, Any]:
-        return {"t": round(self._now_s(), 6), "robot": robot, "event": kind, **fields}
 
     def _note(self, sentence: str) -> None:
         self._watch.notes.append(f"{self._now_s():7.1f} s  {sentence}")

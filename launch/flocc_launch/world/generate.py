@@ -90,8 +90,7 @@ def baked_world(spec: WorldSpec) -> Baked:
 
 def _program_digest() -> str:
     """Changes with the program that makes the world, so that what an older one rendered is not taken for new."""
-    here = [file for file in Path(__file__).parent.glob("*.py") if file.name != "overlap.py"]
-    files = [*sorted(here), Path(datasets.__file__).parent / "drift.py"]
+    files = [*sorted(Path(__file__).parent.glob("*.py")), Path(datasets.__file__).parent / "drift.py"]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -117,6 +116,8 @@ def _prepare(spec: WorldSpec, index: int, folder: Path, truth: Trajectory) -> li
 def _render(spec: WorldSpec, shots: list[_Shot], processes: int, progress: Progress | None) -> None:
     chunks = [shots[i : i + CHUNK_IMAGES] for i in range(0, len(shots), CHUNK_IMAGES)]
     done = 0
+    if progress is not None:
+        progress(0, len(shots))
     with tempfile.TemporaryDirectory(prefix="flocc-world-") as folder:
         baked_world(spec).save(Path(folder))
         with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import Corrections, pose7
+from flocc_agent.core.corrections import LISTED_MAX, Corrections, pose7
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.parameters import GossipParameters, RoundParameters
+from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
+from flocc_agent.core.reports import CorrectionApplied, PeerRefused
 from flocc_agent.core.robot import Restored
 from flocc_agent.geometry import pose
 from flocc_protocol.arrays import Array
@@ -23,7 +24,7 @@ R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
 
 def corrections(own: LogId = R1) -> Corrections:
-    return Corrections(own, GossipParameters(), RoundParameters())
+    return Corrections(own, GossipParameters())
 
 
 def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> LogCorrection:
@@ -114,7 +115,7 @@ def test_a_long_trajectory_is_thinned_and_keeps_its_last_keyframe() -> None:
     message = machine.applied
     assert message is not None
     count = message.T_map_camera.shape[0]
-    assert count <= RoundParameters().correction_keyframes_max
+    assert count <= LISTED_MAX
     assert message.first + message.step * (count - 1) == 1000
 
 
@@ -150,18 +151,16 @@ def test_a_jump_in_whose_middle_the_robot_died_is_told_after_the_restart() -> No
 
 
 def test_a_relay_cannot_forge_a_correction() -> None:
-    machine = Corrections(R1, GossipParameters(), RoundParameters(), Seals("r1"))
+    machine = Corrections(R1, GossipParameters(), Seals("r1"))
     genuine = replace(correction(Term(1, R2), 1), signature=Seals("r2").sign_correction(b""))
     for forged in (replace(genuine, signature=b""), replace(genuine, term=Term(9, R3))):
         effects = machine.on_message("r3", forged)
-        assert effects == [
-            Report("peer_refused", {"peer": "r3", "reason": "correction without its leader's signature"})
-        ]
+        assert effects == [Report(PeerRefused(peer="r3", reason="correction without its leader's signature"))]
     assert delivered(machine.on_message("r3", genuine)) == [(1, 1, False)]
 
 
 def test_a_leader_signs_what_it_publishes() -> None:
-    machine = Corrections(R2, GossipParameters(), RoundParameters(), Seals("r2"))
+    machine = Corrections(R2, GossipParameters(), Seals("r2"))
     (sent,) = [e.message for e in machine.publish(Term(1, R2), 1, solution()) if isinstance(e, Broadcast)]
     assert isinstance(sent, CorrectionBatch)
     assert [c.signature.rstrip(b".") for c in sent.corrections] == [b"r2"]
@@ -173,7 +172,7 @@ def test_a_correction_of_an_absurd_term_is_refused() -> None:
     hostile = correction(Term(TERM_COUNTER_MAX, R2), 1)
     robots.put("r1", MessageReceived(Envelope(R2, CorrectionBatch((hostile,)))))
     assert robots.effects("r1", Deliver) == []
-    assert len(robots.reports("r1", "peer_refused")) == 1
+    assert len(robots.facts("r1", PeerRefused)) == 1
 
 
 def test_a_lost_correction_is_repaired_by_heartbeats() -> None:
@@ -224,7 +223,5 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
     robots.separate()
     robots.run(15.0)
     assert set(robots.frames().values()) == {"map/r1"}
-    changes = [
-        report.fields["map_frame"] for report in robots.reports("r4", "correction") if report.fields["frame_changed"]
-    ]
+    changes = [fact.map_frame for fact in robots.facts("r4", CorrectionApplied) if fact.frame_changed]
     assert changes == ["map/r1"]

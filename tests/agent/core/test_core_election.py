@@ -3,7 +3,7 @@
 from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
-from flocc_agent.core.election import COUNTER_JUMP_MAX, LeaderElection, Role
+from flocc_agent.core.election import ANSWER_TIMEOUT_S, COUNTER_JUMP_MAX, LeaderElection, Role
 from flocc_agent.core.events import Leaving
 from flocc_agent.core.parameters import CoreParameters, ElectionParameters
 from flocc_agent.core.robot import Restored
@@ -148,7 +148,7 @@ def test_a_robot_asks_those_who_outrank_it_before_it_claims() -> None:
     machine = election(R2)
     machine.on_heartbeat(R1, heartbeat(), 0.0)
     assert machine.tick(1.5) == [Unicast("r1", Election(0))]
-    assert claims(machine.tick(1.5 + ElectionParameters().answer_timeout_s)) == [Term(1, R2)]
+    assert claims(machine.tick(1.5 + ANSWER_TIMEOUT_S)) == [Term(1, R2)]
 
 
 def test_an_answer_makes_a_robot_wait_and_ask_again() -> None:

@@ -12,10 +12,12 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
 )
-from flocc_agent.core.latents import Latents, Peer, Reach
-from flocc_agent.core.loop_closing import LoopClosing, registrar_of
+from flocc_agent.core.latents import RELAYS_MAX, RETRY_S, Latents, Peer, Reach
+from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, registrar_of
+from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.reports import ClosureRejected
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
 from flocc_protocol.records import RejectionRecord
@@ -80,8 +82,8 @@ def test_a_pair_of_the_other_robot_is_offered_until_its_record_shows() -> None:
     machine.on_peer("r2", Peer(0))
     found(machine, pair)
     assert offers(machine.tick(0.0)) == [("r2", False)]
-    assert machine.deadline() == PARAMETERS.offer_period_s
-    assert offers(machine.tick(PARAMETERS.offer_period_s)) == [("r2", False)]
+    assert machine.deadline() == OFFER_PERIOD_S
+    assert offers(machine.tick(OFFER_PERIOD_S)) == [("r2", False)]
     machine.on_resolved(pair)
     assert machine.tick(100.0) == []
 
@@ -139,7 +141,7 @@ def test_a_transferred_pair_is_taken_over_when_the_stronger_robot_is_gone() -> N
     hold_all(machine, pair)
     machine.on_lost("s1", 5.0)
     assert machine.tick(5.0) == []
-    assert machine.deadline() == 5.0 + PARAMETERS.takeover_s
+    assert machine.deadline() == 5.0 + TAKEOVER_S
     assert [type(e) for e in machine.tick(machine.deadline())] == [Register]
 
 
@@ -152,7 +154,7 @@ def test_a_registrar_that_comes_back_in_time_keeps_its_pair() -> None:
     machine.on_lost("r2", 5.0)
     machine.tick(6.0)
     machine.on_peer("r2", Peer(0))
-    assert offers(machine.tick(5.0 + PARAMETERS.takeover_s)) == [("r2", False)]
+    assert offers(machine.tick(5.0 + TAKEOVER_S)) == [("r2", False)]
 
 
 def test_a_registrar_that_comes_back_soon_is_not_told_the_same_again_at_once() -> None:
@@ -164,7 +166,7 @@ def test_a_registrar_that_comes_back_soon_is_not_told_the_same_again_at_once() -
     machine.tick(0.5)
     machine.on_peer("r2", Peer(0))
     assert machine.tick(1.0) == []
-    assert machine.deadline() == PARAMETERS.offer_period_s
+    assert machine.deadline() == OFFER_PERIOD_S
 
 
 def test_pairs_of_a_log_whose_writer_lost_its_disk_are_taken_over_at_once() -> None:
@@ -196,8 +198,8 @@ def test_a_registration_without_an_answer_is_tried_again() -> None:
     found(machine, pair)
     hold_all(machine, pair)
     machine.tick(0.0)
-    assert machine.deadline() == PARAMETERS.registration_timeout_s
-    assert [type(e) for e in machine.tick(PARAMETERS.registration_timeout_s)] == [Register]
+    assert machine.deadline() == REGISTRATION_TIMEOUT_S
+    assert [type(e) for e in machine.tick(REGISTRATION_TIMEOUT_S)] == [Register]
 
 
 def test_the_least_similar_candidates_are_dropped_beyond_the_maximum() -> None:
@@ -242,7 +244,7 @@ def test_a_fetch_without_an_answer_is_given_up() -> None:
     latents, wanted = Latents(R1, PARAMETERS), keyframe("r2/1")
     latents.fetch([wanted], reach(r2=()), 0.0)
     latents.give_up(PARAMETERS.fetch_timeout_s)
-    assert latents.due_s(PARAMETERS.fetch_timeout_s) == PARAMETERS.fetch_timeout_s + PARAMETERS.retry_s
+    assert latents.due_s(PARAMETERS.fetch_timeout_s) == PARAMETERS.fetch_timeout_s + RETRY_S
 
 
 def test_a_robot_that_comes_back_is_asked_at_once() -> None:
@@ -284,7 +286,7 @@ def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     for k in range(50):
         latents.on_wants([keyframe(f"r3/{k}")], 0.0)
         latents.add(keyframe(f"r3/{k}"))
-    assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - PARAMETERS.relays_max, 50))
+    assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - RELAYS_MAX, 50))
 
 
 # Whole robots
@@ -377,7 +379,7 @@ def test_a_lost_latent_is_known_to_robots_that_only_hear_the_owner_through_other
     meet(robots, "r1", "r4")
     robots.run(60.0)
     assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
-    assert {r.fields["reason"] for r in robots.reports("r4", "closure_rejected")} == {"a latent was lost"}
+    assert {fact.reason for fact in robots.facts("r4", ClosureRejected)} == {"a latent was lost"}
     robots.run(60.0)
     assert all(core.closing.lost(robots.now_s) == () for core in robots.cores.values())
 

@@ -8,7 +8,8 @@ from flocc_agent.core.effects import Effect, Optimise, Report
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import GraphSolution
-from flocc_agent.core.rounds import Rounds
+from flocc_agent.core.reports import RoundTimedOut
+from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PERIOD_PER_KEYFRAME_S, TIMEOUT_S, Rounds
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -75,16 +76,16 @@ def test_rounds_of_a_large_swarm_follow_each_other_more_slowly() -> None:
     rounds.tick(0.0)
     rounds.on_solution(TERM, 1, SOLUTION, 0.0)
     add_keyframes(assembly, R2, 0, 1)
-    assert rounds.deadline() == 10_000 * PARAMETERS.period_per_keyframe_s > PARAMETERS.period_s
+    assert rounds.deadline() == 10_000 * PERIOD_PER_KEYFRAME_S > PARAMETERS.period_s
 
 
 def test_many_new_keyframes_call_for_a_round() -> None:
     rounds, assembly = leading()
     rounds.tick(0.0)
     rounds.on_solution(TERM, 1, SOLUTION, 0.0)
-    add_keyframes(assembly, R1, 1, PARAMETERS.keyframes_per_round)
+    add_keyframes(assembly, R1, 1, KEYFRAMES_PER_ROUND)
     assert rounds.tick(10.0) == []
-    add_keyframes(assembly, R1, PARAMETERS.keyframes_per_round, PARAMETERS.keyframes_per_round + 1)
+    add_keyframes(assembly, R1, KEYFRAMES_PER_ROUND, KEYFRAMES_PER_ROUND + 1)
     assert started(rounds.tick(10.0)) == [2]
 
 
@@ -92,16 +93,16 @@ def test_a_solution_of_another_term_or_of_an_earlier_round_counts_for_nothing() 
     rounds, _ = leading()
     rounds.tick(0.0)
     assert not rounds.on_solution(Term(9, R2), 1, SOLUTION, 0.0)
-    rounds.tick(PARAMETERS.timeout_s)
+    rounds.tick(TIMEOUT_S)
     assert started(rounds.tick(rounds.deadline())) == [2]
-    assert not rounds.on_solution(TERM, 1, SOLUTION, PARAMETERS.timeout_s)
+    assert not rounds.on_solution(TERM, 1, SOLUTION, TIMEOUT_S)
 
 
 def test_a_solution_that_comes_after_its_round_was_given_up_counts_until_the_next_starts() -> None:
     rounds, _ = leading()
     rounds.tick(0.0)
-    rounds.tick(PARAMETERS.timeout_s)
-    assert rounds.on_solution(TERM, 1, SOLUTION, PARAMETERS.timeout_s + 0.1)
+    rounds.tick(TIMEOUT_S)
+    assert rounds.on_solution(TERM, 1, SOLUTION, TIMEOUT_S + 0.1)
 
 
 def test_a_round_that_is_given_up_is_followed_by_one_with_twice_the_time() -> None:
@@ -110,7 +111,7 @@ def test_a_round_that_is_given_up_is_followed_by_one_with_twice_the_time() -> No
     rounds.tick(rounds.deadline())
     again_s = rounds.deadline()
     assert started(rounds.tick(again_s)) == [2]
-    assert rounds.deadline() == again_s + 2 * PARAMETERS.timeout_s
+    assert rounds.deadline() == again_s + 2 * TIMEOUT_S
 
 
 def test_the_next_round_pauses_as_long_as_the_last_one_took() -> None:
@@ -124,9 +125,9 @@ def test_the_next_round_pauses_as_long_as_the_last_one_took() -> None:
 def test_a_round_that_gives_no_answer_is_given_up_and_tried_again() -> None:
     rounds, _ = leading()
     rounds.tick(0.0)
-    effects = rounds.tick(PARAMETERS.timeout_s)
-    assert [e.event for e in effects if isinstance(e, Report)] == ["round_timeout"]
-    assert rounds.deadline() > PARAMETERS.timeout_s
+    effects = rounds.tick(TIMEOUT_S)
+    assert [type(e.fact) for e in effects if isinstance(e, Report)] == [RoundTimedOut]
+    assert rounds.deadline() > TIMEOUT_S
     assert started(rounds.tick(rounds.deadline())) == [2]
 
 
@@ -150,7 +151,7 @@ def test_a_silent_optimiser_does_not_block_the_swarm() -> None:
     )
     robots.add("r1")
     robots.capture("r1", 0.0, look=1)
-    robots.run(PARAMETERS.timeout_s + 10.0)
+    robots.run(TIMEOUT_S + 10.0)
     assert robots.frames() == {"r1": "map/r1"}
 
 

@@ -3,20 +3,20 @@ import pytest
 from numpy.typing import NDArray
 from tests.agent.perception.classical_scenes import FOCAL_PX, box, camera_at, seen_from
 
-from flocc_agent.config import ClassicalConfig
 from flocc_agent.geometry import angle_rad, inverse, pose, se3_log, so3_exp
-from flocc_agent.perception.classical.bundle import (
+from flocc_agent.perception.classical.matching import mutual_matches
+from flocc_agent.perception.multiview.bundle import (
     View,
     _linearise,
     covariance_of_view,
     inverse_depths_from,
     refine,
 )
-from flocc_agent.perception.classical.matching import mutual_matches
-from flocc_agent.perception.classical.two_view import TwoView, decompose_essential, two_view
+from flocc_agent.perception.multiview.parameters import Geometry
+from flocc_agent.perception.multiview.two_view import TwoView, decompose_essential, two_view
 
 Float = NDArray[np.float64]
-CONFIG = ClassicalConfig()
+GEOMETRY = Geometry()
 
 
 def test_matches_are_mutual_nearest_neighbours_that_pass_the_ratio_test() -> None:
@@ -136,7 +136,9 @@ def test_two_views_give_rotation_and_direction(seed: int, wrong_ratio: float) ->
     T = camera_at((0.8, -0.2, 0.4), (0.05, 0.15, -0.1))
     query = seen_from(scene, np.eye(4), rng)
 
-    pair = two_view(query, seen_from(scene, T, rng, wrong_ratio=wrong_ratio), CONFIG)
+    other = seen_from(scene, T, rng, wrong_ratio=wrong_ratio)
+    matched = mutual_matches(query.descriptors, other.descriptors, 0.8)
+    pair = two_view(query, other, matched, GEOMETRY)
 
     assert isinstance(pair, TwoView)
     T_query_other = inverse(pair.view.T_view_query)

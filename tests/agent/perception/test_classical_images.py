@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.core.registration import Registration, RegistrationFailed
-from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, ClassicalRegistrar
+from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, classical_registrar
 from flocc_agent.perception.classical.codebook import load_codebook, save_codebook
 from flocc_agent.perception.classical.encoder import decode_features
-from flocc_agent.perception.classical.features import undistorted
+from flocc_agent.perception.classical.matching import mutual_matches
 from flocc_agent.perception.classical.patches import dense_patches
 from flocc_agent.perception.classical.procedural import HEIGHT, WIDTH, random_scene, random_view
 from flocc_agent.perception.classical.training import train
-from flocc_agent.perception.classical.two_view import TwoView, two_view
+from flocc_agent.perception.multiview.parameters import Geometry
+from flocc_agent.perception.multiview.picture import undistorted
+from flocc_agent.perception.multiview.two_view import TwoView, two_view
 
 CAMERA = Camera(WIDTH, HEIGHT, 300.0, 300.0, WIDTH / 2, HEIGHT / 2)
 
@@ -104,7 +106,8 @@ def test_features_keep_their_place_where_the_image_is_shrunk() -> None:
     full = ClassicalEncoder(ClassicalConfig(pixels_max=10**9)).encode(image)
     shrunk = ClassicalEncoder(ClassicalConfig(pixels_max=150_000)).encode(image)
 
-    result = two_view(decode_features(full), decode_features(shrunk), ClassicalConfig())
+    first, second = decode_features(full), decode_features(shrunk)
+    result = two_view(first, second, mutual_matches(first.descriptors, second.descriptors, 0.8), Geometry())
 
     assert isinstance(result, TwoView)
     moved_px = np.median(decode_features(full).points[result.query_indices] - result.view.observed, axis=0) * 600.0
@@ -119,7 +122,7 @@ def test_a_turned_camera_is_recognised_as_no_translation() -> None:
     turned = np.asarray(cv2.warpPerspective(grey, H, (WIDTH, HEIGHT)), np.uint8)
     encoder = ClassicalEncoder(ClassicalConfig())
 
-    result = ClassicalRegistrar(ClassicalConfig()).register(
+    result = classical_registrar(ClassicalConfig(acceptance="ratio")).register(
         encoder.encode(rgb(grey)), encoder.encode(rgb(turned)), None
     )
 
@@ -128,7 +131,7 @@ def test_a_turned_camera_is_recognised_as_no_translation() -> None:
 
 
 def test_two_scenes_do_not_register() -> None:
-    encoder, registrar = ClassicalEncoder(ClassicalConfig()), ClassicalRegistrar(ClassicalConfig())
+    encoder, registrar = ClassicalEncoder(ClassicalConfig()), classical_registrar(ClassicalConfig(acceptance="ratio"))
     latents = [encoder.encode(pair[0]) for pair in views(5, seed=8)]
 
     results = [registrar.register(a, b, None) for i, a in enumerate(latents) for b in latents[i + 1 :]]

@@ -9,9 +9,10 @@ from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import angle_rad, between
-from flocc_agent.perception.classical import ClassicalRegistrar
+from flocc_agent.perception.classical import classical_registrar
 from flocc_agent.perception.classical.encoder import MODEL, decode_features, encode_features
 from flocc_agent.perception.latent import BadLatent, pack
+from flocc_agent.perception.multiview import registrar as pair_registrar
 
 Float = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def register(
     odometry = None
     if with_odometry:
         odometry = OdometryPair(latent_from(scene, T_neighbour, 11), between(T_neighbour, QUERY), "n-q")
-    registrar = ClassicalRegistrar(ClassicalConfig())
+    registrar = classical_registrar(ClassicalConfig(acceptance="ratio"))
     return registrar.register(latent_from(scene, QUERY, 12), latent_from(scene, T_match, 13), odometry)
 
 
@@ -118,7 +119,7 @@ def test_odometry_tells_the_two_motions_of_a_plane_apart(seed: int) -> None:
 
 
 def test_another_place_has_few_correspondences() -> None:
-    registrar = ClassicalRegistrar(ClassicalConfig())
+    registrar = classical_registrar(ClassicalConfig(acceptance="ratio"))
     here, elsewhere = box(np.random.default_rng(5)), box(np.random.default_rng(6))
 
     result = registrar.register(latent_from(here, QUERY, 1), latent_from(elsewhere, QUERY, 2), None)
@@ -133,7 +134,7 @@ def test_loop_pair_and_odometry_pair_are_counted_alike() -> None:
     neighbour, query = latent_from(scene, NEIGHBOUR, 11), latent_from(scene, QUERY, 12)
     odometry = OdometryPair(neighbour, between(NEIGHBOUR, QUERY), "n-q")
 
-    result = ClassicalRegistrar(ClassicalConfig()).register(query, neighbour, odometry)
+    result = classical_registrar(ClassicalConfig(acceptance="ratio")).register(query, neighbour, odometry)
 
     assert isinstance(result, Registration)
     assert result.correspondences == result.odometry_correspondences
@@ -143,7 +144,7 @@ def test_the_same_latents_give_the_same_bytes_in_any_thread() -> None:
     scene = box(np.random.default_rng(8))
     query = latent_from(scene, QUERY, 1, wrong_ratio=0.5)
     matches = [latent_from(scene, MATCH, seed, wrong_ratio=0.5) for seed in range(6)]
-    registrar = ClassicalRegistrar(ClassicalConfig())
+    registrar = classical_registrar(ClassicalConfig(acceptance="ratio"))
 
     def result(match: bytes) -> bytes:
         found = registrar.register(query, match, None)
@@ -155,10 +156,11 @@ def test_the_same_latents_give_the_same_bytes_in_any_thread() -> None:
         assert list(pool.map(result, matches * 4)) == expected * 4
 
 
-def test_odometry_pairs_are_kept_by_key_up_to_a_limit() -> None:
+def test_odometry_pairs_are_kept_by_key_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = box(np.random.default_rng(9))
     query, match = latent_from(scene, QUERY, 1), latent_from(scene, MATCH, 2)
-    registrar = ClassicalRegistrar(ClassicalConfig(odometry_pairs_max=2))
+    monkeypatch.setattr(pair_registrar, "ODOMETRY_PAIRS_MAX", 2)
+    registrar = classical_registrar(ClassicalConfig(acceptance="ratio"))
     neighbour = latent_from(scene, NEIGHBOUR, 3)
 
     def with_key(key: str, latent: bytes) -> Registration | RegistrationFailed:
@@ -189,7 +191,7 @@ def test_odometry_pairs_are_kept_by_key_up_to_a_limit() -> None:
 def test_a_bad_latent_of_a_peer_is_a_failure_and_no_exception(latent: bytes) -> None:
     good = latent_from(box(np.random.default_rng(10)), QUERY, 1)
 
-    result = ClassicalRegistrar(ClassicalConfig()).register(good, latent, None)
+    result = classical_registrar(ClassicalConfig(acceptance="ratio")).register(good, latent, None)
 
     assert isinstance(result, RegistrationFailed)
     assert result.failure is RegistrationFailure.BAD_LATENT
@@ -210,7 +212,7 @@ def test_a_latent_of_no_features_is_read_and_not_registered() -> None:
     empty = pack(
         MODEL, {"focal_px": 500.0}, {"points": np.zeros((0, 2), "f4"), "descriptors": np.zeros((0, 128), "u1")}
     )
-    registrar = ClassicalRegistrar(ClassicalConfig())
+    registrar = classical_registrar(ClassicalConfig(acceptance="ratio"))
 
     result = registrar.register(empty, empty, None)
 
@@ -251,8 +253,8 @@ def test_odd_features_give_a_result_or_a_failure_and_no_exception(kind: str) -> 
         match = latent(other)
         for T in (NEIGHBOUR, QUERY):
             odometry = OdometryPair(latent(other), between(T, QUERY), other)
-            result = ClassicalRegistrar(ClassicalConfig()).register(query, match, odometry)
-            same = ClassicalRegistrar(ClassicalConfig()).register(query, query, odometry)
+            result = classical_registrar(ClassicalConfig(acceptance="ratio")).register(query, match, odometry)
+            same = classical_registrar(ClassicalConfig(acceptance="ratio")).register(query, query, odometry)
             for found in (result, same):
                 if isinstance(found, Registration):
                     assert np.all(np.isfinite(found.T_query_match_unscaled))

@@ -200,15 +200,6 @@ def test_two_decodes_that_disagree_reject_the_closure(config: Mast3rConfig) -> N
     assert "disagree" in result.detail
 
 
-def test_inliers_can_be_counted_instead_of_matches(config: Mast3rConfig) -> None:
-    counts = []
-    for kind in ("matches", "inliers"):
-        encoder, registrar, _ = scripted(changed(config, count=kind), se3_exp(np.array([0, 0, 0, 0.5, 0, 0.2])))
-        result = registrar.register(encoder.encode(square("a")), encoder.encode(square("b")), None)
-        counts.append(result.correspondences)
-    assert counts[1] < counts[0]
-
-
 @pytest.mark.parametrize(
     ("spoil", "failure"),
     [("memory", RegistrationFailure.OUT_OF_MEMORY), ("not finite", RegistrationFailure.NO_MODEL)],

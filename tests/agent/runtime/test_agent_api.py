@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 from flocc_agent import Agent, AgentConfig
-from flocc_agent.composition import BadFix, BadKeyframe
+from flocc_agent.composition import BadKeyframe
 from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.interfaces import Camera
+from flocc_agent.core.measurements import BadMeasurement, Fix, StartPose, TagSighting
 from flocc_agent.geometry import Float, pose
 from flocc_agent.perception.synthetic import pose_image
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import Envelope, Heartbeat, LogDigest
+from flocc_protocol.messages import Envelope, Heartbeat, LogDigest, RecordBatch, Records
+from flocc_protocol.records import FixRecord, KeyframeRecord, PoseFixRecord, encode_record
 
 ALONE = TransportConfig(
     control_listen=("tcp/127.0.0.1:0",), bulk_listen=("tcp/127.0.0.1:0",), multicast=False, gossip=False
@@ -40,9 +42,9 @@ async def test_what_cannot_be_used_is_refused_and_the_agent_goes_on() -> None:
                 await agent.add_keyframe(pixels, T, 1.0)
         with pytest.raises(BadKeyframe, match="its camera says"):
             await agent.add_keyframe(np.zeros((7, 5, 3), np.uint8), np.eye(4), 1.0)
-        with pytest.raises(BadFix, match="no position"):
+        with pytest.raises(BadMeasurement, match="no position"):
             agent.add_fix(np.array([np.nan, 0.0, 0.0]), np.eye(3))
-        with pytest.raises(BadFix, match="not positive definite"):
+        with pytest.raises(BadMeasurement, match="not positive definite"):
             agent.add_fix(np.zeros(3), -np.eye(3))
         await agent.add_keyframe(pixels, np.eye(4), 1.0)
         async for correction in agent.corrections():
@@ -55,14 +57,30 @@ async def test_a_robot_whose_disk_is_behind_what_it_published_begins_another_log
     config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
     async with Agent(config, camera()) as agent:
         old = agent.log
-        ahead = Heartbeat(1, 7, 0, None, 0, 0, (LogDigest(old, 5, 77),))
+        lost = KeyframeRecord(0, 1.0, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None)
+        copy = RecordBatch(old, 0, 0, (encode_record(lost),))
         assert agent._driver is not None
-        agent._driver.put(MessageReceived(Envelope(LogId("r2"), ahead)))
+        agent._driver.put(MessageReceived(Envelope(LogId("r2"), Records((copy,)))))
         while "ended" not in _log_state(agent):
             await asyncio.sleep(0.01)
     async with Agent(config, camera()) as agent:
         assert agent.log.robot == "r1"
         assert agent.log != old
+
+
+async def test_what_a_heartbeat_claims_ends_no_log(tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
+    async with Agent(config, camera()) as agent:
+        old = agent.log
+        lie = Heartbeat(1, 7, 0, None, 0, 0, (LogDigest(old, 5, 77), LogDigest(old, 0, 77)))
+        assert agent._driver is not None
+        agent._driver.put(MessageReceived(Envelope(LogId("r2"), lie)))
+        await agent.add_keyframe(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 1.0)
+        async for _ in agent.corrections():
+            break
+        assert _log_state(agent) == "continued"
+    async with Agent(config, camera()) as agent:
+        assert agent.log == old
 
 
 def _log_state(agent: Agent) -> str:
@@ -83,3 +101,78 @@ async def test_an_agent_without_a_camera_says_so() -> None:
     async with Agent(CONFIG) as agent:
         with pytest.raises(BadKeyframe, match="has no camera"):
             await agent.add_keyframe(np.zeros((1, 1, 3), np.uint8), np.eye(4), 0.0)
+
+
+def at_m(x: float) -> Float:
+    return pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def log_of(agent: Agent) -> list[tuple[str, int, float]]:
+    """The agent's own log: kind of record, keyframe and x."""
+    found = []
+    for record in agent.robot.gossip.logs[agent.log].records:
+        if isinstance(record, KeyframeRecord):
+            found.append(("keyframe", record.index, record.T_odom_camera[0]))
+        elif isinstance(record, FixRecord):
+            found.append(("fix", record.index, float(record.position_m.numpy()[0])))
+        elif isinstance(record, PoseFixRecord):
+            found.append(("pose", record.index, record.T_world_camera[0]))
+    return found
+
+
+async def recorded(agent: Agent, count: int) -> list[tuple[str, int, float]]:
+    async with asyncio.timeout(20.0):
+        while len(log_of(agent)) < count:
+            await asyncio.sleep(0.01)
+    return log_of(agent)
+
+
+@pytest.mark.parametrize("slowly", [False, True], ids=["without pauses", "each after the other"])
+async def test_each_fix_belongs_to_the_keyframe_given_before_it(slowly: bool) -> None:
+    """Three keyframes 5 m apart, each followed by its fix: once every fix was 5 m off, and the first was lost."""
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        for k in range(3):
+            assert await agent.add_frame(pixels, at_m(5.0 * k), float(k))
+            agent.add_fix(np.array([5.0 * k, 0.0, 0.0]), np.eye(3))
+            if slowly:
+                await recorded(agent, 2 * (k + 1))
+        found = await recorded(agent, 6)
+    assert found == [(kind, k, 5.0 * k) for k in range(3) for kind in ("keyframe", "fix")]
+
+
+async def test_a_measurement_names_its_keyframe_by_a_stamp() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        for k in range(3):
+            await agent.add_keyframe(pixels, at_m(5.0 * k), 10.0 + k)
+        agent.add_fix(np.array([5.0, 0.0, 0.0]), np.eye(3), stamp_s=11.0)
+        found = await recorded(agent, 4)
+    assert ("fix", 1, 5.0) in found
+
+
+async def test_a_known_start_may_come_before_the_first_keyframe() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        agent.add_measurement(StartPose(at_m(7.0), 0.01 * np.eye(6)))
+        await agent.add_keyframe(pixels, at_m(0.0), 1.0)
+        found = await recorded(agent, 2)
+    assert found == [("keyframe", 0, 0.0), ("pose", 0, 7.0)]
+
+
+async def test_what_belongs_to_no_keyframe_is_refused_at_the_call() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    fix = Fix(np.zeros(3), np.eye(3))
+    async with Agent(CONFIG, camera()) as agent:
+        with pytest.raises(BadMeasurement, match="robot r1: fix: no keyframe was given yet"):
+            agent.add_measurement(fix)
+        await agent.add_frame(pixels, at_m(0.0), 10.0)
+        with pytest.raises(BadMeasurement, match=r"robot r1: fix at 3\.0 s: is older than the map"):
+            agent.add_measurement(fix, stamp_s=3.0)
+        with pytest.raises(BadMeasurement, match="no keyframe has this stamp"):
+            agent.add_measurement(fix, stamp_s=10.5)
+        assert not await agent.add_frame(pixels, at_m(0.1), 11.0)
+        with pytest.raises(BadMeasurement, match="did not become a keyframe"):
+            agent.add_measurement(fix)
+        with pytest.raises(BadMeasurement, match="not positive definite"):
+            agent.add_measurement(TagSighting("7", np.eye(4), np.zeros((6, 6))))

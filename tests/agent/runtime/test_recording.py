@@ -130,14 +130,16 @@ def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
 def test_intrinsics_of_another_size_are_refused(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "r")
     write_camera(path / "camera.toml", Camera(64, 48, 30.0, 30.0, 32.0, 24.0), np.eye(4))
-    with pytest.raises(RecordingError, match=r"000000.png: the image is 32x24, but .*camera.toml are for 64x48"):
+    with pytest.raises(
+        RecordingError, match=r"000000.png: the image is 32x24, but the intrinsics are for 64x48 .*camera.toml"
+    ):
         Recording.open(path)
 
 
 def test_a_damaged_image_is_named(tmp_path: Path) -> None:
     recording = Recording.open(write_recording(tmp_path / "r"))
     recording.frames[1].image_path.write_bytes(b"\x89PNG broken")
-    with pytest.raises(RecordingError, match=r"000001.png: the image cannot be read: it is damaged"):
+    with pytest.raises(RecordingError, match=r"000001.png: the image is (damaged|cut off)"):
         recording.load_image(recording.frames[1])
 
 

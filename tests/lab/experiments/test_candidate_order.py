@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from flocc_lab.experiments.candidate_order import CANDIDATE_ORDER, findings, reached, shares_of
+from flocc_lab.experiments.candidate_orders import CANDIDATE_ORDER, findings, reached, shares_of
 from flocc_lab.experiments.experiment import Verdict
 from flocc_lab.experiments.runner import run_experiment
 

@@ -11,7 +11,7 @@ import pytest
 from tests.lab.experiments.toy_experiment import TOY
 
 from flocc_agent.config import ConfigError
-from flocc_lab.commands.experiment import settings_of
+from flocc_lab.commands.experiments import settings_of
 from flocc_lab.experiments.experiment import ExperimentError
 from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.registry import ALL, find

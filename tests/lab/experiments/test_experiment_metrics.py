@@ -15,8 +15,8 @@ from flocc_lab.experiments.formulation_claims import Measured, formulation_findi
 from flocc_lab.experiments.logistic import fit_logistic
 from flocc_lab.experiments.overlap import joined
 from flocc_lab.experiments.precision_recall import curve
-from flocc_lab.experiments.registration import REGISTRATION, summarise
 from flocc_lab.experiments.registration_data import RegistrationSettings
+from flocc_lab.experiments.registration_quality import REGISTRATION, summarise
 from flocc_lab.experiments.scale_graphs import ScaleSettings, draw_graph
 from flocc_lab.experiments.steepness import learned, with_steepness, write_steepness
 

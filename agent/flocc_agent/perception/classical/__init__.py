@@ -1,7 +1,7 @@
-"""The classical front end: SIFT, aggregated local descriptors, two- and three-view geometry. No weights needed."""
+"""The classical front end: SIFT features, aggregated local descriptors, two- and three-view geometry. No weights."""
 
 from flocc_agent.perception.classical.describer import ClassicalDescriber
 from flocc_agent.perception.classical.encoder import ClassicalEncoder
-from flocc_agent.perception.classical.registrar import ClassicalRegistrar
+from flocc_agent.perception.classical.registrar import classical_registrar
 
-__all__ = ["ClassicalDescriber", "ClassicalEncoder", "ClassicalRegistrar"]
+__all__ = ["ClassicalDescriber", "ClassicalEncoder", "classical_registrar"]

@@ -10,7 +10,7 @@ from flocc_agent.core.interfaces import Image
 from flocc_agent.perception.classical.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features
 from flocc_agent.perception.latent import BadLatent, pack, unpack
 
-MODEL = "classical/sift-1"
+MODEL = "classical/sift-2"
 FEATURES_MAX = 10_000
 POINT_MAX = 100.0
 """Largest |x/z| of a feature; beyond it lies 90 degrees off the axis."""

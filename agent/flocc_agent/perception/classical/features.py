@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import ClassicalConfig
-from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.core.interfaces import Image
+from flocc_agent.perception.multiview.picture import rays_of, reduced_to
 
 DESCRIPTOR_LENGTH = 128
 QUANTISATION = 512.0
+CONTRAST_THRESHOLD = 0.02
+"""Of SIFT: half of OpenCV's, for dim images; with less, features do not repeat."""
 """A RootSIFT component times this fits a byte; the few above 255/512 are clipped."""
 
 
@@ -24,7 +27,7 @@ class Features:
     Attributes:
         points: (N, 2) float32, x/z and y/z in the camera frame, free of distortion.
         descriptors: (N, 128) uint8, RootSIFT times 512.
-        focal_px: Mean focal length; turns distances between points into pixels.
+        focal_px: Mean focal length in pixels of the picture that was searched; turns rays into its pixels.
     """
 
     points: NDArray[np.float32]
@@ -39,42 +42,19 @@ class FeatureExtractor:
         cv2.setNumThreads(1)  # global in OpenCV: one worker, one core
         self._features_max = config.features_max
         self._pixels_max = config.pixels_max
-        self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=config.contrast_threshold)
+        self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=CONTRAST_THRESHOLD)
 
     def extract(self, image: Image) -> Features:
         """Find and describe the features of an image; an image of one colour has none."""
         grey = np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
         reduced = reduced_to(grey, self._pixels_max)
         keypoints, sift = self._sift.detectAndCompute(reduced, None)
-        focal_px = (image.camera.fx + image.camera.fy) / 2.0
-        if sift is None or len(keypoints) == 0:
-            empty = np.zeros((0, DESCRIPTOR_LENGTH), np.uint8)
-            return Features(np.zeros((0, 2), np.float32), empty, focal_px)
-        found = np.array([keypoint.pt for keypoint in keypoints], np.float64)[: self._features_max]
-        factors = np.array(grey.shape[::-1]) / reduced.shape[::-1]
-        pixels = (found + 0.5) * factors - 0.5
-        points = undistorted(pixels, image.camera)
-        return Features(
-            points.astype(np.float32), root_sift(np.asarray(sift[: self._features_max], np.float32)), focal_px
-        )
-
-
-def reduced_to(grey: NDArray[np.uint8], pixels_max: int) -> NDArray[np.uint8]:
-    """Shrink an image (H, W) to at most this many pixels; a smaller one stays."""
-    factor = float(np.sqrt(pixels_max / grey.size))
-    if factor >= 1.0:
-        return grey
-    height, width = (max(round(size * factor), 1) for size in grey.shape)
-    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def undistorted(pixels: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Turn pixels (N, 2) into x/z and y/z (N, 2) in the camera frame, without distortion."""
-    distortion = np.array(camera.distortion)
-    if not np.any(distortion):
-        return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = cv2.undistortPoints(pixels[:, None, :], camera.K(), distortion)
-    return np.asarray(points, np.float64).reshape(-1, 2)
+        count = min(len(keypoints), self._features_max)
+        pixels = np.array([keypoint.pt for keypoint in keypoints[:count]], np.float64).reshape(-1, 2)
+        height, width = reduced.shape
+        points, focal_px = rays_of(pixels, (width, height), image.camera)
+        found = np.zeros((0, DESCRIPTOR_LENGTH)) if sift is None else sift[:count]
+        return Features(points.astype(np.float32), root_sift(np.asarray(found, np.float32)), focal_px)
 
 
 def root_sift(sift: NDArray[np.float32]) -> NDArray[np.uint8]:

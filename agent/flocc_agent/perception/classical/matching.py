@@ -3,12 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Indices = NDArray[np.intp]
+from flocc_agent.perception.multiview.parameters import Indices, Matched
 
 
-def mutual_matches(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], distance_ratio_max: float
-) -> tuple[Indices, Indices]:
+def mutual_matches(first: NDArray[np.uint8], second: NDArray[np.uint8], distance_ratio_max: float) -> Matched:
     """Match descriptors, the same whichever image comes first.
 
     Args:
@@ -38,6 +36,10 @@ def squared_distances(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
 def _nearest(squared: NDArray[np.float32], distance_ratio_max: float) -> tuple[Indices, NDArray[np.bool_]]:
     """Nearest column of every row, and whether it is clearly nearer than the second nearest."""
+    rows = np.arange(len(squared))
     nearest = squared.argmin(axis=1)
-    two = np.partition(squared, 1, axis=1)[:, :2]
-    return nearest, two[:, 0] < distance_ratio_max**2 * two[:, 1]
+    first = squared[rows, nearest]
+    squared[rows, nearest] = np.inf  # for the second smallest, which is faster than to partition
+    second = squared.min(axis=1)
+    squared[rows, nearest] = first
+    return nearest, first < distance_ratio_max**2 * second

@@ -58,6 +58,12 @@ from flocc_agent.perception.mast3r.weights import load_cosplace, load_mast3r
 from flocc_agent.stages import stage
 
 PLACE_SIDE_MIN_PX = 16
+JPEG_QUALITY = 90
+"""Of sent images; a lower one is smaller, and its latent less that of the picture."""
+ENCODED_IMAGES_MAX = 8
+"""Latents of received images kept in memory, 1.5 to 3 MB each."""
+CONSISTENCY_ROTATION_RAD = 0.2
+"""How far the two decodes' rotations, and directions of translation, may differ."""
 ACTIVATION_BYTES = 1_200_000_000
 """What one decode at 512x384 takes above the weights, measured in float32 with attention unfused, rounded up."""
 
@@ -129,7 +135,7 @@ class Mast3rEncoder:
         framed = [self._framed(image) for image in images]
         jpegs: list[NDArray[np.uint8] | None] = [None] * len(images)
         if self._config.exchange != "latent":
-            jpegs = [jpeg_of(pixels, self._config.jpeg_quality) for _, pixels in framed]
+            jpegs = [jpeg_of(pixels, JPEG_QUALITY) for _, pixels in framed]
         latents: list[NDArray[np.float32] | None] = [None] * len(images)
         if self._config.exchange != "image":
             encoded = self._engine.encode([mast3r_input(pixels) for _, pixels in framed])
@@ -161,10 +167,8 @@ class Mast3rRegistrar:
         self._engine = engine
         self._model = model
         self._config = config
-        self._matching = MatchParameters(
-            config.subsample_px, config.border_px, config.match_confidence_min, config.match_both_directions
-        )
-        self._pnp = PnpParameters(config.reprojection_px, config.iterations, inliers_min=config.inliers_min)
+        self._matching = MatchParameters(config.subsample_px)
+        self._pnp = PnpParameters()
         self._odometry_pairs: OrderedDict[str, PairResult] = OrderedDict()
         self._encoded: OrderedDict[bytes, LatentOnDevice] = OrderedDict()
         self._lock = threading.Lock()
@@ -189,26 +193,22 @@ class Mast3rRegistrar:
         loop_pair, *rest = self._register_pairs(pairs)
         if odometry is not None and rest:
             odometry_pair = self._remember_odometry_pair(odometry.key, rest[0])
-        odometry_count = 0 if odometry_pair is None else self._count(odometry_pair)
+        odometry_count = 0 if odometry_pair is None else odometry_pair.matches
         if isinstance(loop_pair.pose, PoseFailed):
-            return failed(loop_pair.pose, self._count(loop_pair), odometry_count)
+            return failed(loop_pair.pose, loop_pair.matches, odometry_count)
         if self._config.consistency_check:
             complaint = self._inconsistency(pairs[0], loop_pair)
             if complaint is not None:
-                return failed(complaint, self._count(loop_pair), odometry_count)
+                return failed(complaint, loop_pair.matches, odometry_count)
         return Registration(
             loop_pair.pose.T_1_2_unscaled,
-            self._count(loop_pair),
+            loop_pair.matches,
             odometry_count,
             scale(odometry, odometry_pair),
             loop_pair.pose.covariance,
             loop_pair.confidence,
             None if odometry_pair is None else odometry_pair.confidence,
         )
-
-    def _count(self, pair: PairResult) -> int:
-        """Correspondences of Eq. (1), counted alike for both kinds of pairs."""
-        return pair.matches if self._config.count == "matches" else pair.inliers()
 
     def _read(self, data: bytes) -> tuple[Geometry, LatentOnDevice]:
         """Read a payload, and encode it where it is a picture."""
@@ -229,7 +229,7 @@ class Mast3rRegistrar:
         latent = LatentOnDevice(self._engine.encode([mast3r_input(payload.pixels)])[0], size)
         with self._lock:
             self._encoded[key] = latent
-            while len(self._encoded) > self._config.encoded_images_max:
+            while len(self._encoded) > ENCODED_IMAGES_MAX:
                 self._encoded.popitem(last=False)
         return latent
 
@@ -259,7 +259,7 @@ class Mast3rRegistrar:
         if isinstance(back.pose, PoseFailed):
             return PoseFailed(f"the decode in the other order gave no pose: {back.pose.detail}")
         difference = disagreement_rad(result.pose.T_1_2_unscaled, back.pose.T_1_2_unscaled)
-        if difference > self._config.consistency_rotation_rad:
+        if difference > CONSISTENCY_ROTATION_RAD:
             return PoseFailed(f"the decodes in both orders disagree by {np.degrees(difference):.0f} degrees")
         return None
 
@@ -304,14 +304,13 @@ def build(config: Mast3rConfig) -> tuple[CosPlaceDescriber, Mast3rEncoder, Mast3
     compute = choose_compute(config.device, config.dtype)
     mast3r_path = given(config.weights, "weights", "MASt3R")
     place_path = given(config.place_weights, "place_weights", "CosPlace")
-    if config.memory_check:
-        check_memory(config, compute, mast3r_path)
+    check_memory(config, compute, mast3r_path)
     place = load_cosplace(place_path, device=compute.device)
     loaded = load_mast3r(
         mast3r_path, NAMED_SIZES[config.network], with_decoder=not config.encode_only, dtype=compute.dtype
     )
     engine = Engine(loaded.network, compute, config.batch_max, config.compile)
-    if config.warm_up:
+    if config.compile:
         engine.warm_up((384, 512) if config.image_size_px == 512 else (224, 224))
     return (
         CosPlaceDescriber(place.network, compute.device, config.place_input),

@@ -37,10 +37,6 @@ class PairResult:
     pose: RelativePose | PoseFailed
     confidence: float | None = None
 
-    def inliers(self) -> int:
-        """Matches that agree with the pose; 0 without one."""
-        return 0 if isinstance(self.pose, PoseFailed) else int(self.pose.inliers.sum())
-
 
 def estimated_K(view: View, geometry: Geometry) -> Float | None:
     """Calibration that a view's own pointmap implies, with the principal point in the middle; None if it fixes none."""

@@ -6,11 +6,11 @@ and counted; the agent goes on.
 
 import asyncio
 import logging
+import math
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.ros2.incoming import Lens, image_of, lens_of, odometry_of
+from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
 from flocc_agent.runtime.ros2.names import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.session import Ros2Session
@@ -43,6 +45,10 @@ logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
+IMAGES_MAX = 8
+"""Images that wait for odometry or for the encoder; the oldest gives way."""
+ODOMETRY_GAP_MAX_S = 0.5
+"""Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
 INBOX_MESSAGES_MAX = 512
 INBOX_BYTES_MAX = 64 * 1024 * 1024
 WATCH_PERIOD_S = 1.0
@@ -61,13 +67,13 @@ class Host:
         add_keyframe: Takes (image, T_odom_camera, stamp_s); may wait.
         mount_camera: Told `T_body_camera` once it is known, before the first keyframe.
         trajectory: Gives stamps (s) and (N, 4, 4) corrected body poses of all keyframes; called off the loop's thread.
-        report: Takes an event and its fields.
+        report: Takes facts for people.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
     mount_camera: Callable[[Float], None]
     trajectory: Callable[[], tuple[list[float], Float]]
-    report: Callable[[str, dict[str, Any]], None]
+    report: Callable[[Fact], None]
 
 
 class Ros2Adapter:
@@ -84,12 +90,12 @@ class Ros2Adapter:
         self._selector = selector
         self._host = host
         self._types = MessageTypes()
-        self._synchroniser = Synchroniser(config.images_max, config.odometry_gap_max_s)
+        self._synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S)
         self._static = StaticFrames()
         self._counter = TrafficCounter()
         self._problems = Problems(host.report)
         self._heard = Counter[str]()
-        self._lens: Lens | None = None
+        self._eye: Eye | None = None
         self._T_body_camera: Float | None = None
         self._teller: Teller | None = None
         self._posed = asyncio.Event()
@@ -146,7 +152,7 @@ class Ros2Adapter:
             wanted["image"] = (config.image_topic, COMPRESSED_IMAGE if config.is_compressed() else IMAGE, SENSOR)
             wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)
             if config.camera_mounting is None:
-                wanted["tf_static"] = (config.tf_static_topic, TF, TF_STATIC)
+                wanted["tf_static"] = (f"{config.tf_topic}_static", TF, TF_STATIC)
         return wanted
 
     # What comes
@@ -160,11 +166,17 @@ class Ros2Adapter:
                 case "image":
                     self._take_image(message.payload)
                 case "camera_info":
-                    self._lens = lens_of(self._types.read(message.payload, CAMERA_INFO), self._config.rectified)
+                    self._take_camera_info(message.payload)
                 case "tf_static":
                     self._static.add(self._types.read(message.payload, TF))
         except BadMessage as error:
             self._refuse(message.kind, str(error))
+
+    def _take_camera_info(self, payload: bytes) -> None:
+        model = model_of(self._types.read(payload, CAMERA_INFO), self._config.rectified)
+        if self._eye is None or self._eye.model != model:
+            view_deg = self._config.field_of_view_deg
+            self._eye = Eye(model, None if view_deg is None else math.radians(view_deg))
 
     def _take_odometry(self, payload: bytes) -> None:
         config = self._config
@@ -209,8 +221,8 @@ class Ros2Adapter:
     async def _consider(self, posed: PosedImage) -> None:
         if not self._selector.wants(posed.T_odom_body):
             return
-        lens = self._lens
-        if lens is None:
+        eye = self._eye
+        if eye is None:
             self._problems.counts["image without intrinsics"] += 1
             return
         message = self._types.read(posed.payload, COMPRESSED_IMAGE if self._config.is_compressed() else IMAGE)
@@ -218,7 +230,7 @@ class Ros2Adapter:
         if T_body_camera is None:
             self._problems.counts["image without mounting"] += 1
             return
-        image = await asyncio.to_thread(image_of, message, lens)
+        image = await asyncio.to_thread(eye.image, message)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
         if self._teller is not None:
@@ -251,7 +263,7 @@ class Ros2Adapter:
             waited_s += WATCH_PERIOD_S
             if self._session.is_connected() != connected:
                 connected = not connected
-                self._host.report("ros2_router", {"router": self._config.router, "connected": connected})
+                self._host.report(RouterConnected(router=self._config.router, connected=connected))
                 logger.info("ROS 2: %s to %s", "connected" if connected else "no longer connected", self._config.router)
             if waited_s == PATIENCE_S and not connected:
                 self._complain("router", f"nobody answers at {self._config.router}; is rmw_zenohd running?")

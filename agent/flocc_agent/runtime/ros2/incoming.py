@@ -1,66 +1,79 @@
 """A robot's messages as an agent takes them: intrinsics, stamped odometry, images."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.core.interfaces import Image
+from flocc_agent.lenses import CameraModel
+from flocc_agent.runtime.pictures import Levels, levels_of
 from flocc_agent.runtime.ros2.pixels import camera_of, compressed_pixels, raw_pixels, rectified_camera_of
 from flocc_agent.runtime.ros2.static_frames import pose_of_numbers
 from flocc_agent.runtime.ros2.types import COMPRESSED_IMAGE, BadMessage, checked_stamp_ns
+from flocc_agent.runtime.straightening import Straightener
 
 Float = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """Intrinsics, and a third radial coefficient that an agent's camera has no place for."""
+class Eye:
+    """One live camera: brings its messages to what an agent takes.
 
-    camera: Camera
-    k3: float = 0.0
+    Attributes:
+        model: How its pictures are taken.
+    """
+
+    def __init__(self, model: CameraModel, view_rad: float | None = None) -> None:
+        """Prepare.
+
+        Raises:
+            BadMessage: The lens does not see as much as is wanted of it.
+        """
+        self.model = model
+        self._size = (model.width, model.height)
+        self._levels: Levels | None = None
+        try:
+            self._straightener = Straightener(model, view_rad)
+        except ValueError as error:
+            raise BadMessage(str(error)) from error
+
+    def image(self, message: Any) -> Image:
+        """The image of an Image or CompressedImage message, without the distortion that an agent's camera cannot say.
+
+        Raises:
+            BadMessage: It cannot be read, or is of another size than the intrinsics.
+        """
+        try:
+            compressed = message.__msgtype__ == COMPRESSED_IMAGE
+            pixels = compressed_pixels(message, self._size) if compressed else raw_pixels(message)
+        except ValueError as error:
+            raise BadMessage(str(error)) from error
+        if pixels.shape[1::-1] != self._size:
+            seen = f"{pixels.shape[1]}x{pixels.shape[0]}"
+            raise BadMessage(f"an image is {seen}, but the intrinsics are for {self._size[0]}x{self._size[1]}")
+        eight = self._eight_bits(pixels) if pixels.dtype == np.uint16 else pixels
+        colour = np.repeat(eight[..., None], 3, axis=2) if eight.ndim == 2 else eight
+        straight = self._straightener.apply(np.ascontiguousarray(colour))
+        return Image(np.ascontiguousarray(straight, dtype=np.uint8), self._straightener.camera)
+
+    def _eight_bits(self, pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """Levels begin with the first image and only widen: what comes later is not known yet."""
+        own = levels_of([pixels])
+        known = self._levels or own
+        self._levels = Levels(min(known.black, own.black), max(known.white, own.white))
+        return self._levels.eight_bits(pixels)
 
 
-def lens_of(message: Any, rectified: bool) -> Lens:
+def model_of(message: Any, rectified: bool) -> CameraModel:
     """Intrinsics of a CameraInfo message.
 
     Raises:
-        BadMessage: The camera is not calibrated, or of a model that flocc does not take.
+        BadMessage: The camera is not calibrated, or of a model that flocc does not read.
     """
     try:
-        return Lens(rectified_camera_of(message)) if rectified else Lens(*camera_of(message))
+        return rectified_camera_of(message) if rectified else camera_of(message)
     except ValueError as error:
         raise BadMessage(str(error)) from error
-
-
-def image_of(message: Any, lens: Lens) -> Image:
-    """The image of an Image or CompressedImage message, undistorted where its lens has a third radial coefficient.
-
-    Raises:
-        BadMessage: It cannot be read, or is of another size than the intrinsics.
-    """
-    try:
-        pixels = compressed_pixels(message) if message.__msgtype__ == COMPRESSED_IMAGE else raw_pixels(message)
-    except ValueError as error:
-        raise BadMessage(str(error)) from error
-    camera = lens.camera
-    if pixels.shape[:2] != (camera.height, camera.width):
-        seen = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        raise BadMessage(f"an image is {seen}, but the intrinsics are for {camera.width}x{camera.height}")
-    colour = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
-    return _straight(np.ascontiguousarray(colour), lens)
-
-
-def _straight(pixels: NDArray[np.uint8], lens: Lens) -> Image:
-    """Take the distortion out where an agent's camera cannot say it."""
-    if lens.k3 == 0.0:
-        return Image(pixels, lens.camera)
-    import cv2
-
-    c = lens.camera
-    straight = cv2.undistort(pixels, c.K(), np.array([*c.distortion, lens.k3]))
-    return Image(np.asarray(straight, dtype=np.uint8), Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy))
 
 
 def odometry_of(message: Any, odom_frame: str, base_frame: str) -> tuple[int, Float]:

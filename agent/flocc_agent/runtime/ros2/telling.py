@@ -21,6 +21,8 @@ RELIABLE = Qos(10)
 TF_QOS = Qos(100)
 LATCHED = Qos(1, transient_local=True)
 PATH_PAUSE_RATIO = 9.0
+MAP_FRAME_TOPIC = "flocc/map_frame"
+"""Name of the swarm's map frame, in the namespace; when it changes, every pose jumps."""
 
 Trajectory = Callable[[], tuple[list[float], Float] | None]
 """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes, None while the body is not known."""
@@ -44,7 +46,7 @@ class Teller:
         self._tf = session.publisher(config.tf_topic, TF, TF_QOS)
         self._path = session.publisher(config.path_topic, PATH, LATCHED)
         self._pose = session.publisher(config.pose_topic, POSE, RELIABLE)
-        self._map_frame = session.publisher(config.map_frame_topic, TEXT, LATCHED)
+        self._map_frame = session.publisher(MAP_FRAME_TOPIC, TEXT, LATCHED)
         self._correction: Correction | None = None
         self._tf_last_ns: int | None = None
         self.path_changed = False
@@ -87,7 +89,7 @@ class Teller:
             pause_s = max(self._config.path_period_s, PATH_PAUSE_RATIO * (time.monotonic() - began_s))
 
     def _drawn(self) -> Any:
-        """The corrected path, of at most `path_poses_max` keyframes and the last; None where it is not known yet."""
+        """The corrected path, thinned evenly, with the last keyframe; None where it is not known yet."""
         known = self._trajectory()
         if known is None or not known[0]:
             return None

@@ -17,7 +17,9 @@ from tests.agent.runtime.ros2.raw_node import RawNode, gid, open_router
 from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.effects import Correction
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.reports import Fact
 from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
+from flocc_agent.runtime.facts import RosProblem, RouterConnected
 from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
@@ -75,7 +77,7 @@ class Agent:
     def __init__(self) -> None:
         self.keyframes: list[tuple[Image, Float, float]] = []
         self.mounted: list[Float] = []
-        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.facts: list[Fact] = []
         self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
         self.poses = [(EPOCH_S + 0.25, np.eye(4)), (EPOCH_S + 1.0, T_MAP_ODOM)]
 
@@ -86,10 +88,10 @@ class Agent:
         return [stamp_s for stamp_s, _ in self.poses], np.stack([T for _, T in self.poses])
 
     def host(self) -> Host:
-        return Host(self.add_keyframe, self.mounted.append, self.trajectory, lambda *event: self.events.append(event))
+        return Host(self.add_keyframe, self.mounted.append, self.trajectory, self.facts.append)
 
     def problems(self) -> list[str]:
-        return [fields["sentence"] for event, fields in self.events if event == "ros2_problem"]
+        return [fact.sentence for fact in self.facts if isinstance(fact, RosProblem)]
 
 
 def correction(covariance: Float | None = None) -> Correction:
@@ -287,8 +289,8 @@ async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None
         assert agent.problems() == [f"ROS 2: nobody answers at tcp/127.0.0.1:{port}; is rmw_zenohd running?"]
         with ros(port) as robot:
             await drive(robot, agent, 2)
-            linked = {"router": f"tcp/127.0.0.1:{port}", "connected": True}
-            await until(lambda: ("ros2_router", linked) in agent.events)
+            linked = RouterConnected(router=f"tcp/127.0.0.1:{port}", connected=True)
+            await until(lambda: linked in agent.facts)
 
 
 async def test_what_an_image_waits_for_is_said() -> None:

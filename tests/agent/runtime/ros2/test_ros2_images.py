@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from tests.agent.runtime.ros2 import cdr_by_hand
 
 from flocc_agent.core.interfaces import Camera, Image
-from flocc_agent.runtime.ros2.incoming import Lens, image_of, lens_of
+from flocc_agent.lenses import CameraModel
+from flocc_agent.runtime.ros2.incoming import Eye, model_of
 from flocc_agent.runtime.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, BadMessage, MessageTypes
 
 TYPES = MessageTypes()
 STAMP = (12, 34)
 HEIGHT, WIDTH = 6, 8
 CAMERA = Camera(WIDTH, HEIGHT, 5.0, 6.0, 4.0, 3.0)
-LENS = Lens(CAMERA)
+MODEL = CameraModel.of_camera(CAMERA)
 RGB = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
 GREY = RGB[..., 0]
 K = (5.0, 0.0, 4.0, 0.0, 6.0, 3.0, 0.0, 0.0, 1.0)
@@ -28,7 +29,7 @@ def read(encoding: str, pixels: NDArray[Any], padding: int = 0, big: int = 0) ->
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(HEIGHT, -1)
     padded = np.concatenate([rows, np.full((HEIGHT, padding), 77, np.uint8)], axis=1)
     payload = cdr_by_hand.image(STAMP, "cam", (HEIGHT, WIDTH), encoding, padded.tobytes(), padded.shape[1], big)
-    return image_of(TYPES.read(payload, IMAGE), LENS)
+    return Eye(MODEL).image(TYPES.read(payload, IMAGE))
 
 
 @pytest.mark.parametrize("padding", [0, 5])
@@ -72,8 +73,8 @@ def test_a_colour_filter_is_interpolated() -> None:
 @pytest.mark.parametrize(
     ("encoding", "said"),
     [
-        ("16UC1", "images are encoded as '16UC1'; flocc reads mono8, 8UC1, mono16, rgb8, bgr8"),
-        ("yuv422", "encoded as 'yuv422'"),
+        ("16UC1", "images are encoded as '16UC1', which is how depth is published; a grey camera publishes mono16"),
+        ("yuv444", "encoded as 'yuv444'; flocc reads mono8, 8UC1, mono16, rgb8, bgr8"),
         ("32FC1", "encoded as '32FC1'"),
         ("", "encoded as ''"),
     ],
@@ -86,23 +87,23 @@ def test_an_encoding_that_is_not_read_is_refused_by_name(encoding: str, said: st
 def test_an_image_with_fewer_bytes_than_its_size_is_refused() -> None:
     payload = cdr_by_hand.image(STAMP, "cam", (HEIGHT, WIDTH), "rgb8", bytes(10), 3 * WIDTH)
     with pytest.raises(BadMessage, match="an image has 10 bytes, too few for its size"):
-        image_of(TYPES.read(payload, IMAGE), LENS)
+        Eye(MODEL).image(TYPES.read(payload, IMAGE))
     short_step = cdr_by_hand.image(STAMP, "cam", (HEIGHT, WIDTH), "rgb8", bytes(3 * WIDTH * HEIGHT), WIDTH)
     with pytest.raises(BadMessage, match="too few"):
-        image_of(TYPES.read(short_step, IMAGE), LENS)
+        Eye(MODEL).image(TYPES.read(short_step, IMAGE))
 
 
 def test_an_image_without_pixels_is_refused() -> None:
     for encoding in ("mono8", "bayer_rggb8"):
         payload = cdr_by_hand.image(STAMP, "cam", (0, WIDTH), encoding, b"", WIDTH)
         with pytest.raises(BadMessage, match="an image has no pixels"):
-            image_of(TYPES.read(payload, IMAGE), LENS)
+            Eye(MODEL).image(TYPES.read(payload, IMAGE))
 
 
 def test_an_image_of_another_size_than_the_intrinsics_is_refused() -> None:
     payload = cdr_by_hand.image(STAMP, "cam", (2, 2), "mono8", bytes(4), 2)
     with pytest.raises(BadMessage, match="an image is 2x2, but the intrinsics are for 8x6"):
-        image_of(TYPES.read(payload, IMAGE), LENS)
+        Eye(MODEL).image(TYPES.read(payload, IMAGE))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -110,34 +111,34 @@ def test_compressed_images_are_read(suffix: str) -> None:
     smooth = cv2.resize(RGB[:2, :2], (WIDTH, HEIGHT))
     encoded = cv2.imencode(suffix, smooth[..., ::-1])[1].tobytes()
     payload = cdr_by_hand.compressed_image(STAMP, "cam", "rgb8; jpeg compressed bgr8", encoded)
-    image = image_of(TYPES.read(payload, COMPRESSED_IMAGE), LENS)
+    image = Eye(MODEL).image(TYPES.read(payload, COMPRESSED_IMAGE))
     np.testing.assert_allclose(image.pixels.astype(int), smooth.astype(int), atol=0 if suffix == ".png" else 40)
 
 
 @pytest.mark.parametrize("data", [b"", b"no image", b"\xff\xd8\xff"])
 def test_a_damaged_compressed_image_is_refused(data: bytes) -> None:
     payload = cdr_by_hand.compressed_image(STAMP, "cam", "h264", data)
-    with pytest.raises(BadMessage, match="compressed as 'h264' cannot be read; flocc reads JPEG and PNG"):
-        image_of(TYPES.read(payload, COMPRESSED_IMAGE), LENS)
+    with pytest.raises(BadMessage, match="compressed as 'h264' cannot be read: the image is"):
+        Eye(MODEL).image(TYPES.read(payload, COMPRESSED_IMAGE))
 
 
 def lens(
     D: tuple[float, ...] = (), rectified: bool = False, model: str = "plumb_bob", k: tuple[float, ...] = K
-) -> Lens:
+) -> CameraModel:
     payload = cdr_by_hand.camera_info(STAMP, "cam", (HEIGHT, WIDTH), k, D, P, model)
-    return lens_of(TYPES.read(payload, CAMERA_INFO), rectified)
+    return model_of(TYPES.read(payload, CAMERA_INFO), rectified)
 
 
 def test_intrinsics_are_read_for_raw_and_for_rectified_images() -> None:
-    assert lens((0.1, 0.2, 0.3, 0.4, 0.0)) == Lens(Camera(WIDTH, HEIGHT, 5.0, 6.0, 4.0, 3.0, (0.1, 0.2, 0.3, 0.4)))
-    assert lens((0.1, 0.2, 0.3, 0.4, 0.5), rectified=True) == Lens(Camera(WIDTH, HEIGHT, 7.0, 8.0, 4.5, 3.5))
+    assert lens((0.1, 0.2, 0.3, 0.4, 0.0)) == CameraModel(WIDTH, HEIGHT, 5.0, 6.0, 4.0, 3.0, (0.1, 0.2, 0.3, 0.4))
+    assert lens((0.1, 0.2, 0.3, 0.4, 0.5), rectified=True) == CameraModel(WIDTH, HEIGHT, 7.0, 8.0, 4.5, 3.5)
 
 
 def test_a_third_radial_coefficient_is_taken_out_of_the_image() -> None:
-    big = Camera(80, 60, 50.0, 50.0, 40.0, 30.0, (0.1, 0.0, 0.0, 0.0))
+    big = CameraModel(80, 60, 50.0, 50.0, 40.0, 30.0, (0.1, 0.0, 0.0, 0.0, -0.2))
     pixels = cv2.resize(RGB, (80, 60))
     payload = cdr_by_hand.image(STAMP, "cam", (60, 80), "rgb8", pixels.tobytes(), 240)
-    image = image_of(TYPES.read(payload, IMAGE), Lens(big, k3=-0.2))
+    image = Eye(big).image(TYPES.read(payload, IMAGE))
     expected = cv2.undistort(pixels, big.K(), np.array([0.1, 0.0, 0.0, 0.0, -0.2]))
     np.testing.assert_array_equal(image.pixels, expected)
     assert image.camera == Camera(80, 60, 50.0, 50.0, 40.0, 30.0)
@@ -146,7 +147,9 @@ def test_a_third_radial_coefficient_is_taken_out_of_the_image() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"model": "equidistant"}, "the distortion model is 'equidistant'; flocc takes plumb_bob"),
+        ({"model": "equidistant"}, "'equidistant' has 4 coefficients, but there are 0"),
+        ({"model": "inverse_brown"}, "the distortion model is 'inverse_brown'; flocc reads plumb_bob"),
+        ({"D": (0.1,) * 8}, "'plumb_bob' has 0 or 4 or 5 coefficients, but there are 8"),
         ({"k": (0.0,) * 9}, "focal lengths positive"),
         ({"k": (float("nan"),) * 9}, "must be finite"),
     ],

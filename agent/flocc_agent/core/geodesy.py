@@ -1,0 +1,37 @@
+"""WGS 84: places on Earth, and the local east-north-up frame around one."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.geometry import inverse, pose
+
+Float = NDArray[np.float64]
+
+SEMI_MAJOR_M = 6_378_137.0
+FLATTENING = 1.0 / 298.257223563
+ECCENTRICITY2 = FLATTENING * (2.0 - FLATTENING)
+
+
+class Place(NamedTuple):
+    """Latitude and longitude in degrees, height above the ellipsoid in metres."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
+def T_earth_enu(place: Place) -> Float:
+    """Pose (4, 4) of the frame east, north, up at a place in the Earth-centred frame (ECEF)."""
+    phi, lam = np.radians(place.latitude_deg), np.radians(place.longitude_deg)
+    east = np.array([-np.sin(lam), np.cos(lam), 0.0])
+    up = np.array([np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)])
+    across_m = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY2 * np.sin(phi) ** 2)
+    origin = across_m * np.array([up[0], up[1], (1.0 - ECCENTRICITY2) * np.sin(phi)]) + place.altitude_m * up
+    return pose(np.column_stack([east, np.cross(up, east), up]), origin)
+
+
+def T_enu_enu(origin: Place, place: Place) -> Float:
+    """Pose (4, 4) of the frame at a place in the frame at another one, the origin."""
+    return np.asarray(inverse(T_earth_enu(origin)) @ T_earth_enu(place))

@@ -1,0 +1,1 @@
+"""Relative poses from matched local features, whatever found and matched them: two and three views, and a verdict."""

@@ -1,0 +1,170 @@
+"""Registration of two latents of local features, with the scale from the query's odometry pair.
+
+The network unit is the length of the odometry pair's translation, so the pair has a translation of length one and
+Eq. (6) makes a closure metric. The closure is in the same unit where enough points are seen in all three images:
+neighbour, query and match. Elsewhere it has length one and no scale.
+
+What finds and matches the features is the front end's: `read` and `match`. So is the rule that accepts a pair: how much
+evidence a wrong one never has depends on the features (`acceptance.py`).
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.registration import (
+    Registration,
+    RegistrationFailed,
+    RegistrationFailure,
+    odometry_scale,
+)
+from flocc_agent.geometry import inverse
+from flocc_agent.perception.latent import BadLatent
+from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, evidence_of, evidence_of_neighbour
+from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
+from flocc_agent.perception.multiview.degeneracy import degeneracy
+from flocc_agent.perception.multiview.parameters import Geometry, Matched, Rays
+from flocc_agent.perception.multiview.three_view import three_view
+from flocc_agent.perception.multiview.two_view import TwoView, two_view
+from flocc_agent.stages import stage
+
+BASELINE_MIN_M = 1e-3
+"""An odometry pair that moved less gives no scale."""
+ROTATION_SIGMA_MIN_RAD = 0.005
+"""Calibration is not better than this, whatever the correspondences say."""
+TRANSLATION_SIGMA_MIN_RATIO = 0.01
+LENGTH_MIN = 0.1
+"""Translations below this, in network units, are not more certain for being short."""
+ODOMETRY_PAIRS_MAX = 256
+"""Odometry-pair results kept in memory, some 30 kB each."""
+
+F = TypeVar("F", bound=Rays)
+Result = Registration | RegistrationFailed
+
+
+class PairRegistrar(Generic[F]):
+    """Two latents to correspondences and a relative pose up to scale.
+
+    Args:
+        read: Features of a latent; raises `BadLatent`.
+        match: Which features of two images look alike.
+        geometry: Thresholds of the two- and three-view geometry.
+        acceptance: What a pair needs to be a closure; None leaves that to Eq. (1) and R_thr, as in the paper.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[bytes], F],
+        match: Callable[[F, F], Matched],
+        geometry: Geometry,
+        acceptance: Acceptance | None = None,
+    ) -> None:
+        self._read = read
+        self._match = match
+        self._geometry = geometry
+        self._acceptance = acceptance
+        self._odometry_pairs: OrderedDict[str, TwoView | int] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Result:
+        """Register the match's latent with the query's; raises nothing for bad latents."""
+        try:
+            return self.examined(query, match, odometry)[0]
+        except BadLatent as error:
+            return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
+
+    def examined(
+        self, query: bytes, match: bytes, odometry: OdometryPair | None, always: bool = False
+    ) -> tuple[Result, Evidence | None]:
+        """Register, and give what the verdict rests on; None where there is no pose.
+
+        Args:
+            query: Latent of the query.
+            match: Latent of the match.
+            odometry: The query's odometry pair.
+            always: Whether to ask the neighbour in any case, for measurements; else only where it decides.
+
+        Raises:
+            BadLatent: A latent is damaged or of another model.
+        """
+        with stage("decode"):
+            query_features, match_features = self._read(query), self._read(match)
+        with stage("match"):
+            odometry_pair = self._odometry_pair(query_features, odometry)
+            loop_pair = self._pair(query_features, match_features)
+        with stage("pose"):
+            result = self._posed(query_features, loop_pair, odometry_pair, odometry)
+        if isinstance(result, RegistrationFailed):
+            return result, None
+        evidence = evidence_of(result)
+        rule = self._acceptance
+        if odometry is not None and (always or (rule is not None and rule.needs_neighbour(evidence))):
+            with stage("match"):
+                neighbour_pair = self._pair(self._read(odometry.latent), match_features)
+            evidence = evidence_of_neighbour(evidence, neighbour_pair, result, odometry.T_neighbour_query)
+        return (result if rule is None else rule.judged(result, evidence)), evidence
+
+    def _pair(self, first: F, second: F, prior: DirectionPrior | None = None) -> TwoView | int:
+        return two_view(first, second, self._match(first, second), self._geometry, prior)
+
+    def _posed(
+        self, query: F, loop_pair: TwoView | int, odometry_pair: TwoView | int, odometry: OdometryPair | None
+    ) -> Result:
+        """Turn verified pairs into a result: with scale, without, or why not."""
+        counts = count(loop_pair), count(odometry_pair)
+        if isinstance(loop_pair, int):
+            detail = f"{loop_pair} verified correspondences, {self._geometry.correspondences_min} needed"
+            return RegistrationFailed(RegistrationFailure.FEW_CORRESPONDENCES, detail, *counts)
+        if odometry is not None and isinstance(odometry_pair, TwoView) and odometry_pair.view.prior is not None:
+            scaled = three_view(query, odometry_pair, loop_pair, self._geometry)
+            scale = odometry_scale(odometry.T_neighbour_query[:3, 3], odometry_pair.view.T_view_query[:3, 3])
+            if scaled is not None and scale is not None:
+                return registration(scaled, 1, counts, scale)
+        points = query.points[loop_pair.query_indices].astype(np.float64)
+        reason = degeneracy(points, loop_pair, self._geometry)
+        if reason is not None:
+            return RegistrationFailed(RegistrationFailure.DEGENERATE, reason, *counts)
+        return registration(loop_pair.refined, 0, counts, None)
+
+    def _odometry_pair(self, query: F, odometry: OdometryPair | None) -> TwoView | int:
+        """Verify the odometry pair, or look it up."""
+        if odometry is None:
+            return 0
+        with self._lock:
+            known = self._odometry_pairs.get(odometry.key)
+        if known is not None:
+            return known
+        T = odometry.T_neighbour_query
+        prior = None
+        if float(np.linalg.norm(T[:3, 3])) > BASELINE_MIN_M:
+            rotation_rad, direction_rad = (
+                self._geometry.odometry_rotation_sigma_rad,
+                self._geometry.odometry_direction_sigma_rad,
+            )
+            prior = DirectionPrior(T, rotation_rad, direction_rad)
+        pair = self._pair(query, self._read(odometry.latent), prior)
+        with self._lock:
+            self._odometry_pairs[odometry.key] = pair
+            while len(self._odometry_pairs) > ODOMETRY_PAIRS_MAX:
+                self._odometry_pairs.popitem(last=False)
+        return pair
+
+
+def registration(refined: Refined, k: int, counts: tuple[int, int], scale_initial: float | None) -> Registration:
+    """Put view k, the match, into a result; without scale its length is one and as uncertain."""
+    view = refined.views[k]
+    length = float(np.linalg.norm(view.T_view_query[:3, 3]))
+    floor = np.array([ROTATION_SIGMA_MIN_RAD] * 3 + [TRANSLATION_SIGMA_MIN_RATIO * max(length, LENGTH_MIN)] * 3)
+    covariance = covariance_of_view(refined, k, floor)
+    if scale_initial is None:
+        covariance[3:, 3:] += np.outer(view.T_view_query[:3, 3], view.T_view_query[:3, 3])
+    return Registration(inverse(view.T_view_query), *counts, scale_initial, covariance)
+
+
+def count(pair: TwoView | int) -> int:
+    """Verified correspondences of a pair, whether or not it gave a pose."""
+    return pair if isinstance(pair, int) else pair.correspondences

@@ -1,0 +1,49 @@
+"""Takes the distortion out of pictures where an agent's camera cannot say it: for recordings, bags and live robots."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.lenses import CameraModel, LensKind, pixel_map, straight_camera
+
+
+class Straightener:
+    """Remaps the pictures of one camera.
+
+    Attributes:
+        model: How the pictures were taken.
+        camera: The agent's camera of what `apply` gives.
+    """
+
+    def __init__(self, model: CameraModel, view_rad: float | None = None) -> None:
+        """Prepare; the map of a wide lens is computed once, with the first picture.
+
+        Args:
+            model: How the pictures were taken.
+            view_rad: Horizontal field of view of a wide lens's remapped pictures; None takes as much as there is.
+
+        Raises:
+            ValueError: The lens does not see so much.
+        """
+        self.model = model
+        self.camera: Camera = straight_camera(model, view_rad)
+        self._map: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether `apply` changes anything."""
+        return self.model.agent_camera() is None
+
+    def apply(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Remap a picture of the model's size, grey or in colour, of 8 or 16 bits."""
+        import cv2
+
+        if not self.is_needed:
+            return pixels
+        if self.model.kind is LensKind.PINHOLE:
+            return np.asarray(cv2.undistort(pixels, self.model.K(), np.array(self.model.distortion)))
+        if self._map is None:
+            self._map = pixel_map(self.model, self.camera)
+        return np.asarray(cv2.remap(pixels, *self._map, cv2.INTER_LINEAR))

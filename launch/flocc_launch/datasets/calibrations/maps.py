@@ -1,0 +1,288 @@
+"""Forms that are maps: which cameras a document holds, each as one flat map that `fields` understands."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flocc_launch.datasets.calibrations.keys import Keys, flat_numbers, plain
+
+Map = dict[str, Any]
+Cameras = dict[str, Map]
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form of calibration that is a map.
+
+    Attributes:
+        name: As a person would call it.
+        fits: Whether a document is of it.
+        cameras: Its cameras by name.
+    """
+
+    name: str
+    fits: Callable[[Map], bool]
+    cameras: Callable[[Map], Cameras]
+
+
+def form_of(document: Map) -> Form:
+    """The form of a document; the plain one where no other fits."""
+    return next(form for form in FORMS if form.fits(document))
+
+
+def _has(*names: str) -> Callable[[Map], bool]:
+    return lambda document: all(name in document for name in names)
+
+
+def _kalibr(document: Map) -> Cameras:
+    rest = {key: value for key, value in document.items() if not _is_camera(key, value)}
+    return {key: {**rest, **value} for key, value in document.items() if _is_camera(key, value)}
+
+
+def _is_camera(key: str, value: Any) -> bool:
+    return re.fullmatch(r"(cam|camera)_?\d+", key.lower()) is not None and isinstance(value, dict)
+
+
+def _listed_cameras(document: Map) -> Cameras:
+    """SVO and maplab (a map `camera` beside `T_B_C`), OKVIS (all in one map)."""
+    found: Cameras = {}
+    for number, entry in enumerate(document["cameras"]):
+        if not isinstance(entry, dict):
+            raise ValueError(f"its camera {number} is no map")
+        inner = entry.get("camera", {})
+        camera = {**{key: value for key, value in entry.items() if key != "camera"}, **inner}
+        if isinstance(distortion := camera.get("distortion"), dict) and "type" in distortion:
+            extra = set(distortion) - {"type", "parameters"}
+            if extra:
+                raise ValueError(f"the key {f'distortion.{min(extra)}'!r} is not understood")
+            camera["distortion"] = distortion.get("parameters") or []
+            camera["distortion_model"] = distortion["type"]
+        camera.pop("id", None)
+        found[str(camera.pop("label", f"cam{number}"))] = camera
+    return found
+
+
+def _orb(document: Map) -> Cameras:
+    """ORB-SLAM 2 and 3: dotted keys; `Camera.` and `Camera1.` are one camera, `Camera2.` and `LEFT.` are others."""
+    groups: dict[str, Map] = {}
+    rest: Map = {}
+    for key, value in document.items():
+        group, dot, name = key.partition(".")
+        if dot and re.fullmatch(r"Camera\d?|LEFT|RIGHT|IMU", group):
+            groups.setdefault(group, {})[name] = value
+        elif not re.match(r"(ORBextractor|Viewer|System|LoopClosing|RGBD|File|Optimizer|PointCloud|Stereo)\.", key):
+            rest[key] = value
+    shared, imu = groups.pop("Camera", {}), groups.pop("IMU", {})
+    rest |= {key: value for key, value in imu.items() if plain(key) in ("tbc", "tbc1")}
+    first = {**rest, **_merged(shared, groups.pop("Camera1", {}))}
+    if plain(str(first.get("type", ""))) == "rectified":
+        first = {key: value for key, value in first.items() if key != "type"}
+    if "LEFT" in groups:
+        return {"Camera": first, **{name: {**rest, **groups[name]} for name in ("LEFT", "RIGHT") if name in groups}}
+    others = {name: {**rest, "type": shared.get("type"), **groups[name]} for name in groups}
+    return {"Camera1": first, **others}
+
+
+def _merged(shared: Map, own: Map) -> Map:
+    twice = next((key for key in own if key in shared and shared[key] != own[key]), None)
+    if twice is not None:
+        raise ValueError(f"the keys 'Camera.{twice}' and 'Camera1.{twice}' say different things")
+    return {**shared, **own}
+
+
+CAMODOCAL = {"pinhole": "radtan", "pinholefull": "rational_polynomial", "mei": "omni", "kannalabrandt": "equidistant"}
+
+
+def _camodocal(document: Map) -> Cameras:
+    """VINS-Mono and VINS-Fusion, by camodocal: parameters in maps of their own, whose names depend on the model."""
+    camera = {key: value for key, value in document.items() if not key.endswith("_parameters")}
+    model = plain(str(document.get("model_type", "")))
+    if model in ("scaramuzza", "ocam"):
+        raise ValueError(
+            "is of Scaramuzza's OCamCalib model; flocc does not read it: calibrate with Kalibr (omni, ds, equi)"
+        )
+    parts = {key: value for key, value in document.items() if key.endswith("_parameters")}
+    for key, part in parts.items():
+        if not isinstance(part, dict):
+            raise ValueError(f"{key} must be a map")
+        renamed = {f"k{k + 1}": f"k{k}" for k in (1, 2, 3, 4)} if model == "kannalabrandt" else {}
+        camera |= {renamed.get(str(name), str(name)): value for name, value in part.items()}
+    if model not in CAMODOCAL:
+        raise ValueError(
+            f"the camera model is {document.get('model_type')!r}; flocc reads {', '.join(CAMODOCAL)} of camodocal"
+        )
+    kept = {name: value for name, value in camera.items() if name != "model_type"}
+    return {"camera": {**kept, "camera_model" if model == "mei" else "distortion_model": CAMODOCAL[model]}}
+
+
+def _basalt(document: Map) -> Cameras:
+    value = document["value0"]
+    extrinsics, sizes = value.get("T_imu_cam"), value.get("resolution")
+    rest = {key: each for key, each in value.items() if key not in ("T_imu_cam", "intrinsics", "resolution")}
+    cameras: Cameras = {}
+    for number, entry in enumerate(value["intrinsics"]):
+        kind, numbers = plain(str(entry.get("camera_type"))), dict(entry.get("intrinsics", {}))
+        numbers.pop("rpmax", None)
+        camera: Map = {**rest, **numbers, "camera_model": {"pinhole": "none"}.get(kind, entry.get("camera_type"))}
+        for name, listed in (("T_imu_cam", extrinsics), ("resolution", sizes)):
+            if listed is not None and len(listed) != len(value["intrinsics"]):
+                raise ValueError(f"has {len(value['intrinsics'])} cameras, but {name} has {len(listed)} entries")
+            if listed is not None:
+                camera[name] = listed[number]
+        cameras[f"cam{number}"] = camera
+    return cameras
+
+
+def _nerfstudio(document: Map) -> Cameras:
+    """Nerfstudio and instant-ngp: one camera for all frames, or one in each, which must be the same."""
+    rest = {key: value for key, value in document.items() if key != "frames"}
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "camera_angle_x")
+    frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
+    own = [{name: frame[name] for name in names if name in frame} for frame in frames]
+    if any(each != own[0] for each in own[1:]):
+        raise ValueError("has frames of different cameras; flocc takes one camera per robot")
+    camera = {**rest, **(own[0] if own else {})}
+    fisheye = camera.pop("is_fisheye", None)
+    model = plain(str(camera.get("camera_model") or ("OPENCV_FISHEYE" if fisheye else "OPENCV")))
+    known = {"opencv": "opencv", "opencvfisheye": "equidistant", "pinhole": "none", "simplepinhole": "none"}
+    if model not in known:
+        raise ValueError(
+            f"the camera model is {camera['camera_model']!r}; flocc reads OPENCV, OPENCV_FISHEYE and PINHOLE"
+        )
+    camera["camera_model"] = None
+    camera["distortion_model"] = (
+        known[model] if model != "opencv" or any(k in camera for k in ("k1", "k2", "p1")) else None
+    )
+    return {"camera": _with_angles(camera)}
+
+
+def _with_angles(camera: Map) -> Map:
+    """Focal lengths from fields of view, where the file has only those."""
+    angles = {axis: camera.pop(f"camera_angle_{axis}", None) for axis in "xy"}
+    if "fl_x" not in camera and angles["x"] is not None:
+        if "w" not in camera or "h" not in camera:
+            raise ValueError("has a field of view (camera_angle_x) but no w and h: add them")
+        width, height = float(camera["w"]), float(camera["h"])
+        focal = width / 2 / float(np.tan(float(angles["x"]) / 2))
+        camera |= {"fl_x": focal, "fl_y": focal, "cx": camera.get("cx", width / 2), "cy": camera.get("cy", height / 2)}
+    elif "fl_x" in camera and "fl_y" not in camera:
+        camera["fl_y"] = camera["fl_x"]
+    return camera
+
+
+def _opensfm(document: Map) -> Cameras:
+    """OpenSfM and ODM: lengths in units of the larger side, the principal point from the middle."""
+    cameras: Cameras = {}
+    for name, given in document.items():
+        keys = Keys(given)
+        kind = plain(keys.text("projection_type") or "")
+        if kind not in ("perspective", "brown", "fisheyeopencv", "simpleradial", "radial"):
+            raise ValueError(
+                f"the projection type is {given.get('projection_type')!r}; "
+                "flocc reads perspective, brown and fisheye_opencv of OpenSfM"
+            )
+        width, height = keys.number("width"), keys.number("height")
+        if width is None or height is None:
+            raise ValueError("the image size is missing (width and height)")
+        side, focal = max(width, height), keys.number("focal")
+        fx, fy = keys.number("focal_x") or focal, keys.number("focal_y") or focal
+        if fx is None or fy is None:
+            raise ValueError("the intrinsics are missing (focal, or focal_x and focal_y)")
+        cx, cy = keys.number("c_x") or 0.0, keys.number("c_y") or 0.0
+        camera: Map = {key: given[key] for key in keys.left()}
+        camera |= {"width": width, "height": height, "fx": fx * side, "fy": fy * side}
+        camera |= {"cx": width / 2 - 0.5 + cx * side, "cy": height / 2 - 0.5 + cy * side}
+        cameras[name] = {**camera, "distortion_model": "equidistant" if kind == "fisheyeopencv" else "opencv"}
+    return cameras
+
+
+def _gyroflow(document: Map) -> Cameras:
+    size, lens = document["calib_dimension"], document["fisheye_params"]
+    keys = ("camera_matrix", "distortion_coeffs")
+    return {
+        "camera": {
+            "width": size["w"], "height": size["h"], "distortion_model": "equidistant",
+            **{key: lens[key] for key in keys},
+        }
+    }  # fmt: skip
+
+
+def _depthai(document: Map) -> Cameras:
+    cameras: Cameras = {}
+    for socket, given in document["cameraData"]:
+        models = {0: "none", 1: "equidistant"}
+        kind = given.get("cameraType", 0)
+        if kind not in models:
+            raise ValueError(f"the camera type is {kind}; flocc reads 0 (perspective) and 1 (fisheye) of DepthAI")
+        coefficients = flat_numbers(given.get("distortionCoeff", []), "distortionCoeff")
+        camera = {
+            "width": given["width"], "height": given["height"], "K": given["intrinsicMatrix"],
+            "distortion": coefficients[:4] if kind == 1 and not any(coefficients[4:]) else coefficients,
+        }  # fmt: skip
+        cameras[f"CAM{socket}"] = camera | ({"distortion_model": models[kind]} if kind else {})
+    return cameras
+
+
+def _stereo(document: Map) -> Cameras:
+    """OpenCV's stereo sample: M1 D1 of the left camera, M2 D2 of the right one."""
+    rest = {key: value for key, value in document.items() if re.fullmatch(r"(image_)?(width|height)", key)}
+    sides = {"left": "1", "right": "2"}
+    return {
+        side: {**rest, "camera_matrix": document[f"M{n}"], "distortion": document[f"D{n}"]}
+        for side, n in sides.items()
+        if f"M{n}" in document and f"D{n}" in document
+    }
+
+
+def _plain(document: Map) -> Cameras:
+    """All in one map: EuRoC, Kimera, ROS, OpenCV, RTAB-Map, MASt3R-SLAM, flocc's own, and whoever is like them."""
+    camera = dict(document)
+    for name in ("camera", "intrinsics", "calibration", "intrinsic", "cam", "camera_info", "color", "rgb"):
+        inner = camera.get(name)
+        if isinstance(inner, dict) and "data" not in inner and "rows" not in inner:
+            del camera[name]
+            twice = next((key for key in inner if key in camera and camera[key] != inner[key]), None)
+            if twice is not None:
+                raise ValueError(f"the keys {twice!r} and '{name}.{twice}' say different things")
+            camera |= inner
+    if isinstance(listed := camera.get("calibration"), list):
+        del camera["calibration"]
+        numbers = flat_numbers(listed, "calibration")
+        camera |= {"intrinsics": numbers[:4], "distortion": numbers[4:]} if "intrinsics" not in camera else {}
+    if isinstance(fisheye := camera.get("fisheye_model"), int | bool):
+        del camera["fisheye_model"]
+        camera |= {"distortion_model": "fisheye"} if fisheye else {}
+    flags = camera.get("flags")
+    if isinstance(flags, str) and "fisheye" in flags.lower() and "distortion_model" not in camera:
+        camera["distortion_model"] = "fisheye"
+    return {"camera": camera}
+
+
+FORMS: tuple[Form, ...] = (
+    Form("Basalt", lambda d: isinstance(d.get("value0"), dict) and "intrinsics" in d["value0"], _basalt),
+    Form("nerfstudio transforms.json", lambda d: isinstance(d.get("frames"), list), _nerfstudio),
+    Form("DepthAI", lambda d: isinstance(d.get("cameraData"), list), _depthai),
+    Form("Gyroflow", _has("fisheye_params", "calib_dimension"), _gyroflow),
+    Form("SVO, maplab or OKVIS", lambda d: isinstance(d.get("cameras"), list), _listed_cameras),
+    Form("Kalibr camchain", lambda d: any(_is_camera(key, value) for key, value in d.items()), _kalibr),
+    Form("camodocal (VINS)", lambda d: "model_type" in d or "projection_parameters" in d, _camodocal),
+    Form("ORB-SLAM settings", lambda d: any(re.match(r"(Camera\d?|LEFT)\.", key) for key in d), _orb),
+    Form("OpenCV stereo", _has("M1", "D1"), _stereo),
+    Form(
+        "OpenSfM",
+        lambda d: bool(d) and all(isinstance(value, dict) and "projection_type" in value for value in d.values()),
+        _opensfm,
+    ),
+    Form("one map", lambda _: True, _plain),
+)
+
+REFUSED_MAPS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], str], ...] = (
+    ("a Meshroom scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
+    ("a Kalibr target", lambda d: "target_type" in d, "give the camchain file that Kalibr writes"),
+    ("Kalibr's IMU file", lambda d: "accelerometer_noise_density" in d and "fx" not in d and "intrinsics" not in d,
+     "give the camchain file that Kalibr writes"),
+    ("a COCO or other annotation", lambda d: "annotations" in d and "images" in d, "give a calibration"),
+)  # fmt: skip

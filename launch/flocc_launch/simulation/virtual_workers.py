@@ -1,0 +1,157 @@
+"""Simulated workers: real perception and optimisation, whose answers come after a drawn time.
+
+Each robot has one encoder, one registrar and one optimiser. Results are computed when they are due, so a robot that
+dies meanwhile costs nothing; they never depend on how long they took.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.blocks import BlockProblem, BlockStep
+from flocc_agent.core.effects import IterateBlock, Optimise, Register
+from flocc_agent.core.events import (
+    BlockIterated,
+    BlockIterationFailed,
+    Event,
+    GraphOptimisationFailed,
+    GraphOptimised,
+    KeyframeEncoded,
+    KeyframeEncodingFailed,
+    LatentMissing,
+    PairRegistered,
+)
+from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
+from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.geometry import pose_from_tq
+from flocc_agent.stages import StageTimes
+from flocc_launch.simulation.disk import Disk
+from flocc_launch.simulation.virtual_playback import Capture
+from flocc_protocol.arrays import Array
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import KeyframeId
+
+logger = logging.getLogger(__name__)
+
+Float = NDArray[np.float64]
+Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+Iterator = Callable[[BlockProblem], BlockStep | OptimisationFailed]
+
+
+class Eyes(Protocol):
+    """Perception as the simulation needs it."""
+
+    def encode(self, capture: Capture) -> tuple[Array, bytes]:
+        """Descriptor and latent of a keyframe."""
+        ...
+
+    def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
+        """Register the match's latent with the query's."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class WorkTimes:
+    """How long workers take, drawn uniformly between half and one and a half of these."""
+
+    encode_s: float = 0.1
+    register_s: float = 0.25
+    optimise_s: float = 0.15
+    iterate_s: float = 0.05
+
+
+class Workers:
+    """The workers of one robot.
+
+    Attributes:
+        slowness: Factor on every duration.
+        stages: How long what was asked of them takes, on virtual time.
+    """
+
+    def __init__(
+        self, eyes: Eyes, optimiser: Optimiser, iterator: Iterator, times: WorkTimes, rng: np.random.Generator
+    ) -> None:
+        self.slowness = 1.0
+        self.stages = StageTimes()
+        self._eyes = eyes
+        self._optimiser = optimiser
+        self._iterator = iterator
+        self._times = times
+        self._rng = rng
+        self._encoder_free_s = 0.0
+
+    def encoded_at_s(self, now_s: float) -> float:
+        """When the encoder, which takes one image after the other, is done with one more."""
+        self.stages.observe("encode_wait", max(self._encoder_free_s - now_s, 0.0))
+        self._encoder_free_s = max(now_s, self._encoder_free_s) + self._lasts("encode", self._times.encode_s)
+        return self._encoder_free_s
+
+    def registered_at_s(self, now_s: float) -> float:
+        """When a registration that starts now is done."""
+        return now_s + self._lasts("register", self._times.register_s)
+
+    def optimised_at_s(self, now_s: float) -> float:
+        """When an optimisation that starts now is done."""
+        return now_s + self._lasts("optimise", self._times.optimise_s)
+
+    def iterated_at_s(self, now_s: float) -> float:
+        """When an iteration of the own block that starts now is done."""
+        return now_s + self._lasts("iterate", self._times.iterate_s)
+
+    def restart(self) -> None:
+        """Forget the queue."""
+        self._encoder_free_s = 0.0
+
+    def encode(self, keyframe: KeyframeId, capture: Capture, disk: Disk) -> Event:
+        """Describe and encode an image, and store the latent."""
+        try:
+            descriptor, latent = self._eyes.encode(capture)
+        except FloccError as error:
+            return KeyframeEncodingFailed(keyframe, str(error))
+        disk.put_latent(keyframe, latent)
+        return KeyframeEncoded(keyframe, descriptor)
+
+    def register(self, job: Register, disk: Disk) -> Event:
+        """Register a pair, or say which latent is missing."""
+        latents: list[bytes] = []
+        for keyframe in (job.query, job.match, job.neighbour):
+            latent = disk.latents.get(keyframe)
+            if latent is None:
+                return LatentMissing(job.pair, keyframe)
+            latents.append(latent)
+        query, match, neighbour = latents
+        T_neighbour_query = pose_from_tq(np.array(job.T_neighbour_query))
+        odometry = OdometryPair(neighbour, T_neighbour_query, f"{job.neighbour} {job.query}")
+        try:
+            return PairRegistered(job.pair, self._eyes.register(query, match, odometry))
+        except Exception as error:  # as in the real workers, a failure is an event
+            logger.error("registering %s with %s failed", job.query, job.match, exc_info=True)
+            return PairRegistered(job.pair, RegistrationFailed(RegistrationFailure.CRASHED, str(error)))
+
+    def optimise(self, job: Optimise) -> Event:
+        """Optimise a pose graph; how long it really took is nobody's business on virtual time."""
+        try:
+            solution = self._optimiser(job.graph, job.initial)
+        except Exception as error:  # as in the real workers, a failure is an event
+            logger.error("round %d of %s failed", job.round, job.term, exc_info=True)
+            return GraphOptimisationFailed(job.term, job.round, str(error).strip().split("\n")[0])
+        if isinstance(solution, OptimisationFailed):
+            return GraphOptimisationFailed(job.term, job.round, solution.reason)
+        return GraphOptimised(job.term, job.round, replace(solution, solve_s=0.0, timings_s={}))
+
+    def iterate(self, job: IterateBlock) -> Event:
+        """Do one iteration of a robot's block."""
+        step = self._iterator(job.problem)
+        if isinstance(step, OptimisationFailed):
+            return BlockIterationFailed(job.number, step.reason)
+        return BlockIterated(job.number, step)
+
+    def _lasts(self, stage: str, typical_s: float) -> float:
+        lasts_s = self.slowness * typical_s * float(self._rng.uniform(0.5, 1.5))
+        self.stages.observe(stage, lasts_s)
+        return lasts_s
