@@ -67,7 +67,7 @@ def head_of(data: Encoded) -> Head:
     """
     if len(data) == 0:
         raise PictureError("the image is empty")
-    start = bytes(data[:16])
+    start = bytes(data[:32])
     reader = next((read for magic, read in _READERS if magic.match(start)), None)
     if reader is None:
         name = next((name for magic, name in REFUSED if magic.match(start)), None)
@@ -203,6 +203,19 @@ def _tiff(data: Encoded) -> Head:
     return Head("TIFF", width, height, max(bits, 8), _orientation(page))
 
 
+def stored_tiff(data: Encoded) -> bytes:
+    """The same TIFF with orientation 1: OpenCV turns TIFFs even where it is told not to."""
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = struct.unpack(f"{order}I", data[4:8])
+    (count,) = struct.unpack(f"{order}H", data[at : at + 2])
+    patched = bytearray(data)
+    for place in range(at + 2, at + 2 + 12 * count, 12):
+        if struct.unpack(f"{order}H", data[place : place + 2])[0] == _ORIENTATION:
+            patched[place + 8 : place + 10] = struct.pack(f"{order}H", 1)
+    return bytes(patched)
+
+
+_ORIENTATION = 274
 _TIFF_PAGES_MAX = 64
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
 
@@ -241,7 +254,7 @@ def _exif_orientation(exif: bytes) -> int:
 
 
 def _orientation(page: dict[int, tuple[int, ...]]) -> int:
-    value = page.get(274, (1,))[0]
+    value = page.get(_ORIENTATION, (1,))[0]
     return value if 1 <= value <= 8 else 1
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.picture_heads import Encoded, Head, PictureError, head_of
+from flocc_agent.runtime.picture_heads import Encoded, Head, PictureError, head_of, stored_tiff
 
 __all__ = ["FULL", "Head", "Levels", "PictureError", "good_pictures", "levels_of", "picture_head", "read_picture"]
 
@@ -117,6 +117,8 @@ def decoded(encoded: Encoded, size: Size | None = None) -> Pixels:
     import cv2
 
     head = head_of(encoded)
+    if head.format == "TIFF" and head.orientation != 1:
+        encoded = stored_tiff(encoded)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)

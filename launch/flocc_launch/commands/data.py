@@ -31,6 +31,9 @@ TrajectoryFormat = Annotated[
         "kitti, or a line such as 'time[ms] x y z qw qx qy qz'."
     ),
 ]
+View = Annotated[
+    float | None, typer.Option(min=1, max=159, help="Horizontal field of view kept of a wide lens, degrees.")
+]
 Every = Annotated[int, typer.Option(min=1, help="Of a bag, keep one image of so many.")]
 
 
@@ -66,6 +69,7 @@ def convert(
     every: Every = 1,
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
     trajectory_format: TrajectoryFormat = None,
+    field_of_view: View = None,
 ) -> None:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended."""
     from flocc_launch.datasets.commands import convert as run
@@ -74,7 +78,7 @@ def convert(
         path = run(
             source, out, format_name=format_name, camera=camera, odometry=odometry, truth=truth,
             image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg,
-            form=trajectory_format, progress=progress,
+            form=trajectory_format, view_deg=field_of_view, progress=progress,
         )  # fmt: skip
     typer.echo(f"recording: {path}")
 
@@ -125,6 +129,7 @@ def split(
     drift: Annotated[
         str | None, typer.Option(help="What carried the camera, where odometry is made: handheld, wheeled, car, drone.")
     ] = None,
+    field_of_view: View = None,
 ) -> None:
     """Cut a data set by time into recordings of several robots; odometry that it lacks is made from ground truth."""
     from flocc_launch.datasets.commands import split as run
@@ -134,7 +139,7 @@ def split(
     with progress_bar("cutting") as progress:
         paths = run(
             source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format, kind=kind,
-            progress=progress,
+            view_deg=field_of_view, progress=progress,
         )  # fmt: skip
     for path in paths:
         typer.echo(f"recording: {path}")

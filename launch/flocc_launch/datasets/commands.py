@@ -1,6 +1,7 @@
 """What `flocc dataset info | convert | split` do: look at a data set, turn it into recordings, cut it into robots."""
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
+from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
@@ -235,6 +237,7 @@ def convert(
     jpeg: bool = False,
     form: str | None = None,
     robot: str | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -254,6 +257,7 @@ def convert(
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
         robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -269,7 +273,7 @@ def convert(
         for note in convert_video(path, out, camera, odometry, form, every, progress):
             logger.warning("%s", note)
         return out
-    source = read_source(path, format_name, camera, form if odometry is None else None)
+    source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
     _tell(source)
     identity = _identity("convert", path, source, drift, seed)
     given = None if odometry is None else _given_odometry(source, odometry, form)
@@ -292,6 +296,7 @@ def split(
     camera: Path | None = None,
     form: str | None = None,
     kind: DriftKind | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Cut one data set by time into recordings of several robots, which then run at the same time.
@@ -310,6 +315,7 @@ def split(
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -318,7 +324,7 @@ def split(
     Raises:
         DatasetError: Nothing can be used, there are fewer images than robots, or a part was bad; the good one is kept.
     """
-    source = read_source(path, format_name, camera, form)
+    source = _viewed(read_source(path, format_name, camera, form), view_deg)
     _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
@@ -352,6 +358,13 @@ def _note_drift(recording: Path, spec: DriftSpec | None) -> None:
     """Say in a recording how its odometry was made, for the report of a run."""
     if spec is not None:
         (recording / ODOMETRY_MADE).write_text(summary(spec) + "\n", encoding="utf-8")
+
+
+def _viewed(source: Source, view_deg: float | None) -> Source:
+    """The source with the field of view that is wanted of its lens."""
+    if view_deg is None or source.lens is None:
+        return source
+    return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
 
 
 def _tell(source: Source) -> None:
@@ -388,4 +401,7 @@ def _complain(source: Source, out: Path, count: int) -> None:
 
 def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None, seed: int) -> str:
     errors = drift.model_dump_json() if drift is not None else "default"
-    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}"
+    lens, changed = source.lens, ""
+    if lens is not None and (lens.camera.agent_camera() is None or source.levels != FULL):
+        changed = f" of {lens.camera} view={lens.view_rad} {source.levels}"
+    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}{changed}"

@@ -1,6 +1,7 @@
 """What the readers of folders share: lists of images, the files in a folder, a camera beside them."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -14,7 +15,7 @@ from flocc_launch.datasets.source import DatasetError, Lens
 
 T = TypeVar("T")
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
 CAMERA_FILES = ("camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "intrinsics.yaml", "sensor.yaml")
 
 
@@ -78,7 +79,9 @@ def image_files(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder")
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(
+        file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+    )
 
 
 def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
@@ -88,8 +91,20 @@ def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
         DatasetError: There is none.
     """
     if not images:
-        raise DatasetError(f"{where}: no image was found")
+        raise DatasetError(f"{where}: no image was found{_what_is_there(where)}")
     return images
+
+
+def _what_is_there(where: Path) -> str:
+    """What a folder without images holds, and what an image would be."""
+    if not where.is_dir():
+        return ""
+    entries = [entry for entry in sorted(where.iterdir()) if not entry.name.startswith(".")]
+    kinds = Counter(entry.suffix or "nameless" for entry in entries if entry.is_file())
+    told = [f"{count} {kind} file{'s' * (count > 1)}" for kind, count in kinds.most_common(4)]
+    told += [f"{entry.name}/" for entry in entries if entry.is_dir()][:4]
+    read = ", ".join(IMAGE_SUFFIXES)
+    return f"; there is {', '.join(told) or 'nothing'}, but images are {read}: convert them to JPEG or PNG"
 
 
 def camera_file(

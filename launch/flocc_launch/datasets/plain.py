@@ -84,7 +84,12 @@ def _first_trajectory(
 
 
 def _image_folder(path: Path) -> Path:
-    return next((path / name for name in IMAGE_FOLDERS if (path / name).is_dir()), path)
+    """Where the images are: in a folder of a usual name, or in the only folder inside of it (images/cam0)."""
+    folder = next((path / name for name in IMAGE_FOLDERS if (path / name).is_dir()), path)
+    if folder == path or image_files(folder):
+        return folder
+    inside = [entry for entry in folder.iterdir() if entry.is_dir()]
+    return inside[0] if len(inside) == 1 else folder
 
 
 def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:

@@ -121,7 +121,7 @@ def _dataset_folder(source: Path, how: str) -> Path:
     """Where a data set's recordings are kept; a data set that was changed since gets another folder."""
     files = [source] if source.is_file() else sorted(source.rglob("*"))
     stats = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
-    key = hashlib.sha256(f"{source} {how} {stats}".encode()).hexdigest()[:12]
+    key = hashlib.sha256(f"2 {source} {how} {stats}".encode()).hexdigest()[:12]
     return cache_folder() / "datasets" / f"{source.name}-{key}"
 
 

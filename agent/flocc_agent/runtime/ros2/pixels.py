@@ -20,7 +20,7 @@ class _Layout:
 
     Attributes:
         channels: Values per pixel.
-        order: "rgb", "bgr", "grey", or an OpenCV conversion's name without `COLOR_` and `2RGB`.
+        order: "rgb", "bgr", "grey", or an OpenCV conversion's name without `COLOR_`.
         value: Type of a value without its byte order.
     """
 
@@ -44,15 +44,15 @@ _ENCODINGS = {
     "16UC3": _Layout(3, "bgr", "u2"),
     "rgba16": _Layout(4, "rgb", "u2"),
     "bgra16": _Layout(4, "bgr", "u2"),
-    "yuv422": _Layout(2, "YUV_UYVY"),
-    "uyvy": _Layout(2, "YUV_UYVY"),
-    "yuv422_yuy2": _Layout(2, "YUV_YUYV"),
-    "yuyv": _Layout(2, "YUV_YUYV"),
-    **{f"bayer_{name}{bits}": _Layout(1, f"Bayer{opencv}", f"u{bits // 8}")
+    "yuv422": _Layout(2, "YUV2RGB_UYVY"),
+    "uyvy": _Layout(2, "YUV2RGB_UYVY"),
+    "yuv422_yuy2": _Layout(2, "YUV2RGB_YUYV"),
+    "yuyv": _Layout(2, "YUV2RGB_YUYV"),
+    **{f"bayer_{name}{bits}": _Layout(1, f"Bayer{opencv}2RGB", f"u{bits // 8}")
        for bits in (8, 16)
        for name, opencv in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB"))},
 }  # fmt: skip
-_PLANES = {"nv21": "YUV_NV21", "nv12": "YUV_NV12"}
+_PLANES = {"nv21": "YUV2RGB_NV21", "nv12": "YUV2RGB_NV12"}
 """4:2:0 in two planes: one and a half times as many rows as the picture has."""
 _DEPTH = ("16UC1", "32FC1")
 
@@ -96,7 +96,7 @@ def _in_order(values: Pixels, layout: _Layout) -> Pixels:
     if layout.order in ("rgb", "bgr"):
         return values[..., :3] if layout.order == "rgb" else values[..., 2::-1]
     try:
-        return np.asarray(cv2.cvtColor(values, getattr(cv2, f"COLOR_{layout.order}2RGB")))
+        return np.asarray(cv2.cvtColor(values, getattr(cv2, f"COLOR_{layout.order}")))
     except cv2.error:
         raise ValueError(f"an image of {values.shape[1]}x{values.shape[0]} values is no {layout.order}") from None
 

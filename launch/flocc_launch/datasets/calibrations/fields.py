@@ -54,7 +54,7 @@ CAMERA_BODY = (
     "T_cam_to_body_inv",
 )
 SHAPES = {
-    LensKind.FOV: (("omega", "w"),),
+    LensKind.FOV: (("omega",),),
     LensKind.OMNIDIRECTIONAL: (("xi",),),
     LensKind.DOUBLE_SPHERE: (("xi",), ("alpha",)),
     LensKind.EUCM: (("alpha",), ("beta",)),
@@ -74,7 +74,7 @@ HARMLESS = re.compile(
     r"depthscale|depthfactor|thdepth|thfarpoints|aabbscale|applied(transform|scale)|perviewreprojectionerrors|imagepoints|"
     r"extrinsicparameters|gridpoints|flagvalue|flags|fixprincipalpoint|ttracking|tlr|left.*|right.*|camera2.*|tcncnm1|"
     r"perviewerrors|stddevintrinsics|stddevextrinsics|intrinsicsstd|camoverlaps|rotationrate|t\d\d|posestd|calibaccel.*|"
-    r"calibgyro.*|fisheyemodelname|vignette.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile)$"
+    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile)$"
 )
 """Plain names of keys that look as if they mattered and do not: of other sensors or rectified images."""
 
@@ -317,17 +317,19 @@ def _coefficients(keys: Keys, kind: LensKind | None, name: str | None) -> list[f
 
 def _ordered(single: dict[str, float | None], names: tuple[str, ...], kind: LensKind | None) -> list[float]:
     values = [single[key] for key in names]
-    last = max((place for place, value in enumerate(values) if value), default=-1) + 1
     if kind is LensKind.EQUIDISTANT:
         missing = [key for key, value in zip(names, values, strict=True) if value is None]
         if missing:
             raise ValueError(f"of the distortion, {', '.join(missing)} is missing")
-        last = 4
-    count = next(count for count in COUNTS if count >= last)
-    gaps = [key for key, value in zip(names[5:count], values[5:count], strict=True) if value is None]
-    if gaps:
-        raise ValueError(f"of the distortion, {', '.join(gaps)} is missing: OpenCV's rational model has k4, k5 and k6")
-    return [value or 0.0 for value in values[:count]]
+        return [value or 0.0 for value in values]
+    given = [place + 1 for place, value in enumerate(values) if value is not None]
+    telling = [place + 1 for place, value in enumerate(values) if value]
+    for last in (max(given, default=0), max(telling, default=0)):
+        count = next(count for count in COUNTS if count >= last)
+        if None not in values[5:count]:
+            return [value or 0.0 for value in values[:count]]
+    missing = [key for key, value in zip(names[5:count], values[5:count], strict=True) if value is None]
+    raise ValueError(f"of the distortion, {', '.join(missing)} is missing: OpenCV's rational model has k4, k5 and k6")
 
 
 def _padded(values: list[float]) -> Float:

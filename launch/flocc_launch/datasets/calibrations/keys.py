@@ -96,7 +96,7 @@ def flat_numbers(value: Any, name: str) -> list[float]:
     if isinstance(value, dict):
         keys = Keys(value)
         rows, columns, data = keys.number("rows"), keys.number("cols", "columns"), keys.take("data")
-        keys.take("dt", "type_id")
+        keys.used |= {"dt", "typeid"}
         if keys.left() or data is None:
             raise ValueError(f"{name} must be a list or a matrix, not {str(value)[:80]!r}")
         numbers = flat_numbers(data, name)

@@ -49,11 +49,12 @@ def _is_camera(key: str, value: Any) -> bool:
 def _listed_cameras(document: Map) -> Cameras:
     """SVO and maplab (a map `camera` beside `T_B_C`), OKVIS (all in one map)."""
     found: Cameras = {}
+    rest = {key: value for key, value in document.items() if key not in ("cameras", "label", "id")}
     for number, entry in enumerate(document["cameras"]):
         if not isinstance(entry, dict):
             raise ValueError(f"its camera {number} is no map")
         inner = entry.get("camera", {})
-        camera = {**{key: value for key, value in entry.items() if key != "camera"}, **inner}
+        camera = {**rest, **{key: value for key, value in entry.items() if key != "camera"}, **inner}
         if isinstance(distortion := camera.get("distortion"), dict) and "type" in distortion:
             extra = set(distortion) - {"type", "parameters"}
             if extra:
@@ -126,6 +127,8 @@ def _basalt(document: Map) -> Cameras:
     for number, entry in enumerate(value["intrinsics"]):
         kind, numbers = plain(str(entry.get("camera_type"))), dict(entry.get("intrinsics", {}))
         numbers.pop("rpmax", None)
+        if kind == "fov":
+            numbers["omega"] = numbers.pop("w", None)
         camera: Map = {**rest, **numbers, "camera_model": {"pinhole": "none"}.get(kind, entry.get("camera_type"))}
         for name, listed in (("T_imu_cam", extrinsics), ("resolution", sizes)):
             if listed is not None and len(listed) != len(value["intrinsics"]):
@@ -200,35 +203,33 @@ def _opensfm(document: Map) -> Cameras:
 
 
 def _gyroflow(document: Map) -> Cameras:
+    """Gyroflow's lens profile: beside the lens, it names products."""
     size, lens = document["calib_dimension"], document["fisheye_params"]
-    keys = ("camera_matrix", "distortion_coeffs")
-    return {
-        "camera": {
-            "width": size["w"], "height": size["h"], "distortion_model": "equidistant",
-            **{key: lens[key] for key in keys},
-        }
-    }  # fmt: skip
+    told = ("camera_brand", "camera_model", "lens_model", "camera_setting", "calib_dimension", "fisheye_params")
+    rest = {key: value for key, value in document.items() if key not in told}
+    return {"camera": {"distortion_model": "equidistant", **rest, **lens, "width": size["w"], "height": size["h"]}}
 
 
 def _depthai(document: Map) -> Cameras:
     cameras: Cameras = {}
+    rest = {key: value for key, value in document.items() if key not in ("cameraData", "imuExtrinsics")}
+    told = ("cameraType", "distortionCoeff", "extrinsics", "specHfovDeg", "lensPosition")
     for socket, given in document["cameraData"]:
-        models = {0: "none", 1: "equidistant"}
+        models = {0: None, 1: "equidistant"}
         kind = given.get("cameraType", 0)
         if kind not in models:
             raise ValueError(f"the camera type is {kind}; flocc reads 0 (perspective) and 1 (fisheye) of DepthAI")
-        coefficients = flat_numbers(given.get("distortionCoeff", []), "distortionCoeff")
-        camera = {
-            "width": given["width"], "height": given["height"], "K": given["intrinsicMatrix"],
-            "distortion": coefficients[:4] if kind == 1 and not any(coefficients[4:]) else coefficients,
-        }  # fmt: skip
-        cameras[f"CAM{socket}"] = camera | ({"distortion_model": models[kind]} if kind else {})
+        camera: Map = {key: value for key, value in given.items() if key not in told}
+        camera |= {"distortion": given.get("distortionCoeff"), "distortion_model": models[kind]}
+        camera["intrinsic_matrix"] = camera.pop("intrinsicMatrix", None)
+        cameras[f"CAM{socket}"] = {**rest, **camera}
     return cameras
 
 
 def _stereo(document: Map) -> Cameras:
-    """OpenCV's stereo sample: M1 D1 of the left camera, M2 D2 of the right one."""
-    rest = {key: value for key, value in document.items() if re.fullmatch(r"(image_)?(width|height)", key)}
+    """OpenCV's stereo sample: M1 D1 of the left camera, M2 D2 of the right one, and what lies between them."""
+    between = ("M1", "D1", "M2", "D2", "R", "T", "E", "F", "R1", "R2", "P1", "P2", "Q")
+    rest = {key: value for key, value in document.items() if key not in between}
     sides = {"left": "1", "right": "2"}
     return {
         side: {**rest, "camera_matrix": document[f"M{n}"], "distortion": document[f"D{n}"]}
@@ -248,6 +249,8 @@ def _plain(document: Map) -> Cameras:
             if twice is not None:
                 raise ValueError(f"the keys {twice!r} and '{name}.{twice}' say different things")
             camera |= inner
+    if isinstance(document.get("camera"), dict) and isinstance(camera.get("scale"), int | float):
+        camera["depth_scale"] = camera.pop("scale")  # Replica's renderings
     if isinstance(listed := camera.get("calibration"), list):
         del camera["calibration"]
         numbers = flat_numbers(listed, "calibration")
