@@ -132,6 +132,8 @@ def _without_unit(bare: str) -> str:
 
 
 def _unit(name: str) -> str | None:
+    if _HEADER_STAMP.fullmatch(_bare(name)):
+        return "nanoseconds"  # as rostopic echo -p writes it
     bracketed = re.search(r"[\[(](.*?)[\])]", name)
     words = [bracketed[1].lower()] if bracketed else []
     return next((_UNIT_OF[word] for word in [*words, _bare(name).rpartition("_")[2]] if word in _UNIT_OF), None)

@@ -351,9 +351,9 @@ def _unit(stamps: Float, columns: Columns, form: str | None, path: Path) -> tupl
     if said is not None and (form is not None or said in possible or not possible):
         return said, ()
     if said is not None:
-        epoch = since_1970(float(np.median(stamps)))
-        if epoch is None:
+        if len(possible) > 1 or possible[0] != since_1970(float(np.median(stamps))):
             return said, ()
+        epoch = possible[0]
         return epoch, (f"{path}: stamps are said to be in {said}, but can only be in {epoch}, and were read so",)
     if len(possible) < 2:
         return (possible or ["seconds"])[0], ()
