@@ -160,13 +160,15 @@ def free_form(rows: list[Row], rng: np.random.Generator) -> tuple[str, str, bool
     is_wxyz, separator = bool(rng.integers(2)), str(rng.choice([" ", ",", "\t", ", "]))
     unit = str(rng.choice(["s", "ms", "us", "ns"]))
     per_s = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
-    stamp = (lambda s: s) if unit == "s" else (lambda s: round(s * per_s))
     header = str(rng.choice(["none", "unit", "full"]))
     q = "qw qx qy qz" if is_wxyz else "qx qy qz qw"
     names = {"unit": f"time[{unit}] x y z {q}", "full": f"timestamp_{unit} p_x p_y p_z {q.replace('q', 'q_')}"}
     mark = str(rng.choice(["# ", ""]))
     head = "" if header == "none" else mark + separator.join(names[header].split()) + "\n"
-    text = head + "".join(line([stamp(r[0]), *(wxyz(r) if is_wxyz else xyzw(r))], separator) for r in rows)
+    text = head + "".join(
+        line([r[0] if unit == "s" else round(r[0] * per_s), *(wxyz(r) if is_wxyz else xyzw(r))], separator)
+        for r in rows
+    )
     return f"{'wxyz' if is_wxyz else 'xyzw'} in {unit}, header {header}", text, header != "none"
 
 
