@@ -37,6 +37,7 @@ FORMS = {
 MATRIX_FORM = "kitti"
 DAMAGED_RATIO_MAX = 0.2
 ROWS_TRIED_MAX = 2000
+STRAY_STEPS_MIN = 20.0
 SAID_STEP_MAX_S = 600.0
 """Stamps whose steps would be longer are not in the unit that is said."""
 WAY_OUT = "name the columns in a first line such as '# timestamp tx ty tz qx qy qz qw', or with --trajectory-format"
@@ -381,6 +382,17 @@ def _duration_s(stamps: Float) -> float:
     return float(np.max(stamps) - np.min(stamps))
 
 
+def _strays(stamps_s: Float) -> NDArray[np.bool_]:
+    """Rows whose stamp is far ahead, while the row behind goes on where the row before was."""
+    found = np.zeros(len(stamps_s), dtype=bool)
+    if len(stamps_s) < 4:
+        return found
+    before, here, after = stamps_s[:-2], stamps_s[1:-1], stamps_s[2:]
+    step_s = float(np.median(np.abs(np.diff(stamps_s))))
+    found[1:-1] = (here - before > STRAY_STEPS_MIN * step_s) & (after < here) & (after > before)
+    return found
+
+
 def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     """A trajectory of poses; those that go back in time are left out and counted."""
     stamps_s, T, lines, notes = poses.stamps_s, poses.T_fixed_body, poses.lines, list(poses.notes)
@@ -388,6 +400,12 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     if len(stamps_s) > 2 and np.all(np.diff(stamps_s) <= 0) and stamps_s[0] > stamps_s[-1]:
         stamps_s, T, lines = stamps_s[::-1], T[::-1], lines[::-1]
         notes.append(f"{path}: rows stand in reversed order of time, and were turned round")
+    stray = _strays(stamps_s)
+    if np.any(stray):
+        first = int(np.argmax(stray))
+        note = f"{np.count_nonzero(stray)} rows with a stamp far ahead of those around them were left out"
+        notes.append(f"{path}:{lines[first]}: {note}")
+        stamps_s, T, lines = stamps_s[~stray], T[~stray], lines[~stray]
     highest_s = np.maximum.accumulate(stamps_s)
     later = np.concatenate([[True], stamps_s[1:] > highest_s[:-1]])
     back = np.concatenate([[False], stamps_s[1:] < highest_s[:-1]])

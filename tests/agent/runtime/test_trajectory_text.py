@@ -245,3 +245,11 @@ def test_matrices_take_the_stamps_that_they_are_given(tmp_path: Path) -> None:
     assert found.T_fixed_body[:, 0, 3].tolist() == [0.0, 1.0, 2.0]
     with pytest.raises(RecordingError, match="has 3 poses without stamps, but there are 2 images"):
         read_trajectory(path, stamps_s=[5.0, 6.0])
+
+
+def test_a_stamp_in_the_future_costs_its_row(tmp_path: Path) -> None:
+    poses = rows(40)
+    poses[20] = (4e9, *poses[20][1:])
+    found, notes = read_trajectory(write(tmp_path, "f.tum", tum(poses).encode()))
+    assert len(found) == 39
+    assert "f.tum:21: 1 rows with a stamp far ahead of those around them were left out" in notes[0]
