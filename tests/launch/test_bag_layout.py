@@ -188,3 +188,42 @@ def test_bags_of_the_same_time_are_a_robot_each(tmp_path: Path) -> None:
     folder = write_parts(tmp_path / "team", [range(0, 6), range(1, 6)])
     assert read_scenario(str(folder), {}).names() == ["drive_0", "drive_1"]
     assert [found.images for found in infos(folder)] == [6, 5]
+
+
+@pytest.mark.parametrize("topic", ["/odom", "/cam/image/compressed"])
+def test_one_stamp_in_the_future_costs_itself(tmp_path: Path, topic: str, caplog: pytest.LogCaptureFixture) -> None:
+    script = walking(False, 20)
+    [message for name, _, _, message in script.messages if name == topic][5].header.stamp.sec = 2**31 - 1
+    recording = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out"))
+    assert len(recording.frames) == (20 if topic == "/odom" else 19)
+    assert f"{topic}: 1 of {40 if topic == '/odom' else 20} messages were left out: the stamp is zero" in caplog.text
+
+
+def test_a_robot_without_odometry_is_left_out_of_a_team(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = team()
+    for k in range(4):
+        script.compressed("/carol/cam/image/compressed", ZERO_NS + k * S)
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["alpha", "bob_2"]
+    assert "carol has images but no odometry of its own, and is left out" in caplog.text
+
+
+def test_other_topics_of_poses_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = walking(False)
+    script.pose_stamped("/vio/pose", ZERO_NS + S, 1.0)
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    assert "odometry is /odom; not taken: /vio/pose (--odometry-topic)" in caplog.text
+
+
+@pytest.mark.parametrize("spoil", ["empty storage", "no storage", "broken metadata"])
+def test_a_broken_ros_2_folder_is_one_sentence(tmp_path: Path, spoil: str) -> None:
+    bag = walking(False).write(tmp_path / "run", "db3")
+    if spoil == "broken metadata":
+        (bag / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: [\n")
+    elif spoil == "no storage":
+        next(bag.glob("*.db3")).unlink()
+    else:
+        next(bag.glob("*.db3")).write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"run: (cannot be opened|is damaged or cut off): ") as caught:
+        convert(bag, tmp_path / "out")
+    assert "\n" not in str(caught.value)

@@ -242,10 +242,7 @@ def test_an_unknown_compression_is_said_and_the_rest_is_kept(tmp_path: Path, cap
     script = walking(False)
     script.compressed("/cam/image/compressed", ZERO_NS + 9 * 10**9, form="webp")
     convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
-    assert (
-        "/cam/image/compressed: 1 of 6 messages were left out: an image compressed as 'webp' cannot be read"
-        in caplog.text
-    )
+    assert "/cam/image/compressed: 1 of 6 messages were left out: an image compressed as 'webp'" in caplog.text
     assert len(Recording.open(tmp_path / "out").frames) == 5
 
 
@@ -299,9 +296,7 @@ def test_too_many_damaged_messages_are_refused(tmp_path: Path) -> None:
     script = walking(False)
     for k in range(3):
         script.compressed("/cam/image/compressed", ZERO_NS + (9 + k) * 10**9, form="webp")
-    with pytest.raises(
-        DatasetError, match=r"3 of 8 messages were left out: an image compressed as 'webp' cannot be read.*5 images"
-    ):
+    with pytest.raises(DatasetError, match=r"3 of 8 messages were left out: an image compressed as 'webp'.*5 images"):
         convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
 
 

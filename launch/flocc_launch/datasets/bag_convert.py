@@ -33,7 +33,8 @@ from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_MESSAGES = 200
+CHECKPOINT_MESSAGES = 1000
+STRAY = "the stamp is zero, or more than a minute off that of the others"
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
 
@@ -119,6 +120,8 @@ def _wanted(layout: Layout, options: BagOptions) -> list[RobotTopics]:
         robots = [RobotTopics("", image, None if options.camera else layout.info_of(image), poses)]
     else:
         robots = layout.robots()
+        for left in layout.left_out:
+            logger.warning("%s: %s", bag.path, left)
     if options.robot is not None and len(robots) > 1:
         robots = [robot for robot in robots if robot_name(robot.name) == options.robot]
         if not robots:
@@ -135,6 +138,9 @@ def _convert_robot(
     lens = lens if options.view_rad is None else replace(lens, view_rad=options.view_rad)
     clock = choose_clock(layout, robot)
     identity = f"bag {layout.bag.path.resolve()} {robot.image.name} {robot.poses or options.odometry}"
+    others = layout.other_poses(robot)
+    if others:
+        notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
     run = _Conversion(layout.bag, robot, lens, options, clock, out, identity)
     run.convert(progress)
     for note in (*notes, *([clock.note] if clock.note else []), *run.notes):
@@ -289,6 +295,9 @@ class _Conversion:
         except DatasetError as error:
             self.poses.damage(_bare(error, self.robot.poses.topic if self.robot.poses else self.robot.image))
             return
+        if len(posed) == 1 and not self.clock.is_bag and self.clock.is_off(posed[0][0], bag_ns):
+            self.poses.damage(STRAY)
+            return
         for header_ns, numbers in posed:
             taken_ns = bag_ns if self.clock.is_bag else header_ns
             for is_new, good_ns, good in self.watch.take(taken_ns, numbers):
@@ -317,8 +326,8 @@ class _Conversion:
         try:
             message = self.bag.decoded(raw, topic)
             taken_ns = bag_ns if self.clock.is_bag else stamp_ns(message.header)
-            if taken_ns == 0:
-                raise DatasetError(f"topic {topic.name}: the stamp is zero")
+            if taken_ns == 0 or (not self.clock.is_bag and self.clock.is_off(taken_ns, bag_ns)):
+                raise DatasetError(STRAY)
             if self.options.from_zero and self.zero_ns == 0:
                 self.zero_ns = taken_ns
             stamp_s = (taken_ns - self.zero_ns) * 1e-9

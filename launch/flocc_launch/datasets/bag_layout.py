@@ -92,6 +92,7 @@ class Layout:
     static: StaticFrames = field(default_factory=StaticFrames)
     edges: dict[tuple[str, str], str] = field(default_factory=dict)
     has_static: bool = False
+    left_out: list[str] = field(default_factory=list)
     _heads: dict[str, Head | None] = field(default_factory=dict)
 
     @classmethod
@@ -136,10 +137,13 @@ class Layout:
         images = self._of_types(IMAGE_TYPES)
         groups = _by_namespace([topic.name for topic in images])
         parts = {name: [topic for topic in images if topic.name in topics] for name, topics in groups.items()}
-        if len(parts) > 1:
-            found = {name: self._poses_of(name, group) for name, group in parts.items()}
-            if all(found.values()) and len({str(poses) for poses in found.values()}) == len(found):
-                return [self._robot(name, group, found[name]) for name, group in parts.items()]
+        found = {name: self._poses_of(name, group) for name, group in parts.items()}
+        own = {name: poses for name, poses in found.items() if poses is not None}
+        if len(own) > 1 and len({str(poses) for poses in own.values()}) == len(own):
+            self.left_out = [
+                f"{name} has images but no odometry of its own, and is left out" for name in found if name not in own
+            ]
+            return [self._robot(name, parts[name], poses) for name, poses in own.items()]
         return [self._robot("", images, None)]
 
     def _of_types(self, types: Sequence[str]) -> list[BagTopic]:
@@ -227,6 +231,16 @@ class Layout:
         if len(own) == 1 or len(odometry) == 1:
             return PoseSource((odometry or own)[0])
         return None if own else self.edge_of(image)
+
+    def other_poses(self, robot: RobotTopics) -> list[str]:
+        """Topics of poses in a robot's namespace that are not taken as its odometry."""
+        if robot.poses is None:
+            return []
+        return [
+            topic.name
+            for topic in self._of_types(POSE_TYPES)
+            if topic != robot.poses.topic and (not robot.name or robot.name in topic.name.strip("/").split("/"))
+        ]
 
     def _named_edge(self, name: str) -> PoseSource:
         topic_name, _, frames = name.partition(":")

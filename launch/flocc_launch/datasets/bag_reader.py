@@ -4,6 +4,8 @@ A bag that was cut off in the middle is read as far as it goes; `Bag.damage` the
 """
 
 import re
+import sqlite3
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,6 +18,8 @@ from flocc_launch.datasets.foxglove import ROS_TYPES, ForeignMcap, as_ros, is_fo
 from flocc_launch.datasets.source import DatasetError
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
+SALVAGE_ERRORS = (struct.error, ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, sqlite3.Error)
+"""What bytes that are no bag make of those who read them."""
 PARTS_GAP_MAX_S = 60.0
 """Parts of one ROS 1 recording follow each other; bags of several robots overlap, or are of other days."""
 
@@ -127,7 +131,7 @@ class Bag:
         try:
             self._reader = self._stack.enter_context(AnyReader(paths, default_typestore=_default_types()))
         except self._known_errors as error:
-            self._open_damaged(paths[0], str(error))
+            self._open_damaged(paths[0], " ".join(str(error).split()))
             return self
         self.topics = {
             name: BagTopic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
@@ -157,9 +161,7 @@ class Bag:
             start_ns: Leave out what the bag recorded before.
         """
         if self._reader is None:
-            for name, stamp_ns, message in self._salvage.messages(list(names)):
-                if start_ns is None or stamp_ns >= start_ns:
-                    yield self.topics[name], stamp_ns, message
+            yield from self._salvaged(names, start_ns)
             return
         connections = [c for c in self._reader.connections if c.topic in names]
         if not connections:
@@ -172,9 +174,17 @@ class Bag:
             except StopIteration:
                 return
             except self._known_errors as error:
-                self.damage = f"{self.path}: is damaged or cut off: {error}"
+                self.damage = f"{self.path}: is damaged or cut off: {' '.join(str(error).split())}"
                 return
             yield topics[connection.topic], stamp_ns, message
+
+    def _salvaged(self, names: Sequence[str], start_ns: int | None) -> Iterator[tuple[BagTopic, int, bytes]]:
+        try:
+            for name, stamp_ns, message in self._salvage.messages(list(names)):
+                if start_ns is None or stamp_ns >= start_ns:
+                    yield self.topics[name], stamp_ns, message
+        except SALVAGE_ERRORS as error:
+            self.damage = f"{self.path}: is damaged or cut off: {error}"
 
     def first(self, name: str, tries: int = 20) -> tuple[int, Any] | None:
         """Bag time and content of a topic's first message that can be decoded, or None."""
@@ -226,11 +236,18 @@ class Bag:
         file = path if path.is_file() else next(iter(_storages(path)), None)
         if file is None:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}")
-        if file.suffix == ".mcap" and is_foreign(file):
+        try:
+            foreign = file.suffix == ".mcap" and is_foreign(file)
+        except SALVAGE_ERRORS:
+            foreign = False
+        if foreign:
             self._open_foreign(file)
             return
         self._salvage = Salvage(file)
-        self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
+        try:
+            self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
+        except SALVAGE_ERRORS as error:
+            raise DatasetError(f"{self.path}: cannot be opened: {reason}") from error
         if not self.topics:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         self.damage = f"{self.path}: is damaged or cut off: {reason}"

@@ -18,7 +18,7 @@ from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, read_source, team_folder
-from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
+from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
@@ -33,6 +33,9 @@ from flocc_launch.datasets.video import (
 from flocc_launch.datasets.writer import Progress, write_source
 
 logger = logging.getLogger(__name__)
+
+ODOMETRY_MADE = "odometry_made.txt"
+"""In a recording: how its odometry was made of ground truth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +236,8 @@ def convert(
     every: int = 1,
     jpeg: bool = False,
     form: str | None = None,
-    view_deg: float | None = None,
     robot: str | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -253,8 +256,8 @@ def convert(
         every: Of a bag, keeps one image of so many.
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
-        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -287,6 +290,7 @@ def convert(
     given = None if odometry is None else _given_odometry(source, odometry, form)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
+    _note_drift(out, drift if given is None else None)
     _complain(source, out, len(source.images))
     return out
 
@@ -302,6 +306,7 @@ def split(
     format_name: str | None = None,
     camera: Path | None = None,
     form: str | None = None,
+    kind: DriftKind | None = None,
     view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -315,7 +320,8 @@ def split(
         out: Gets one folder per robot: alpha, bravo, charlie.
         robots: How many parts.
         seed: Of the drift; each robot has its own.
-        drift: Makes odometry from the ground truth; None takes the data set's own, else `HANDHELD_DRIFT`.
+        drift: Makes odometry from the ground truth; None takes the data set's own, else `needed_drift`.
+        kind: What carried the camera, where odometry is made; None tells it by the data set and the motion.
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
@@ -333,16 +339,36 @@ def split(
     _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
-    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift, seed)
+    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift or needed_drift(source, kind), seed)
     folders = []
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, drift or needed_drift(part), rng)
+        spec = drift or needed_drift(part, kind)
+        moved = _odometry(part, spec, rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
+        _note_drift(out / name, spec)
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
+
+
+def needed_drift(source: Source, kind: DriftKind | None = None) -> DriftSpec | None:
+    """How odometry is made of ground truth where a data set has none of its own; None where it has.
+
+    Args:
+        source: The data set, or a robot's part of it.
+        kind: What carried the camera; None tells it by the data set and the motion.
+    """
+    if source.odometry is not None or source.truth is None:
+        return None
+    return fitted(kind or kind_of(source.format, source.truth), source.truth.length_m())
+
+
+def _note_drift(recording: Path, spec: DriftSpec | None) -> None:
+    """Say in a recording how its odometry was made, for the report of a run."""
+    if spec is not None:
+        (recording / ODOMETRY_MADE).write_text(summary(spec) + "\n", encoding="utf-8")
 
 
 def _viewed(source: Source, view_deg: float | None) -> Source:
@@ -350,11 +376,6 @@ def _viewed(source: Source, view_deg: float | None) -> Source:
     if view_deg is None or source.lens is None:
         return source
     return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
-
-
-def needed_drift(source: Source) -> DriftSpec | None:
-    """How odometry is made of ground truth where a data set has none of its own."""
-    return HANDHELD_DRIFT if source.odometry is None and source.truth is not None else None
 
 
 def _tell(source: Source) -> None:

@@ -62,7 +62,9 @@ def detect_format(path: Path) -> str:
     other = kind_of_folder(path) if path.is_dir() else kind_of_file(path)
     if other is not None:
         raise DatasetError(f"{path}: {other}")
-    inside = [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry)] if path.is_dir() else []
+    inside = (
+        [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry) or is_bag(entry)] if path.is_dir() else []
+    )
     raise DatasetError(
         f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
         f"(odometry.tum or groundtruth.tum) and camera.yaml; {_what_is_there(path)}"

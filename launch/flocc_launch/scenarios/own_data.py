@@ -11,6 +11,7 @@ from flocc_launch.datasets.bag_convert import robots_of_bag
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.commands import needed_drift
 from flocc_launch.datasets.detect import detect_format, is_dataset, read_source, team_folder
+from flocc_launch.datasets.drift import kind_of
 from flocc_launch.datasets.names import robot_name as name_of
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import is_video
@@ -88,7 +89,10 @@ class OwnData:
         near_m = self._near_m()
         spacing = "" if near_m is None else f"; a keyframe every {near_m:g} m, because robots move little"
         made = [name for name, source in self.sources.items() if needed_drift(source) is not None]
-        drift = "; odometry is made of ground truth, with seeded drift" if made else ""
+        kinds = sorted(
+            {kind_of(self.sources[name].format, truth) for name in made if (truth := self.sources[name].truth)}
+        )
+        drift = f"; odometry is made of ground truth, with seeded drift as of {' and '.join(kinds)}" if made else ""
         return f"data: {self.path}, {taken}{spacing}{drift}{self._pairs()}"
 
     def _pairs(self) -> str:

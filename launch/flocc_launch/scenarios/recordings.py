@@ -80,8 +80,8 @@ def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
 
     is_stream = is_bag(dataset.source) or is_video(dataset.source)
     source = _recording(dataset.source, progress) if is_stream else dataset.source.resolve()
-    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed}")
-    return split(source, out, dataset.robots, seed=dataset.seed, progress=progress)
+    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed} {dataset.drift}")
+    return split(source, out, dataset.robots, seed=dataset.seed, kind=dataset.drift, progress=progress)
 
 
 def _recording(path: Path, progress: Progress | None, seed: int = 0, robot: str | None = None) -> Path:
