@@ -35,6 +35,7 @@ from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
+from flocc_agent.runtime.network_faults import network_faults
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
@@ -107,6 +108,7 @@ class Agent:
         self._store: Store | None = None
         self._run: asyncio.Task[None] | None = None
         self._playing: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._ros2: Ros2Adapter | None = None
         self._bridging: asyncio.Task[None] | None = None
         self._radio: Radio | None = None
@@ -129,6 +131,7 @@ class Agent:
         except BaseException:
             await self._close()
             raise
+        self._looking = asyncio.create_task(self._look_at_network())
         if self._recording is not None:
             self._playing = asyncio.create_task(self._play(self._recording))
         if self._ros2 is not None:
@@ -139,14 +142,20 @@ class Agent:
         """Hand over, close everything; an error of the loop is raised here."""
         assert self._run is not None
         self.stop()
-        if self._playing is not None:
-            self._playing.cancel()
+        for task in (self._playing, self._looking):
+            if task is not None:
+                task.cancel()
         try:
             await self._run
             fed = [task for task in (self._playing, self._bridging) if task is not None]
             await asyncio.gather(*fed, return_exceptions=True)
         finally:
             await self._close()
+
+    async def _look_at_network(self) -> None:
+        """Say once what of the configured network is not there; the agent goes on trying."""
+        for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
+            logger.warning("%s: %s", self.config.name, fault)
 
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.

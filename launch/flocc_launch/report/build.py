@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from flocc_agent.core.reports import ClosureAccepted, PeerRefused, RoundSolved
 from flocc_agent.runtime.event_lines import UnknownFact, of_kind
 from flocc_agent.runtime.facts import AgentDied, BytesCounted
 from flocc_agent.stages import BOUNDS_S
+from flocc_launch.datasets.commands import ODOMETRY_MADE
 from flocc_launch.report.accounts import links_of, stages_by_robot, stages_of
 from flocc_launch.report.model import (
     Closures,
@@ -38,6 +40,12 @@ from flocc_launch.runs.version import flocc_version
 Float = NDArray[np.float64]
 
 
+def _odometry_made(recordings: Mapping[str, str]) -> dict[str, str]:
+    """What recordings say of odometry that was made; one that is no longer there says nothing."""
+    files = {robot: Path(folder) / ODOMETRY_MADE for robot, folder in recordings.items()}
+    return {robot: file.read_text(encoding="utf-8").strip() for robot, file in files.items() if file.is_file()}
+
+
 def build(loaded: LoadedRun) -> RunReport:
     """Compute the report of a run."""
     run, tracks = loaded.run, loaded.tracks
@@ -53,6 +61,7 @@ def build(loaded: LoadedRun) -> RunReport:
         duration_s=loaded.end_s,
         wall_s=run.wall_s,
         robots=list(loaded.robots),
+        odometry_made=_odometry_made(run.recordings),
         map_frames=frames,
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),

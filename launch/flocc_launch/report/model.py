@@ -152,6 +152,8 @@ class RunReport(Record):
     """Length of the run on its own clock."""
     wall_s: float | None
     robots: list[str]
+    odometry_made: dict[str, str] = Field(default_factory=dict)
+    """Robot -> how its odometry was made of ground truth, where its data set had none."""
     map_frames: list[str]
     """Frames at the end, each named once; a robot that was never corrected adds none."""
     merged_after_s: float | None

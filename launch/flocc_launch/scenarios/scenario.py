@@ -27,6 +27,7 @@ from flocc_agent.config import (
     validated,
 )
 from flocc_agent.core.parameters import CoreParameters
+from flocc_launch.datasets.drift import DriftKind
 from flocc_protocol.ids import checked_name
 
 RobotName = Annotated[str, AfterValidator(checked_name)]
@@ -80,6 +81,8 @@ class DatasetScenario(Section):
     """Pieces it is cut into."""
     seed: int = Field(7, ge=0)
     """Seed of the odometry drift."""
+    drift: DriftKind | None = None
+    """What carried the camera, where odometry is made: handheld, wheeled, car or drone; None tells it by the data."""
 
 
 class TracksScenario(Section):

@@ -20,7 +20,7 @@ from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped
-from flocc_protocol.errors import FloccError
+from flocc_launch.setup.world_faults import sentence_of
 
 if TYPE_CHECKING:
     from flocc_launch.dashboard.own import AgentSource
@@ -193,8 +193,11 @@ def main() -> None:
     try:
         config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
         asyncio.run(_run_launched(config, arguments.epoch_s))
-    except FloccError as error:
-        sys.stderr.write(f"error: {error}\n")
+    except Exception as error:
+        sentence = sentence_of(error)
+        if sentence is None:
+            raise
+        sys.stderr.write(f"error: {sentence}\n")
         sys.exit(EXIT_BAD_INPUT)
 
 
