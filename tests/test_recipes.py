@@ -7,10 +7,12 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from flocc_agent.config import PerceptionConfig
 from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, Registrar
 from flocc_agent.core.registration import RegistrationFailed
 from flocc_protocol.records import UnknownRecord, decode_record
@@ -144,11 +146,12 @@ def test_a_report_touches_two_files_as_the_recipe_says(tmp_path: Path) -> None:
 
 def test_the_front_end_of_the_recipe_is_one() -> None:
     (code,) = re.findall(r"```python\n(.*?)```", recipe("Add a front end"), re.DOTALL)
-    names: dict[str, type] = {}
+    names: dict[str, Any] = {}
     exec(code, names)  # the page's own block
-    describer: Describer = names["GreyDescriber"]()
-    encoder: Encoder = names["GreyEncoder"]()
-    registrar: Registrar = names["GreyRegistrar"]()
+    built = names["build"](PerceptionConfig(), 0)
+    describer: Describer = built.describer
+    encoder: Encoder = built.encoder
+    registrar: Registrar = built.registrar
     camera = Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     image = Image(np.full((48, 64, 3), 90, np.uint8), camera)
     descriptor = describer.describe(image)

@@ -7,10 +7,14 @@ ordered as GTSAM's: rotation (rad), then translation (m).
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
+
 Float = NDArray[np.float64]
 
 SMALL_ANGLE_RAD = 1e-9
 RIGID_TOLERANCE = 1e-3
+_UPPER = np.triu_indices(6)
 
 
 def pose(R: Float, t: Float) -> Float:
@@ -201,6 +205,30 @@ def tq_from_poses(T: Float) -> Float:
 def tq_from_pose(T: Float) -> Float:
     """Seven numbers of a pose: translation x y z, quaternion w x y z."""
     return np.concatenate([T[:3, 3], q_wxyz_from_R(T[:3, :3])])
+
+
+def pose7(T: Float) -> Pose7:
+    """A pose (4, 4) as the wire has it: translation x y z, quaternion w x y z."""
+    x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
+    return (x, y, z, qw, qx, qy, qz)
+
+
+def interpolated(T_a_b: Float, T_a_c: Float, share: float) -> Float:
+    """Pose on the way from b (share 0) to c (share 1), along one twist."""
+    return np.asarray(T_a_b @ se3_exp(share * se3_log(between(T_a_b, T_a_c))))
+
+
+def symmetric(upper: Float) -> Float:
+    """Covariance (6, 6) of its upper triangle (21,)."""
+    out = np.empty((6, 6))
+    out[_UPPER] = upper
+    out.T[_UPPER] = upper
+    return out
+
+
+def upper_triangle(covariance: Float) -> Array:
+    """Upper triangle (21,) of a covariance (6, 6), as the wire has it: float32."""
+    return Array.of(covariance[_UPPER], "f4")
 
 
 def umeyama(source: Float, target: Float, with_scale: bool = False) -> tuple[float, Float]:

@@ -53,7 +53,7 @@ class NotReached(FloccError):
     """What was waited for did not happen in time."""
 
 
-class Swarm:
+class LiveSwarm:
     """Agent processes on one folder, with one clock."""
 
     def __init__(self, scenario: Scenario, folder: Path, with_recordings: bool = True, start_s: float = 0.0) -> None:
@@ -161,7 +161,7 @@ def meeting(robots: int = 3, rate: float = 4.0, length_m: float = 40.0) -> Scena
 
 async def failover(folder: Path, runs: int) -> dict[str, Any]:
     """Kill the leader again and again: seconds until all others follow the next one, and until its first correction."""
-    swarm = Swarm(meeting(), folder)
+    swarm = LiveSwarm(meeting(), folder)
     times_s: list[tuple[float, float]] = []
     await swarm.start()
     try:
@@ -183,7 +183,7 @@ async def failover(folder: Path, runs: int) -> dict[str, Any]:
     }
 
 
-async def _failed_over(swarm: Swarm) -> tuple[float, float]:
+async def _failed_over(swarm: LiveSwarm) -> tuple[float, float]:
     """Kill r1, and give the seconds until the others follow r2, and until each has its first correction."""
     rest, killed_s = swarm.agents[1:], swarm.now_s()
     swarm.agents[0].kill()
@@ -204,7 +204,7 @@ async def partition(folder: Path, runs: int, outage_s: float) -> dict[str, Any]:
 
 
 async def _healed_after_s(folder: Path, outage_s: float) -> float:
-    swarm = Swarm(meeting(robots=4, rate=2.0, length_m=160.0), folder)
+    swarm = LiveSwarm(meeting(robots=4, rate=2.0, length_m=160.0), folder)
     await swarm.start()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1") and one_frame(swarm.agents), START_S, "one map")
@@ -231,7 +231,7 @@ async def _healed_after_s(folder: Path, outage_s: float) -> float:
 
 async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
     """CPU and memory of agents that have nothing to do, children included, once the warm-up is over."""
-    swarm = Swarm(meeting(), folder, with_recordings=False)
+    swarm = LiveSwarm(meeting(), folder, with_recordings=False)
     await swarm.start()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1"), START_S, "r1 leads")
@@ -248,9 +248,9 @@ async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
 async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
     """Many agents with two keyframes per second each, once all have started: CPU, memory, queues, late heartbeats."""
     start_s = CROWD_START_PER_AGENT_S * agents
-    swarm = Swarm(crowd(agents, duration_s), folder, start_s=start_s)
+    swarm = LiveSwarm(crowd(agents, duration_s), folder, start_s=start_s)
     await swarm.start()
-    watched = Watched()
+    watched = WatchedSwarm()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1"), CROWD_START_S, "r1 leads")
         await asyncio.sleep(max(start_s + SETTLE_S - swarm.now_s(), 0.0))
@@ -280,7 +280,7 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
     }
 
 
-class Watched:
+class WatchedSwarm:
     """What was seen of a crowd over time.
 
     Attributes:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flocc_agent.perception.learned.files import WeightFile
+from flocc_agent.perception.learned.weight_sources import WeightFile
 from flocc_launch.setup import learned_weights
 from flocc_launch.setup.learned_weights import download_command, get, status
 from flocc_launch.setup.weight_files import WeightsError

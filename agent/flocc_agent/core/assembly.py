@@ -11,11 +11,10 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import pose7, symmetric
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import between, pose_from_tq, poses_from_tq
+from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair

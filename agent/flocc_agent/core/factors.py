@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import symmetric
 from flocc_agent.core.geodesy import Place
 from flocc_agent.core.measurements import (
     Fix,
@@ -22,7 +21,7 @@ from flocc_agent.core.measurements import (
     TagSighting,
 )
 from flocc_agent.core.pose_graph import EARTH, WORLD, MeasuredFactor, landmark
-from flocc_agent.geometry import adjoint, between, inverse, pose, pose_from_tq, se3_exp, se3_log
+from flocc_agent.geometry import adjoint, between, inverse, pose, pose_from_tq, se3_exp, se3_log, symmetric
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
     FixRecord,
@@ -37,7 +36,7 @@ from flocc_protocol.records import (
 Float = NDArray[np.float64]
 
 
-class Track(Protocol):
+class OdometryTrack(Protocol):
     """One log's odometry, as far as factors need it."""
 
     def stamp_s(self, index: int) -> float:
@@ -60,7 +59,7 @@ class Waiting(NamedTuple):
     stamp_s: float
 
 
-Tracks = Mapping[LogId, Track]
+Tracks = Mapping[LogId, OdometryTrack]
 Made = MeasuredFactor | Waiting | None
 
 

@@ -1,10 +1,9 @@
 """Judgement: whether a registration becomes a loop closure, by the ratio of Eq. (1) (Sec. III-B)."""
 
-from flocc_agent.core.corrections import pose7, upper_triangle
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected
-from flocc_agent.geometry import is_rigid
+from flocc_agent.geometry import is_rigid, pose7, upper_triangle
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
     SCALE_INITIAL_MAX,

@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import symmetric
 from flocc_agent.core.factors import Tracks, Waiting, factor_of
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.pose_graph import MeasuredFactor, is_landmark
+from flocc_agent.geometry import symmetric
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
     MetricClosureRecord,

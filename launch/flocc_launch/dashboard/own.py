@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.event_lines import Reported

@@ -21,7 +21,7 @@ from flocc_launch.datasets.bag_messages import (
     stamp_ns,
 )
 from flocc_launch.datasets.bag_poses import PoseDecoder
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import ImageWriter
 from flocc_launch.datasets.source import DatasetError, Lens
@@ -95,7 +95,7 @@ def convert_bag(path: Path, out: Path, options: BagOptions | None = None, progre
     return out
 
 
-def chosen(bag: Bag, types: Sequence[str], name: str | None, what: str, option: str) -> Topic:
+def chosen(bag: Bag, types: Sequence[str], name: str | None, what: str, option: str) -> BagTopic:
     """The topic to take: the named one, or the only one of fitting type.
 
     Raises:
@@ -116,11 +116,11 @@ def chosen(bag: Bag, types: Sequence[str], name: str | None, what: str, option: 
     raise DatasetError(f"{bag.path}: has no {what} topic; it has {_listed(list(bag.topics.values()))}")
 
 
-def _listed(topics: list[Topic]) -> str:
+def _listed(topics: list[BagTopic]) -> str:
     return ", ".join(str(topic) for topic in topics[:12]) + (" and others" if len(topics) > 12 else "") or "no topic"
 
 
-def _lens(bag: Bag, image_topic: Topic, camera: Path | Lens | None) -> Lens:
+def _lens(bag: Bag, image_topic: BagTopic, camera: Path | Lens | None) -> Lens:
     if isinstance(camera, Lens):
         return camera
     if camera is not None:
@@ -141,8 +141,8 @@ class _Conversion:
     """One pass over a bag."""
 
     bag: Bag
-    image_topic: Topic
-    odometry_topic: Topic | None
+    image_topic: BagTopic
+    odometry_topic: BagTopic | None
     lens: Lens
     options: BagOptions
     writer: RecordingWriter

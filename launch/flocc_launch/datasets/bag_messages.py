@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.runtime.picture_heads import SUFFIXES, PictureError, head_of
-from flocc_agent.runtime.ros2.pixels import camera_of, raw_pixels, refuse_depth
+from flocc_agent.runtime.ros2.raw_images import camera_of, raw_pixels, refuse_depth
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
-from flocc_launch.datasets.bag_reader import Topic
+from flocc_launch.datasets.bag_reader import BagTopic
 from flocc_launch.datasets.pixels import encoded_image
 from flocc_launch.datasets.source import DatasetError, Lens
 
@@ -30,7 +30,7 @@ def stamp_ns(header: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
+def image_file(message: Any, topic: BagTopic, jpeg: bool) -> tuple[bytes, str]:
     """Bytes and suffix of an image message.
 
     A compressed image is passed on as it is; a raw one becomes PNM (fast, lossless) or JPEG (small), of 16 bits PNG.
@@ -59,7 +59,7 @@ def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
     return b"%s\n%d %d\n%d\n%s" % (kind, width, height, largest, values.tobytes()), suffix
 
 
-def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]:
+def poses(message: Any, topic: BagTopic) -> Iterator[tuple[int, tuple[float, ...]]]:
     """Yield stamps in nanoseconds and `tx ty tz qx qy qz qw` of a pose message; a path has many.
 
     Raises:
@@ -73,12 +73,12 @@ def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]
     yield stamp_ns(message.header), _numbers(pose, topic)
 
 
-def _numbers(pose: Any, topic: Topic) -> tuple[float, ...]:
+def _numbers(pose: Any, topic: BagTopic) -> tuple[float, ...]:
     p, q = pose.position, pose.orientation
     return checked_numbers((p.x, p.y, p.z, q.x, q.y, q.z, q.w), topic)
 
 
-def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ...]:
+def checked_numbers(numbers: tuple[float, ...], topic: BagTopic) -> tuple[float, ...]:
     """`tx ty tz qx qy qz qw` with a quaternion of unit length.
 
     Raises:
@@ -93,7 +93,7 @@ def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ..
     return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm
 
 
-def lens_of(message: Any, topic: Topic) -> Lens:
+def lens_of(message: Any, topic: BagTopic) -> Lens:
     """Intrinsics of a CameraInfo message; the camera is taken as the body.
 
     Raises:

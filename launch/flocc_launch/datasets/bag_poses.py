@@ -8,7 +8,7 @@ import struct
 from typing import Any
 
 from flocc_launch.datasets.bag_messages import checked_numbers, poses
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 
 Posed = tuple[int, tuple[float, ...]]
 """Stamp in nanoseconds and `tx ty tz qx qy qz qw`."""
@@ -23,7 +23,7 @@ STRINGS = {
 class PoseDecoder:
     """Called with a raw message, returns its poses."""
 
-    def __init__(self, bag: Bag, topic: Topic) -> None:
+    def __init__(self, bag: Bag, topic: BagTopic) -> None:
         self._bag = bag
         self._topic = topic
         self._straight: bool | None = None if topic.type in STRINGS else False

@@ -17,7 +17,7 @@ Decoder = Callable[[bytes], Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class BagTopic:
     """A topic of a bag.
 
     Attributes:
@@ -48,7 +48,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.topics: dict[str, Topic] = {}
+        self.topics: dict[str, BagTopic] = {}
         self.damage: str | None = None
         self.start_ns: int | None = None
         self.end_ns: int | None = None
@@ -72,7 +72,7 @@ class Bag:
             self._open_damaged(path, str(error))
             return self
         self.topics = {
-            name: Topic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
+            name: BagTopic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
         }
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
         return self
@@ -89,7 +89,7 @@ class Bag:
 
     def messages(
         self, names: list[str], start_ns: int | None = None, decoders: Mapping[str, Decoder] | None = None
-    ) -> Iterator[tuple[Topic, int, Any]]:
+    ) -> Iterator[tuple[BagTopic, int, Any]]:
         """Yield topic, bag time in nanoseconds and message, in the bag's order.
 
         Args:
@@ -117,7 +117,7 @@ class Bag:
             decoder = decoders.get(topic.name) if decoders else None
             yield topic, stamp_ns, self.decoded(raw, topic) if decoder is None else decoder(raw)
 
-    def decoded(self, raw: bytes, topic: Topic) -> Any:
+    def decoded(self, raw: bytes, topic: BagTopic) -> Any:
         """Decode a message.
 
         Raises:
@@ -149,14 +149,14 @@ class Bag:
         if file is None:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}")
         self._salvage = Salvage(file)
-        self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
+        self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
         if not self.topics:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         self.damage = f"{self.path}: is damaged or cut off: {reason}"
 
     def _salvaged(
         self, names: list[str], start_ns: int | None, decoders: Mapping[str, Decoder]
-    ) -> Iterator[tuple[Topic, int, Any]]:
+    ) -> Iterator[tuple[BagTopic, int, Any]]:
         for name, stamp_ns, raw in self._salvage.messages(names):
             if start_ns is None or stamp_ns >= start_ns:
                 topic, decoder = self.topics[name], decoders.get(name)

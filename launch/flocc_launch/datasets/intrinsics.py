@@ -9,8 +9,8 @@ from flocc_agent.runtime.recording import read_camera
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_launch.datasets.calibrations.document import parsed_json, parsed_xml, parsed_yaml, read_text
 from flocc_launch.datasets.calibrations.fields import lens_of_keys
-from flocc_launch.datasets.calibrations.keys import Keys, plain
 from flocc_launch.datasets.calibrations.maps import FORMS, REFUSED_MAPS, Cameras, form_of
+from flocc_launch.datasets.calibrations.taken_keys import Keys, plain
 from flocc_launch.datasets.calibrations.texts import REFUSED_TEXTS, TEXT_FORMS, text_form
 from flocc_launch.datasets.source import DatasetError, Lens
 

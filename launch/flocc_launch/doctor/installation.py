@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from flocc_agent.config import Mast3rConfig, PerceptionConfig, TransportConfig
+from flocc_agent.perception.backends import OWN, PerceptionError, check_perception, methods
 from flocc_launch.doctor.finding import Finding, Severity, good
 from flocc_launch.doctor.network_check import discovery, ports
 from flocc_protocol.errors import FloccError
@@ -68,6 +69,12 @@ def packages() -> list[Finding]:
 
 def networks(config: PerceptionConfig) -> list[Finding]:
     """Torch and the checkpoints, where perception needs them."""
+    try:
+        check_perception(config)
+    except PerceptionError as error:
+        return [Finding("perception", Severity.BLOCKS, f"{error}.", "Install the package that brings it.")]
+    if config.method not in OWN:
+        return [good("perception", f"Perception '{config.method}' comes from {methods()[config.method]}.")]
     if config.method != "mast3r":
         return [good("checkpoint", f"Perception '{config.method}' needs neither torch nor checkpoints.")]
     problem = import_problem("torch")

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from flocc_agent.perception.learned.files import WEIGHT_FILES, WeightFile, sha256_of, weights_folder
+from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, WeightFile, sha256_of, weights_folder
 from flocc_launch.setup.weight_files import WeightsError
 
 DOWNLOAD_TIMEOUT_S = 1800.0

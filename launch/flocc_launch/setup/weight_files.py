@@ -36,7 +36,7 @@ class WeightsError(FloccError):
 
 
 @dataclass(frozen=True, slots=True)
-class Needed:
+class NeededFile:
     """One checkpoint that the front end needs.
 
     Attributes:
@@ -55,14 +55,14 @@ class Needed:
 
 
 NEEDED = (
-    Needed(
+    NeededFile(
         "mast3r",
         "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth",
         "perception.mast3r.weights",
         "CC BY-NC-SA 4.0 (Naver) plus the terms of the training sets (CHECKPOINTS_NOTICE): non-commercial use only",
         "https://github.com/naver/mast3r",
     ),
-    Needed(
+    NeededFile(
         "cosplace",
         "ResNet101_512_cosplace.pth (or another backbone and dimension of release v1.0)",
         "perception.mast3r.place_weights",
@@ -208,8 +208,8 @@ def synthesize(
 
     from flocc_agent.perception.mast3r.cosplace import CosPlace
     from flocc_agent.perception.mast3r.keyed import COSPLACE_SEED, MAST3R_SEED, keyed_state
-    from flocc_agent.perception.mast3r.network import Mast3r
     from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
+    from flocc_agent.perception.mast3r.two_view_network import Mast3r
 
     folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Kind, Path] = {

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from flocc_agent.composition import build_optimiser, build_perception
+from flocc_agent.backend import build_optimiser
 from flocc_agent.core.reports import (
     CandidateFound,
     ClosureAccepted,
@@ -12,6 +12,7 @@ from flocc_agent.core.reports import (
     KeyframeTaken,
     RoundSolved,
 )
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.event_lines import line_of
 from flocc_agent.runtime.facts import AccountKept, AgentStopped, BytesCounted
 from flocc_agent.runtime.measurement_file import rows_of

@@ -84,7 +84,7 @@ async def _run(
     lines: Lines,
     source: "AgentSource | None",
 ) -> None:
-    from flocc_agent.composition import Agent
+    from flocc_agent.agent import Agent
 
     def on_report(event: Reported[Fact]) -> None:
         lines.write(event)
@@ -134,7 +134,7 @@ def _page(config: AgentConfig, where: str | None, clock_s: Callable[[], float]) 
 
 def recover_result(config: AgentConfig) -> None:
     """Write the result of an agent that was killed, from what its store holds."""
-    from flocc_agent.composition import stored_result
+    from flocc_agent.agent import stored_result
 
     if config.folder is not None and (config.folder / "store").exists():
         _write_result(config.folder, stored_result(config))
@@ -149,7 +149,7 @@ def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
 
 async def _tell(agent: Any, on_status: Callable[[dict[str, Any]], None]) -> None:
     while True:
-        on_status(agent.status())
+        on_status(agent.status().model_dump(mode="json"))
         await asyncio.sleep(STATUS_PERIOD_S)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, assert_never
 
 from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
+from flocc_agent.perception.backends import check_perception
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.report.finish import finish
@@ -82,6 +83,7 @@ def launch(
         FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
     """
     check_faults(scenario)
+    check_perception(scenario.perception)
     names = scenario.names()
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
     paths = recordings(scenario, progress)

@@ -15,8 +15,8 @@ from flocc_agent.core.interfaces import Camera, Image, OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import angle_rad, between
 from flocc_agent.perception.latent import BadLatent, pack
-from flocc_agent.perception.learned.features import read_features, write_features
-from flocc_agent.perception.learned.files import ALIKED_N16ROT, BadWeights, checked
+from flocc_agent.perception.learned.keypoints import read_features, write_features
+from flocc_agent.perception.learned.weight_sources import ALIKED_N16ROT, BadWeights, checked
 
 NEIGHBOUR = camera_at((-0.4, 0.05, 0.0), (0.0, 0.02, 0.0))
 QUERY = camera_at((0.0, 0.0, 0.0))

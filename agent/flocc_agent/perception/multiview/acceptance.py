@@ -26,7 +26,7 @@ ROTATION_AGREES_RAD = float(np.radians(5.0))
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
 
 
-class Neighbour(Enum):
+class OdometryNeighbour(Enum):
     """What the query's neighbour says of the pair."""
 
     NOT_ASKED = "not asked"
@@ -52,7 +52,7 @@ class Evidence:
     match_ratio: float
     has_scale: bool
     rotation_sigma_rad: float
-    neighbour: Neighbour = Neighbour.NOT_ASKED
+    neighbour: OdometryNeighbour = OdometryNeighbour.NOT_ASKED
     neighbour_correspondences: int = 0
 
 
@@ -107,7 +107,7 @@ class Acceptance:
         if self.has_ratio(evidence):
             return True
         needed = self.needed(evidence)
-        agrees = evidence.neighbour is Neighbour.AGREES
+        agrees = evidence.neighbour is OdometryNeighbour.AGREES
         enough = needed.agreeing if agrees else needed.alone
         return evidence.correspondences >= enough and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
 
@@ -146,9 +146,9 @@ def evidence_of_neighbour(
         T_neighbour_query: (4, 4) from odometry, metres.
     """
     if isinstance(neighbour_pair, int):
-        return replace(evidence, neighbour=Neighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
+        return replace(evidence, neighbour=OdometryNeighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
     agrees = agree(inverse(neighbour_pair.view.T_view_query), result, T_neighbour_query)
-    word = Neighbour.AGREES if agrees else Neighbour.CONTRADICTS
+    word = OdometryNeighbour.AGREES if agrees else OdometryNeighbour.CONTRADICTS
     return replace(evidence, neighbour=word, neighbour_correspondences=neighbour_pair.correspondences)
 
 

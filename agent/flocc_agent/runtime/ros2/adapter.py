@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
-from flocc_agent.runtime.ros2.names import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.session import Ros2Session
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
 from flocc_agent.runtime.ros2.synchroniser import PosedImage, Synchroniser
 from flocc_agent.runtime.ros2.telling import Teller
+from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_agent.lenses.names import NONE, RATIONAL, READ, kind_of, plain_name, with_distortion
+from flocc_agent.lenses.lens_names import NONE, RATIONAL, READ, kind_of, plain_name, with_distortion
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import checked_pose
 from flocc_launch.datasets.calibrations.document import TwiceError
-from flocc_launch.datasets.calibrations.keys import Keys, flat_numbers, plain
+from flocc_launch.datasets.calibrations.taken_keys import Keys, flat_numbers, plain
 from flocc_launch.datasets.source import Lens
 
 Float = NDArray[np.float64]

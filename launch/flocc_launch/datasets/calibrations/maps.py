@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flocc_launch.datasets.calibrations.keys import Keys, flat_numbers, plain
+from flocc_launch.datasets.calibrations.taken_keys import Keys, flat_numbers, plain
 
 Map = dict[str, Any]
 Cameras = dict[str, Map]

@@ -15,16 +15,19 @@ from tests.agent.runtime.ros2.cdr_by_hand import Stamped
 from tests.agent.runtime.ros2.raw_node import RawNode, gid, open_router
 
 from flocc_agent.config import KeyframeConfig, Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import CorrectedLog, Correction, RecordedOdometry
+from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.reports import Fact
-from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
+from flocc_agent.geometry import Float, pose, pose7, so3_exp, tq_from_pose
 from flocc_agent.runtime.facts import RosProblem, RouterConnected
 from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 from flocc_agent.runtime.ros2.types import BadMessage, Ros2Error
+from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import LogCorrection
 
 EPOCH_S = 1_700_000_000
 SIZE = (4, 6)
@@ -96,7 +99,10 @@ class Agent:
 
 def correction(covariance: Float | None = None) -> Correction:
     term = Term(1, LogId("r1", 0))
-    return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, 0, 1, np.zeros((0, 4, 4)))
+    nowhere = Array.of(np.zeros((0, 7)), "f4")
+    message = LogCorrection(term.leader, term, 1, term.leader, pose7(T_MAP_ODOM), None, 0, 1, nowhere)
+    own = CorrectedLog(message, RecordedOdometry(LogCopy()))
+    return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, own, {})
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """What a closure of learned features needs, by model; fitted on all scenes together (docs/learned.md)."""
 
 from flocc_agent.perception.multiview.acceptance import Acceptance, Needed
-from flocc_agent.perception.multiview.parameters import Geometry
+from flocc_agent.perception.multiview.view_parameters import Geometry
 
 GEOMETRY = Geometry()
 ACCEPTANCE = {

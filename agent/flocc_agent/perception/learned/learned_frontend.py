@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import LearnedConfig
 from flocc_agent.core.interfaces import Describer, Encoder, Image, Registrar
-from flocc_agent.perception.learned.acceptance import ACCEPTANCE, GEOMETRY
-from flocc_agent.perception.learned.codebook import load_codebook
-from flocc_agent.perception.learned.features import SIDE_MAX_PX, LearnedFeatures, read_features, write_features
-from flocc_agent.perception.learned.files import BadWeights, weights_folder
+from flocc_agent.perception.learned.acceptance_by_model import ACCEPTANCE, GEOMETRY
+from flocc_agent.perception.learned.keypoint_codebook import load_codebook
+from flocc_agent.perception.learned.keypoints import SIDE_MAX_PX, LearnedFeatures, read_features, write_features
 from flocc_agent.perception.learned.networks import VARIANTS, Networks
+from flocc_agent.perception.learned.weight_sources import BadWeights, weights_folder
 from flocc_agent.perception.multiview.picture import reduced_to
 from flocc_agent.perception.multiview.registrar import PairRegistrar
 

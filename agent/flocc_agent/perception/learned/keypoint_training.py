@@ -1,4 +1,4 @@
-"""Learn a codebook from generated pictures: `python -m flocc_agent.perception.learned.training MODEL`.
+"""Learn a codebook from generated pictures: `python -m flocc_agent.perception.learned.keypoint_training MODEL`.
 
 The files in the package were made with the defaults; no photograph took part. A minute with XFeat, four with ALIKED.
 """
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from flocc_agent.perception.classical.procedural import random_scene, random_view
 from flocc_agent.perception.classical.training import clustered
-from flocc_agent.perception.learned.codebook import LearnedCodebook, codebook_path
-from flocc_agent.perception.learned.files import weights_folder
+from flocc_agent.perception.learned.keypoint_codebook import LearnedCodebook, codebook_path
 from flocc_agent.perception.learned.networks import VARIANTS, Networks
+from flocc_agent.perception.learned.weight_sources import weights_folder
 
 Float32 = NDArray[np.float32]
 
