@@ -321,9 +321,9 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        evidence = evidence_of(driver.robot, self.config.core, driver.last_solution)
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
         status = self.status().model_dump(mode="json")
-        return json.dumps({**status, "compute_class": self.config.compute_class, **evidence}).encode()
+        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""

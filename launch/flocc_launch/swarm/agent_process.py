@@ -20,6 +20,7 @@ from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped
+from flocc_agent.runtime.status import AgentStatus
 from flocc_protocol.errors import FloccError
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Lines:
 async def run_agent(
     config: AgentConfig,
     epoch_s: float,
-    on_status: Callable[[dict[str, Any]], None],
+    on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
 ) -> None:
@@ -79,7 +80,7 @@ async def run_agent(
 async def _run(
     config: AgentConfig,
     epoch_s: float,
-    on_status: Callable[[dict[str, Any]], None],
+    on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None,
     lines: Lines,
     source: "AgentSource | None",
@@ -147,9 +148,9 @@ def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
         path.with_suffix(".tmp").replace(path)
 
 
-async def _tell(agent: Any, on_status: Callable[[dict[str, Any]], None]) -> None:
+async def _tell(agent: Any, on_status: Callable[[AgentStatus], None]) -> None:
     while True:
-        on_status(agent.status().model_dump(mode="json"))
+        on_status(agent.status())
         await asyncio.sleep(STATUS_PERIOD_S)
 
 
@@ -174,8 +175,8 @@ async def _standard_input() -> asyncio.StreamReader:
     return reader
 
 
-def _print_status(status: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(status, separators=(",", ":")) + "\n")
+def _print_status(status: AgentStatus) -> None:
+    sys.stdout.write(status.model_dump_json() + "\n")
     sys.stdout.flush()
 
 
