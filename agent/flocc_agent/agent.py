@@ -5,6 +5,7 @@ Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import time
@@ -48,6 +49,8 @@ from flocc_protocol.keys import Admin
 
 if TYPE_CHECKING:
     from flocc_agent.runtime.ros2.adapter import Ros2Adapter
+
+logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
@@ -349,8 +352,11 @@ class Agent:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
         def measure(stamped: Stamped, frame_s: float) -> None:
-            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
-            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            try:
+                measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+                self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            except BadMeasurement as error:
+                logger.warning("robot %s: %s; left out", self.config.name, error)
 
         await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
 
@@ -364,6 +370,7 @@ class Agent:
             lambda *keyframe: self._started.add_keyframe(*keyframe),
             lambda T_body_camera: self._started.mount_camera(T_body_camera),
             lambda: self._started.corrected_bodies(),
+            lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
             report,
         )
         return Ros2Adapter(config, self.config.name, self._selector, host)

@@ -9,7 +9,7 @@ from flocc_agent.perception.multiview.acceptance import Evidence, OdometryNeighb
 
 fit = pytest.importorskip("flocc_lab.bench.acceptance_fit")
 rows_module = pytest.importorskip("flocc_lab.bench.acceptance_rows")
-Row = rows_module.Row
+Row = rows_module.AcceptanceRow
 
 
 def rows(scene: str, seed: int, wrong_up_to: int = 40) -> list[object]:

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flocc_agent.core import corrections
 from flocc_agent.core.corrected import Correction, Corrector
 from flocc_agent.geometry import inverse
 from flocc_agent.runtime.trajectory import Trajectory
@@ -42,7 +41,7 @@ def told(swarm: Swarm, name: str) -> Correction:
 def test_poses_of_keyframes_and_times_are_those_of_the_reports_trajectories(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(corrections, "LISTED_MAX", 8)
+    monkeypatch.setattr("flocc_agent.core.corrections.LISTED_MAX", 8)
     swarm = swarm_of(SCENARIO, playbacks_of(SCENARIO, {}), 1)
     folder = RunFolder.create(tmp_path / "run")
     write(folder, swarm, 1, run(swarm))

@@ -16,11 +16,11 @@ from scipy.special import chdtri
 
 from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
+from flocc_agent.backend.graduated import gnc_finished, gnc_weights, initial_control
 from flocc_agent.backend.measured import measured_odometry
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
 from flocc_agent.backend.rbcd import Block, Links
 from flocc_agent.backend.screening import first_not_rigid
-from flocc_agent.backend.solvers import gnc_finished, gnc_weights, initial_control
 from flocc_agent.config import BackendConfig, Solver
 from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep, decides
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed

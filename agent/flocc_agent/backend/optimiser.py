@@ -13,15 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from flocc_agent.backend.consistency import inconsistent
+from flocc_agent.backend.descent import Objective
 from flocc_agent.backend.edges import state_of
 from flocc_agent.backend.initial import initial_poses, initial_world, trusted_closures
 from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.measured import with_factors, without_factors
+from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import build
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component, rejected
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import Objective, solve
+from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     AbsoluteFix,
@@ -202,7 +204,8 @@ def _solve_connected(
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     objective = Objective(problem.edges, problem.closure_rows, linear, config)
     trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None
-    solved = solve(objective, state, trusted)
+    places = Places(problem, trajectories, closures, config.steepness)
+    solved = solve(objective, state, trusted, places)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())

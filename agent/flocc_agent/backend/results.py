@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flocc_agent.backend.covariance import covariances_of
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, residuals, scales_at
 from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.scale_report import scale_warnings
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Objective, Solved
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.config import Solver
 from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, inverse

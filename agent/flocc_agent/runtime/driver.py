@@ -33,7 +33,12 @@ from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Lea
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution
-from flocc_agent.core.reports import Fact, LogForked, NeighbourDown, PeerRefused
+from flocc_agent.core.reports import (
+    Fact,
+    LogForked,
+    NeighbourDown,
+    PeerRefused,
+)
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose7
 from flocc_agent.runtime.admission import Refusal, admitted

@@ -68,7 +68,7 @@ def has_ratio(row: AcceptanceRow, ratio_min: float) -> bool:
 
 def best_needed(rows: Sequence[AcceptanceRow]) -> Needed:
     """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
-    table = EvidenceTable(rows)
+    table = AcceptanceTable(rows)
     scored = [
         (table.score(needed), needed.alone, needed.agreeing, -needed.rotation_sigma_max_rad, needed)
         for needed in choices()
@@ -81,7 +81,7 @@ def choices() -> Iterator[Needed]:
     return (Needed(a, g, float(np.radians(s))) for a in ALONE for g in AGREEING if g <= a for s in SIGMAS_DEG)
 
 
-class EvidenceTable:
+class AcceptanceTable:
     """Rows of one kind as arrays, for trying many rules."""
 
     def __init__(self, rows: Sequence[AcceptanceRow]) -> None:

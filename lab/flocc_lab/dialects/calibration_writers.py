@@ -33,7 +33,7 @@ class Rig:
 
 
 @dataclass(frozen=True, slots=True)
-class WrittenForm:
+class WriterForm:
     """How one tool writes a calibration.
 
     Attributes:
@@ -495,42 +495,42 @@ def gyroflow(rig: Rig) -> str:
     return json.dumps({"camera_brand": "a", "calib_dimension": size, "fisheye_params": lens, "fps": 60.0})
 
 
-FORMS: dict[str, WrittenForm] = {
-    "flocc YAML": WrittenForm("camera.yaml", flat, mounting=True),
-    "flocc TOML": WrittenForm("camera.toml", toml, mounting=True),
-    "EuRoC, Kimera": WrittenForm("sensor.yaml", euroc, (P, E), (4,), True),
-    "Kalibr": WrittenForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
-    "OpenVINS": WrittenForm("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
-    "ROS camera_info": WrittenForm("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
-    "ros2 topic echo": WrittenForm("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
-    "ROS INI": WrittenForm("ost.txt", ros_ini, counts=(0, 4, 5)),
-    "OpenCV YAML": WrittenForm("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
-    "OpenCV XML": WrittenForm("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV JSON": WrittenForm("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV stereo": WrittenForm("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
-    "ORB-SLAM 2": WrittenForm("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
-    "ORB-SLAM 3": WrittenForm("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
-    "VINS-Fusion (camodocal)": WrittenForm("cam0.yaml", camodocal, (P, E, MEI)),
-    "VINS-Mono": WrittenForm("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
-    "Basalt": WrittenForm("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
-    "COLMAP": WrittenForm("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
-    "nerfstudio, instant-ngp": WrittenForm("transforms.json", nerfstudio, (P, E)),
-    "DSO, TUM monoVO": WrittenForm("camera.txt", dso, (P, E, F)),
-    "RTAB-Map": WrittenForm("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
-    "SVO, maplab": WrittenForm("svo.yaml", svo, (P, E), mounting=True),
-    "OKVIS": WrittenForm("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
-    "MASt3R-SLAM": WrittenForm("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
-    "DROID-SLAM": WrittenForm("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
-    "matrix (7-Scenes, ScanNet, Stray Scanner)": WrittenForm(
+FORMS: dict[str, WriterForm] = {
+    "flocc YAML": WriterForm("camera.yaml", flat, mounting=True),
+    "flocc TOML": WriterForm("camera.toml", toml, mounting=True),
+    "EuRoC, Kimera": WriterForm("sensor.yaml", euroc, (P, E), (4,), True),
+    "Kalibr": WriterForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
+    "OpenVINS": WriterForm("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
+    "ROS camera_info": WriterForm("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
+    "ros2 topic echo": WriterForm("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
+    "ROS INI": WriterForm("ost.txt", ros_ini, counts=(0, 4, 5)),
+    "OpenCV YAML": WriterForm("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
+    "OpenCV XML": WriterForm("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV JSON": WriterForm("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV stereo": WriterForm("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
+    "ORB-SLAM 2": WriterForm("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
+    "ORB-SLAM 3": WriterForm("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
+    "VINS-Fusion (camodocal)": WriterForm("cam0.yaml", camodocal, (P, E, MEI)),
+    "VINS-Mono": WriterForm("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
+    "Basalt": WriterForm("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
+    "COLMAP": WriterForm("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
+    "nerfstudio, instant-ngp": WriterForm("transforms.json", nerfstudio, (P, E)),
+    "DSO, TUM monoVO": WriterForm("camera.txt", dso, (P, E, F)),
+    "RTAB-Map": WriterForm("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
+    "SVO, maplab": WriterForm("svo.yaml", svo, (P, E), mounting=True),
+    "OKVIS": WriterForm("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
+    "MASt3R-SLAM": WriterForm("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
+    "DROID-SLAM": WriterForm("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
+    "matrix (7-Scenes, ScanNet, Stray Scanner)": WriterForm(
         "intrinsic_color.txt", matrix_text, counts=(0,), sized=False
     ),
-    "KITTI odometry": WrittenForm("calib.txt", kitti, counts=(0,), sized=False),
-    "KITTI raw": WrittenForm("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
-    "Open3D": WrittenForm("camera_intrinsic.json", open3d, counts=(0,)),
-    "Replica": WrittenForm("cam_params.json", replica, counts=(0,)),
-    "OpenSfM, ODM": WrittenForm("camera_models.json", opensfm, (P, E), (0, 4, 5)),
-    "DepthAI": WrittenForm("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
-    "Gyroflow": WrittenForm("gyroflow.json", gyroflow, (E,)),
+    "KITTI odometry": WriterForm("calib.txt", kitti, counts=(0,), sized=False),
+    "KITTI raw": WriterForm("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
+    "Open3D": WriterForm("camera_intrinsic.json", open3d, counts=(0,)),
+    "Replica": WriterForm("cam_params.json", replica, counts=(0,)),
+    "OpenSfM, ODM": WriterForm("camera_models.json", opensfm, (P, E), (0, 4, 5)),
+    "DepthAI": WriterForm("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
+    "Gyroflow": WriterForm("gyroflow.json", gyroflow, (E,)),
 }
 """Every form that is read, by the name that docs/data-sets.md has for it."""
 

@@ -23,7 +23,16 @@ from flocc_agent.core.parameters import (
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed, PoseGraph
 from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected
 from flocc_agent.runtime.event_lines import of_kind
-from flocc_lab.experiments.experiment import Cell, Experiment, ExperimentFinding, Row, Settings, Summary, grid, judged
+from flocc_lab.experiments.experiment import (
+    Cell,
+    Experiment,
+    ExperimentFinding,
+    Row,
+    Settings,
+    Summary,
+    grid,
+    judged,
+)
 from flocc_lab.experiments.plots import COLOURS, from_zero
 from flocc_lab.experiments.statistics import grouped, middle, values
 from flocc_launch.runs.trajectory_errors import ate_m

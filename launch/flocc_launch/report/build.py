@@ -17,7 +17,7 @@ from flocc_launch.report.model import (
     LeaderSpan,
     Optimisations,
     RobotBytes,
-    RobotDetails,
+    RobotReport,
     RunReport,
     TrackError,
 )
@@ -113,12 +113,12 @@ def track_error(estimate: Float, truth: Float) -> TrackError:
     )
 
 
-def robot_part(loaded: LoadedRun, robot: str) -> RobotDetails:
+def robot_part(loaded: LoadedRun, robot: str) -> RobotReport:
     """One robot's part of the report."""
     track, result = loaded.tracks[robot], loaded.results.get(robot)
     corrections = corrections_of(loaded.events, robot)
     end = ends(loaded.events).get(robot)
-    return RobotDetails(
+    return RobotReport(
         robot=robot,
         incarnation=None if result is None else result.incarnation,
         end=None if end is None else "died" if isinstance(end.fact, AgentDied) else "stopped",

@@ -59,7 +59,7 @@ class TrackError(Record):
     """RMSE of the turn from one keyframe to the next."""
 
 
-class RobotDetails(Record):
+class RobotReport(Record):
     """One robot at the end of the run."""
 
     robot: str
@@ -184,5 +184,5 @@ class RunReport(Record):
     """How often the robots went from one leader to another, the upper median over the robots."""
     optimisations: Optimisations
     expectations: list[Expectation]
-    robot_details: list[RobotDetails]
+    robot_details: list[RobotReport]
     warnings: list[str]

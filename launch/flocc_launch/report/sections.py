@@ -10,7 +10,7 @@ from flocc_launch.doctor import Severity, diagnose_loaded
 from flocc_launch.report.figure_charts import error_figure, ratio_figure
 from flocc_launch.report.figure_map import colour, map_figure, scenes, view_of
 from flocc_launch.report.figure_time import time_figure
-from flocc_launch.report.model import RobotDetails, RunReport
+from flocc_launch.report.model import RobotReport, RunReport
 from flocc_launch.report.svg import element, text_of
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
@@ -293,7 +293,7 @@ def robots(report: RunReport) -> str:
     return element("h2", "Robots") + wide + (leaders if led else "")
 
 
-def robot_row(report: RunReport, robot: RobotDetails) -> list[str]:
+def robot_row(report: RunReport, robot: RobotReport) -> list[str]:
     """One robot's row."""
     end = "–" if robot.end is None else f"{robot.end} at {seconds(robot.ended_s)}"
     return [
