@@ -11,7 +11,7 @@ import signal
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
@@ -251,7 +252,7 @@ class Agent:
             for task in done:
                 task.result()
 
-    def result(self) -> dict[str, Any] | None:
+    def result(self) -> RobotResult | None:
         """What this robot knows (`result.json`), None before it started."""
         return None if self._driver is None else self._driver.result()
 
@@ -390,7 +391,7 @@ class BadKeyframe(FloccError):
     """A keyframe that cannot be used; the agent goes on without it."""
 
 
-def stored_result(config: AgentConfig) -> dict[str, Any]:
+def stored_result(config: AgentConfig) -> RobotResult:
     """What a robot knew when it was killed (`result.json`), from its store."""
     recording = _recording(config)
     T_body_camera = np.eye(4) if recording is None else recording.T_body_camera

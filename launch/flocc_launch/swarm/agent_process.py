@@ -20,6 +20,7 @@ from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.status import AgentStatus
 from flocc_protocol.errors import FloccError
 
@@ -141,10 +142,10 @@ def recover_result(config: AgentConfig) -> None:
         _write_result(config.folder, stored_result(config))
 
 
-def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
+def _write_result(folder: Path | None, result: RobotResult | None) -> None:
     if folder is not None and result is not None:
         path = folder / "result.json"
-        path.with_suffix(".tmp").write_text(json.dumps(result, allow_nan=False), encoding="utf-8")
+        path.with_suffix(".tmp").write_text(result.model_dump_json(), encoding="utf-8")
         path.with_suffix(".tmp").replace(path)
 
 
