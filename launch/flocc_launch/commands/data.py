@@ -1,6 +1,6 @@
 """Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -155,7 +155,7 @@ def status(
     from flocc_launch.setup.weight_files import status as look
 
     mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
-    for needed in (*look(mast3r), *look_at_learned()):
+    for needed in [*map(asdict, look(mast3r)), *map(asdict, look_at_learned())]:
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")
