@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend import rotations
-from flocc_agent.backend.alignment import PairAlignment, align_pair, rays_from, travelled_m
+from flocc_agent.backend.alignment import TRANSLATION_TOLERANCE_M, PairAlignment, align_pair, rays_from, travelled_m
 from flocc_agent.backend.edges import State
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory, components_of
@@ -40,6 +40,7 @@ class Places:
     problem: Problem
     trajectories: Mapping[LogId, Trajectory]
     closures: Mapping[int, LoopClosure]
+    votes: Float
     steepness: float
 
     def proposals(self, state: State, chosen: Bool) -> Iterator[Placement]:
@@ -52,10 +53,17 @@ class Places:
                 continue
             crossing = self._crossing(body)
             agreeing = np.isin(self.problem.closure_ids, found.agreeing)
-            if np.count_nonzero(agreeing & ~chosen) == 0:
+            here = chosen & crossing
+            if self.votes[agreeing].sum() <= self.votes[here].sum():
                 continue
-            if np.count_nonzero(agreeing) > np.count_nonzero(chosen & crossing):
+            if not np.any(here) or self._moves(body, T, found.T_a_b):
                 yield Placement(body, self._moved(state, body, found.T_a_b), (chosen & ~crossing) | agreeing)
+
+    def _moves(self, body: frozenset[LogId], T: Mapping[LogId, Float], T_move: Float) -> bool:
+        """Whether a motion takes some keyframe of a body further than alignment can tell."""
+        before = np.concatenate([T[log][:, :3, 3] for log in body])
+        after = before @ T_move[:3, :3].T + T_move[:3, 3]
+        return bool(np.max(np.linalg.norm(after - before, axis=1)) > TRANSLATION_TOLERANCE_M)
 
     def _poses(self, state: State) -> dict[LogId, Float]:
         T, offsets = state.poses(), self.problem.offsets
@@ -85,7 +93,9 @@ class Places:
             query, match = self.closures[k].query, self.closures[k].match
             ends[k] = (match, query) if query.log in body else (query, match)
         rays = rays_from(ids, self.closures, ends, T, path_m, self.steepness)
-        found = align_pair(replace(rays, travelled_a_m=np.zeros(len(ids))), HYPOTHESES_MAX)
+        votes = self.votes[np.isin(self.problem.closure_ids, ids)]
+        judges = replace(rays, weight=rays.weight * votes, travelled_a_m=np.zeros(len(ids)))
+        found = align_pair(judges, HYPOTHESES_MAX)
         return found if len(found.agreeing) >= AGREEING_MIN else None
 
     def _moved(self, state: State, body: frozenset[LogId], T_move: Float) -> State:
