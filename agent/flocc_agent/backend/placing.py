@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend import rotations
-from flocc_agent.backend.alignment import TRANSLATION_TOLERANCE_M, PairAlignment, align_pair, rays_from, travelled_m
+from flocc_agent.backend.alignment import PairAlignment, align_pair, rays_from, travelled_m
 from flocc_agent.backend.edges import State
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory, components_of
@@ -22,6 +22,9 @@ Bool = NDArray[np.bool_]
 Float = NDArray[np.float64]
 
 AGREEING_MIN = 2
+HYPOTHESES_MAX = 200
+KEPT_RATIO_MAX = 0.5
+"""A place with which more of the used closures agree is the one where the body is, told less exactly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,16 +57,10 @@ class Places:
             crossing = self._crossing(body)
             agreeing = np.isin(self.problem.closure_ids, found.agreeing)
             here = chosen & crossing
-            if self.votes[agreeing].sum() <= self.votes[here].sum():
-                continue
-            if not np.any(here) or self._moves(body, T, found.T_a_b):
+            more = self.votes[agreeing].sum() > self.votes[here].sum()
+            elsewhere = self.votes[here & agreeing].sum() <= KEPT_RATIO_MAX * self.votes[here].sum()
+            if more and elsewhere:
                 yield Placement(body, self._moved(state, body, found.T_a_b), (chosen & ~crossing) | agreeing)
-
-    def _moves(self, body: frozenset[LogId], T: Mapping[LogId, Float], T_move: Float) -> bool:
-        """Whether a motion takes some keyframe of a body further than alignment can tell."""
-        before = np.concatenate([T[log][:, :3, 3] for log in body])
-        after = before @ T_move[:3, :3].T + T_move[:3, 3]
-        return bool(np.max(np.linalg.norm(after - before, axis=1)) > TRANSLATION_TOLERANCE_M)
 
     def _poses(self, state: State) -> dict[LogId, Float]:
         T, offsets = state.poses(), self.problem.offsets
@@ -104,6 +101,3 @@ class Places:
             rows = slice(self.problem.offsets[log], self.problem.offsets[log] + len(self.trajectories[log]))
             T[rows] = T_move @ T[rows]
         return State(rotations.quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), state.scale)
-
-
-HYPOTHESES_MAX = 200
