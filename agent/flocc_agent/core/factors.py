@@ -24,13 +24,17 @@ from flocc_agent.core.pose_graph import EARTH, WORLD, MeasuredFactor, landmark
 from flocc_agent.geometry import adjoint, between, inverse, pose, pose_from_tq, se3_exp, se3_log, symmetric
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
+    ClosureRecord,
     FixRecord,
     GeodeticFixRecord,
     MetricClosureRecord,
     PoseFixRecord,
+    Record,
+    RejectionRecord,
     RobotBearingRecord,
     RobotSightingRecord,
     TagSightingRecord,
+    UnknownRecord,
 )
 
 Float = NDArray[np.float64]
@@ -145,9 +149,13 @@ def factor_of(log: LogId, record: object, tracks: Tracks) -> Made:
     return None if maker is None else maker(log, record, tracks)
 
 
-def makes_factor(record: object) -> bool:
-    """Whether records of this type become factors."""
-    return type(record) in _MAKERS
+def made_at(log: LogId, record: Record) -> KeyframeId | None:
+    """The keyframe of its log at which a measurement was made; None where the record names its keyframes itself."""
+    match record:
+        case ClosureRecord() | RejectionRecord() | MetricClosureRecord() | UnknownRecord():
+            return None
+        case _:
+            return KeyframeId(log, record.index)
 
 
 def _seen(log: LogId, robot: str, stamp_s: float, tracks: Tracks) -> tuple[KeyframeId, Float, Float] | None:

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from flocc_launch.dashboard.status_table import PairStatus, RobotStatus
+from flocc_agent.runtime.status import PairStatus
+from flocc_launch.dashboard.status_table import RobotStatus
 from flocc_launch.doctor.finding import Finding, Severity, blocked
 from flocc_launch.doctor.merge_evidence import held_records
 from flocc_launch.runs.plain_numbers import number

@@ -14,7 +14,7 @@ from pathlib import Path
 from flocc_agent.config import KeyframeConfig
 from flocc_agent.perception.backends import build_perception
 from flocc_launch.runs.run_folder import write_json
-from flocc_launch.scenarios.scenario import FaultKind, Scenario, TracksScenario
+from flocc_launch.scenarios.scenario import FaultKind, Scenario, SensorsScenario, TracksScenario
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
 from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
@@ -126,15 +126,18 @@ def prepared(scenario: Scenario) -> Swarm:
 def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     assert scenario.tracks is not None
     tracks = scenario.tracks.model_copy(update={"robots": ROBOTS_MAX})
-    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json())
+    sensors = None if scenario.sensors is None else scenario.sensors.model_dump_json()
+    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json(), sensors)
     return {name: drawn[name] for name in scenario.names()}
 
 
 @lru_cache(maxsize=64)
-def _walked(tracks: str, keyframes: str) -> dict[str, Playback]:
-    """Playbacks of walks, drawn once for all seeds that share them; both parameters are JSON."""
+def _walked(tracks: str, keyframes: str, sensors: str | None) -> dict[str, Playback]:
+    """Playbacks of walks, drawn once for all seeds that share them; the parameters are JSON."""
     scenario = Scenario(
-        tracks=TracksScenario.model_validate_json(tracks), keyframes=KeyframeConfig.model_validate_json(keyframes)
+        tracks=TracksScenario.model_validate_json(tracks),
+        keyframes=KeyframeConfig.model_validate_json(keyframes),
+        sensors=None if sensors is None else SensorsScenario.model_validate_json(sensors),
     )
     return playbacks_of(scenario, {})
 
