@@ -16,6 +16,7 @@ from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
+from flocc_launch.datasets.clocks import ClockFit, measured
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, read_source, team_folder
 from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
@@ -221,6 +222,19 @@ def infos(path: Path, format_name: str | None = None, form: str | None = None) -
         logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
 
 
+def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, form: str | None = None) -> ClockFit:
+    """Measure how far a data set's pictures and its trajectory (or another one) are apart in time.
+
+    Raises:
+        DatasetError: There is no trajectory or calibration, or the pictures do not tell.
+    """
+    source = read_source(path, None, camera, form if odometry is None else None, time_offset_s=None)
+    trajectory = source.odometry or source.truth if odometry is None else read_trajectory(odometry, form)[0]
+    if trajectory is None:
+        raise DatasetError(f"{path}: has neither odometry nor ground truth ({expected_files(path)})")
+    return measured(source.images, source.lens.camera if source.lens else None, trajectory)
+
+
 def convert(
     path: Path,
     out: Path,
@@ -238,6 +252,7 @@ def convert(
     form: str | None = None,
     robot: str | None = None,
     view_deg: float | None = None,
+    time_offset_s: float = 0.0,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -258,6 +273,7 @@ def convert(
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
         robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
         view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
+        time_offset_s: Added to the stamps of a folder's odometry and ground truth.
         progress: Called with images done and images in all.
 
     Returns:
@@ -273,10 +289,13 @@ def convert(
         for note in convert_video(path, out, camera, odometry, form, every, progress):
             logger.warning("%s", note)
         return out
-    source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
+    own_form = form if odometry is None else None
+    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
     _tell(source)
-    identity = _identity("convert", path, source, drift, seed)
-    given = None if odometry is None else _given_odometry(source, odometry, form)
+    identity = _identity(
+        f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
+    )
+    given = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
     _note_drift(out, drift if given is None else None)
@@ -373,8 +392,9 @@ def _tell(source: Source) -> None:
         logger.warning("%s", note)
 
 
-def _given_odometry(source: Source, path: Path, form: str | None) -> Trajectory:
-    given, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+def _given_odometry(source: Source, path: Path, form: str | None, time_offset_s: float) -> Trajectory:
+    read, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+    given = read.later(time_offset_s)
     _tell(replace(source, notes=notes))
     check_times(source, given, path)
     return given.relative_to_first()
