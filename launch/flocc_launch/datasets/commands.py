@@ -32,6 +32,7 @@ from flocc_launch.datasets.video import (
     read_head,
 )
 from flocc_launch.datasets.writer import Progress, write_source
+from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)
 
@@ -216,7 +217,10 @@ def infos(path: Path, format_name: str | None = None, form: str | None = None) -
         yield info(path, format_name, form)
         return
     for entry in team.values():
-        yield info(entry, None, form)
+        try:
+            yield info(entry, None, form)
+        except FloccError as error:
+            logger.warning("%s", error)
     others = [entry.name for entry in sorted(path.iterdir()) if entry not in team.values() and entry.name[0] != "."]
     if others:
         logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
