@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,6 +37,12 @@ from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)
 
+USED_NAMES = re.compile(
+    r"(odometry|trajectory|poses|vio|groundtruth|gt|ground_truth|traj|images|rgb|times|source|odometry_made)"
+    r"\.(tum|txt|csv)$|state_groundtruth|mocap0|camera|calib|intrinsics|sensor|transforms\.json$|sparse$|frame-",
+    re.IGNORECASE,
+)
+"""Names of what readers use beside images."""
 ODOMETRY_MADE = "odometry_made.txt"
 """In a recording: how its odometry was made of ground truth."""
 
@@ -106,8 +113,21 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source)),
-        notes=source.notes,
+        notes=(*source.notes, *_unused(source)),
     )
+
+
+def _unused(source: Source) -> list[str]:
+    """What lies in a data set's folder and is not used, in one sentence."""
+    root = source.path / "mav0" if (source.path / "mav0").is_dir() else source.path
+    used = {file.relative_to(root).parts[0] for _, file in source.images if file.is_relative_to(root)}
+    others = [
+        entry.name
+        for entry in sorted(root.iterdir())
+        if entry.name[0] != "." and entry.name not in used and not USED_NAMES.match(entry.name)
+    ]
+    more = f" and {len(others) - 8} more" if len(others) > 8 else ""
+    return [f"{root}: not used: {', '.join(others[:8])}{more}"] if others else []
 
 
 def _posed(source: Source, trajectory: Trajectory | None) -> int | None:
