@@ -1,5 +1,6 @@
 """The recipes of CONTRIBUTING.md, done: what they insert goes into a copy of the packages, and is used there."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -9,9 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.agent.perception.plugin_folder import install
 
-from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, Registrar
+from flocc_agent.config import PerceptionConfig
+from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.core.registration import RegistrationFailed
+from flocc_agent.perception.backends import build_perception
 from flocc_protocol.records import UnknownRecord, decode_record
 
 ROOT = Path(__file__).parents[1]
@@ -42,6 +46,7 @@ import sys
 from flocc_agent.core.effects import Report
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.reports import PeerPauses
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.zenoh_transport import PRIORITY
 from flocc_protocol.ids import LogId
@@ -53,8 +58,31 @@ envelope = Envelope(LogId("r2"), Pause(3.0))
 assert decode(encode(envelope)) == envelope
 assert set(PRIORITY) == set(MESSAGE_KINDS) == {kind.value for kind in Kind}
 effects = Robot(LogId("r1"), 0, 1, CoreParameters(), 0.0).handle(MessageReceived(envelope), 1.0)
-assert Report("peer_pauses", {"peer": "r2", "seconds": 3.0}) in effects
+assert Report(PeerPauses(peer="r2", seconds=3.0)) in effects
 sys.stdout.write("done")
+"""
+
+REPORT = """
+import json, sys
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.gossip import NewRecord
+from flocc_agent.core.parameters import RoundParameters
+from flocc_agent.core.reports import RoundsFailing
+from flocc_agent.core.rounds import Rounds
+from flocc_agent.runtime.event_lines import Reported, line_of, reported_of
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.records import KeyframeRecord
+
+assembly, term = GraphAssembly(), Term(3, LogId("r1"))
+assembly.add(NewRecord(LogId("r1"), 0, KeyframeRecord(0, 0.0, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None)))
+rounds = Rounds(assembly, RoundParameters())
+rounds.on_term(term)
+rounds.tick(0.0)
+told = [effect.fact for effect in rounds.tick(rounds.deadline())]
+assert told[1] == RoundsFailing(term=term, failures=1)
+line = json.dumps(line_of(Reported(7.5, "r1", told[1])))
+assert reported_of(line) == Reported(7.5, "r1", told[1])
+sys.stdout.write(line)
 """
 
 
@@ -110,23 +138,29 @@ def test_a_message_is_added_as_the_recipe_says(tmp_path: Path) -> None:
     assert run_there(tmp_path, MESSAGE) == "done"
 
 
-def test_the_front_end_of_the_recipe_is_one() -> None:
+def test_a_report_touches_two_files_as_the_recipe_says(tmp_path: Path) -> None:
+    files = follow("Add a report", tmp_path)
+    assert files == ["agent/flocc_agent/core/reports.py", "agent/flocc_agent/core/rounds.py"]
+    line = json.loads(run_there(tmp_path, REPORT))
+    assert line == {"t": 7.5, "robot": "r1", "event": "rounds_failing", "term": "3:r1", "failures": 1}
+
+
+def test_the_front_end_of_the_recipe_is_chosen_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", recipe("Add a front end"), re.DOTALL)
-    names: dict[str, type] = {}
-    exec(code, names)  # the page's own block
-    describer: Describer = names["GreyDescriber"]()
-    encoder: Encoder = names["GreyEncoder"]()
-    registrar: Registrar = names["GreyRegistrar"]()
+    (entry,) = re.findall(r'"flocc.perception"\]\n\s*(\w+) = "([\w:]+)"', recipe("Add a front end"))
+    (tmp_path / "grey_eyes.py").write_text(code, encoding="utf-8")
+    install(tmp_path, *entry)
+    monkeypatch.syspath_prepend(tmp_path)
+    perception = build_perception(PerceptionConfig(method="grey"))
     camera = Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     image = Image(np.full((48, 64, 3), 90, np.uint8), camera)
-    descriptor = describer.describe(image)
-    assert descriptor.shape == (describer.dimension,)
-    assert descriptor.dtype == np.dtype(np.float32)
+    descriptor = perception.describer.describe(image)
+    assert descriptor.shape == (perception.describer.dimension,)
     assert np.linalg.norm(descriptor) == pytest.approx(1.0)
-    latent = encoder.encode(image)
-    assert isinstance(registrar.register(latent, latent, None), RegistrationFailed)
+    latent = perception.encode(image)
+    assert isinstance(perception.register(latent, latent, None), RegistrationFailed)
 
 
-@pytest.mark.parametrize("title", ["Add a record", "Add a message"])
+@pytest.mark.parametrize("title", ["Add a record", "Add a message", "Add a report"])
 def test_every_block_of_a_recipe_is_a_step(title: str) -> None:
-    assert recipe(title).count("```python") == len(list(STEP.finditer(recipe(title)))) >= 5
+    assert recipe(title).count("```python") == len(list(STEP.finditer(recipe(title)))) >= 3

@@ -25,7 +25,7 @@ from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AccountKept
 from flocc_agent.runtime.zenoh_observer import Observer
 from flocc_launch.dashboard import live_dashboard
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_shipped
@@ -79,7 +79,7 @@ class Watched:
     intervals_s: list[float]
     sent_bytes: int
     observer_bytes: int
-    report: Report
+    report: RunReport
 
 
 def watched(scenario: Scenario, folder: Path, observed: bool) -> Watched:
@@ -109,7 +109,7 @@ def _attached(
         threads[-1].start()
 
     def show(watch: Watch) -> None:
-        if witnesses or not all(agent.status for agent in watch.agents):
+        if witnesses or not all(agent.status is not None for agent in watch.agents):
             return
         transport = AgentConfig.read(watch.agents[-1].folder / "config.json").transport
         witnesses.append(Witness(Observer(transport, scenario.name, (Kind.HEARTBEAT,))))

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flocc_agent.perception.multiview.acceptance import Evidence, Neighbour
+from flocc_agent.perception.multiview.acceptance import Evidence, OdometryNeighbour
 
 fit = pytest.importorskip("flocc_lab.bench.acceptance_fit")
 rows_module = pytest.importorskip("flocc_lab.bench.acceptance_rows")
-Row = rows_module.Row
+Row = rows_module.AcceptanceRow
 
 
 def rows(scene: str, seed: int, wrong_up_to: int = 40) -> list[object]:
@@ -19,7 +19,7 @@ def rows(scene: str, seed: int, wrong_up_to: int = 40) -> list[object]:
     for k in range(200):
         is_right = bool(rng.uniform() < 0.7)
         count = int(rng.integers(15, 200) if is_right else rng.integers(15, wrong_up_to))
-        word = Neighbour.AGREES if is_right else Neighbour.CONTRADICTS
+        word = OdometryNeighbour.AGREES if is_right else OdometryNeighbour.CONTRADICTS
         evidence = Evidence(count, count / 400, bool(k % 2), 0.006 if is_right else 0.012, word)
         made.append(Row(scene, k, k + 1, True, float(rng.uniform(0, 150)), count, 400, evidence, is_right))
     return made
@@ -50,7 +50,7 @@ def test_a_rule_of_the_other_scenes_is_what_judges_a_scene() -> None:
 
 
 def test_the_neighbour_is_not_heard_where_the_rule_does_not_ask_it() -> None:
-    contradicted = Evidence(100, 0.1, True, 0.001, Neighbour.CONTRADICTS)
+    contradicted = Evidence(100, 0.1, True, 0.001, OdometryNeighbour.CONTRADICTS)
     row = Row("a", 0, 1, True, 10.0, 100, 1000, contradicted, True)
 
     rule = fit.fitted([row])

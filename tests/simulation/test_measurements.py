@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
@@ -38,7 +38,7 @@ def measured(folder: Path) -> dict[str, int]:
     return found
 
 
-def run(folder: Path, sensors: dict[str, Any] | None, **changes: Any) -> Report:
+def run(folder: Path, sensors: dict[str, Any] | None, **changes: Any) -> RunReport:
     report = simulate(scenario(sensors, **changes), folder)
     assert report.closures.accepted == 0, "the robots must not have a common view"
     assert events(folder, "measurement_refused") == []

@@ -15,6 +15,7 @@ from flocc_agent.core.reports import (
     LeaderFollowed,
 )
 from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_launch.dashboard.snapshot import MapGroup
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.virtual_robot import Station
@@ -67,8 +68,8 @@ def test_a_listeners_picture_is_that_of_the_run() -> None:
     state = SwarmState(["r1", "r2"])
     for event in events:
         state.apply(event)
-    snapshot = state.snapshot(25.0)
-    assert snapshot["maps"] == [{"frame": "map/r1", "robots": ["r1", "r2"]}]
-    assert snapshot["leaders"] == ["r1"]
-    assert len(snapshot["closures"]) == len(of_kind(told, ClosureAccepted))
-    assert all(end is not None for closure in snapshot["closures"] for end in closure["ends_m"])
+    snapshot = state.snapshot(25.0, "broken")
+    assert snapshot.maps == [MapGroup("map/r1", ["r1", "r2"])]
+    assert snapshot.leaders == ["r1"]
+    assert len(snapshot.closures) == len(of_kind(told, ClosureAccepted))
+    assert all(end is not None for closure in snapshot.closures for end in closure.ends_m)

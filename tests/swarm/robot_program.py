@@ -4,7 +4,6 @@ Usage: CONFIG.json KEYFRAMES PERIOD_S PHASE_RAD. Runs until its standard input e
 """
 
 import asyncio
-import json
 import math
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.config import AgentConfig
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.perception.synthetic import pose_image
@@ -46,7 +45,7 @@ async def drive(agent: Agent, name: str, keyframes: int, period_s: float, phase_
 async def tell(agent: Agent) -> None:
     """Print the agent's state again and again."""
     while True:
-        print(json.dumps(agent.status()), flush=True)
+        print(agent.status().model_dump_json(), flush=True)
         await asyncio.sleep(STATUS_PERIOD_S)
 
 

@@ -71,7 +71,7 @@ async def walked(agents: list[Agent], seen: Callable[[int, int], Measurement | N
 
 
 def frames(agents: list[Agent]) -> list[object]:
-    return [agent.status()["map_frame"] for agent in agents]
+    return [agent.status().map_frame for agent in agents]
 
 
 def T_map_bodies(agent: Agent) -> Float:
@@ -106,13 +106,13 @@ async def test_two_robots_without_a_common_view_end_in_one_frame(
         await walked(agents, seen)
         await reached(lambda: frames(agents) == ["map/r1", "map/r1"], agents)
         await reached(lambda: len(T_map_bodies(agents[1])) == KEYFRAMES and error_m(agents) < 0.05, agents)
-        assert [agent.status()["closures"] for agent in agents] == [0, 0]
-        assert agents[0].status()["logs"] == agents[1].status()["logs"]
+        assert [agent.status().closures for agent in agents] == [0, 0]
+        assert agents[0].status().logs == agents[1].status().logs
 
 
 async def test_without_it_they_stay_apart() -> None:
     async with team() as agents:
         await walked(agents, lambda robot, k: None)
         await reached(lambda: frames(agents) == ["map/r1", "map/r2"], agents)
-        await reached(lambda: not any(agent.status()["busy"] for agent in agents), agents)
+        await reached(lambda: not any(agent.status().busy for agent in agents), agents)
         assert frames(agents) == ["map/r1", "map/r2"]

@@ -57,7 +57,7 @@ async def write(agent: Agent, number: int) -> None:
 
 
 def logs(agents: list[Agent]) -> list[Any]:
-    return [agent.status()["logs"] for agent in agents]
+    return [agent.status().logs for agent in agents]
 
 
 async def test_one_robot_writes_records_that_the_others_do_not_know(tmp_path: Path) -> None:
@@ -78,19 +78,19 @@ async def test_one_robot_writes_records_that_the_others_do_not_know(tmp_path: Pa
         def settled() -> bool:
             held = logs(agents)
             equal = held[0] == held[1] == held[2] and len(held[0]) == 3
-            return equal and not any(agent.status()["busy"] for agent in agents)
+            return equal and not any(agent.status().busy for agent in agents)
 
         await reached(settled, lambda: [agent.status() for agent in agents])
         theirs = r1.robot.gossip.logs[LogId("r3")]
         unread = [record for record in theirs.records if isinstance(record, UnknownRecord)]
         assert len(unread) == KEYFRAMES
         assert theirs.encoded == r3.robot.gossip.logs[LogId("r3")].encoded
-        closures = [agent.status()["closures"] for agent in agents]
+        closures = [agent.status().closures for agent in agents]
         assert closures[0] == closures[1] == closures[2] >= KEYFRAMES
-        assert {agent.status()["map_frame"] for agent in agents} == {"map/r1"}
-        assert all(agent.status()["refused"] == {} for agent in agents)
+        assert {agent.status().map_frame for agent in agents} == {"map/r1"}
+        assert all(agent.status().refused == {} for agent in agents)
     async with Agent(configs["r3"], CAMERA) as again:
-        assert again.status()["keyframes"] == KEYFRAMES, "it starts on its own store with its own unknown records"
+        assert again.status().keyframes == KEYFRAMES, "it starts on its own store with its own unknown records"
 
 
 def refusals(told: list[Reported[Fact]]) -> list[Fact]:
@@ -115,7 +115,7 @@ async def test_another_version_of_the_messages_is_named_at_both_ends() -> None:
             return bool(refusals(told)) and bool(heard)
 
         await reached(refused, agent.status)
-        assert agent.status()["neighbours"] == []
+        assert agent.status().neighbours == ()
     reason = f"protocol version 2, this robot speaks {PROTOCOL_VERSION}"
     assert refusals(told) == [PeerRefused(peer="alice", reason=reason)]
     assert heard[0][1] == PROTOCOL_VERSION != 2, "the other end reads the version in the same byte, and says the same"

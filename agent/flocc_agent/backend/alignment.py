@@ -4,8 +4,9 @@ For a pair of logs every closure k proposes the rotation `R_k = R_i R_hat R_j^T`
 rotation R, a ray on which the translation lies: `t = (p_i - R p_j) + s u_k`, s >= 0, `u_k = R_i t_hat / |t_hat|`.
 A hypothesis is the rotation of one closure and the point of its ray nearest to another's. The hypothesis that the
 most probability agrees with wins; all closures that agree with it are then averaged. Tolerances grow with the
-distance that both robots travelled between two closures, because odometry drifts. Pairs are joined along the tree
-of greatest support, so that the first closure that happens to come decides nothing.
+distance that both robots travelled between two closures, because odometry drifts. The map grows by the pair of
+greatest support, so that the first closure that happens to come decides nothing; a robot that is placed has all its
+closures with the robots that are there already as judges, because a robot may be held by one closure with each of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import Float, inverse, nearest_rotation, pose
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 
 Bool = NDArray[np.bool_]
 Int = NDArray[np.int64]
@@ -118,7 +119,7 @@ def align(
         (a, b): align_pair(rays_of(ids, closures, trajectories, path_m, steepness))
         for (a, b), ids in sorted(pairs.items())
     }
-    return _spanning_tree(sorted(trajectories), aligned), aligned
+    return _grown(sorted(trajectories), aligned, trajectories, closures, path_m, steepness), aligned
 
 
 def travelled_m(trajectory: Trajectory) -> Float:
@@ -135,18 +136,31 @@ def rays_of(
     steepness: float,
 ) -> Rays:
     """Bring closures of one pair of logs into the order (lower log, higher log), within a log (earlier, later)."""
+    ends = {k: (min(c.query, c.match), max(c.query, c.match)) for k in ids for c in (closures[k],)}
+    poses = {log: np.asarray(t.T_odom_keyframe, dtype=float) for log, t in trajectories.items()}
+    return rays_from(ids, closures, ends, poses, path_m, steepness)
+
+
+def rays_from(
+    ids: Sequence[int],
+    closures: Mapping[int, LoopClosure],
+    ends: Mapping[int, tuple[KeyframeId, KeyframeId]],
+    poses: Mapping[LogId, Float],
+    path_m: Mapping[LogId, Float],
+    steepness: float,
+) -> Rays:
+    """Closures from their ends on side a to those on side b, with poses (N, 4, 4) of each log in its side's frame."""
     T_i, T_j, T_hat, known, exact, weight, path = [], [], [], [], [], [], []
     for k in ids:
-        c = closures[k]
+        c, (a, b) = closures[k], ends[k]
         T = np.asarray(c.T_query_match_unscaled, dtype=float)
-        low, high = sorted((c.query, c.match))
-        T_hat.append(T if low == c.query else inverse(T))
-        T_i.append(trajectories[low.log].T_odom_keyframe[low.index])
-        T_j.append(trajectories[high.log].T_odom_keyframe[high.index])
+        T_hat.append(T if a == c.query else inverse(T))
+        T_i.append(poses[a.log][a.index])
+        T_j.append(poses[b.log][b.index])
         known.append(1.0 if c.metric else (c.scale_initial or np.nan))
         exact.append(c.metric)
         weight.append(closure_probability(c.match_ratio, steepness))
-        path.append((path_m[low.log][low.index], path_m[high.log][high.index]))
+        path.append((path_m[a.log][a.index], path_m[b.log][b.index]))
     T_hats, T_is = np.array(T_hat), np.array(T_i)
     norms = np.linalg.norm(T_hats[:, :3, 3], axis=1)
     u = np.einsum("kij,kj->ki", T_is[:, :3, :3], T_hats[:, :3, 3]) / np.maximum(norms, 1e-12)[:, None]
@@ -157,12 +171,12 @@ def rays_of(
     )  # fmt: skip
 
 
-def align_pair(rays: Rays) -> PairAlignment:
+def align_pair(rays: Rays, hypotheses_max: int = HYPOTHESES_MAX) -> PairAlignment:
     """Find the pose of frame b in frame a with which the most closures agree, and average those."""
     R_all = rays.rotations_a_b()
     best_score, best_R, best_t, best_tolerance = -1.0, np.eye(3), np.zeros(3), np.ones(len(R_all))
     judges = evenly(np.arange(len(R_all)), SCORED_MAX)
-    for k in _strongest(rays, R_all):
+    for k in _strongest(rays, R_all, hypotheses_max):
         apart_m = np.abs(rays.travelled_a_m - rays.travelled_a_m[k]) + np.abs(
             rays.travelled_b_m - rays.travelled_b_m[k]
         )
@@ -179,15 +193,15 @@ def align_pair(rays: Rays) -> PairAlignment:
     return _averaged(rays, R_all, best_R, best_t, best_tolerance)
 
 
-def _strongest(rays: Rays, R_all: Float) -> list[int]:
+def _strongest(rays: Rays, R_all: Float, count_max: int) -> list[int]:
     """Closures that are tried as hypotheses: those whose rotation the most others share, then the first."""
-    if len(R_all) <= HYPOTHESES_MAX:
+    if len(R_all) <= count_max:
         return list(range(len(R_all)))
     voters = evenly(np.arange(len(R_all)), SCORED_MAX)
     votes = np.array([rays.weight[voters] @ (_angles(R_all[voters], R) < ROTATION_TOLERANCE_RAD) for R in R_all])
     ranked = np.lexsort((np.arange(len(votes)), -votes))
-    spread = ranked[: max(len(ranked) // 2, HYPOTHESES_MAX)]
-    return [int(k) for k in evenly(spread, HYPOTHESES_MAX)]
+    spread = ranked[: max(len(ranked) // 2, count_max)]
+    return [int(k) for k in evenly(spread, count_max)]
 
 
 def evenly(indices: Int, count_max: int) -> Int:
@@ -238,7 +252,14 @@ def _angles(R_all: Float, R: Float) -> Float:
     return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _spanning_tree(logs: Sequence[LogId], aligned: Mapping[tuple[LogId, LogId], PairAlignment]) -> dict[LogId, Float]:
+def _grown(
+    logs: Sequence[LogId],
+    aligned: Mapping[tuple[LogId, LogId], PairAlignment],
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    path_m: Mapping[LogId, Float],
+    steepness: float,
+) -> dict[LogId, Float]:
     """Grow the map frame from the anchor along the pairs of greatest support."""
     T_map_odom: dict[LogId, Float] = {logs[0]: np.eye(4)}
     while True:
@@ -248,8 +269,31 @@ def _spanning_tree(logs: Sequence[LogId], aligned: Mapping[tuple[LogId, LogId], 
         if not reachable:
             return T_map_odom
         _, a, b = min(reachable)
-        T_a_b = aligned[a, b].T_a_b
-        if a in T_map_odom:
-            T_map_odom[b] = T_map_odom[a] @ T_a_b
-        else:
-            T_map_odom[a] = T_map_odom[b] @ inverse(T_a_b)
+        there, new = (a, b) if a in T_map_odom else (b, a)
+        of_pair = aligned[a, b]
+        T_there_new = of_pair.T_a_b if there == a else inverse(of_pair.T_a_b)
+        T_map = {log: T @ np.asarray(trajectories[log].T_odom_keyframe) for log, T in T_map_odom.items()}
+        of_all = align_pair(rays_to(new, T_map, closures, trajectories, path_m, steepness))
+        joint = of_all.support > of_pair.support and len(of_all.agreeing) > len(of_pair.agreeing)
+        T_map_odom[new] = of_all.T_a_b if joint else T_map_odom[there] @ T_there_new
+
+
+def rays_to(
+    log: LogId,
+    T_map_keyframe: Mapping[LogId, Float],
+    closures: Mapping[int, LoopClosure],
+    trajectories: Mapping[LogId, Trajectory],
+    path_m: Mapping[LogId, Float],
+    steepness: float,
+) -> Rays:
+    """Closures of one log with all logs that have poses (N, 4, 4) in the map: those are side a, the log is side b."""
+    ids = [
+        k
+        for k, c in sorted(closures.items())
+        if (c.query.log == log and c.match.log in T_map_keyframe)
+        or (c.match.log == log and c.query.log in T_map_keyframe)
+    ]
+    ends = {k: (closures[k].match, closures[k].query) for k in ids}
+    ends = {k: pair if pair[1].log == log else (pair[1], pair[0]) for k, pair in ends.items()}
+    T_own = {log: np.asarray(trajectories[log].T_odom_keyframe, dtype=float)}
+    return rays_from(ids, closures, ends, {**T_map_keyframe, **T_own}, path_m, steepness)

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import jacobians, residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.problem import Problem
-from flocc_agent.backend.solvers import WEIGHT_MIN, Objective, Solved
 from flocc_agent.core.pose_graph import Trajectory
 from flocc_agent.geometry import Float, adjoint
 from flocc_protocol.ids import KeyframeId, LogId
@@ -53,8 +53,7 @@ def keyframe_covariances(objective: Objective, solved: Solved, indices: Sequence
     """Marginal covariance (6, 6) of poses in their own tangent spaces; zero for the pose that does not move."""
     at = residuals(objective.edges, solved.state)
     jac = jacobians(objective.edges, at)
-    weights = np.maximum(solved.weights, WEIGHT_MIN)
-    return objective.linear.marginals(objective.edges, solved.state, at, jac, weights, list(indices))
+    return objective.linear.marginals(objective.edges, solved.state, at, jac, solved.weights, list(indices))
 
 
 def _usable(S: Float) -> Float | None:

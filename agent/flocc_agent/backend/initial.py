@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
 from flocc_agent.backend.screening import first_not_rigid
+from flocc_agent.backend.straightening import straightened
 from flocc_agent.core.pose_graph import AbsoluteFix, ClosureState, Component, GraphSolution, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, inverse, pose, umeyama
 from flocc_protocol.ids import LogId
@@ -36,7 +37,8 @@ def initial_poses(
     judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
     if warm and all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
         return warm, True
-    return {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}, False
+    rigid = {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}
+    return straightened(rigid, closures), False
 
 
 def by_pair(closures: Mapping[int, LoopClosure]) -> list[list[LoopClosure]]:

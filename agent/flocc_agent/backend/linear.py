@@ -5,11 +5,14 @@ C++. Column-major arrays with an explicit unit noise model pass three times as f
 instead of 122 ms for 8,000 factors).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from flocc_agent.backend.conjugate_gradients import Structure, System, right_side
 from flocc_agent.backend.edges import Edges, Jacobians, Residuals, State
@@ -19,6 +22,10 @@ Float = NDArray[np.float64]
 SCALE_KEYS_FROM = 1 << 40
 ITERATIVE_LOOPS_MIN = 2500
 """From so many edges beyond a tree on, conjugate gradients are faster than elimination (`flocc bench solver`)."""
+
+
+TETHER = 1.0
+"""Information by which a part of the graph that nothing holds stays where it is: any value gives the same step."""
 
 
 class SingularSystem(Exception):
@@ -42,6 +49,7 @@ class LinearSolver:
     scale_prior_sigma: float
     iterative_loops_min: int = ITERATIVE_LOOPS_MIN
     _ordering: gtsam.Ordering | None = field(default=None, repr=False)
+    _ordered: bytes = field(default=b"", repr=False)
     _structure: Structure | None = field(default=None, repr=False)
     _gave_up: bool = field(default=False, repr=False)
 
@@ -97,9 +105,12 @@ class LinearSolver:
         if graph.size() == 0:
             return np.zeros(6 * len(state.q) + len(state.scale))
         if damping > 0:
-            self._damp(graph, len(state.q), len(state.scale), damping)
-        if self._ordering is None:
-            self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+            self._damp(graph, range(len(state.q)), range(len(state.scale)), damping)
+        else:
+            self._damp(graph, loose(edges, weights, len(state.q), self.fixed), (), TETHER)
+        taking_part = (weights > 0.0).tobytes()
+        if self._ordering is None or taking_part != self._ordered:
+            self._ordering, self._ordered = gtsam.Ordering.ColamdGaussianFactorGraph(graph), taking_part
         try:
             moved = graph.optimize(self._ordering).vector()
         except RuntimeError as error:
@@ -137,8 +148,10 @@ class LinearSolver:
         a_scale, b = (w * jac.a_scale)[:, :, None], -w * at.e
         fixed, add = self.fixed, graph.add
         scale_keys = np.where(edges.cluster >= 0, SCALE_KEYS_FROM + edges.cluster, -1).tolist()
-        rows = zip(edges.i.tolist(), edges.j.tolist(), scale_keys, A_i, A_j, a_scale, b, strict=True)
-        for i, j, key, A_of_i, A_of_j, a, right in rows:
+        rows = zip(edges.i.tolist(), edges.j.tolist(), scale_keys, A_i, A_j, a_scale, b, weights.tolist(), strict=True)
+        for i, j, key, A_of_i, A_of_j, a, right, weight in rows:
+            if weight == 0.0:
+                continue
             if fixed in (i, j):
                 moving, A = (j, A_of_j) if i == fixed else (i, A_of_i)
                 if key >= 0:
@@ -164,15 +177,26 @@ class LinearSolver:
             right = np.array([-sqrt_weights[k] * at.bound[k]])
             graph.add(SCALE_KEYS_FROM + int(edges.cluster[k]), slope, right, unit)
 
-    def _damp(self, graph: gtsam.GaussianFactorGraph, poses: int, clusters: int, damping: float) -> None:
+    def _damp(
+        self, graph: gtsam.GaussianFactorGraph, poses: Iterable[int], clusters: Iterable[int], damping: float
+    ) -> None:
         root = np.sqrt(damping)
         rows, zeros, unit = np.asfortranarray(root * np.eye(6)), np.zeros(6), gtsam.noiseModel.Unit.Create(6)
-        for n in range(poses):
+        for n in poses:
             if n != self.fixed:
                 graph.add(n, rows, zeros, unit)
         one = gtsam.noiseModel.Unit.Create(1)
-        for c in range(clusters):
+        for c in clusters:
             graph.add(SCALE_KEYS_FROM + c, np.full((1, 1), root), np.zeros(1), one)
+
+
+def loose(edges: Edges, weights: Float, poses: int, fixed: int) -> list[int]:
+    """The first pose of each part of the graph that no edge with a weight joins to the fixed pose."""
+    on = weights > 0.0
+    joined = coo_array((np.ones(np.count_nonzero(on), dtype=np.int8), (edges.i[on], edges.j[on])), shape=(poses, poses))
+    labels = connected_components(joined, directed=False)[1]
+    _, first = np.unique(labels, return_index=True)
+    return [int(pose) for pose in first if labels[pose] != labels[fixed]]
 
 
 def column_major(A: Float) -> Float:

@@ -13,15 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from flocc_agent.backend.consistency import inconsistent
+from flocc_agent.backend.descent import Objective
 from flocc_agent.backend.edges import state_of
 from flocc_agent.backend.initial import initial_poses, initial_world, trusted_closures
 from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.measured import with_factors, without_factors
+from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import build
-from flocc_agent.backend.results import Outcome, Solution, collect, excluded, odometry_component, rejected
+from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component, rejected
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import Objective, solve
+from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     AbsoluteFix,
@@ -96,13 +98,13 @@ def _solve_group(
     config: BackendConfig,
     initial: GraphSolution | None,
     covariance_of: Sequence[KeyframeId],
-) -> Outcome:
+) -> SolvedLogs:
     """Solve logs that closures connect; where that fails, every log keeps its odometry."""
     trajectories = {log: screened.trajectories[log] for log in logs}
     closures = {k: c for k, c in usable.items() if c.query.log in trajectories and c.match.log in trajectories}
     fixes = [fix for fix in screened.fixes if fix.keyframe.log in trajectories]
     if not closures and not fixes:
-        return Outcome(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
+        return SolvedLogs(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
     wanted = [keyframe for keyframe in covariance_of if keyframe.log in trajectories]
     try:
         return _solve_and_split(trajectories, closures, fixes, config, initial, wanted)
@@ -110,7 +112,7 @@ def _solve_group(
         reason = f"the component of robot {logs[0]} could not be solved and keeps its odometry: {error}"
         logger.error("%s", reason)
         components = tuple(odometry_component(log, trajectories[log]) for log in logs)
-        return Outcome(components, {k: excluded(c, reason) for k, c in closures.items()}, (reason,))
+        return SolvedLogs(components, {k: excluded(c, reason) for k, c in closures.items()}, (reason,))
 
 
 def _solve_and_split(
@@ -120,13 +122,13 @@ def _solve_and_split(
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
-) -> Outcome:
+) -> SolvedLogs:
     """Solve; where too few closures join maps, or are left to, solve each component with the closures that it has."""
     began = time.perf_counter()
     dropped = inconsistent(trajectories, closures, config) if config.pairwise_consistency else {}
     turned_away = {k: rejected(closures[k], reason) for k, reason in dropped.items()}
     turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
-    outcome = Outcome((), {})
+    outcome = SolvedLogs((), {})
     groups = _groups(trajectories, closures, turned_away)
     if len(groups) == 1:
         kept = {k: c for k, c in closures.items() if k not in turned_away}
@@ -165,11 +167,11 @@ def _groups(
     return components_of(list(trajectories), [c for k, c in closures.items() if k not in turned_away])
 
 
-def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], before: Outcome) -> Outcome:
+def _joined(parts: Sequence[SolvedLogs], turned_away: Mapping[int, ClosureResult], before: SolvedLogs) -> SolvedLogs:
     closures = dict(turned_away)
     for part in parts:
         closures.update(part.closures)
-    return Outcome(
+    return SolvedLogs(
         tuple(c for part in parts for c in part.components),
         closures,
         tuple(w for part in parts for w in part.warnings),
@@ -178,7 +180,7 @@ def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], 
     )
 
 
-def summed_timings(outcomes: Sequence[Outcome]) -> dict[str, float]:
+def summed_timings(outcomes: Sequence[SolvedLogs]) -> dict[str, float]:
     """Seconds of each stage, of all outcomes together."""
     names = sorted({name for outcome in outcomes for name in outcome.timings_s})
     return {name: sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes) for name in names}
@@ -191,7 +193,7 @@ def _solve_connected(
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
-) -> Outcome:
+) -> SolvedLogs:
     times = [time.perf_counter()]
     T_initial, warm = initial_poses(trajectories, closures, config.steepness, initial)
     T_map_world = initial_world(T_initial, fixes)
@@ -202,7 +204,8 @@ def _solve_connected(
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     objective = Objective(problem.edges, problem.closure_rows, linear, config)
     trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None
-    solved = solve(objective, state, trusted)
+    places = Places(problem, trajectories, closures, config.steepness)
+    solved = solve(objective, state, trusted, places)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flocc_agent.backend.covariance import covariances_of
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, residuals, scales_at
 from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.scale_report import scale_warnings
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Objective, Solved
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.config import Solver
 from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, inverse
@@ -17,7 +18,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SolvedLogs:
     """What solving some logs gave: their components, their closures' results by index, and sentences."""
 
     components: tuple[Component, ...]
@@ -55,14 +56,14 @@ def odometry_component(log: LogId, trajectory: Trajectory) -> Component:
     return Component((log,), {log: T}, {log: np.eye(4)}, {log: np.zeros((6, 6))})
 
 
-def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> Outcome:
+def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> SolvedLogs:
     """Component, closure results and warnings of a solved component; covariances where they are wanted."""
     results = closure_results(solution)
     component = _component(solution, wanted)
     warnings = scale_warnings(solution.problem, solution.solved, solution.closures)
     if not solution.solved.converged:
         warnings = (*warnings, f"{component.map_frame}: the solver stopped before it converged")
-    return Outcome((component,), results, warnings, solution.solved.iterations)
+    return SolvedLogs((component,), results, warnings, solution.solved.iterations)
 
 
 def closure_results(solution: Solution) -> dict[int, ClosureResult]:

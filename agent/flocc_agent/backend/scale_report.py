@@ -5,9 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend.descent import Solved
 from flocc_agent.backend.edges import GAMMA_MIN, scales_at
 from flocc_agent.backend.problem import Problem
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, Solved
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.core.pose_graph import LoopClosure
 
 NAMED_MAX = 5

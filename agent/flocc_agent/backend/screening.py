@@ -15,6 +15,8 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TRANSLATION_UNSCALED_MIN = 1e-9
+TRANSLATION_MAX_M = 1e6
+"""Nothing that a robot registers is a thousand kilometres away; a correction could not even say so."""
 SAME_ROTATION_RAD = 0.02
 SAME_TRANSLATION_RATIO = 0.05
 CONDITION_MAX = 1e14
@@ -155,6 +157,9 @@ def _plain_complaint(closure: LoopClosure, trajectories: Mapping[LogId, Trajecto
     if scale is not None and not (math.isfinite(scale) and scale > 0):
         return f"the initial scale {scale} is not positive"
     x, y, z = closure.T_query_match_unscaled[:3, 3].tolist()
+    length_m = math.hypot(x, y, z) * (1.0 if closure.metric else scale or 1.0)
+    if math.isfinite(length_m) and length_m > TRANSLATION_MAX_M:
+        return f"the measured length of {length_m:.3g} m is longer than {TRANSLATION_MAX_M:.0g} m"
     if not closure.metric and math.hypot(x, y, z) < TRANSLATION_UNSCALED_MIN:
         return "a translation of zero length has no direction to scale"
     return ""

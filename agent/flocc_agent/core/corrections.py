@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
-from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
+from flocc_agent.geometry import pose7, tq_from_poses, upper_triangle
 from flocc_protocol.arrays import Array
-from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import (
@@ -32,7 +31,6 @@ from flocc_protocol.messages import (
 
 Float = NDArray[np.float64]
 
-_UPPER = np.triu_indices(6)
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
 LISTED_MAX = 400
@@ -189,16 +187,15 @@ class Corrections:
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
-        correction = delivered(message, changed)
         fact = CorrectionApplied(
             term=message.term.counter,
             leader=message.term.leader.robot,
             round=message.round,
-            map_frame=correction.map_frame,
-            frame_changed=correction.frame_changed,
+            map_frame=map_frame(message.anchor),
+            frame_changed=changed,
             T_map_odom=message.T_map_odom,
         )
-        return [PersistCorrection(message, changed), Deliver(correction), Report(fact)]
+        return [PersistCorrection(message, changed), Deliver(message, changed), Report(fact)]
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:
@@ -213,42 +210,8 @@ def correction_of(component: Component, log: LogId, term: Term, round_number: in
         round=round_number,
         anchor=component.anchor,
         T_map_odom=pose7(component.T_map_odom[log]),
-        covariance=None if covariance is None else Array.of(covariance[_UPPER], "f4"),
+        covariance=None if covariance is None else upper_triangle(covariance),
         first=first,
         step=step,
         T_map_camera=Array.of(tq_from_poses(poses[first::step]), "f4"),
     )
-
-
-def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
-    """A correction as consumers get it."""
-    return Correction(
-        term=message.term,
-        round=message.round,
-        map_frame=map_frame(message.anchor),
-        frame_changed=frame_changed,
-        T_map_odom=pose_from_tq(np.array(message.T_map_odom)),
-        covariance=None if message.covariance is None else symmetric(message.covariance.numpy()),
-        first=message.first,
-        step=message.step,
-        T_map_camera=poses_from_tq(message.T_map_camera.numpy()),
-    )
-
-
-def symmetric(upper: Float) -> Float:
-    """Covariance (6, 6) of its upper triangle (21)."""
-    out = np.empty((6, 6))
-    out[_UPPER] = upper
-    out.T[_UPPER] = upper
-    return out
-
-
-def upper_triangle(covariance: Float) -> Array:
-    """Upper triangle (21) of a covariance (6, 6), float32."""
-    return Array.of(covariance[_UPPER], "f4")
-
-
-def pose7(T: Float) -> Pose7:
-    """A pose as the wire has it."""
-    x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
-    return (x, y, z, qw, qx, qy, qz)

@@ -14,10 +14,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import Report
 from flocc_agent.core.reports import MeasurementKept, MeasurementRefused
-from flocc_agent.geometry import adjoint, inverse, is_rigid, pose
+from flocc_agent.geometry import adjoint, inverse, is_rigid, pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError

@@ -6,6 +6,7 @@ order. Same seed and same events give the same effects, on virtual time and on a
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import assert_never
 
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
@@ -80,8 +81,10 @@ from flocc_protocol.messages import (
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
+    MeasurementRecord,
     Record,
     RejectionRecord,
+    UnknownRecord,
     encode_record,
 )
 
@@ -393,7 +396,10 @@ class Robot:
         described: list[tuple[KeyframeId, Array]] = []
         for new in new_records:
             self.assembly.add(new)
-            match new.record:
+            record = new.record
+            if isinstance(record, MeasurementRecord | UnknownRecord):
+                continue
+            match record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
                     if descriptor is not None:
@@ -403,7 +409,7 @@ class Robot:
                 case RejectionRecord(query, match):
                     self.closing.on_resolved(CandidatePair.of(query, match))
                 case _:
-                    pass
+                    assert_never(record)
         return self._recognise(described, now) if described else []
 
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:

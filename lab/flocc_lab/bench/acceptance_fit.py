@@ -13,16 +13,17 @@ import numpy as np
 
 from flocc_agent.core.registration import match_ratio
 from flocc_agent.perception.multiview.acceptance import (
+    NEVER,
     RATIO_CORRESPONDENCES_MIN,
     Acceptance,
     Evidence,
     Needed,
-    Neighbour,
+    OdometryNeighbour,
 )
-from flocc_lab.bench.acceptance_rows import ANGLES_DEG, Row
+from flocc_lab.bench.acceptance_rows import ANGLES_DEG, AcceptanceRow
 
-ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 10_000)
-AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, 10_000)
+ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, NEVER)
+AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, NEVER)
 SIGMAS_DEG = (0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.7)
 WRONG_COST = 50
 """Right pairs that one wrong pair outweighs in the fit: at most 2 % wrong among the pairs that a step adds."""
@@ -43,7 +44,7 @@ class Kept:
     """Right ones before the rule."""
 
 
-def fitted(rows: Sequence[Row]) -> Acceptance:
+def fitted(rows: Sequence[AcceptanceRow]) -> Acceptance:
     """The rule that fits these rows: the ratio first, then each kind of what it leaves."""
     posed = [(row, row.evidence) for row in rows if row.evidence is not None]
     ratio_min = max(RATIOS, key=lambda ratio: (ratio_score(rows, ratio), ratio))
@@ -54,21 +55,21 @@ def fitted(rows: Sequence[Row]) -> Acceptance:
     return Acceptance(with_scale, without_scale, ratio_min)
 
 
-def ratio_score(rows: Sequence[Row], ratio_min: float) -> int:
+def ratio_score(rows: Sequence[AcceptanceRow], ratio_min: float) -> int:
     """Right pairs that a threshold of Eq. (1) keeps, less what the wrong ones cost."""
     right = sum(row.is_right and has_ratio(row, ratio_min) for row in rows)
     return right - WRONG_COST * sum(not row.is_right and has_ratio(row, ratio_min / MARGIN) for row in rows)
 
 
-def has_ratio(row: Row, ratio_min: float) -> bool:
+def has_ratio(row: AcceptanceRow, ratio_min: float) -> bool:
     """Whether the paper's rule accepts a pair with this threshold."""
     ratio = match_ratio(row.correspondences, row.odometry_correspondences)
     return row.evidence is not None and row.correspondences >= RATIO_CORRESPONDENCES_MIN and ratio >= ratio_min
 
 
-def best_needed(rows: Sequence[Row]) -> Needed:
+def best_needed(rows: Sequence[AcceptanceRow]) -> Needed:
     """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
-    table = Table(rows)
+    table = AcceptanceTable(rows)
     scored = [
         (table.score(needed), needed.alone, needed.agreeing, -needed.rotation_sigma_max_rad, needed)
         for needed in choices()
@@ -81,16 +82,16 @@ def choices() -> Iterator[Needed]:
     return (Needed(a, g, float(np.radians(s))) for a in ALONE for g in AGREEING if g <= a for s in SIGMAS_DEG)
 
 
-class Table:
+class AcceptanceTable:
     """Rows of one kind as arrays, for trying many rules."""
 
-    def __init__(self, rows: Sequence[Row]) -> None:
+    def __init__(self, rows: Sequence[AcceptanceRow]) -> None:
         evidence = [row.evidence for row in rows if row.evidence is not None]
         self._right = np.array([row.is_right for row in rows], bool)
         factor = np.where(self._right, 1.0, MARGIN)
         self._count = np.array([e.correspondences for e in evidence]) * factor
         self._sigma_rad = np.array([e.rotation_sigma_rad for e in evidence]) / factor
-        self._agrees = np.array([e.neighbour is Neighbour.AGREES for e in evidence], bool)
+        self._agrees = np.array([e.neighbour is OdometryNeighbour.AGREES for e in evidence], bool)
 
     def score(self, needed: Needed) -> int:
         """Right pairs kept, less what the wrong ones cost."""
@@ -99,14 +100,14 @@ class Table:
         return int((kept & self._right).sum()) - WRONG_COST * int((kept & ~self._right).sum())
 
 
-def kept(rows: Sequence[Row], rule: Acceptance | None) -> Kept:
+def kept(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> Kept:
     """What a rule keeps; None is the paper's, Eq. (1) against R_thr."""
     accepted = [row for row in rows if accepts(row, rule)]
     right = sum(row.is_right for row in accepted)
     return Kept(right, len(accepted) - right, sum(row.is_right for row in rows))
 
 
-def accepts(row: Row, rule: Acceptance | None) -> bool:
+def accepts(row: AcceptanceRow, rule: Acceptance | None) -> bool:
     """Whether a rule accepts a pair; the neighbour is heard only where the rule asks it."""
     if row.evidence is None:
         return False
@@ -117,10 +118,10 @@ def accepts(row: Row, rule: Acceptance | None) -> bool:
 
 def heard(evidence: Evidence, rule: Acceptance) -> Evidence:
     """The evidence as the registrar would have it."""
-    return evidence if rule.needs_neighbour(evidence) else replace(evidence, neighbour=Neighbour.NOT_ASKED)
+    return evidence if rule.needs_neighbour(evidence) else replace(evidence, neighbour=OdometryNeighbour.NOT_ASKED)
 
 
-def leave_one_out(rows: Sequence[Row]) -> dict[str, Kept]:
+def leave_one_out(rows: Sequence[AcceptanceRow]) -> dict[str, Kept]:
     """By scene: what the rule of all other scenes keeps of it."""
     names = sorted({row.scene for row in rows})
     return {
@@ -129,12 +130,12 @@ def leave_one_out(rows: Sequence[Row]) -> dict[str, Kept]:
     }
 
 
-def by_angle(rows: Sequence[Row], rule: Acceptance | None) -> list[Kept]:
+def by_angle(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> list[Kept]:
     """What a rule keeps, by the angle between the viewing directions."""
     return [kept([row for row in rows if low <= row.angle_deg < high], rule) for low, high in pairwise(ANGLES_DEG)]
 
 
-def report(rows: Sequence[Row]) -> dict[str, Any]:
+def report(rows: Sequence[AcceptanceRow]) -> dict[str, Any]:
     """The rule of all scenes, and tables by scene and angle, for the paper's rule, the fitted one and leave-one-out."""
     rule = fitted(rows)
     left_out = leave_one_out(rows)

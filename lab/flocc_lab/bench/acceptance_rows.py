@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import PerceptionConfig
-from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.interfaces import OdometryPair, Perception
 from flocc_agent.core.registration import Registration
 from flocc_agent.geometry import angle_rad
-from flocc_agent.perception.multiview.acceptance import Evidence, Neighbour
+from flocc_agent.perception.backends import build_perception
+from flocc_agent.perception.multiview.acceptance import Evidence, OdometryNeighbour
 from flocc_agent.perception.multiview.registrar import PairRegistrar
 from flocc_lab.bench.perception_quality import cross_pairs, odometry_pair
 from flocc_lab.bench.registration_scenes import (
-    Scene,
+    RegistrationScene,
     fountain,
     kitti,
     relative,
@@ -59,14 +59,14 @@ class JudgedScene:
         reach_m: Views nearer to each other than this may see the same, from whatever side.
     """
 
-    scene: Scene
+    scene: RegistrationScene
     depth_m: float
     reach_m: float
 
 
 def judged_scenes(shared: Path, recordings: Sequence[Path] = ()) -> Iterator[JudgedScene]:
     """The research sets that are there, and recordings as one more scene."""
-    sets: dict[str, tuple[Callable[[Path], Scene], float, float]] = {
+    sets: dict[str, tuple[Callable[[Path], RegistrationScene], float, float]] = {
         "street": (lambda folder: robots_beside(folder, 3.0), 8.0, 12.0),
         "herz_jesu": (lambda folder: robots_beside(folder, 4.0), 12.0, 30.0),
         "sevenscenes": (colour_sevenscenes, 2.0, 2.0),
@@ -84,7 +84,7 @@ def judged_scenes(shared: Path, recordings: Sequence[Path] = ()) -> Iterator[Jud
         yield JudgedScene(from_recordings(list(recordings), KeyframeConfig()), 8.0, 12.0)
 
 
-def colour_sevenscenes(folder: Path) -> Scene:
+def colour_sevenscenes(folder: Path) -> RegistrationScene:
     """The handheld room with a focal length that fits its colour images better than the depth camera's."""
     scene = sevenscenes(folder)
     views = (
@@ -95,7 +95,7 @@ def colour_sevenscenes(folder: Path) -> Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class AcceptanceRow:
     """One pair and one front end.
 
     Attributes:
@@ -129,7 +129,7 @@ class Row:
 
 def collected(
     front_end: str, shared: Path, recordings: Sequence[Path], scenes: Sequence[str], pairs_max: int, out: Path
-) -> list[Row]:
+) -> list[AcceptanceRow]:
     """Rows of all scenes for one front end; those that the folder has are read, others are made and kept there."""
     found = []
     for judged in judged_scenes(shared, recordings):
@@ -149,7 +149,7 @@ def perception_of(front_end: str) -> PerceptionConfig:
     )
 
 
-def rows_of(judged: JudgedScene, config: PerceptionConfig, pairs_max: int, cache: Path) -> list[Row]:
+def rows_of(judged: JudgedScene, config: PerceptionConfig, pairs_max: int, cache: Path) -> list[AcceptanceRow]:
     """Register a scene's chosen pairs with one front end.
 
     Args:
@@ -169,7 +169,7 @@ def rows_of(judged: JudgedScene, config: PerceptionConfig, pairs_max: int, cache
 
 def row(
     judged: JudgedScene, i: int, j: int, is_candidate: bool, registrar: PairRegistrar[Any], latents: Sequence[bytes]
-) -> Row:
+) -> AcceptanceRow:
     """Register one pair and hold it against the truth."""
     views = judged.scene.views
     truth = relative(views[i].T_world_camera, views[j].T_world_camera)
@@ -179,7 +179,7 @@ def row(
     counts = result.correspondences, result.odometry_correspondences
     given = (judged.scene.name, i, j, is_candidate, angle_deg, *counts)
     if not isinstance(result, Registration) or evidence is None:
-        return Row(*given)
+        return AcceptanceRow(*given)
     T = result.T_query_match_unscaled
     length, distance_m = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(truth[:3, 3]))
     rotation_deg = float(np.degrees(angle_rad(T[:3, :3].T @ truth[:3, :3])))
@@ -190,7 +190,7 @@ def row(
     near = direction_deg <= DIRECTION_ERROR_MAX_DEG or error_ratio <= TRANSLATION_ERROR_MAX_RATIO
     is_right = rotation_deg <= ROTATION_ERROR_MAX_DEG and near
     ratio = None if result.scale_initial is None else scale * length / max(distance_m, 1e-9)
-    return Row(*given, evidence, is_right, rotation_deg, direction_deg, ratio)
+    return AcceptanceRow(*given, evidence, is_right, rotation_deg, direction_deg, ratio)
 
 
 def chosen_pairs(judged: JudgedScene, pairs_max: int, cache: Path) -> list[tuple[int, int, bool]]:
@@ -221,7 +221,7 @@ def drawn(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, int]]
     return [pairs[int(k)] for k in np.random.default_rng(SEED).permutation(len(pairs))[:count]]
 
 
-def cached_latents(scene: Scene, wanted: Sequence[int], skills: Perception, cache: Path) -> list[bytes]:
+def cached_latents(scene: RegistrationScene, wanted: Sequence[int], skills: Perception, cache: Path) -> list[bytes]:
     """Latents of the wanted views, b'' of the others; made once per model and image."""
     folder = cache / hashlib.sha256(skills.encoder.model.encode()).hexdigest()[:12] / scene.name
     folder.mkdir(parents=True, exist_ok=True)
@@ -234,7 +234,7 @@ def cached_latents(scene: Scene, wanted: Sequence[int], skills: Perception, cach
     return latents
 
 
-def cached_descriptors(scene: Scene, skills: Perception, cache: Path) -> NDArray[np.float32]:
+def cached_descriptors(scene: RegistrationScene, skills: Perception, cache: Path) -> NDArray[np.float32]:
     """Place descriptors (N, D) of all views, made once per model."""
     name = hashlib.sha256(skills.encoder.model.encode()).hexdigest()[:12]
     path = cache / name / f"{scene.name}.descriptors.npy"
@@ -245,20 +245,20 @@ def cached_descriptors(scene: Scene, skills: Perception, cache: Path) -> NDArray
     return found
 
 
-def write_rows(rows: Sequence[Row], path: Path) -> None:
+def write_rows(rows: Sequence[AcceptanceRow], path: Path) -> None:
     """Write rows as JSON lines."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = (json.dumps(asdict(row), default=lambda word: word.value) for row in rows)
     path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
-def read_rows(path: Path) -> list[Row]:
+def read_rows(path: Path) -> list[AcceptanceRow]:
     """Read what `write_rows` wrote."""
     rows = []
     for line in path.read_text(encoding="utf-8").splitlines():
         fields = json.loads(line)
         evidence = fields.pop("evidence")
         if evidence is not None:
-            evidence = Evidence(**{**evidence, "neighbour": Neighbour(evidence["neighbour"])})
-        rows.append(Row(**fields, evidence=evidence))
+            evidence = Evidence(**{**evidence, "neighbour": OdometryNeighbour(evidence["neighbour"])})
+        rows.append(AcceptanceRow(**fields, evidence=evidence))
     return rows

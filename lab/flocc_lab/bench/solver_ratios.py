@@ -20,13 +20,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import Edges, state_of
 from flocc_agent.backend.initial import initial_poses
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.rotations import matrices
-from flocc_agent.backend.solvers import Objective, Solved, solve
+from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
 from flocc_agent.geometry import hat
@@ -248,15 +249,18 @@ def gtsam_gnc(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, bench: Be
     """Run GTSAM's GNC; odometry and the anchor are known to be right."""
     closures = len(bench.graph.closures)
     known = [*range(graph.size() - 1 - closures), graph.size() - 1]
-    return gnc_with(graph, values, known)
+    return gnc_with(graph, values, known)[0]
 
 
-def gnc_with(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, known: list[int]) -> gtsam.Values:
-    """Run GTSAM's GNC with truncated least squares and its default parameters."""
+def gnc_with(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, known: list[int]
+) -> tuple[gtsam.Values, NDArray[np.float64]]:
+    """Run GTSAM's GNC with truncated least squares and its default parameters; poses and every factor's weight."""
     params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers(known)
-    return gtsam.GncLMOptimizer(graph, values, params).optimize()
+    optimiser = gtsam.GncLMOptimizer(graph, values, params)
+    return optimiser.optimize(), np.asarray(optimiser.getWeights())
 
 
 def custom_factor(problem: Problem, bench: Bench) -> float:

@@ -114,7 +114,7 @@ def _gtsam_scale_task(file: GraphFile, config: BackendConfig) -> float:
     problem = build(graph.trajectories, closures, (), config, T_start, np.eye(4))
     factors, values = between_factors(problem, T_start)
     known = [*range(problem.closure_rows.start), factors.size() - 1]
-    poses = gnc_with(factors, values, known)
+    poses, _ = gnc_with(factors, values, known)
     found = {
         log: np.array([poses.atPose3(problem.offsets[log] + k).translation() for k in range(len(trajectory))])
         for log, trajectory in graph.trajectories.items()

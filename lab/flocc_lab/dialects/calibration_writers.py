@@ -33,7 +33,7 @@ class Rig:
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class WriterForm:
     """How one tool writes a calibration.
 
     Attributes:
@@ -43,6 +43,7 @@ class Form:
         counts: Numbers of distortion coefficients that it can say of a pinhole.
         mounting: Whether it says `T_body_camera`.
         sized: Whether it says the size of the images.
+        sizes: Those that it can say; none means any.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Form:
     counts: tuple[int, ...] = (0, 4)
     mounting: bool = False
     sized: bool = True
+    sizes: tuple[tuple[int, int], ...] = ()
 
 
 def _list(values: Sequence[float] | Float) -> str:
@@ -495,40 +497,99 @@ def gyroflow(rig: Rig) -> str:
     return json.dumps({"camera_brand": "a", "calib_dimension": size, "fisheye_params": lens, "fps": 60.0})
 
 
-FORMS: dict[str, Form] = {
-    "flocc YAML": Form("camera.yaml", flat, mounting=True),
-    "flocc TOML": Form("camera.toml", toml, mounting=True),
-    "EuRoC, Kimera": Form("sensor.yaml", euroc, (P, E), (4,), True),
-    "Kalibr": Form("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
-    "OpenVINS": Form("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
-    "ROS camera_info": Form("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
-    "ros2 topic echo": Form("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
-    "ROS INI": Form("ost.txt", ros_ini, counts=(0, 4, 5)),
-    "OpenCV YAML": Form("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
-    "OpenCV XML": Form("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV JSON": Form("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
-    "OpenCV stereo": Form("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
-    "ORB-SLAM 2": Form("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
-    "ORB-SLAM 3": Form("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
-    "VINS-Fusion (camodocal)": Form("cam0.yaml", camodocal, (P, E, MEI)),
-    "VINS-Mono": Form("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
-    "Basalt": Form("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
-    "COLMAP": Form("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
-    "nerfstudio, instant-ngp": Form("transforms.json", nerfstudio, (P, E)),
-    "DSO, TUM monoVO": Form("camera.txt", dso, (P, E, F)),
-    "RTAB-Map": Form("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
-    "SVO, maplab": Form("svo.yaml", svo, (P, E), mounting=True),
-    "OKVIS": Form("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
-    "MASt3R-SLAM": Form("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
-    "DROID-SLAM": Form("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
-    "matrix (7-Scenes, ScanNet, Stray Scanner)": Form("intrinsic_color.txt", matrix_text, counts=(0,), sized=False),
-    "KITTI odometry": Form("calib.txt", kitti, counts=(0,), sized=False),
-    "KITTI raw": Form("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
-    "Open3D": Form("camera_intrinsic.json", open3d, counts=(0,)),
-    "Replica": Form("cam_params.json", replica, counts=(0,)),
-    "OpenSfM, ODM": Form("camera_models.json", opensfm, (P, E), (0, 4, 5)),
-    "DepthAI": Form("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
-    "Gyroflow": Form("gyroflow.json", gyroflow, (E,)),
+def vikit(rig: Rig) -> str:
+    """Write camera.yaml of rpg's vikit; ATAN with lengths relative to the size."""
+    m = rig.model
+    focal = _focal(m)
+    if m.kind is F:
+        focal = m.fx / m.width, m.fy / m.height, (m.cx + 0.5) / m.width, (m.cy + 0.5) / m.height
+    name = {P: "Pinhole", F: "ATAN", E: "EquidistantCamera"}[m.kind]
+    keys = "".join(f"cam_{key}: {value!r}\n" for key, value in zip(("fx", "fy", "cx", "cy"), focal, strict=True))
+    values = m.shape or _radtan(m, 4)
+    keys += "".join(f"cam_d{k}: {value!r}\n" for k, value in enumerate(values))
+    return f"cam_model: {name}\ncam_width: {m.width}\ncam_height: {m.height}\nscale: 0.5\n{keys}"
+
+
+def record3d(rig: Rig) -> str:
+    """Write the metadata of a capture of Record3D: the matrix by columns, and the poses of the phone."""
+    m = rig.model
+    poses = [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
+    return json.dumps({"w": m.width, "h": m.height, "K": m.K().T.ravel().tolist(), "fps": 60, "poses": poses})
+
+
+def spectacular(rig: Rig) -> str:
+    """Write calibration.json of SpectacularAI."""
+    m = rig.model
+    names = ("focalLengthX", "focalLengthY", "principalPointX", "principalPointY")
+    camera: dict[str, Any] = dict(zip(names, _focal(m), strict=True))
+    camera |= {"imageWidth": m.width, "imageHeight": m.height, "imuToCamera": inverse(rig.T_body_camera).tolist()}
+    camera |= {
+        "model": "kannala-brandt4" if m.kind is E else "brown-conrady",
+        "distortionCoefficients": list(_radtan(m, 4)),
+    }
+    return json.dumps({"cameras": [camera]})
+
+
+def zed(rig: Rig) -> str:
+    """Write SNxxxx.conf of a ZED camera, of which one section is of the images' size."""
+    m = rig.model
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    keys = "".join(f"{key}={value!r}\n" for key, value in zip(names, (*_focal(m), *_radtan(m, 5)), strict=True))
+    name = {(672, 376): "VGA", (1280, 720): "HD", (1920, 1080): "FHD"}[(m.width, m.height)]
+    other = "fx=1\nfy=1\ncx=1\ncy=1\nk1=0\n"
+    return f"[LEFT_CAM_2K]\n{other}\n[LEFT_CAM_{name}]\n{keys}\n[RIGHT_CAM_{name}]\n{other}\n[STEREO]\nBaseline=119.9\n"
+
+
+def nested(rig: Rig) -> str:
+    """Write the settings of a neural SLAM, with the camera somewhere inside (NICE-SLAM, MonoGS)."""
+    m = rig.model
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    keys = "".join(f"    {key}: {value!r}\n" for key, value in zip(names, (*_focal(m), *_radtan(m, 5)), strict=True))
+    size = f"    width: {m.width}\n    height: {m.height}\n    depth_scale: 5000.0\n    distorted: True\n"
+    return f"Results:\n  save_dir: out/a\nDataset:\n  type: tum\n  Calibration:\n{keys}{size}Training:\n  lr: 0.1\n"
+
+
+FORMS: dict[str, WriterForm] = {
+    "flocc YAML": WriterForm("camera.yaml", flat, mounting=True),
+    "flocc TOML": WriterForm("camera.toml", toml, mounting=True),
+    "EuRoC, Kimera": WriterForm("sensor.yaml", euroc, (P, E), (4,), True),
+    "Kalibr": WriterForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
+    "OpenVINS": WriterForm("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
+    "ROS camera_info": WriterForm("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
+    "ros2 topic echo": WriterForm("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),
+    "ROS INI": WriterForm("ost.txt", ros_ini, counts=(0, 4, 5)),
+    "OpenCV YAML": WriterForm("out_camera_data.yml", opencv_yaml, (P, E), (0, 4, 5, 8, 12, 14)),
+    "OpenCV XML": WriterForm("out_camera_data.xml", opencv_xml, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV JSON": WriterForm("out_camera_data.json", opencv_json, counts=(0, 4, 5, 8, 12, 14)),
+    "OpenCV stereo": WriterForm("intrinsics.yml", opencv_stereo, counts=(0, 4, 5, 8), sized=False),
+    "ORB-SLAM 2": WriterForm("TUM1.yaml", orb_slam2, counts=(0, 4, 5), sized=False),
+    "ORB-SLAM 3": WriterForm("EuRoC.yaml", orb_slam3, (P, E), (0, 4, 5), True),
+    "VINS-Fusion (camodocal)": WriterForm("cam0.yaml", camodocal, (P, E, MEI)),
+    "VINS-Mono": WriterForm("euroc_config.yaml", vins_mono, (P, E, MEI), mounting=True),
+    "Basalt": WriterForm("calibration.json", basalt, (P, E, F, D, U), (0, 4, 5, 8), True),
+    "COLMAP": WriterForm("cameras.txt", colmap, (P, E, F), (0, 4, 8)),
+    "nerfstudio, instant-ngp": WriterForm("transforms.json", nerfstudio, (P, E)),
+    "DSO, TUM monoVO": WriterForm("camera.txt", dso, (P, E, F)),
+    "RTAB-Map": WriterForm("rtabmap_camera.yaml", rtabmap, (P, E), (0, 4, 5, 8), True),
+    "SVO, maplab": WriterForm("svo.yaml", svo, (P, E), mounting=True),
+    "OKVIS": WriterForm("config_fpga_p2_euroc.yaml", okvis, (P, E), (4,), True),
+    "MASt3R-SLAM": WriterForm("intrinsics.yaml", mast3r_slam, counts=(0, 4, 5, 8)),
+    "DROID-SLAM": WriterForm("droid.txt", droid, counts=(0, 4, 5, 8), sized=False),
+    "matrix (7-Scenes, ScanNet, Stray Scanner)": WriterForm(
+        "intrinsic_color.txt", matrix_text, counts=(0,), sized=False
+    ),
+    "KITTI odometry": WriterForm("calib.txt", kitti, counts=(0,), sized=False),
+    "KITTI raw": WriterForm("calib_cam_to_cam.txt", kitti_raw, counts=(0,)),
+    "Open3D": WriterForm("camera_intrinsic.json", open3d, counts=(0,)),
+    "Replica": WriterForm("cam_params.json", replica, counts=(0,)),
+    "OpenSfM, ODM": WriterForm("camera_models.json", opensfm, (P, E), (0, 4, 5)),
+    "DepthAI": WriterForm("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
+    "Gyroflow": WriterForm("gyroflow.json", gyroflow, (E,)),
+    "vikit (SVO 1, FAST-LIVO)": WriterForm("pinhole.yaml", vikit, (P, E, F)),
+    "Record3D": WriterForm("metadata.json", record3d, counts=(0,)),
+    "SpectacularAI": WriterForm("spectacular.json", spectacular, (P, E), mounting=True),
+    "ZED": WriterForm("SN123.conf", zed, counts=(0, 4, 5), sizes=((672, 376), (1280, 720), (1920, 1080)), sized=False),
+    "NICE-SLAM, MonoGS": WriterForm("fr1_desk.yaml", nested, counts=(0, 4, 5)),
 }
 """Every form that is read, by the name that docs/data-sets.md has for it."""
 
@@ -548,6 +609,10 @@ REFUSED: dict[str, tuple[str, str]] = {
     "Meshroom": ("scene.sfm", '{"views": [], "intrinsics": [], "poses": []}'),
     "Bundler, VisualSFM": ("bundle.out", "# Bundle file v0.3\n1 1\n"),
     "COLMAP thin prism": ("cameras.txt", "1 THIN_PRISM_FISHEYE 640 480 500 500 320 240 0 0 0 0 0 0 0 0\n"),
+    "rs-enumerate-devices": (
+        "realsense.txt",
+        ' Intrinsic of "Color" / 640x480\n  PPX:  320.6\n  Distortion: Inverse Brown Conrady\n',
+    ),
     "ROS launch file": ("camera.launch", "<launch>\n<node pkg='a'/></launch>\n"),
 }
 """Forms that are refused by name, with a file of each."""

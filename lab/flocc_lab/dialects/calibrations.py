@@ -20,7 +20,7 @@ import numpy as np
 
 from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_lab.dialects.calibration_writers import FORMS, Form, Rig
+from flocc_lab.dialects.calibration_writers import FORMS, Rig, WriterForm
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_protocol.errors import FloccError
 
@@ -31,7 +31,7 @@ SIZES = ((640, 480), (752, 480), (1280, 720), (512, 512), (1224, 1024), (160, 12
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class DialectVerdict:
     """What became of one file.
 
     Attributes:
@@ -52,9 +52,10 @@ class Verdict:
         return self.outcome == ("right" if self.fault is None else "refused")
 
 
-def drawn_rig(form: Form, rng: np.random.Generator) -> Rig:
+def drawn_rig(form: WriterForm, rng: np.random.Generator) -> Rig:
     """A camera that a form can say."""
-    width, height = SIZES[rng.integers(len(SIZES))]
+    sizes = form.sizes or SIZES
+    width, height = sizes[rng.integers(len(sizes))]
     focal = float(np.round(width * rng.uniform(0.5, 1.2), 4))
     fx, fy = focal, float(np.round(focal * rng.uniform(0.98, 1.02), 4))
     cx, cy = (float(np.round(side * rng.uniform(0.45, 0.55), 3)) for side in (width, height))
@@ -65,7 +66,9 @@ def drawn_rig(form: Form, rng: np.random.Generator) -> Rig:
     return Rig(model, T if form.mounting else np.eye(4))
 
 
-def _drawn_lens(kind: LensKind, form: Form, rng: np.random.Generator) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _drawn_lens(
+    kind: LensKind, form: WriterForm, rng: np.random.Generator
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     def within(*limits: float) -> tuple[float, ...]:
         signs = rng.choice([-1.0, 1.0], len(limits))
         return tuple(
@@ -164,10 +167,10 @@ FAULTS: dict[str, Fault] = {
     "a model that contradicts": _model_contradicts,
     "a mounting that is no pose": _not_rigid,
 }
-TEXTS = ("ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw")
+TEXTS = ("ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw", "ZED")
 
 
-def judged(name: str, fault: str | None, rng: np.random.Generator, folder: Path) -> Verdict:
+def judged(name: str, fault: str | None, rng: np.random.Generator, folder: Path) -> DialectVerdict:
     """Draw one file, read it, and judge what came of it."""
     form = FORMS[name]
     rig = drawn_rig(form, rng)
@@ -180,9 +183,9 @@ def judged(name: str, fault: str | None, rng: np.random.Generator, folder: Path)
     try:
         lens = read_lens(path, None if form.sized else (rig.model.width, rig.model.height))
     except FloccError as error:
-        return Verdict(name, fault, "refused", str(error))
+        return DialectVerdict(name, fault, "refused", str(error))
     same = _is_same(lens.camera, rig.model) and np.allclose(lens.T_body_camera, rig.T_body_camera, atol=1e-6)
-    return Verdict(name, fault, "right" if same else "wrong", f"{lens.camera} of {rig.model}\n{text}")
+    return DialectVerdict(name, fault, "right" if same else "wrong", f"{lens.camera} of {rig.model}\n{text}")
 
 
 def _is_same(found: CameraModel, wanted: CameraModel) -> bool:
@@ -192,7 +195,7 @@ def _is_same(found: CameraModel, wanted: CameraModel) -> bool:
     return len(first) == len(second) and bool(np.allclose(first, second, rtol=1e-9, atol=1e-9))
 
 
-def campaign(count: int, seed: int, folder: Path) -> list[Verdict]:
+def campaign(count: int, seed: int, folder: Path) -> list[DialectVerdict]:
     """Judge so many drawn files, every form in turn."""
     rng = np.random.default_rng(seed)
     names, faults = list(FORMS), list(FAULTS)

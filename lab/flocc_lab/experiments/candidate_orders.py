@@ -23,7 +23,16 @@ from flocc_agent.core.parameters import (
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed, PoseGraph
 from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected
 from flocc_agent.runtime.event_lines import of_kind
-from flocc_lab.experiments.experiment import Cell, Experiment, Finding, Row, Settings, Summary, grid, judged
+from flocc_lab.experiments.experiment import (
+    Cell,
+    Experiment,
+    ExperimentFinding,
+    Row,
+    Settings,
+    Summary,
+    grid,
+    judged,
+)
 from flocc_lab.experiments.plots import COLOURS, from_zero
 from flocc_lab.experiments.statistics import grouped, middle, values
 from flocc_launch.runs.trajectory_errors import ate_m
@@ -241,7 +250,7 @@ def _note(run: int, of_all: float | None, of_first: float | None) -> str:
     return f"Run {run}: {of_all:.2f} of the closures that were spent, {of_first:.2f} of the first that sufficed."
 
 
-def findings(rows: Sequence[Row]) -> list[Finding]:
+def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
     """The target, and the same against the first closures with which similarity order was as good as at its end."""
     shares = shares_of(rows)
     if not shares:

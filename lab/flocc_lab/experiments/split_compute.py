@@ -18,7 +18,7 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Settings,
@@ -31,9 +31,10 @@ from flocc_lab.experiments.plots import COLOURS
 from flocc_lab.experiments.simulated import simulated
 from flocc_lab.experiments.statistics import grouped, middle
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.scenarios.recordings import cache_folder, recordings
+from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_scenario
+from flocc_launch.setup.cache import cache_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -197,7 +198,7 @@ def _level(similarity: float | None, rows: Sequence[Row], devices: dict[str, tup
     return row
 
 
-def findings(table: Sequence[Row]) -> list[Finding]:
+def findings(table: Sequence[Row]) -> list[ExperimentFinding]:
     """Whether encoding once per keyframe computes less, judged at the most permissive threshold, as the paper's."""
     if not table:
         return []

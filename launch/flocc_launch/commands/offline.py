@@ -63,11 +63,11 @@ def optimise(
 
 def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
     """Simulate drawn scenarios under all checkers; leave with exit code 1 when an invariant was violated."""
-    from flocc_launch.simulation.campaign import Outcome, campaign, write_campaign
+    from flocc_launch.simulation.campaign import SeedOutcome, campaign, write_campaign
     from flocc_launch.simulation.campaign import shrink as smaller
     from flocc_launch.simulation.generator import drawn_scenario
 
-    def tell(outcome: Outcome) -> None:
+    def tell(outcome: SeedOutcome) -> None:
         for violation in outcome.violations:
             typer.echo(f"seed {outcome.seed}: {violation.invariant} at {violation.at_s:.2f} s")
 

@@ -7,14 +7,14 @@ while somebody looks, so that a page nobody has open costs the agent nothing but
 import asyncio
 import json
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.event_lines import Reported
+from flocc_launch.dashboard.snapshot import Snapshot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.runs.heard import Heard
 from flocc_protocol.ids import LogId
@@ -63,12 +63,12 @@ class AgentSource:
             TimeoutError: The agent is too busy to answer.
         """
         asked = asyncio.run_coroutine_threadsafe(self._look(), self._loop)
-        return json.dumps(asked.result(ANSWER_S_MAX), allow_nan=False)
+        return json.dumps(asked.result(ANSWER_S_MAX).as_json(), allow_nan=False)
 
-    async def _look(self) -> dict[str, Any]:
+    async def _look(self) -> Snapshot:
         if self._agent is not None:
             self._read_robot(self._agent.robot)
-        return {"scenario": self._swarm, "seen_by": self._name} | self._state.snapshot(self._clock_s())
+        return self._state.snapshot(self._clock_s(), self._swarm, self._name)
 
     def _read_robot(self, robot: Robot) -> None:
         """Take in what is new in the core: records, corrections, and whom the neighbours follow."""

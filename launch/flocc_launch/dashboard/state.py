@@ -3,7 +3,6 @@
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from flocc_agent.core.reports import (
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import Reported, is_of
 from flocc_agent.runtime.facts import AccountKept, AgentDied, AgentStopped, BytesCounted
+from flocc_launch.dashboard.snapshot import ClosureView, LinkView, MapGroup, RobotView, RoundView, Said, Snapshot
 from flocc_launch.dashboard.words import sentence_of
 from flocc_protocol.ids import KeyframeId
 
@@ -102,7 +102,7 @@ class SwarmState:
         self.robots = {robot: RobotState() for robot in sorted(robots)}
         self.servers = frozenset(servers)
         self.closures: dict[tuple[KeyframeId, KeyframeId], float | None] = {}
-        self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT_MAX)
+        self.recent: deque[Said] = deque(maxlen=RECENT_MAX)
         self.optimised: Reported[RoundSolved] | None = None
         self.t = 0.0
 
@@ -117,7 +117,7 @@ class SwarmState:
             self.optimised = event
         said = sentence_of(event)
         if said is not None:
-            self.recent.append({"t": event.t, "robot": event.robot, "text": said})
+            self.recent.append(Said(event.t, event.robot, said))
 
     def place(self, name: str, corrected_m: Mapping[int, Float]) -> None:
         """Corrected positions (3,) of single keyframes by their index, in the map frame of the last correction."""
@@ -127,26 +127,30 @@ class SwarmState:
         """A robot was heard of, without an event."""
         self.robots.setdefault(name, RobotState()).last_s = t
 
-    def snapshot(self, now_s: float | None = None) -> dict[str, Any]:
-        """Everything as plain JSON values.
+    def snapshot(self, now_s: float | None, scenario: str, seen_by: str | None = None) -> Snapshot:
+        """Everything that is to be shown.
 
         Args:
             now_s: Now on the run's clock; None for a run that is over.
+            scenario: Of the run, or the swarm's name.
+            seen_by: The robot whose view this is.
         """
         names = sorted(self.robots)
         here = ("running",) if now_s is not None else ("running", "stopped")
         living = {name: robot for name, robot in self.robots.items() if state_of(robot, now_s) in here}
-        return {
-            "t": self.t if now_s is None else now_s,
-            "running": now_s is not None,
-            "robots": [robot_json(name, self.robots[name], now_s) | {"server": name in self.servers} for name in names],
-            "maps": groups([(name, self.robots[name].map_frame) for name in names if name not in self.servers]),
-            "ranges": ranges(living),
-            "leaders": sorted({robot.leader for robot in living.values() if robot.leader is not None}),
-            "closures": [closure_json(self, query, match) for query, match in self.closures],
-            "optimised": optimised_json(self.optimised),
-            "recent": list(self.recent)[::-1],
-        }
+        return Snapshot(
+            scenario=scenario,
+            seen_by=seen_by,
+            t=self.t if now_s is None else now_s,
+            running=now_s is not None,
+            robots=[robot_view(name, self.robots[name], now_s, name in self.servers) for name in names],
+            maps=groups([(name, self.robots[name].map_frame) for name in names if name not in self.servers]),
+            ranges=ranges(living),
+            leaders=sorted({robot.leader for robot in living.values() if robot.leader is not None}),
+            closures=[closure_view(self, query, match) for query, match in self.closures],
+            optimised=None if self.optimised is None else round_view(self.optimised),
+            recent=list(self.recent)[::-1],
+        )
 
 
 def apply_to(robot: RobotState, fact: Fact) -> None:
@@ -196,51 +200,51 @@ def state_of(robot: RobotState, now_s: float | None) -> str:
     return "silent"
 
 
-def robot_json(name: str, robot: RobotState, now_s: float | None) -> dict[str, Any]:
-    """One robot as JSON values; its path is thinned."""
+def robot_view(name: str, robot: RobotState, now_s: float | None, server: bool) -> RobotView:
+    """One robot; its path is thinned."""
     path = robot.path_m()
     step = max(1, -(-len(path) // PATH_POINTS_MAX))
     kept = path[::step] if step == 1 or not len(path) else np.vstack([path[::step], path[-1:]])
-    return {
-        "robot": name,
-        "state": state_of(robot, now_s),
-        "leader": robot.leader,
-        "term": robot.term,
-        "neighbours": sorted(robot.neighbours),
-        "links": links_json(robot),
-        "queues": dict(robot.queues),
-        "map_frame": robot.map_frame,
-        "keyframes": len(robot.positions_odom_m),
-        "candidates": robot.candidates,
-        "accepted": robot.accepted,
-        "rejected": robot.rejected,
-        "sent": dict(sorted(robot.sent.items())),
-        "sent_bytes": sum(robot.sent.values()),
-        "received_bytes": sum(robot.received.values()),
-        "last_s": robot.last_s,
-        "path_m": np.round(kept, 3).tolist(),
-    }
+    return RobotView(
+        robot=name,
+        server=server,
+        state=state_of(robot, now_s),
+        leader=robot.leader,
+        term=robot.term,
+        neighbours=sorted(robot.neighbours),
+        links=link_views(robot),
+        queues=robot.queues,
+        map_frame=robot.map_frame,
+        keyframes=len(robot.positions_odom_m),
+        candidates=robot.candidates,
+        accepted=robot.accepted,
+        rejected=robot.rejected,
+        sent=dict(sorted(robot.sent.items())),
+        sent_bytes=sum(robot.sent.values()),
+        received_bytes=sum(robot.received.values()),
+        last_s=robot.last_s,
+        path_m=np.round(kept, 3).tolist(),
+    )
 
 
-def links_json(robot: RobotState) -> dict[str, dict[str, Any]]:
-    """What a robot knows of its links, by peer; null where it does not know."""
+def link_views(robot: RobotState) -> dict[str, LinkView]:
+    """What a robot knows of its links, by peer."""
     peers = sorted({*robot.neighbours, *robot.sent_to, *robot.received_from})
     return {
-        peer: {
-            "hears": peer in robot.neighbours,
-            "loss_ratio": robot.loss.get(peer) if peer in robot.neighbours else None,
-            "sent_bytes": robot.sent_to.get(peer),
-            "received_bytes": robot.received_from.get(peer),
-        }
+        peer: LinkView(
+            hears=peer in robot.neighbours,
+            loss_ratio=robot.loss.get(peer) if peer in robot.neighbours else None,
+            sent_bytes=robot.sent_to.get(peer),
+            received_bytes=robot.received_from.get(peer),
+        )
         for peer in peers
     }
 
 
-def closure_json(state: SwarmState, query: KeyframeId, match: KeyframeId) -> dict[str, Any]:
-    """A closure with the places of its ends, null where they are not known."""
+def closure_view(state: SwarmState, query: KeyframeId, match: KeyframeId) -> ClosureView:
+    """A closure with the places of its ends."""
     ends = [place_of(state, keyframe) for keyframe in (query, match)]
-    probability = state.closures[query, match]
-    return {"query": str(query), "match": str(match), "probability": probability, "ends_m": ends}
+    return ClosureView(str(query), str(match), state.closures[query, match], ends)
 
 
 def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
@@ -250,11 +254,11 @@ def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
     return None if position_m is None else [round(float(v), 3) for v in position_m]
 
 
-def groups(members: list[tuple[str, str | None]]) -> list[dict[str, Any]]:
+def groups(members: list[tuple[str, str | None]]) -> list[MapGroup]:
     """Robots by map frame; those without one last."""
     frames = Counter(frame for _, frame in members)
     ordered = sorted(frames, key=lambda frame: (frame is None, frame or ""))
-    return [{"frame": f, "robots": [name for name, frame in members if frame == f]} for f in ordered]
+    return [MapGroup(f, [name for name, frame in members if frame == f]) for f in ordered]
 
 
 def ranges(robots: dict[str, RobotState]) -> list[list[str]]:
@@ -273,17 +277,16 @@ def ranges(robots: dict[str, RobotState]) -> list[list[str]]:
     return found
 
 
-def optimised_json(event: Reported[RoundSolved] | None) -> dict[str, Any] | None:
+def round_view(event: Reported[RoundSolved]) -> RoundView:
     """The last optimisation."""
-    if event is None:
-        return None
-    return {
-        "t": event.t,
-        "leader": event.robot,
-        "round": event.fact.round,
-        "cost": event.fact.cost,
-        "solve_s": event.fact.solve_s,
-        "closures_used": event.fact.closures_used,
-        "closures_rejected": event.fact.closures_rejected,
-        "warnings": list(event.fact.warnings),
-    }
+    solved = event.fact
+    return RoundView(
+        t=event.t,
+        leader=event.robot,
+        round=solved.round,
+        cost=solved.cost,
+        solve_s=solved.solve_s,
+        closures_used=solved.closures_used,
+        closures_rejected=solved.closures_rejected,
+        warnings=solved.warnings,
+    )

@@ -8,18 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.runtime.pictures import PictureError
+from flocc_agent.runtime.pictures import FULL, PictureError
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_clock import ClockChoice, choose_clock
 from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, listed, only
-from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, image_file, lens_of, stamp_ns
+from flocc_launch.datasets.bag_messages import (
+    CAMERA_TYPE,
+    IMAGE_TYPES,
+    POSE_TYPES,
+    image_file,
+    lens_of,
+    sampled_levels,
+    stamp_ns,
+)
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
-from flocc_launch.datasets.pixels import ImageWriter
+from flocc_launch.datasets.pixels import ImageWriter, levels_note
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
@@ -62,6 +70,7 @@ class BagOptions:
     form: str | None = None
     published_form: str | None = None
     robot: str | None = None
+    view_rad: float | None = None
 
 
 def convert_bag(path: Path, out: Path, options: BagOptions | None = None, progress: Progress | None = None) -> Path:
@@ -126,6 +135,7 @@ def _convert_robot(
     layout: Layout, robot: RobotTopics, out: Path, options: BagOptions, progress: Progress | None
 ) -> None:
     lens, notes = _lens(layout, robot, options)
+    lens = lens if options.view_rad is None else replace(lens, view_rad=options.view_rad)
     clock = choose_clock(layout, robot)
     identity = f"bag {layout.bag.path.resolve()} {robot.image.name} {robot.poses or options.odometry}"
     others = layout.other_poses(robot)
@@ -142,7 +152,8 @@ def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens
     if isinstance(options.camera, Lens):
         return options.camera, []
     if options.camera is not None:
-        return read_lens(options.camera), []
+        lens = read_lens(options.camera)
+        return lens, list(lens.notes)
     bag = layout.bag
     infos = [topic for topic in bag.topics.values() if topic.type == CAMERA_TYPE]
     if robot.info is None:
@@ -185,7 +196,7 @@ class Tally:
         self.backwards += 1
         self.step = self.step or f"time goes backwards, from {last_s:.6f} s to {stamp_s:.6f} s"
 
-    def sentences(self, topic: Topic) -> list[str]:
+    def sentences(self, topic: BagTopic) -> list[str]:
         """What was left out."""
         damaged = f"topic {topic.name}: {self.damaged} of {self.seen} messages were left out: {self.reason}"
         back = f"topic {topic.name}: {self.step}; {self.backwards} of {self.seen} messages were left out"
@@ -229,6 +240,10 @@ class _Conversion:
         decoder = None if source is None else _decoder(self.bag, source)
         names = [self.robot.image.name, *([] if source is None else [source.topic.name])]
         image_topic, total = self.robot.image, self.robot.image.count or 0
+        levels = sampled_levels(self.bag, image_topic)
+        if levels != FULL:
+            self.notes.append(f"{self.bag.path}: topic {image_topic.name}: {levels_note(levels)}")
+        self._pictures = ImageWriter(self.lens, levels)
         self._open()
         try:
             for number, (topic, bag_ns, raw) in enumerate(self.bag.raw(names, start_ns)):
@@ -252,7 +267,6 @@ class _Conversion:
         self._writer = RecordingWriter(out, f"{self.identity}{f' journey {self.journey + 1}' if self.journey else ''}")
         self._log = PoseWriter(out / "odometry.tum", self.robot.poses is not None)
         self._log.__enter__()
-        self._pictures = ImageWriter(self.lens)
         self._writer.write_lens(self._pictures.lens)
         self._done_s = self._writer.last_stamp_s
 
@@ -329,10 +343,11 @@ class _Conversion:
             tally.damage(_bare(error, topic))
 
     def _encoded(self, message: Any) -> tuple[bytes, str]:
+        encoded, suffix = image_file(message, self.robot.image, self.options.jpeg)
         try:
-            return self._pictures.written(*image_file(message, self.robot.image, self.options.jpeg))
+            return self._pictures.written(encoded, suffix)
         except PictureError as error:
-            raise DatasetError(str(error)) from error
+            raise DatasetError(f"topic {self.robot.image.name}: {error}") from error
 
     def _restored(self) -> int | None:
         """Bag time to go on from, or None at the start."""
@@ -411,7 +426,7 @@ def _decoder(bag: Bag, source: PoseSource) -> PoseDecoder | TransformDecoder:
     return PoseDecoder(bag, source.topic) if source.edge is None else TransformDecoder(bag, source.topic, source.edge)
 
 
-def _bare(error: Exception, topic: Topic) -> str:
+def _bare(error: Exception, topic: BagTopic) -> str:
     """What went wrong, without the topic's name, which the sentence around it says."""
     return str(error).rpartition(f"topic {topic.name}: ")[2]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flocc_agent.runtime.ros2.static_frames import StaticFrames
 from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES, stamp_ns
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.source import DatasetError
 
 Float = NDArray[np.float64]
@@ -54,7 +54,7 @@ class PoseSource:
         edge: Of a topic of transforms, the parent's and the child's frame.
     """
 
-    topic: Topic
+    topic: BagTopic
     edge: tuple[str, str] | None = None
 
     def __str__(self) -> str:
@@ -67,14 +67,14 @@ class RobotTopics:
 
     Attributes:
         name: Its namespace, or "" where the bag is one robot's.
-        image: Topic of its camera.
-        info: Topic of the camera's intrinsics, or None.
+        image: BagTopic of its camera.
+        info: BagTopic of the camera's intrinsics, or None.
         poses: Odometry, or None.
     """
 
     name: str
-    image: Topic
-    info: Topic | None
+    image: BagTopic
+    info: BagTopic | None
     poses: PoseSource | None
 
     def __str__(self) -> str:
@@ -104,7 +104,7 @@ class Layout:
                 layout._read_transforms(topic)
         return layout
 
-    def _read_transforms(self, topic: Topic) -> None:
+    def _read_transforms(self, topic: BagTopic) -> None:
         is_static = topic.name.rsplit("/", 1)[-1] == "tf_static"
         for number, (_, _, raw) in enumerate(self.bag.raw([topic.name])):
             if number >= TRANSFORMS_READ_MAX:
@@ -121,7 +121,7 @@ class Layout:
                     edge = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
                     self.edges.setdefault(edge, topic.name)
 
-    def head(self, topic: Topic) -> Head | None:
+    def head(self, topic: BagTopic) -> Head | None:
         """What a topic's first message says, or None where it has none."""
         if topic.name not in self._heads:
             found = self.bag.first(topic.name)
@@ -146,20 +146,20 @@ class Layout:
             return [self._robot(name, parts[name], poses) for name, poses in own.items()]
         return [self._robot("", images, None)]
 
-    def _of_types(self, types: Sequence[str]) -> list[Topic]:
+    def _of_types(self, types: Sequence[str]) -> list[BagTopic]:
         return [topic for topic in self.bag.topics.values() if topic.type in types]
 
-    def _poses_of(self, name: str, images: list[Topic]) -> PoseSource | None:
+    def _poses_of(self, name: str, images: list[BagTopic]) -> PoseSource | None:
         own = [t for t in self._of_types(POSE_TYPES) if name in t.name.strip("/").split("/")[:-1]]
         if len(own) == 1:
             return PoseSource(own[0])
         return None if own else self.edge_of(images[0])
 
-    def _robot(self, name: str, images: list[Topic], poses: PoseSource | None) -> RobotTopics:
+    def _robot(self, name: str, images: list[BagTopic], poses: PoseSource | None) -> RobotTopics:
         image = self.chosen_image(images)
         return RobotTopics(name, image, self.info_of(image), poses or self.chosen_poses(image))
 
-    def chosen_image(self, images: list[Topic], name: str | None = None) -> Topic:
+    def chosen_image(self, images: list[BagTopic], name: str | None = None) -> BagTopic:
         """The camera's topic: the named one, or the only one that holds pictures.
 
         Raises:
@@ -170,7 +170,7 @@ class Layout:
         kept = [topic for topic in images if not self._is_depth(topic)]
         if images and not kept:
             raise DatasetError(f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}")
-        by_base: dict[str, Topic] = {}
+        by_base: dict[str, BagTopic] = {}
         for topic in kept:
             base = topic.name.removesuffix("/compressed")
             best = by_base.get(base)
@@ -180,14 +180,14 @@ class Layout:
             return left
         return only(self.bag, list(by_base.values()), "image", "--image-topic")
 
-    def _is_depth(self, topic: Topic) -> bool:
+    def _is_depth(self, topic: BagTopic) -> bool:
         leaf = topic.name.rsplit("/", 1)[-1]
         if leaf in ("compressedDepth", "theora"):
             return True
         head = self.head(topic)
         return head is not None and head.coding.split(";")[0].strip() in ("16UC1", "32FC1")
 
-    def info_of(self, image: Topic) -> Topic | None:
+    def info_of(self, image: BagTopic) -> BagTopic | None:
         """The CameraInfo of an image topic: of its namespace, else of its frame, else the only one; None where unclear.
 
         Raises:
@@ -211,11 +211,11 @@ class Layout:
         related = [t for t in infos if len(_by_namespace([image.name, t.name])) == 1]
         return infos[0] if len(infos) == 1 and (unframed or related) else None
 
-    def _frame(self, topic: Topic) -> str:
+    def _frame(self, topic: BagTopic) -> str:
         head = self.head(topic)
         return head.frame if head else ""
 
-    def chosen_poses(self, image: Topic, name: str | None = None) -> PoseSource | None:
+    def chosen_poses(self, image: BagTopic, name: str | None = None) -> PoseSource | None:
         """Odometry: the named topic or `TOPIC:PARENT.CHILD`, the only topic of poses, or an edge of /tf.
 
         Raises:
@@ -251,7 +251,7 @@ class Layout:
             raise DatasetError(f"{self.bag.path}: has no transform {name}; there are {edges or 'none'}")
         return PoseSource(topic, found[0])
 
-    def edge_of(self, image: Topic) -> PoseSource | None:
+    def edge_of(self, image: BagTopic) -> PoseSource | None:
         """The transform that moves the body on which the camera is mounted, or None."""
         camera = self._frame(image)
         moving = [edge for edge in self.edges if self.static.between(edge[1], camera) is not None or edge[1] == camera]
@@ -323,7 +323,7 @@ def _by_namespace(names: Sequence[str]) -> dict[str, list[str]]:
     return groups
 
 
-def _left_of(topics: dict[str, Topic]) -> Topic | None:
+def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
     """The left one of two cameras whose names differ in nothing else."""
     lefts = [name for name in topics if "left" in name.lower()]
     if len(topics) == 2 and len(lefts) == 1:
@@ -333,7 +333,7 @@ def _left_of(topics: dict[str, Topic]) -> Topic | None:
     return None
 
 
-def named(bag: Bag, types: Sequence[str], name: str) -> Topic:
+def named(bag: Bag, types: Sequence[str], name: str) -> BagTopic:
     """The topic of a name.
 
     Raises:
@@ -347,7 +347,7 @@ def named(bag: Bag, types: Sequence[str], name: str) -> Topic:
     return topic
 
 
-def only(bag: Bag, fitting: list[Topic], what: str, option: str) -> Topic:
+def only(bag: Bag, fitting: list[BagTopic], what: str, option: str) -> BagTopic:
     """The only topic that fits.
 
     Raises:
@@ -360,6 +360,6 @@ def only(bag: Bag, fitting: list[Topic], what: str, option: str) -> Topic:
     raise DatasetError(f"{bag.path}: has no {what} topic; it has {listed(list(bag.topics.values()))}")
 
 
-def listed(topics: list[Topic]) -> str:
+def listed(topics: list[BagTopic]) -> str:
     """Topics as a sentence has them."""
     return ", ".join(str(topic) for topic in topics[:12]) + (" and others" if len(topics) > 12 else "") or "no topic"

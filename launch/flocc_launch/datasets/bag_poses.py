@@ -8,7 +8,7 @@ import struct
 from typing import Any
 
 from flocc_launch.datasets.bag_messages import checked_numbers, poses, stamp_ns, transform_numbers
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.source import DatasetError
 
 Posed = tuple[int, tuple[float, ...]]
@@ -28,7 +28,7 @@ LOST_COVARIANCE = 9999.0
 class PoseDecoder:
     """Called with a raw message, returns its poses."""
 
-    def __init__(self, bag: Bag, topic: Topic) -> None:
+    def __init__(self, bag: Bag, topic: BagTopic) -> None:
         self._bag = bag
         self._topic = topic
         self._straight: bool | None = None if topic.type in STRINGS else False
@@ -92,7 +92,7 @@ class PoseDecoder:
 class TransformDecoder:
     """Called with a raw message of transforms, returns the poses of one edge."""
 
-    def __init__(self, bag: Bag, topic: Topic, edge: tuple[str, str]) -> None:
+    def __init__(self, bag: Bag, topic: BagTopic, edge: tuple[str, str]) -> None:
         self._bag = bag
         self._topic = topic
         self._edge = edge
@@ -111,7 +111,7 @@ class TransformDecoder:
         ]
 
 
-def _lost(topic: Topic) -> DatasetError:
+def _lost(topic: BagTopic) -> DatasetError:
     return DatasetError(
         f"topic {topic.name}: odometry calls itself lost (its covariance is {LOST_COVARIANCE:g} or more)"
     )

@@ -25,7 +25,7 @@ PARTS_GAP_MAX_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class BagTopic:
     """A topic of a bag.
 
     Attributes:
@@ -107,7 +107,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.topics: dict[str, Topic] = {}
+        self.topics: dict[str, BagTopic] = {}
         self.damage: str | None = None
         self.start_ns: int | None = None
         self.end_ns: int | None = None
@@ -134,12 +134,12 @@ class Bag:
             self._open_damaged(paths[0], " ".join(str(error).split()))
             return self
         self.topics = {
-            name: Topic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
+            name: BagTopic(name, info.msgtype or "?", info.msgcount) for name, info in self._reader.topics.items()
         }
         for name, topic in self.topics.items():
             if (short := short_name(topic.type)) is not None:
                 self._foxglove[name] = topic.type
-                self.topics[name] = Topic(name, ROS_TYPES[short], topic.count)
+                self.topics[name] = BagTopic(name, ROS_TYPES[short], topic.count)
         self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
         return self
 
@@ -153,7 +153,7 @@ class Bag:
         """Whether messages are in ROS 1's serialisation, not in CDR."""
         return self._ros1
 
-    def raw(self, names: Sequence[str], start_ns: int | None = None) -> Iterator[tuple[Topic, int, bytes]]:
+    def raw(self, names: Sequence[str], start_ns: int | None = None) -> Iterator[tuple[BagTopic, int, bytes]]:
         """Yield topic, bag time in nanoseconds and the undecoded message, in the bag's order.
 
         Args:
@@ -178,7 +178,7 @@ class Bag:
                 return
             yield topics[connection.topic], stamp_ns, message
 
-    def _salvaged(self, names: Sequence[str], start_ns: int | None) -> Iterator[tuple[Topic, int, bytes]]:
+    def _salvaged(self, names: Sequence[str], start_ns: int | None) -> Iterator[tuple[BagTopic, int, bytes]]:
         try:
             for name, stamp_ns, message in self._salvage.messages(list(names)):
                 if start_ns is None or stamp_ns >= start_ns:
@@ -196,7 +196,7 @@ class Bag:
                     break
         return None
 
-    def decoded(self, raw: bytes, topic: Topic) -> Any:
+    def decoded(self, raw: bytes, topic: BagTopic) -> Any:
         """Decode a message.
 
         Raises:
@@ -245,7 +245,7 @@ class Bag:
             return
         self._salvage = Salvage(file)
         try:
-            self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
+            self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
         except SALVAGE_ERRORS as error:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}") from error
         if not self.topics:
@@ -256,7 +256,7 @@ class Bag:
         """Open an MCAP file of protobuf or JSON, of which Foxglove's messages are read."""
         self._salvage, self._is_foreign = ForeignMcap(file), True
         try:
-            self.topics = {name: Topic(name, kind, None) for name, kind in self._salvage.topics().items()}
+            self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
         except ValueError as error:
             raise DatasetError(f"{self.path}: is an MCAP of protobuf messages, not of ROS: {error}") from error
         if not any(topic.type in ROS_TYPES.values() for topic in self.topics.values()):

@@ -307,7 +307,18 @@ def convert(
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
     if is_bag(path):
-        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg, form=form, robot=robot)
+        options = BagOptions(
+            image_topic,
+            odometry_topic,
+            camera,
+            odometry,
+            truth,
+            every,
+            jpeg,
+            form=form,
+            robot=robot,
+            view_rad=None if view_deg is None else math.radians(view_deg),
+        )
         return convert_bag(path, out, options, progress)
     if is_video(path):
         for note in convert_video(path, out, camera, odometry, form, every, progress):

@@ -18,14 +18,22 @@ from flocc_launch.report.model import (
     Expectation,
     LeaderSpan,
     Optimisations,
-    Report,
-    Robot,
     RobotBytes,
+    RobotReport,
+    RunReport,
     TrackError,
 )
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
-from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.timeline import (
+    corrections_of,
+    deaths_unasked,
+    ends,
+    how_it_died,
+    leader_changes,
+    merged_after_s,
+    terms_led,
+)
+from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.runs.version import flocc_version
 
@@ -38,13 +46,13 @@ def _odometry_made(recordings: Mapping[str, str]) -> dict[str, str]:
     return {robot: file.read_text(encoding="utf-8").strip() for robot, file in files.items() if file.is_file()}
 
 
-def build(loaded: LoadedRun) -> Report:
+def build(loaded: LoadedRun) -> RunReport:
     """Compute the report of a run."""
     run, tracks = loaded.run, loaded.tracks
     frames = sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
     by_robot = bytes_by_robot(loaded)
-    report = Report(
+    report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
         driver=run.driver,
@@ -77,17 +85,18 @@ def build(loaded: LoadedRun) -> Report:
         optimisations=optimisations_part(loaded),
         expectations=[],
         robot_details=robots,
+        deaths_unasked=deaths_unasked(loaded.events),
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
 
 
-def with_keyframes(tracks: Iterable[Track]) -> list[Track]:
+def with_keyframes(tracks: Iterable[RobotTrack]) -> list[RobotTrack]:
     """The tracks that have keyframes at all."""
     return [track for track in tracks if len(track)]
 
 
-def ate_joint_m(tracks: Mapping[str, Track]) -> float | None:
+def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:
     """Joint ATE, or None unless every robot with keyframes is in one map frame and has ground truth."""
     moved = with_keyframes(tracks.values())
     frames = {track.map_frame for track in moved}
@@ -96,13 +105,13 @@ def ate_joint_m(tracks: Mapping[str, Track]) -> float | None:
     return ate_in_frame_m(moved, frames.pop() or "")
 
 
-def ate_in_frame_m(tracks: Iterable[Track], frame: str) -> float | None:
+def ate_in_frame_m(tracks: Iterable[RobotTrack], frame: str) -> float | None:
     """Joint ATE of the robots in one map frame."""
     pairs = [track.corrected_and_true() for track in tracks if track.map_frame == frame]
     return ate_m([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
 
 
-def ate_joint_odometry_m(tracks: Mapping[str, Track], aligned: bool) -> float | None:
+def ate_joint_odometry_m(tracks: Mapping[str, RobotTrack], aligned: bool) -> float | None:
     """Joint ATE of odometry placed at its true starts, or None unless every robot has ground truth."""
     moved = with_keyframes(tracks.values())
     pairs = [track.odometry_and_true() for track in moved]
@@ -122,12 +131,12 @@ def track_error(estimate: Float, truth: Float) -> TrackError:
     )
 
 
-def robot_part(loaded: LoadedRun, robot: str) -> Robot:
+def robot_part(loaded: LoadedRun, robot: str) -> RobotReport:
     """One robot's part of the report."""
     track, result = loaded.tracks[robot], loaded.results.get(robot)
     corrections = corrections_of(loaded.events, robot)
     end = ends(loaded.events).get(robot)
-    return Robot(
+    return RobotReport(
         robot=robot,
         incarnation=None if result is None else result.incarnation,
         end=None if end is None else "died" if isinstance(end.fact, AgentDied) else "stopped",
@@ -219,7 +228,7 @@ def registered_by(loaded: LoadedRun) -> Counter[str]:
 
 
 def judged(
-    limits: Mapping[str, float | str], report: Report, registered: Mapping[str, int] | None = None
+    limits: Mapping[str, float | str], report: RunReport, registered: Mapping[str, int] | None = None
 ) -> list[Expectation]:
     """Hold a scenario's expectations against a report.
 
@@ -243,7 +252,7 @@ def met(name: str, limit: float | str, value: float | str | None) -> bool | None
     return value >= limit if name.endswith("_min") else value <= limit
 
 
-def measured(report: Report, registered: Mapping[str, int]) -> dict[str, float | str | None]:
+def measured(report: RunReport, registered: Mapping[str, int]) -> dict[str, float | str | None]:
     """The values that expectations can name."""
     before, after = report.ate_joint_odometry_m, report.ate_joint_m
     leader = max(report.leaders, key=lambda span: span.to_s).leader if report.leaders else None
@@ -259,5 +268,6 @@ def measured(report: Report, registered: Mapping[str, int]) -> dict[str, float |
         "bytes_max": sum(report.bytes.values()),
         "wall_max_s": report.wall_s,
         "leader": leader,
+        "deaths_max": len(report.deaths_unasked),
         "leader_registered_ratio_min": None if leader is None or not closures else registered.get(leader, 0) / closures,
     }

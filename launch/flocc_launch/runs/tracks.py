@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from flocc_agent.core.reports import Fact, KeyframeTaken
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_agent.runtime.robot_result import RobotResult, stacked_poses
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import RobotResult, stacked_poses
 from flocc_launch.runs.trajectory_errors import associate, placed_at_true_start
 
 Float = NDArray[np.float64]
@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class RobotTrack:
     """Keyframes of one robot.
 
     Attributes:
@@ -66,7 +66,7 @@ class Track:
 
 def tracks_of(
     folder: RunFolder, results: Mapping[str, RobotResult], events: Sequence[Reported[Fact]]
-) -> dict[str, Track]:
+) -> dict[str, RobotTrack]:
     """Put together every robot's track; one that left no result has the odometry of its `keyframe` events."""
     taken = of_kind(events, KeyframeTaken)
     tracks = {}
@@ -79,7 +79,7 @@ def tracks_of(
     return tracks
 
 
-def track_of_result(result: RobotResult, truth: Trajectory | None) -> Track:
+def track_of_result(result: RobotResult, truth: Trajectory | None) -> RobotTrack:
     """Track of a robot that left a result; a keyframe after the last correction moves with `T_map_odom`."""
     stamps_s = np.array([keyframe.stamp_s for keyframe in result.keyframes])
     T_odom_body = result.T_odom_body()
@@ -92,7 +92,7 @@ def track_of_result(result: RobotResult, truth: Trajectory | None) -> Track:
     return completed(result.robot, result.incarnation, result.map_frame, stamps_s, T_odom_body, T_map_body, truth)
 
 
-def track_of_events(keyframes: list[KeyframeTaken], robot: str, truth: Trajectory | None) -> Track:
+def track_of_events(keyframes: list[KeyframeTaken], robot: str, truth: Trajectory | None) -> RobotTrack:
     """Track of a robot that left no result: odometry only."""
     stamps_s = np.array([taken.stamp_s for taken in keyframes])
     T_odom_body = stacked_poses([taken.T_odom_body for taken in keyframes])
@@ -108,7 +108,7 @@ def completed(
     T_odom_body: Float,
     T_map_body: Float,
     truth: Trajectory | None,
-) -> Track:
+) -> RobotTrack:
     """Put a track together with the ground truth at its stamps."""
     T_world_body = np.full_like(T_odom_body, np.nan)
     true: Mask = np.zeros(len(stamps_s), dtype=bool)
@@ -116,7 +116,7 @@ def completed(
         true, poses = associate(stamps_s, truth)
         T_world_body[true] = poses
     corrected: Mask = np.asarray(np.isfinite(T_map_body).all(axis=(1, 2)))
-    return Track(robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
+    return RobotTrack(robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
 
 
 def ground_truth(folder: RunFolder, robot: str) -> Trajectory | None:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,18 +10,13 @@ from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, SensorsScenario, TracksScenario, WorldScenario
 from flocc_launch.scenarios.sensors import sense
+from flocc_launch.setup.cache import cache_folder
 
 if TYPE_CHECKING:
     from flocc_launch.scenarios.walks import Walk
 
 RECORDING_FILES = ("images.txt", "odometry.tum", "camera.toml")
 Progress = Callable[[int, int], None]
-
-
-def cache_folder() -> Path:
-    """Where generated data is kept: FLOCC_CACHE, or flocc's folder in the user's cache."""
-    given = os.environ.get("FLOCC_CACHE")
-    return Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "flocc"
 
 
 def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str, Path]:

@@ -185,6 +185,12 @@ class FaultKind(StrEnum):
     CALM = "calm"
 
 
+LinkFault = Literal[
+    FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.HEAL, FaultKind.LOSS, FaultKind.LATENCY, FaultKind.RANGE
+]
+"""Faults that concern links; the others concern robots."""
+
+
 class Fault(Section):
     """One entry of the timeline."""
 
@@ -253,6 +259,8 @@ class Expectations(Section):
     """Who leads at the end."""
     leader_registered_ratio_min: float | None = Field(None, ge=0, le=1)
     """Share of the accepted closures that the leader of the end registered."""
+    deaths_max: int = Field(0, ge=0)
+    """Agents that died without a fault of the scenario or an operator's order."""
 
     def limits(self) -> dict[str, float | str]:
         """What was asked for, by name."""

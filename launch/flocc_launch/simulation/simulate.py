@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from flocc_agent.composition import build_optimiser, build_perception
+from flocc_agent.backend import build_optimiser
 from flocc_agent.core.reports import (
     CandidateFound,
     ClosureAccepted,
@@ -12,6 +12,7 @@ from flocc_agent.core.reports import (
     KeyframeTaken,
     RoundSolved,
 )
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.event_lines import line_of
 from flocc_agent.runtime.facts import AccountKept, AgentStopped, BytesCounted
 from flocc_agent.runtime.measurement_file import rows_of
@@ -20,8 +21,8 @@ from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
 from flocc_agent.stages import counts_of
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
-from flocc_launch.runs.run_folder import RobotResult, Run, RunFolder
+from flocc_launch.report.model import RunReport
+from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.sensors import sense
@@ -44,7 +45,7 @@ def simulate(
     seed: int | None = None,
     recordings: Mapping[str, Path] | None = None,
     cache: Path | None = None,
-) -> Report:
+) -> RunReport:
     """Run a scenario on virtual time.
 
     Args:
@@ -150,8 +151,7 @@ def _write_robot(folder: RunFolder, swarm: Swarm, name: str) -> None:
     links, stages = swarm.network.links.tables(name), counts_of(station.workers.stages.snapshot())
     swarm.report(name, AccountKept(since_s=0.0, **links, stages=stages))
     if station.core is not None:
-        fields = result_of(station.core, station.playback.T_body_camera, station.solution)
-        folder.write_result(RobotResult.model_validate(fields))
+        folder.write_result(result_of(station.core, station.playback.T_body_camera, station.solution))
         swarm.report(name, AgentStopped())
 
 

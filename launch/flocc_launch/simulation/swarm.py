@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flocc_agent.composition import build_iterator
+from flocc_agent.backend import build_iterator
 from flocc_agent.config import BackendMode
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
@@ -22,7 +22,7 @@ from flocc_launch.simulation.virtual_fetches import LatentFetcher
 from flocc_launch.simulation.virtual_network import Network
 from flocc_launch.simulation.virtual_playback import Playback
 from flocc_launch.simulation.virtual_robot import Clock, Station, Surroundings
-from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, Workers, WorkTimes
+from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, VirtualWorkers, WorkTimes
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Envelope, Message
 
@@ -91,7 +91,7 @@ class Swarm:
         if station.running:
             station.kill()
             self._fetcher.forget(name)
-            self.report(name, AgentDied(signal=9))
+            self.report(name, AgentDied(signal=9, scripted=True))
 
     def leave(self, name: str) -> None:
         """A robot stops in order."""
@@ -133,7 +133,7 @@ class Swarm:
             LogId(name),
             robot.compute_class,
             playback,
-            Workers(
+            VirtualWorkers(
                 self._equipment.eyes,
                 self._equipment.optimiser,
                 build_iterator(self.scenario.backend),

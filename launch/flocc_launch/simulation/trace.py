@@ -202,9 +202,9 @@ def _told(effect: Effect) -> str | None:
             return f"fetches {keyframe} from {holder}"
         case Register(query=query, match=match):
             return f"registers {query} with {match}"
-        case Deliver(correction):
-            jump = ", which is another" if correction.frame_changed else ""
-            return f"applies {correction.term} round {correction.round} in {correction.map_frame}{jump}"
+        case Deliver(correction, frame_changed):
+            jump = ", which is another" if frame_changed else ""
+            return f"applies {correction.term} round {correction.round} in {map_frame(correction.anchor)}{jump}"
         case Broadcast(message):
             return "hands over" if isinstance(message, Handover) else None
         case Optimise(term, number):

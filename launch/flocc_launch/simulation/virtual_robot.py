@@ -6,8 +6,8 @@ memory is gone: answers of workers and links that belong to an earlier life are 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import assert_never
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -28,12 +28,13 @@ from flocc_agent.core.measurements import BadMeasurement
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import pose7
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture, Playback
-from flocc_launch.simulation.virtual_workers import Workers
+from flocc_launch.simulation.virtual_workers import VirtualWorkers
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Message
 
@@ -90,7 +91,7 @@ class Station:
         log: LogId,
         compute_class: int,
         playback: Playback,
-        workers: Workers,
+        workers: VirtualWorkers,
         disk: Disk,
         clock: Clock,
         agenda: Agenda,
@@ -262,3 +263,5 @@ class Station:
                 self.disk.correction, self.disk.frame_changed = correction, frame_changed
             case Deliver() | Report():
                 pass
+            case _:
+                assert_never(effect)

@@ -121,8 +121,8 @@ class Overheard:
             case Records(batches):
                 for batch in batches:
                     yield from self._records(batch, t)
-            case _:
-                for correction in corrections_of(envelope):
+            case CorrectionBatch(corrections):
+                for correction in corrections:
                     applied = self._heard.correction(correction, t)
                     if applied is not None:
                         yield applied

@@ -8,7 +8,7 @@ import pytest
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.corrections import correction_of
-from flocc_agent.core.pose_graph import AbsoluteFix, GraphSolution, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import AbsoluteFix, ClosureState, GraphSolution, LoopClosure, PoseGraph, Trajectory
 from flocc_protocol.ids import KeyframeId, LogId, Term
 
 A, B = LogId("a"), LogId("b")
@@ -62,3 +62,12 @@ def test_the_plain_graph_has_covariances() -> None:
     solution = optimise(PLAIN, BackendConfig(), None)
     assert isinstance(solution, GraphSolution)
     assert all(S is not None for component in solution.components for S in component.covariance_map_odom.values())
+
+
+@pytest.mark.parametrize("name", ["a closure over 10,000 km", "a closure of scale 1e9"])
+def test_a_closure_longer_than_any_registration_is_refused_by_name(name: str) -> None:
+    solution = optimise(EXTREMES[name], BackendConfig(formulation=Formulation.BASE, solver=Solver.LM), None)
+    assert isinstance(solution, GraphSolution)
+    assert [c.state for c in solution.closures] == [*[ClosureState.USED] * 4, ClosureState.EXCLUDED]
+    assert "closure a/4 - b/4" in solution.closures[4].reason
+    assert "is longer than" in solution.closures[4].reason

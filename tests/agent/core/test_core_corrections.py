@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import LISTED_MAX, Corrections, pose7
+from flocc_agent.core.corrections import LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import GossipParameters
@@ -13,7 +13,7 @@ from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused
 from flocc_agent.core.robot import Restored
-from flocc_agent.geometry import pose
+from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
@@ -33,8 +33,8 @@ def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> 
 
 
 def delivered(effects: list[Effect]) -> list[tuple[int, int, bool]]:
-    found = [e.correction for e in effects if isinstance(e, Deliver)]
-    return [(c.term.counter, c.round, c.frame_changed) for c in found]
+    found = [e for e in effects if isinstance(e, Deliver)]
+    return [(e.correction.term.counter, e.correction.round, e.frame_changed) for e in found]
 
 
 def solution(shift_m: float = 0.0, keyframes: int = 3) -> GraphSolution:

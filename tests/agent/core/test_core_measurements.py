@@ -1,5 +1,7 @@
 """Claims on measurements: each belongs to its keyframe, waits for it, and is refused with a reason where it cannot."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from tests.agent.core.virtual_time import Robots, answer
@@ -212,3 +214,13 @@ def test_a_bearing_and_range_becomes_a_position_with_its_spread_along_and_across
     assert isinstance(record, RobotBearingRecord)
     np.testing.assert_allclose(record.position_m.numpy(), [10.0, 0.0, 0.0])
     np.testing.assert_allclose(record.covariance_m2.numpy(), np.diag([0.25, 0.01, 0.01]).ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["TagSighting", "RobotSighting", "RobotBearing", "GeodeticFix"])
+def test_a_kind_of_measurement_touches_at_most_four_source_files(kind: str) -> None:
+    """Simulated sensors and the positions' file format aside, which name some kinds for reasons of their own."""
+    roots = [
+        Path(__file__).parents[3] / root for root in ("protocol", "agent/flocc_agent/core", "agent/flocc_agent/backend")
+    ]
+    touched = [path for root in roots for path in root.rglob("*.py") if kind in path.read_text(encoding="utf-8")]
+    assert 3 <= len(touched) <= 4, touched

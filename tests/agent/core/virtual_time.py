@@ -6,7 +6,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -28,9 +27,10 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
 from flocc_agent.core.robot import Restored, Robot
-from flocc_agent.geometry import pose
+from flocc_agent.geometry import pose, pose7
 from flocc_launch.simulation.rigid_alignment import align
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
@@ -151,7 +151,7 @@ class Robots:
         found: dict[str, str] = {}
         for _, name, effect in self.done:
             if isinstance(effect, Deliver):
-                found[name] = effect.correction.map_frame
+                found[name] = map_frame(effect.correction.anchor)
         return {name: found[name] for name in sorted(found) if name in self.cores}
 
     def _send(self, sender: str, receiver: str, message: Message) -> None:

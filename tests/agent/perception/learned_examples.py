@@ -12,7 +12,7 @@ from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, Regis
 from flocc_agent.geometry import inverse
 from flocc_agent.perception.classical.procedural import random_texture
 from flocc_agent.perception.learned import build
-from flocc_agent.perception.learned.files import WEIGHT_FILES, weights_folder
+from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, weights_folder
 
 Float = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from flocc_agent.perception.classical.matching import mutual_matches
 from flocc_agent.perception.classical.patches import dense_patches
 from flocc_agent.perception.classical.procedural import HEIGHT, WIDTH, random_scene, random_view
 from flocc_agent.perception.classical.training import train
-from flocc_agent.perception.multiview.parameters import Geometry
 from flocc_agent.perception.multiview.picture import undistorted
 from flocc_agent.perception.multiview.two_view import TwoView, two_view
+from flocc_agent.perception.multiview.view_parameters import Geometry
 
 CAMERA = Camera(WIDTH, HEIGHT, 300.0, 300.0, WIDTH / 2, HEIGHT / 2)
 

@@ -26,18 +26,18 @@ class Board:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class BoardScene:
     """Boards from far to near before an even background."""
 
     boards: tuple[Board, ...]
     background: float
 
 
-def random_scene(rng: np.random.Generator) -> Scene:
+def random_scene(rng: np.random.Generator) -> BoardScene:
     """Draw a scene of 10 to 40 boards."""
     count = int(rng.integers(10, 40))
     boards = tuple(random_board(rng, k / count) for k in range(count))
-    return Scene(boards, rng.uniform(40, 200))
+    return BoardScene(boards, rng.uniform(40, 200))
 
 
 def random_board(rng: np.random.Generator, nearness: float) -> Board:
@@ -51,7 +51,7 @@ def random_board(rng: np.random.Generator, nearness: float) -> Board:
     return Board(random_texture(rng), corners @ rotation(angle_rad).T + centre, 0.3 + nearness)
 
 
-def random_view(scene: Scene, rng: np.random.Generator) -> NDArray[np.uint8]:
+def random_view(scene: BoardScene, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Render a scene (240, 320) uint8 from a random place nearby, in random light, with blur and noise."""
     shift_px = rng.uniform(-1, 1, 2) * [45, 15]
     skew = rng.normal(0, 0.03, (2, 2)) + np.eye(2)

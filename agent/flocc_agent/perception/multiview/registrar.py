@@ -27,9 +27,9 @@ from flocc_agent.perception.latent import BadLatent
 from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, evidence_of, evidence_of_neighbour
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
-from flocc_agent.perception.multiview.parameters import Geometry, Matched, Rays
 from flocc_agent.perception.multiview.three_view import three_view
 from flocc_agent.perception.multiview.two_view import TwoView, two_view
+from flocc_agent.perception.multiview.view_parameters import Geometry, LocalFeatures, Matched
 from flocc_agent.stages import stage
 
 BASELINE_MIN_M = 1e-3
@@ -42,7 +42,7 @@ LENGTH_MIN = 0.1
 ODOMETRY_PAIRS_MAX = 256
 """Odometry-pair results kept in memory, some 30 kB each."""
 
-F = TypeVar("F", bound=Rays)
+F = TypeVar("F", bound=LocalFeatures)
 Result = Registration | RegistrationFailed
 
 

@@ -11,7 +11,7 @@ Matched = tuple[Indices, Indices]
 """Indices (K,) into the features of the first and of the second image, ascending in the first."""
 
 
-class Rays(Protocol):
+class LocalFeatures(Protocol):
     """Local features as the geometry sees them."""
 
     @property

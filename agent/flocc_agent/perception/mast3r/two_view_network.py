@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from flocc_agent.perception.mast3r.blocks import AttentionKind, DecoderBlock, EncoderBlock, layer_norm
-from flocc_agent.perception.mast3r.dpt import Head
+from flocc_agent.perception.mast3r.dpt import DptHead
 from flocc_agent.perception.mast3r.rope import Rotation, grid_rotation
 from flocc_agent.perception.mast3r.sizes import FULL, LOCAL_DIMENSION, PATCH_PX, Mast3rSizes
+from flocc_agent.perception.mast3r.transformer_blocks import AttentionKind, DecoderBlock, EncoderBlock, layer_norm
 
 Grid = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class DenseView:
     """Dense outputs of one view, float32.
 
     Attributes:
@@ -35,7 +35,7 @@ class View:
     desc_conf: Tensor
 
 
-def postprocess(dense: Tensor, local: Tensor) -> View:
+def postprocess(dense: Tensor, local: Tensor) -> DenseView:
     """Turn raw head outputs into points, descriptors and confidences.
 
     Args:
@@ -47,7 +47,7 @@ def postprocess(dense: Tensor, local: Tensor) -> View:
     direction = dense[..., :3]
     length = direction.norm(dim=-1, keepdim=True)
     desc = local[..., :LOCAL_DIMENSION]
-    return View(
+    return DenseView(
         pts3d=direction / length.clamp(min=1e-8) * torch.expm1(length),
         conf=1.0 + dense[..., 3].exp(),
         desc=desc / desc.norm(dim=-1, keepdim=True),
@@ -112,8 +112,8 @@ class Mast3r(nn.Module):
         self.dec_blocks = nn.ModuleList([DecoderBlock(*decoder) for _ in range(sizes.decoder_depth)])
         self.dec_blocks2 = nn.ModuleList([DecoderBlock(*decoder) for _ in range(sizes.decoder_depth)])
         self.dec_norm = layer_norm(sizes.decoder_dim)
-        self.downstream_head1 = Head(sizes)
-        self.downstream_head2 = Head(sizes)
+        self.downstream_head1 = DptHead(sizes)
+        self.downstream_head2 = DptHead(sizes)
 
     def encode(self, images: Tensor) -> Tensor:
         """Compute latents, the tensors after `enc_norm`.
@@ -156,7 +156,7 @@ class Mast3r(nn.Module):
 
     def heads(
         self, tokens_1: Sequence[Tensor], grid_1: Grid, tokens_2: Sequence[Tensor], grid_2: Grid
-    ) -> tuple[View, View]:
+    ) -> tuple[DenseView, DenseView]:
         """Dense outputs of both views from their token lists."""
         dtype = self.downstream_head1.head_local_features.fc1.weight.dtype
         raw_1 = self.downstream_head1([tokens.to(dtype) for tokens in tokens_1], grid_1)
@@ -172,7 +172,7 @@ class Mast3r(nn.Module):
 
     def decode(
         self, latent_1: Tensor, size_1: tuple[int, int], latent_2: Tensor, size_2: tuple[int, int]
-    ) -> tuple[View, View]:
+    ) -> tuple[DenseView, DenseView]:
         """Decode two latents together; both views' points are in view 1's camera frame.
 
         Args:

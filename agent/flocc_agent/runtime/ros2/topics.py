@@ -19,7 +19,7 @@ _ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")
 _TOKEN_CHUNKS = 13
 
 
-class Role(Enum):
+class EntityRole(Enum):
     """What an entity of the graph does with its topic."""
 
     PUBLISHES = "MP"
@@ -88,7 +88,7 @@ class Node:
         """Liveliness token of the node."""
         return f"{self._place(0)}/NN/{self._name()}"
 
-    def endpoint_token(self, number: int, role: Role, topic: Topic) -> str:
+    def endpoint_token(self, number: int, role: EntityRole, topic: Topic) -> str:
         """Liveliness token of a publisher or subscription; numbers are unique within the session and not 0."""
         described = f"{mangled(topic.name)}/{dds_type(topic.type)}/{topic.hash}/{topic.qos}"
         return f"{self._place(number)}/{role.value}/{self._name()}/{described}"
@@ -112,13 +112,13 @@ class Offer:
 
 def offers_of(domain_id: int) -> str:
     """Key expression of the tokens of all publishers of a domain."""
-    return f"{TOKENS}/{domain_id}/*/*/*/{Role.PUBLISHES.value}/**"
+    return f"{TOKENS}/{domain_id}/*/*/*/{EntityRole.PUBLISHES.value}/**"
 
 
 def read_offer(token: str) -> Offer | None:
     """Read the token of a publisher; None for any other."""
     chunks = token.split("/")
-    if len(chunks) != _TOKEN_CHUNKS or chunks[0] != TOKENS or chunks[5] != Role.PUBLISHES.value:
+    if len(chunks) != _TOKEN_CHUNKS or chunks[0] != TOKENS or chunks[5] != EntityRole.PUBLISHES.value:
         return None
     node = f"{chunks[7].replace('%', '/').rstrip('/')}/{chunks[8]}"
     return Offer(node, chunks[9].replace("%", "/"), _ros_type(chunks[10]), chunks[11])

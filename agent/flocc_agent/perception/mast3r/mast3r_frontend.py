@@ -28,7 +28,6 @@ from flocc_agent.perception.mast3r.device import (
     require_memory,
 )
 from flocc_agent.perception.mast3r.engine import Engine, LatentOnDevice
-from flocc_agent.perception.mast3r.matching import MatchParameters
 from flocc_agent.perception.mast3r.pair import (
     PairResult,
     disagreement_rad,
@@ -36,8 +35,8 @@ from flocc_agent.perception.mast3r.pair import (
     register_pair,
 )
 from flocc_agent.perception.mast3r.payload import (
-    Geometry,
     Payload,
+    PixelGeometry,
     jpeg_of,
     read_payload,
     sooner_part,
@@ -52,6 +51,7 @@ from flocc_agent.perception.mast3r.preprocess import (
     resized,
     without_distortion,
 )
+from flocc_agent.perception.mast3r.reciprocal_matching import MatchParameters
 from flocc_agent.perception.mast3r.relative_pose import PnpParameters, PoseFailed
 from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
 from flocc_agent.perception.mast3r.weights import load_cosplace, load_mast3r
@@ -153,11 +153,11 @@ class Mast3rEncoder:
         """
         return sooner_part(latent, encode_bytes)
 
-    def _framed(self, image: Image) -> tuple[Geometry, NDArray[np.uint8]]:
+    def _framed(self, image: Image) -> tuple[PixelGeometry, NDArray[np.uint8]]:
         """Undistort, resize and cut an image, and carry its calibration along."""
         image = without_distortion(image)
         crop = plan_crop(image.camera.width, image.camera.height, self._config.image_size_px)
-        return Geometry(crop, crop.K(image.camera.K())), resized(image.pixels, crop)
+        return PixelGeometry(crop, crop.K(image.camera.K())), resized(image.pixels, crop)
 
 
 class Mast3rRegistrar:
@@ -210,7 +210,7 @@ class Mast3rRegistrar:
             None if odometry_pair is None else odometry_pair.confidence,
         )
 
-    def _read(self, data: bytes) -> tuple[Geometry, LatentOnDevice]:
+    def _read(self, data: bytes) -> tuple[PixelGeometry, LatentOnDevice]:
         """Read a payload, and encode it where it is a picture."""
         payload = read_payload(data, self._model, self._engine.channels)
         size = (payload.geometry.crop.height, payload.geometry.crop.width)
@@ -234,7 +234,7 @@ class Mast3rRegistrar:
         return latent
 
     def _register_pairs(
-        self, pairs: Sequence[tuple[tuple[Geometry, LatentOnDevice], tuple[Geometry, LatentOnDevice]]]
+        self, pairs: Sequence[tuple[tuple[PixelGeometry, LatentOnDevice], tuple[PixelGeometry, LatentOnDevice]]]
     ) -> list[PairResult]:
         """Decode and register pairs; uncalibrated ones are decoded in both orders for both focal lengths."""
         forward = [(first[1], second[1]) for first, second in pairs]
@@ -250,7 +250,7 @@ class Mast3rRegistrar:
 
     def _inconsistency(
         self,
-        pair: tuple[tuple[Geometry, LatentOnDevice], tuple[Geometry, LatentOnDevice]],
+        pair: tuple[tuple[PixelGeometry, LatentOnDevice], tuple[PixelGeometry, LatentOnDevice]],
         result: PairResult,
     ) -> PoseFailed | None:
         """Compare with the decode in the other order."""

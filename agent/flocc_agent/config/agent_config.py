@@ -11,9 +11,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, PlainSerializer, model_validator
 
 from flocc_agent.config.backend import BackendConfig
+from flocc_agent.config.emulated_radio import RadioConfig
 from flocc_agent.config.network import MetricsConfig, TransportConfig
 from flocc_agent.config.perception import PerceptionConfig
-from flocc_agent.config.radio import RadioConfig
 from flocc_agent.config.ros2 import Ros2Config
 from flocc_agent.config.section import Section, parsed_change, put_value, read_json, read_toml, validated
 from flocc_agent.core.parameters import INNER, CoreParameters

@@ -7,8 +7,8 @@ from flocc_agent.perception.classical.encoder import decode_features
 from flocc_agent.perception.classical.features import Features
 from flocc_agent.perception.classical.matching import mutual_matches
 from flocc_agent.perception.multiview.acceptance import Acceptance, Needed
-from flocc_agent.perception.multiview.parameters import Geometry, Matched
 from flocc_agent.perception.multiview.registrar import PairRegistrar
+from flocc_agent.perception.multiview.view_parameters import Geometry, Matched
 
 DISTANCE_RATIO_MAX = 0.8
 """Lowe's ratio, as in his paper: lower keeps fewer and surer matches."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.lenses import CameraModel
-from flocc_agent.lenses.names import with_distortion
+from flocc_agent.lenses.lens_names import with_distortion
 from flocc_agent.runtime.pictures import PictureError, Size, decoded
 
 Pixels = NDArray[Any]

@@ -5,55 +5,47 @@ Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend import iterate_own_block, optimise_graph
-from flocc_agent.config import AgentConfig, BackendConfig, BackendMode, PerceptionConfig, RadioConfig, Ros2Config
-from flocc_agent.core.blocks import BlockProblem, BlockStep
-from flocc_agent.core.effects import Correction
-from flocc_agent.core.interfaces import (
-    Camera,
-    Describer,
-    Encoder,
-    Image,
-    OdometryPair,
-    PictureEncoder,
-    Registrar,
-)
+from flocc_agent.backend import build_iterator, build_optimiser
+from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
+from flocc_agent.core.corrected import Correction
+from flocc_agent.core.interfaces import Camera, Image, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
-from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
-from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import is_rigid
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
-from flocc_agent.runtime.driver import Driver, Skills
+from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
+from flocc_agent.runtime.facts import KilledByOrder
+from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
+from flocc_agent.runtime.network_faults import network_faults
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
-from flocc_agent.stages import stage
-from flocc_protocol.arrays import Array
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
@@ -61,92 +53,12 @@ from flocc_protocol.keys import Admin
 if TYPE_CHECKING:
     from flocc_agent.runtime.ros2.adapter import Ros2Adapter
 
+logger = logging.getLogger(__name__)
+
 Float = NDArray[np.float64]
 
 KILL_AFTER_S = 0.2
 """Time for the answer to an operator's order to leave."""
-
-Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
-
-
-@dataclass(frozen=True, slots=True)
-class EncodedImage:
-    """An image's place descriptor (int8) and its latent."""
-
-    descriptor: Array
-    latent: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Perception:
-    """A perception back-end, whole."""
-
-    describer: Describer
-    encoder: Encoder
-    registrar: Registrar
-
-    def encode(self, image: Image) -> EncodedImage:
-        """Describe and encode one image, once per keyframe."""
-        with stage("describe"):
-            descriptor = Array.int8(self.describer.describe(image))
-        with stage("encode"):
-            return EncodedImage(descriptor, self.encoder.encode(image))
-
-    def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
-        """Give what is sent of a stored latent; see `PictureEncoder.part`."""
-        return self.encoder.part(latent, encode_bytes) if isinstance(self.encoder, PictureEncoder) else latent
-
-    def encode_s(self) -> float | None:
-        """Tell how long encoding a received picture takes, seconds; None where pictures are not wanted."""
-        return self.encoder.encode_s if isinstance(self.encoder, PictureEncoder) else None
-
-    def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
-        """Register the match's latent with the query's."""
-        return self.registrar.register(query, match, odometry)
-
-
-def build_perception(config: PerceptionConfig, seed: int = 0) -> Perception:
-    """Make the configured perception back-end.
-
-    Raises:
-        FloccError: A checkpoint or an extra is missing.
-    """
-    match config.method:
-        case "classical":
-            from flocc_agent.perception.classical import ClassicalDescriber, ClassicalEncoder, classical_registrar
-
-            classical = config.classical
-            return Perception(
-                ClassicalDescriber(classical), ClassicalEncoder(classical), classical_registrar(classical)
-            )
-        case "synthetic":
-            from flocc_agent.perception.synthetic import SyntheticPerception
-
-            synthetic = SyntheticPerception(config.synthetic, seed)
-            return Perception(synthetic, synthetic, synthetic)
-        case "recorded":
-            from flocc_agent.perception.recorded import RecordedPerception
-
-            recorded = RecordedPerception(config.recorded)
-            return Perception(recorded, recorded, recorded)
-        case "mast3r":
-            from flocc_agent.perception.mast3r import build
-
-            return Perception(*build(config.mast3r))
-        case "learned":
-            from flocc_agent.perception.learned import build as build_learned
-
-            return Perception(*build_learned(config.learned))
-
-
-def build_optimiser(config: BackendConfig) -> Optimiser:
-    """Make the pose-graph optimiser; it can be sent to a worker process."""
-    return partial(optimise_graph, config)
-
-
-def build_iterator(config: BackendConfig) -> Callable[[BlockProblem], BlockStep | OptimisationFailed]:
-    """Make what iterates on a robot's block in distributed mode; it can be sent to a worker process."""
-    return partial(iterate_own_block, config)
 
 
 class Agent:
@@ -167,6 +79,7 @@ class Agent:
         T_body_camera: Float | None = None,
         on_report: Callable[[Reported[Fact]], None] | None = None,
         clock_s: Callable[[], float] | None = None,
+        perception: Perception | None = None,
     ) -> None:
         """Prepare an agent; `async with` starts it.
 
@@ -176,6 +89,7 @@ class Agent:
             T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
             on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
             clock_s: Seconds since the start of the run; None counts from now.
+            perception: What it sees with; None builds what `config.perception` names.
 
         Raises:
             FloccError: The recording, the store, a checkpoint or the network cannot be used.
@@ -184,6 +98,7 @@ class Agent:
         self.config = config
         self._on_report = on_report or (lambda _: None)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
+        self._perception = perception
         self._recording = _recording(config)
         self._camera = self._recording.camera if self._recording else camera
         given = np.eye(4) if T_body_camera is None else T_body_camera
@@ -194,6 +109,7 @@ class Agent:
         self._store: Store | None = None
         self._run: asyncio.Task[None] | None = None
         self._playing: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._ros2: Ros2Adapter | None = None
         self._bridging: asyncio.Task[None] | None = None
         self._radio: Radio | None = None
@@ -216,6 +132,7 @@ class Agent:
         except BaseException:
             await self._close()
             raise
+        self._looking = asyncio.create_task(self._look_at_network())
         if self._recording is not None:
             self._playing = asyncio.create_task(self._play(self._recording))
         if self._ros2 is not None:
@@ -226,14 +143,20 @@ class Agent:
         """Hand over, close everything; an error of the loop is raised here."""
         assert self._run is not None
         self.stop()
-        if self._playing is not None:
-            self._playing.cancel()
+        for task in (self._playing, self._looking):
+            if task is not None:
+                task.cancel()
         try:
             await self._run
             fed = [task for task in (self._playing, self._bridging) if task is not None]
             await asyncio.gather(*fed, return_exceptions=True)
         finally:
             await self._close()
+
+    async def _look_at_network(self) -> None:
+        """Say once what of the configured network is not there; the agent goes on trying."""
+        for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
+            logger.warning("%s: %s", self.config.name, fault)
 
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.
@@ -339,7 +262,7 @@ class Agent:
             for task in done:
                 task.result()
 
-    def result(self) -> dict[str, Any] | None:
+    def result(self) -> RobotResult | None:
         """What this robot knows (`result.json`), None before it started."""
         return None if self._driver is None else self._driver.result()
 
@@ -353,15 +276,18 @@ class Agent:
         if self._workers is not None:
             self._workers.slowdown = max(factor, 1.0)
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> AgentStatus:
         """What the agent does now, for tables and dashboards."""
         status = self._started.status()
         playing = self._playing is not None and not self._playing.done()
         failure = None if self._store is None else self._store.failure
-        disk = None if failure is None else str(failure)
-        refused = {**status["refused"], **(self._ros2.counters() if self._ros2 is not None else {})}
-        busy = status["busy"] or playing
-        return {**status, "refused": refused, "playing": playing, "busy": busy, "disk_failure": disk}
+        changed = {
+            "refused": {**status.refused, **(self._ros2.counters() if self._ros2 is not None else {})},
+            "playing": playing,
+            "busy": status.busy or playing,
+            "disk_failure": None if failure is None else str(failure),
+        }
+        return status.model_copy(update=changed)
 
     @property
     def _started(self) -> Driver:
@@ -379,7 +305,6 @@ class Agent:
         )
         if config.ros2 is not None:
             self._ros2 = self._adapter(config.ros2)
-        perception = build_perception(config.perception, config.seed)
         restored = restore(self._store)
         log = self._store.identity.log
         boot = int.from_bytes(os.urandom(6))
@@ -391,34 +316,28 @@ class Agent:
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
         )
-        transport.serve_admin(Admin.STATUS, lambda _: json.dumps({**self.status(), **self._evidence()}).encode())
+        transport.serve_admin(Admin.STATUS, self._answer_status)
         if config.transport.chaos:
             transport.serve_admin(Admin.CHAOS, self._disturb)
-        return Driver(
-            core,
-            transport,
-            self._store,
+        tools = Tools(
+            self._perception or build_perception(config.perception, config.seed),
+            build_optimiser(config.backend),
+            build_iterator(config.backend),
             self._workers,
-            Skills(
-                perception.encode,
-                perception.register,
-                build_optimiser(config.backend),
-                build_iterator(config.backend),
-                perception.part,
-                perception.encode_s,
-            ),
-            Reporter(config.name, self._T_body_camera, config.backend.steepness),
-            self._on_report,
+            self._store,
+            transport,
             self._clock_s,
         )
+        return Driver(
+            core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
+        )
 
-    def _evidence(self) -> dict[str, Any]:
-        """What an operator may want to know of maps that have not merged."""
+    def _answer_status(self, _: bytes) -> bytes:
+        """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        return {
-            "compute_class": self.config.compute_class,
-            **evidence_of(driver.robot, self.config.core, driver.last_solution),
-        }
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
+        status = self.status().model_dump(mode="json")
+        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""
@@ -433,6 +352,7 @@ class Agent:
         if order.kind == "slow" and order.value is not None:
             self.set_slowness(order.value)
         if order.kind == "kill":
+            self._on_report(Reported(self._clock_s(), self.config.name, KilledByOrder()))
             asyncio.get_running_loop().call_later(KILL_AFTER_S, os.kill, os.getpid(), signal.SIGKILL)
         return b"done"
 
@@ -444,8 +364,11 @@ class Agent:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
 
         def measure(stamped: Stamped, frame_s: float) -> None:
-            measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
-            self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            try:
+                measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+                self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            except BadMeasurement as error:
+                logger.warning("robot %s: %s; left out", self.config.name, error)
 
         await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
 
@@ -459,6 +382,7 @@ class Agent:
             lambda *keyframe: self._started.add_keyframe(*keyframe),
             lambda T_body_camera: self._started.mount_camera(T_body_camera),
             lambda: self._started.corrected_bodies(),
+            lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
             report,
         )
         return Ros2Adapter(config, self.config.name, self._selector, host)
@@ -478,7 +402,7 @@ class BadKeyframe(FloccError):
     """A keyframe that cannot be used; the agent goes on without it."""
 
 
-def stored_result(config: AgentConfig) -> dict[str, Any]:
+def stored_result(config: AgentConfig) -> RobotResult:
     """What a robot knew when it was killed (`result.json`), from its store."""
     recording = _recording(config)
     T_body_camera = np.eye(4) if recording is None else recording.T_body_camera

@@ -1,0 +1,146 @@
+"""Descent to the nearest optimum of weighted squares: Gauss-Newton steps, shortened, then damped.
+
+Closures carry weights in [0, 1] that multiply their information; odometry and fixes always weigh 1. A closure of
+weight 0 takes no part at all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from flocc_agent.backend.edges import Edges, Jacobians, Residuals, State, jacobians, residuals
+from flocc_agent.backend.linear import LinearSolver, SingularSystem
+from flocc_agent.config import BackendConfig
+
+Float = NDArray[np.float64]
+
+DAMPING_MIN, DAMPING_MAX = 1.0, 1e12
+DAMPING_FACTOR = 10.0
+LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Parts of a step that are tried before it is damped: they cost residuals, damping costs a linear system and holds back
+the softest motions most, which are those that long chains need."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """Where a solver stopped.
+
+    Attributes:
+        state: The best state.
+        weights: (E,) robust weight of each edge.
+        cost: Sum of half squared weighted residuals, scale priors included.
+        iterations: Linear systems solved.
+        converged: Whether the stop rule was met before the iterations ran out.
+    """
+
+    state: State
+    weights: Float
+    cost: float
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """What is minimised: edges, which of them are closures, and how its linear systems are solved."""
+
+    edges: Edges
+    closures: slice
+    linear: LinearSolver
+    config: BackendConfig
+
+    def cost(self, state: State, weights: Float, hold: bool) -> float:
+        """Sum of half squared residuals, weighted, with the priors of cluster scales."""
+        return self.cost_at(residuals(self.edges, state, hold), state, weights)
+
+    def cost_at(self, at: Residuals, state: State, weights: Float) -> float:
+        """The cost of residuals that are already there."""
+        prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
+        return float(0.5 * (weights @ at.squared() + prior))
+
+    def truncated_cost(self, state: State) -> float:
+        """The cost in which no closure counts more than one at its bound: what robust solvers are compared by."""
+        at = residuals(self.edges, state)
+        squared = at.squared()
+        squared[self.closures] = np.minimum(squared[self.closures], self.bounds())
+        prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
+        return float(0.5 * (np.sum(squared) + prior))
+
+    def closure_residuals(self, state: State) -> Float:
+        """Squared residuals (L,) of the closures."""
+        return residuals(self.edges, state, hold=False).squared()[self.closures]
+
+    def weights(self, of_closures: Float | float = 1.0) -> Float:
+        """Weights (E,) of all edges, given those of the closures."""
+        out = np.ones(len(self.edges))
+        out[self.closures] = of_closures
+        return out
+
+    def bounds(self) -> Float:
+        """Squared residual (L,) below which a right closure lies with the configured probability.
+
+        A free scale takes one of the six degrees of freedom.
+        """
+        free = (self.edges.sigma[self.closures] > 0) | (self.edges.cluster[self.closures] >= 0)
+        return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - self.config.inlier_probability))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Point:
+    """A state, its residuals and its cost."""
+
+    state: State
+    at: Residuals
+    cost: float
+
+
+def descend(
+    objective: Objective, state: State, weights: Float, steps_max: int | None = None, hold: bool = False
+) -> Solved:
+    """Go down for given weights until the cost rests, or so many linear systems are solved."""
+    budget = objective.config.iterations_max if steps_max is None else steps_max
+    here, damping, solves = _point(objective, state, weights, hold), 0.0, 0
+    while solves < budget:
+        jac = jacobians(objective.edges, here.at)
+        while True:
+            solves += 1
+            there = _lower(objective, here, jac, weights, damping, hold)
+            if there.cost <= here.cost:
+                break
+            if _is_finished(objective.config, here.cost, there.cost - here.cost):
+                return Solved(here.state, weights, here.cost, solves, True)
+            if solves >= budget or damping >= DAMPING_MAX:
+                return Solved(here.state, weights, here.cost, solves, False)
+            damping = max(damping * DAMPING_FACTOR, DAMPING_MIN)
+        decrease, here = here.cost - there.cost, there
+        if _is_finished(objective.config, here.cost, decrease):
+            return Solved(here.state, weights, here.cost, solves, True)
+        damping = 0.0 if damping <= DAMPING_MIN else damping / DAMPING_FACTOR**2
+    return Solved(here.state, weights, here.cost, solves, False)
+
+
+def _point(objective: Objective, state: State, weights: Float, hold: bool) -> Point:
+    at = residuals(objective.edges, state, hold)
+    return Point(state, at, objective.cost_at(at, state, weights))
+
+
+def _lower(objective: Objective, here: Point, jac: Jacobians, weights: Float, damping: float, hold: bool) -> Point:
+    """The first of the shortened steps that goes down, or the least bad of them; infinite cost where there is none."""
+    try:
+        delta = objective.linear.step(objective.edges, here.state, here.at, jac, weights, damping)
+    except SingularSystem:
+        return Point(here.state, here.at, np.inf)
+    best = Point(here.state, here.at, np.inf)
+    for length in LENGTHS:
+        there = _point(objective, here.state.retract(length * delta), weights, hold)
+        if there.cost < best.cost:
+            best = there
+        if best.cost <= here.cost or _is_finished(objective.config, here.cost, best.cost - here.cost):
+            break
+    return best
+
+
+def _is_finished(config: BackendConfig, cost: float, change: float) -> bool:
+    return change <= max(config.relative_tolerance * cost, config.absolute_tolerance)

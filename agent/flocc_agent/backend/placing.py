@@ -1,0 +1,99 @@
+"""Robots that ended in the wrong place, and where their rejected closures would put them.
+
+A robot that few closures hold may be placed by a wrong one that came first, or be left alone: its shape is right, its
+place is not. So every body (a robot, or robots that used closures join) is asked: is there a rigid motion with which
+more of its closures agree than are used now? Where there is one, the solver starts again from there.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend.alignment import PairAlignment, align_pair, rays_from, travelled_m
+from flocc_agent.backend.edges import State
+from flocc_agent.backend.problem import Problem
+from flocc_agent.core.pose_graph import LoopClosure, Trajectory, components_of
+from flocc_agent.geometry import quaternions
+from flocc_protocol.ids import LogId
+
+Bool = NDArray[np.bool_]
+Float = NDArray[np.float64]
+
+AGREEING_MIN = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """A body moved: the state, and the closures (L,) that would be used there."""
+
+    body: frozenset[LogId]
+    state: State
+    chosen: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Proposes placements for one component."""
+
+    problem: Problem
+    trajectories: Mapping[LogId, Trajectory]
+    closures: Mapping[int, LoopClosure]
+    steepness: float
+
+    def proposals(self, state: State, chosen: Bool) -> Iterator[Placement]:
+        """Placements with which more closures agree than are used, for closures (L,) that are chosen at a state."""
+        T = self._poses(state)
+        path_m = {log: travelled_m(trajectory) for log, trajectory in self.trajectories.items()}
+        for body in self._bodies(chosen):
+            found = self._aligned(body, T, path_m)
+            if found is None:
+                continue
+            crossing = self._crossing(body)
+            agreeing = np.isin(self.problem.closure_ids, found.agreeing)
+            if np.count_nonzero(agreeing & ~chosen) == 0:
+                continue
+            if np.count_nonzero(agreeing) > np.count_nonzero(chosen & crossing):
+                yield Placement(body, self._moved(state, body, found.T_a_b), (chosen & ~crossing) | agreeing)
+
+    def _poses(self, state: State) -> dict[LogId, Float]:
+        T, offsets = state.poses(), self.problem.offsets
+        return {log: T[offsets[log] : offsets[log] + len(self.trajectories[log])] for log in self.problem.logs}
+
+    def _bodies(self, chosen: Bool) -> list[frozenset[LogId]]:
+        """Parts that chosen closures join, where there are several, then robots alone; not the whole."""
+        logs = self.problem.logs
+        used = [self.closures[k] for k, on in zip(self.problem.closure_ids, chosen, strict=True) if on]
+        groups = [frozenset(group) for group in components_of(logs, used)]
+        bodies = [*(groups[1:] if len(groups) > 1 else ()), *(frozenset((log,)) for log in logs)]
+        return list(dict.fromkeys(bodies))
+
+    def _crossing(self, body: frozenset[LogId]) -> Bool:
+        """Closures (L,) between a body and the rest."""
+        ends = [self.closures[k] for k in self.problem.closure_ids]
+        return np.array([(c.query.log in body) != (c.match.log in body) for c in ends], dtype=bool)
+
+    def _aligned(
+        self, body: frozenset[LogId], T: Mapping[LogId, Float], path_m: Mapping[LogId, Float]
+    ) -> PairAlignment | None:
+        ids = [k for k, on in zip(self.problem.closure_ids, self._crossing(body), strict=True) if on]
+        if len(ids) < AGREEING_MIN:
+            return None
+        ends = {}
+        for k in ids:
+            query, match = self.closures[k].query, self.closures[k].match
+            ends[k] = (match, query) if query.log in body else (query, match)
+        rays = rays_from(ids, self.closures, ends, T, path_m, self.steepness)
+        found = align_pair(replace(rays, travelled_a_m=np.zeros(len(ids))), HYPOTHESES_MAX)
+        return found if len(found.agreeing) >= AGREEING_MIN else None
+
+    def _moved(self, state: State, body: frozenset[LogId], T_move: Float) -> State:
+        T = state.poses()
+        for log in body:
+            rows = slice(self.problem.offsets[log], self.problem.offsets[log] + len(self.trajectories[log]))
+            T[rows] = T_move @ T[rows]
+        return State(quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), state.scale)
+
+
+HYPOTHESES_MAX = 200
