@@ -7,14 +7,15 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from tests.agent.perception.plugin_folder import install
 
 from flocc_agent.config import PerceptionConfig
-from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, Registrar
+from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.core.registration import RegistrationFailed
+from flocc_agent.perception.backends import build_perception
 from flocc_protocol.records import UnknownRecord, decode_record
 
 ROOT = Path(__file__).parents[1]
@@ -144,22 +145,20 @@ def test_a_report_touches_two_files_as_the_recipe_says(tmp_path: Path) -> None:
     assert line == {"t": 7.5, "robot": "r1", "event": "rounds_failing", "term": "3:r1", "failures": 1}
 
 
-def test_the_front_end_of_the_recipe_is_one() -> None:
+def test_the_front_end_of_the_recipe_is_chosen_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", recipe("Add a front end"), re.DOTALL)
-    names: dict[str, Any] = {}
-    exec(code, names)  # the page's own block
-    built = names["build"](PerceptionConfig(), 0)
-    describer: Describer = built.describer
-    encoder: Encoder = built.encoder
-    registrar: Registrar = built.registrar
+    (entry,) = re.findall(r'"flocc.perception"\]\n\s*(\w+) = "([\w:]+)"', recipe("Add a front end"))
+    (tmp_path / "grey_eyes.py").write_text(code, encoding="utf-8")
+    install(tmp_path, *entry)
+    monkeypatch.syspath_prepend(tmp_path)
+    perception = build_perception(PerceptionConfig(method="grey"))
     camera = Camera(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
     image = Image(np.full((48, 64, 3), 90, np.uint8), camera)
-    descriptor = describer.describe(image)
-    assert descriptor.shape == (describer.dimension,)
-    assert descriptor.dtype == np.dtype(np.float32)
+    descriptor = perception.describer.describe(image)
+    assert descriptor.shape == (perception.describer.dimension,)
     assert np.linalg.norm(descriptor) == pytest.approx(1.0)
-    latent = encoder.encode(image)
-    assert isinstance(registrar.register(latent, latent, None), RegistrationFailed)
+    latent = perception.encode(image)
+    assert isinstance(perception.register(latent, latent, None), RegistrationFailed)
 
 
 @pytest.mark.parametrize("title", ["Add a record", "Add a message", "Add a report"])

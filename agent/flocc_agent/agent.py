@@ -11,7 +11,7 @@ import signal
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,17 @@ from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
+from flocc_agent.runtime.facts import KilledByOrder
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
+from flocc_agent.runtime.network_faults import network_faults
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
@@ -106,6 +109,7 @@ class Agent:
         self._store: Store | None = None
         self._run: asyncio.Task[None] | None = None
         self._playing: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._ros2: Ros2Adapter | None = None
         self._bridging: asyncio.Task[None] | None = None
         self._radio: Radio | None = None
@@ -128,6 +132,7 @@ class Agent:
         except BaseException:
             await self._close()
             raise
+        self._looking = asyncio.create_task(self._look_at_network())
         if self._recording is not None:
             self._playing = asyncio.create_task(self._play(self._recording))
         if self._ros2 is not None:
@@ -138,14 +143,20 @@ class Agent:
         """Hand over, close everything; an error of the loop is raised here."""
         assert self._run is not None
         self.stop()
-        if self._playing is not None:
-            self._playing.cancel()
+        for task in (self._playing, self._looking):
+            if task is not None:
+                task.cancel()
         try:
             await self._run
             fed = [task for task in (self._playing, self._bridging) if task is not None]
             await asyncio.gather(*fed, return_exceptions=True)
         finally:
             await self._close()
+
+    async def _look_at_network(self) -> None:
+        """Say once what of the configured network is not there; the agent goes on trying."""
+        for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
+            logger.warning("%s: %s", self.config.name, fault)
 
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.
@@ -251,7 +262,7 @@ class Agent:
             for task in done:
                 task.result()
 
-    def result(self) -> dict[str, Any] | None:
+    def result(self) -> RobotResult | None:
         """What this robot knows (`result.json`), None before it started."""
         return None if self._driver is None else self._driver.result()
 
@@ -324,9 +335,9 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        evidence = evidence_of(driver.robot, self.config.core, driver.last_solution)
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
         status = self.status().model_dump(mode="json")
-        return json.dumps({**status, "compute_class": self.config.compute_class, **evidence}).encode()
+        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""
@@ -341,6 +352,7 @@ class Agent:
         if order.kind == "slow" and order.value is not None:
             self.set_slowness(order.value)
         if order.kind == "kill":
+            self._on_report(Reported(self._clock_s(), self.config.name, KilledByOrder()))
             asyncio.get_running_loop().call_later(KILL_AFTER_S, os.kill, os.getpid(), signal.SIGKILL)
         return b"done"
 
@@ -390,7 +402,7 @@ class BadKeyframe(FloccError):
     """A keyframe that cannot be used; the agent goes on without it."""
 
 
-def stored_result(config: AgentConfig) -> dict[str, Any]:
+def stored_result(config: AgentConfig) -> RobotResult:
     """What a robot knew when it was killed (`result.json`), from its store."""
     recording = _recording(config)
     T_body_camera = np.eye(4) if recording is None else recording.T_body_camera

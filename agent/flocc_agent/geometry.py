@@ -187,19 +187,22 @@ def poses_from_tq(tq: Float) -> Float:
     return T
 
 
-def tq_from_poses(T: Float) -> Float:
-    """Rows (N, 7) of poses (N, 4, 4): translation x y z, unit quaternion w x y z, w not negative."""
-    m = T[:, :3, :3]
-    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+def quaternions(R: Float) -> Float:
+    """Unit quaternions (N, 4), w first and not negative, of rotations (N, 3, 3); stable at every angle."""
+    xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], axis=1)
-    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    wx, wy, wz = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
     s0, s1, s2, s3 = squares.T
     rows = np.array([[s0, wx, wy, wz], [wx, s1, xy, xz], [wy, xy, s2, yz], [wz, xz, yz, s3]])
-    largest = np.argmax(squares, axis=1)
-    q_wxyz = rows[largest, :, np.arange(len(T))]
-    q_wxyz *= np.where(q_wxyz[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
-    return np.concatenate([T[:, :3, 3], q_wxyz], axis=1)
+    q = rows[np.argmax(squares, axis=1), :, np.arange(len(R))]
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(np.where(q[:, :1] < 0, -q, q))
+
+
+def tq_from_poses(T: Float) -> Float:
+    """Rows (N, 7) of poses (N, 4, 4): translation x y z, unit quaternion w x y z, w not negative."""
+    return np.concatenate([T[:, :3, 3], quaternions(T[:, :3, :3])], axis=1)
 
 
 def tq_from_pose(T: Float) -> Float:

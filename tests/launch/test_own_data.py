@@ -57,7 +57,7 @@ def test_keyframes_are_closer_where_robots_move_little(own: Path) -> None:
     assert keyframes.distance_m == pytest.approx(PASSES * 3.0 / 3 / 25, abs=0.01)
     assert len(told) == 1
     assert "cut by time into 3 robots; a keyframe every 0.12 m, because" in told[0]
-    assert told[0].endswith("odometry is made of ground truth, with seeded drift")
+    assert told[0].endswith("odometry is made of ground truth, with seeded drift as of wheeled")
 
 
 def test_a_folder_of_data_sets_is_a_robot_each(own: Path, tmp_path: Path) -> None:

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend import rotations
 from flocc_agent.backend.clusters import cluster_labels
 from flocc_agent.backend.edges import NO_CLUSTER, Edges
 from flocc_agent.config import BackendConfig, Formulation, ScaleInitial
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.core.registration import closure_probability
-from flocc_agent.geometry import inverse
+from flocc_agent.geometry import inverse, quaternions
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -85,7 +84,7 @@ def plain_edges(i: Int, j: Int, T_hat: Float, L: Float) -> Edges:
     """Edges with a metric measurement (E, 4, 4) and square-root information (E, 6, 6)."""
     d = np.zeros((len(i), 6))
     d[:, 3:] = np.einsum("eji,ej->ei", T_hat[:, :3, :3], T_hat[:, :3, 3])
-    return Edges(i, j, rotations.quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(len(i)), np.full(len(i), NO_CLUSTER))
+    return Edges(i, j, quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(len(i)), np.full(len(i), NO_CLUSTER))
 
 
 def sqrt_informations(covariances: Float) -> Float:

@@ -21,14 +21,24 @@ def judged(
     counts = (result.correspondences, result.odometry_correspondences)
     if isinstance(result, RegistrationFailed):
         return RejectionRecord(query, match, result.failure.value, *counts)
+    if result.judged_ratio is not None:
+        return _recorded(query, match, result, result.judged_ratio)
     ratio = match_ratio(*counts)
-    if not result.is_judged and result.correspondences < limits.correspondences_min:
+    if result.correspondences < limits.correspondences_min:
         return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
-    if not result.is_judged and ratio < limits.match_ratio_threshold:
+    if ratio < limits.match_ratio_threshold:
         return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
+    return _recorded(query, match, result, ratio)
+
+
+def _recorded(
+    query: KeyframeId, match: KeyframeId, result: Registration, ratio: float
+) -> ClosureRecord | RejectionRecord:
+    """The record of an accepted registration, or of why no log may hold it."""
     try:
         return _closure(query, match, result, ratio)
     except ValueError as error:
+        counts = (result.correspondences, result.odometry_correspondences)
         return RejectionRecord(query, match, f"no closure: {error}", *counts)
 
 
@@ -52,8 +62,8 @@ def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: 
 
 def told(record: ClosureRecord | RejectionRecord, by: LogId) -> ClosureAccepted | ClosureRejected:
     """An accepted or refused registration, for people; `by` is the log that its record stands in."""
-    ratio = round(match_ratio(record.correspondences, record.odometry_correspondences), 4)
     if isinstance(record, RejectionRecord):
+        ratio = round(match_ratio(record.correspondences, record.odometry_correspondences), 4)
         return ClosureRejected(
             query=record.query,
             match=record.match,
@@ -68,7 +78,7 @@ def told(record: ClosureRecord | RejectionRecord, by: LogId) -> ClosureAccepted 
         match=record.match,
         correspondences=record.correspondences,
         odometry_correspondences=record.odometry_correspondences,
-        ratio=ratio,
+        ratio=round(record.match_ratio, 4),
         by=by.robot,
         scale_initial=record.scale_initial,
     )

@@ -28,7 +28,7 @@ class NeighbourParameters:
 
     __pydantic_config__ = _FORBID
 
-    heartbeat_period_s: float = 0.5
+    heartbeat_period_s: float = _inner(0.5)
     """Time between heartbeats; shorter notices a lost robot sooner and costs more bytes."""
     timeout_s: float = 3.0
     """A robot that was silent for this long is out of range; six periods ride through 30 % loss."""

@@ -50,15 +50,22 @@ class AccountKept:
 
 @fact("agent_died")
 class AgentDied:
-    """An agent ended without being asked to.
+    """An agent ended, but not in order.
 
     Attributes:
         signal: That ended it.
         exit_code: With which it ended, where no signal did.
+        scripted: A fault of the scenario killed it.
     """
 
     signal: int | str | None = None
     exit_code: int | None = None
+    scripted: bool = False
+
+
+@fact("killed_by_order")
+class KilledByOrder:
+    """An operator's `flocc chaos kill` ends the agent now."""
 
 
 @fact("agent_stopped")

@@ -23,6 +23,10 @@ REFUSED = (
     (re.compile(rb"\xff\x0a|\0\0\0\x0cJXL "), "JPEG XL"),
     (re.compile(rb"\x76\x2f\x31\x01"), "OpenEXR"),
     (re.compile(rb"RIFF....AVI ", re.DOTALL), "an AVI video"),
+    (re.compile(rb"II\+\0|MM\0\+"), "BigTIFF"),
+    (re.compile(rb"P7\s"), "PAM"),
+    (re.compile(rb"#\?RADIANCE|#\?RGBE"), "Radiance HDR"),
+    (re.compile(rb"\0\0\x01\0"), "an icon"),
     (re.compile(rb"8BPS"), "a Photoshop file"),
     (re.compile(rb"\x93NUMPY"), "a numpy array"),
     (re.compile(rb"FUJIFILMCCD-RAW|II\x55\0|IIRO|IIRS"), "a camera's raw file"),
@@ -45,6 +49,7 @@ class PictureHead:
         height: As it is stored.
         bits: Per channel.
         orientation: EXIF's, 1 (as stored) to 8.
+        largest: Value of white where the file says it (PNM), else None.
     """
 
     format: str
@@ -52,6 +57,7 @@ class PictureHead:
     height: int
     bits: int = 8
     orientation: int = 1
+    largest: int | None = None
 
     @property
     def is_turned(self) -> bool:
@@ -180,7 +186,9 @@ def _pnm(data: Encoded) -> PictureHead:
     if kind in (5, 6):
         pixel_bytes = (3 if kind == 6 else 1) * (2 if largest > 255 else 1)
         _whole(len(data) >= fields.end() + width * height * pixel_bytes)
-    return PictureHead("PNM", width, height, 16 if largest > 255 else 8)
+    return PictureHead(
+        "PNM", width, height, 16 if largest > 255 else 8, largest=largest if kind not in (1, 4) else None
+    )
 
 
 def _tiff(data: Encoded) -> PictureHead:

@@ -38,6 +38,8 @@ SAMPLE_MAX = 32
 VALUES_MAX = 20_000
 FLAT_LEVELS = 32
 """Pictures whose values, brought to 8 bits by their largest one, would use fewer levels than this are stretched."""
+CONTRAST_MIN = 16
+"""Fewer values than this are noise, which is not stretched."""
 BAD_RATIO_MAX = 0.1
 
 
@@ -76,7 +78,7 @@ def levels_of(pictures: Iterable[NDArray[np.uint16]]) -> Levels:
         return FULL
     white = next(2**bits - 1 for bits in BITS if top < 2**bits)
     low, high = (int(value) for value in np.percentile(np.concatenate(values), (0.5, 99.5)))
-    if (high - low) * 256 >= FLAT_LEVELS * (white + 1):
+    if high - low < CONTRAST_MIN or (high - low) * 256 >= FLAT_LEVELS * (white + 1):
         return Levels(0, white)
     margin = max((high - low) // 4, 1)
     return Levels(max(low - margin, 0), min(high + margin, 65535))
@@ -137,7 +139,15 @@ def decoded(encoded: Encoded, size: Size | None = None) -> Pixels:
         raise PictureError(f"the image cannot be read: it is a damaged {head.format}")
     if bgr.dtype not in (np.uint8, np.uint16):
         raise PictureError(f"the image has pixels of {bgr.dtype}; flocc reads 8 and 16 bits")
-    return _turned(bgr[..., ::-1], head, size)
+    return _turned(_to_full_range(bgr, head)[..., ::-1], head, size)
+
+
+def _to_full_range(pixels: Pixels, head: PictureHead) -> Pixels:
+    """Pixels whose file says that white is less than their type can hold, brought to the whole range."""
+    full = int(np.iinfo(pixels.dtype).max)
+    if head.largest in (None, full):
+        return pixels
+    return np.minimum(pixels.astype(np.uint64) * full // head.largest, full).astype(pixels.dtype)
 
 
 def size_fault(head: PictureHead, size: Size) -> str | None:

@@ -76,3 +76,61 @@ class AgentStatus(BaseModel):
     busy: bool = False
     playing: bool = False
     disk_failure: str | None = None
+
+
+class PairStatus(BaseModel):
+    """What came of the pairs of keyframes of two robots, as the logs that one robot holds tell.
+
+    Attributes:
+        robots: The two, sorted.
+        accepted: Pairs that became closures.
+        rejected: Pairs that were registered, or given up, and refused.
+        best_ratio: Best match ratio of those that were refused, Eq. (1).
+        reason: Why the best one was refused.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    robots: tuple[str, str]
+    accepted: int = 0
+    rejected: int = 0
+    best_ratio: float | None = None
+    reason: str | None = None
+
+
+class SolverStatus(BaseModel):
+    """What the last solution that a robot made used and warned of.
+
+    Attributes:
+        components: Robots of each part that closures join.
+        closures_used: Closures that the solver kept.
+        closures_rejected: All others.
+        warnings: Its first sentences.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    components: list[list[str]] = []
+    closures_used: int = 0
+    closures_rejected: int = 0
+    warnings: list[str] = []
+
+
+class MergeStatus(BaseModel):
+    """What a robot can tell an operator who asks why maps have not merged.
+
+    Attributes:
+        best_similarities: Robot -> best similarity of its keyframes with one of this robot, below the threshold too.
+        similarity_threshold: Of place recognition.
+        match_ratio_threshold: R_thr.
+        pairs: By two robots.
+        solver: Of the last own solution, None where it made none.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    best_similarities: dict[str, float] = {}
+    similarity_threshold: float | None = None
+    match_ratio_threshold: float | None = None
+    pairs: list[PairStatus] = []
+    solver: SolverStatus | None = None

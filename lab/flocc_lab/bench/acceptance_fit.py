@@ -13,6 +13,7 @@ import numpy as np
 
 from flocc_agent.core.registration import match_ratio
 from flocc_agent.perception.multiview.acceptance import (
+    NEVER,
     RATIO_CORRESPONDENCES_MIN,
     Acceptance,
     Evidence,
@@ -21,8 +22,8 @@ from flocc_agent.perception.multiview.acceptance import (
 )
 from flocc_lab.bench.acceptance_rows import ANGLES_DEG, AcceptanceRow
 
-ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 10_000)
-AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, 10_000)
+ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, NEVER)
+AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, NEVER)
 SIGMAS_DEG = (0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.7)
 WRONG_COST = 50
 """Right pairs that one wrong pair outweighs in the fit: at most 2 % wrong among the pairs that a step adds."""

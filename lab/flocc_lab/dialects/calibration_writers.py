@@ -43,6 +43,7 @@ class WriterForm:
         counts: Numbers of distortion coefficients that it can say of a pinhole.
         mounting: Whether it says `T_body_camera`.
         sized: Whether it says the size of the images.
+        sizes: Those that it can say; none means any.
     """
 
     name: str
@@ -51,6 +52,7 @@ class WriterForm:
     counts: tuple[int, ...] = (0, 4)
     mounting: bool = False
     sized: bool = True
+    sizes: tuple[tuple[int, int], ...] = ()
 
 
 def _list(values: Sequence[float] | Float) -> str:
@@ -495,6 +497,58 @@ def gyroflow(rig: Rig) -> str:
     return json.dumps({"camera_brand": "a", "calib_dimension": size, "fisheye_params": lens, "fps": 60.0})
 
 
+def vikit(rig: Rig) -> str:
+    """Write camera.yaml of rpg's vikit; ATAN with lengths relative to the size."""
+    m = rig.model
+    focal = _focal(m)
+    if m.kind is F:
+        focal = m.fx / m.width, m.fy / m.height, (m.cx + 0.5) / m.width, (m.cy + 0.5) / m.height
+    name = {P: "Pinhole", F: "ATAN", E: "EquidistantCamera"}[m.kind]
+    keys = "".join(f"cam_{key}: {value!r}\n" for key, value in zip(("fx", "fy", "cx", "cy"), focal, strict=True))
+    values = m.shape or _radtan(m, 4)
+    keys += "".join(f"cam_d{k}: {value!r}\n" for k, value in enumerate(values))
+    return f"cam_model: {name}\ncam_width: {m.width}\ncam_height: {m.height}\nscale: 0.5\n{keys}"
+
+
+def record3d(rig: Rig) -> str:
+    """Write the metadata of a capture of Record3D: the matrix by columns, and the poses of the phone."""
+    m = rig.model
+    poses = [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
+    return json.dumps({"w": m.width, "h": m.height, "K": m.K().T.ravel().tolist(), "fps": 60, "poses": poses})
+
+
+def spectacular(rig: Rig) -> str:
+    """Write calibration.json of SpectacularAI."""
+    m = rig.model
+    names = ("focalLengthX", "focalLengthY", "principalPointX", "principalPointY")
+    camera: dict[str, Any] = dict(zip(names, _focal(m), strict=True))
+    camera |= {"imageWidth": m.width, "imageHeight": m.height, "imuToCamera": inverse(rig.T_body_camera).tolist()}
+    camera |= {
+        "model": "kannala-brandt4" if m.kind is E else "brown-conrady",
+        "distortionCoefficients": list(_radtan(m, 4)),
+    }
+    return json.dumps({"cameras": [camera]})
+
+
+def zed(rig: Rig) -> str:
+    """Write SNxxxx.conf of a ZED camera, of which one section is of the images' size."""
+    m = rig.model
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    keys = "".join(f"{key}={value!r}\n" for key, value in zip(names, (*_focal(m), *_radtan(m, 5)), strict=True))
+    name = {(672, 376): "VGA", (1280, 720): "HD", (1920, 1080): "FHD"}[(m.width, m.height)]
+    other = "fx=1\nfy=1\ncx=1\ncy=1\nk1=0\n"
+    return f"[LEFT_CAM_2K]\n{other}\n[LEFT_CAM_{name}]\n{keys}\n[RIGHT_CAM_{name}]\n{other}\n[STEREO]\nBaseline=119.9\n"
+
+
+def nested(rig: Rig) -> str:
+    """Write the settings of a neural SLAM, with the camera somewhere inside (NICE-SLAM, MonoGS)."""
+    m = rig.model
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    keys = "".join(f"    {key}: {value!r}\n" for key, value in zip(names, (*_focal(m), *_radtan(m, 5)), strict=True))
+    size = f"    width: {m.width}\n    height: {m.height}\n    depth_scale: 5000.0\n    distorted: True\n"
+    return f"Results:\n  save_dir: out/a\nDataset:\n  type: tum\n  Calibration:\n{keys}{size}Training:\n  lr: 0.1\n"
+
+
 FORMS: dict[str, WriterForm] = {
     "flocc YAML": WriterForm("camera.yaml", flat, mounting=True),
     "flocc TOML": WriterForm("camera.toml", toml, mounting=True),
@@ -531,6 +585,11 @@ FORMS: dict[str, WriterForm] = {
     "OpenSfM, ODM": WriterForm("camera_models.json", opensfm, (P, E), (0, 4, 5)),
     "DepthAI": WriterForm("depthai.json", depthai, (P, E), (0, 4, 5, 8, 12, 14)),
     "Gyroflow": WriterForm("gyroflow.json", gyroflow, (E,)),
+    "vikit (SVO 1, FAST-LIVO)": WriterForm("pinhole.yaml", vikit, (P, E, F)),
+    "Record3D": WriterForm("metadata.json", record3d, counts=(0,)),
+    "SpectacularAI": WriterForm("spectacular.json", spectacular, (P, E), mounting=True),
+    "ZED": WriterForm("SN123.conf", zed, counts=(0, 4, 5), sizes=((672, 376), (1280, 720), (1920, 1080)), sized=False),
+    "NICE-SLAM, MonoGS": WriterForm("fr1_desk.yaml", nested, counts=(0, 4, 5)),
 }
 """Every form that is read, by the name that docs/data-sets.md has for it."""
 
@@ -550,6 +609,10 @@ REFUSED: dict[str, tuple[str, str]] = {
     "Meshroom": ("scene.sfm", '{"views": [], "intrinsics": [], "poses": []}'),
     "Bundler, VisualSFM": ("bundle.out", "# Bundle file v0.3\n1 1\n"),
     "COLMAP thin prism": ("cameras.txt", "1 THIN_PRISM_FISHEYE 640 480 500 500 320 240 0 0 0 0 0 0 0 0\n"),
+    "rs-enumerate-devices": (
+        "realsense.txt",
+        ' Intrinsic of "Color" / 640x480\n  PPX:  320.6\n  Distortion: Inverse Brown Conrady\n',
+    ),
     "ROS launch file": ("camera.launch", "<launch>\n<node pkg='a'/></launch>\n"),
 }
 """Forms that are refused by name, with a file of each."""

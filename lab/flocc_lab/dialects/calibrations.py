@@ -54,7 +54,8 @@ class DialectVerdict:
 
 def drawn_rig(form: WriterForm, rng: np.random.Generator) -> Rig:
     """A camera that a form can say."""
-    width, height = SIZES[rng.integers(len(SIZES))]
+    sizes = form.sizes or SIZES
+    width, height = sizes[rng.integers(len(sizes))]
     focal = float(np.round(width * rng.uniform(0.5, 1.2), 4))
     fx, fy = focal, float(np.round(focal * rng.uniform(0.98, 1.02), 4))
     cx, cy = (float(np.round(side * rng.uniform(0.45, 0.55), 3)) for side in (width, height))
@@ -166,7 +167,7 @@ FAULTS: dict[str, Fault] = {
     "a model that contradicts": _model_contradicts,
     "a mounting that is no pose": _not_rigid,
 }
-TEXTS = ("ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw")
+TEXTS = ("ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw", "ZED")
 
 
 def judged(name: str, fault: str | None, rng: np.random.Generator, folder: Path) -> DialectVerdict:

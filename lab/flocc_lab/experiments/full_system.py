@@ -34,8 +34,8 @@ from flocc_lab.experiments.statistics import grouped, middle, values, with_sprea
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.scenarios.recordings import cache_folder
 from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.setup.cache import cache_folder
 from flocc_launch.simulation.simulate import playbacks_of, run, swarm_of, write
 
 if TYPE_CHECKING:

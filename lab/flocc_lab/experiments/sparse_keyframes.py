@@ -25,9 +25,10 @@ from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.plots import COLOURS, drawn_values, from_zero, spread_line
 from flocc_lab.experiments.simulated import simulated
 from flocc_lab.experiments.statistics import grouped, middle, values, with_spread
-from flocc_launch.scenarios.recordings import cache_folder, recordings
+from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario, TracksScenario
 from flocc_launch.scenarios.shipped import read_scenario
+from flocc_launch.setup.cache import cache_folder
 from flocc_launch.simulation.simulate import playbacks_of
 
 if TYPE_CHECKING:

@@ -31,9 +31,10 @@ from flocc_lab.experiments.plots import COLOURS
 from flocc_lab.experiments.simulated import simulated
 from flocc_lab.experiments.statistics import grouped, middle
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.scenarios.recordings import cache_folder, recordings
+from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_scenario
+from flocc_launch.setup.cache import cache_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

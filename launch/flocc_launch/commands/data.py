@@ -1,6 +1,6 @@
 """Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -47,11 +47,13 @@ def add_data(app: typer.Typer) -> None:
 @dataset.command()
 def info(source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None) -> None:
     """Say what a data set holds, without writing anything."""
-    from flocc_launch.datasets.commands import info as look
-    from flocc_launch.datasets.commands import info_lines
+    from flocc_launch.datasets.commands import info_lines, infos
 
-    for name, value in info_lines(look(source, format_name, trajectory_format)):
-        typer.echo(f"{name:14} {value}")
+    for number, found in enumerate(infos(source, format_name, trajectory_format)):
+        if number:
+            typer.echo("")
+        for name, value in info_lines(found):
+            typer.echo(f"{name:14} {value}")
 
 
 @dataset.command()
@@ -124,14 +126,19 @@ def split(
     format_name: Format = None,
     camera: CameraFile = None,
     trajectory_format: TrajectoryFormat = None,
+    drift: Annotated[
+        str | None, typer.Option(help="What carried the camera, where odometry is made: handheld, wheeled, car, drone.")
+    ] = None,
     field_of_view: View = None,
 ) -> None:
     """Cut a data set by time into recordings of several robots; odometry that it lacks is made from ground truth."""
     from flocc_launch.datasets.commands import split as run
+    from flocc_launch.datasets.drift import checked_kind
 
+    kind = checked_kind(drift)
     with progress_bar("cutting") as progress:
         paths = run(
-            source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format,
+            source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format, kind=kind,
             view_deg=field_of_view, progress=progress,
         )  # fmt: skip
     for path in paths:
@@ -148,7 +155,7 @@ def status(
     from flocc_launch.setup.weight_files import status as look
 
     mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
-    for needed in (*look(mast3r), *look_at_learned()):
+    for needed in [*map(asdict, look(mast3r)), *map(asdict, look_at_learned())]:
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")

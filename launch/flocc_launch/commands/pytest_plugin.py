@@ -87,7 +87,8 @@ class ScenarioRunner:
         Raises:
             FloccError: The scenario cannot be used.
         """
-        from flocc_launch.scenarios.recordings import cache_folder, recordings
+        from flocc_launch.scenarios.recordings import recordings
+        from flocc_launch.setup.cache import cache_folder
         from flocc_launch.simulation.simulate import simulate
 
         read, folder = self._read(scenario, seed, changes), self._fresh()

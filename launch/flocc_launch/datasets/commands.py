@@ -13,17 +13,29 @@ from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
+from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.cut import cut
-from flocc_launch.datasets.detect import check_times, read_source
-from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
+from flocc_launch.datasets.detect import check_times, read_source, team_folder
+from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.video import (
+    WHAT_ODOMETRY,
+    convert_video,
+    is_video,
+    lens_beside,
+    odometry_beside,
+    read_head,
+)
 from flocc_launch.datasets.writer import Progress, write_source
 
 logger = logging.getLogger(__name__)
+
+ODOMETRY_MADE = "odometry_made.txt"
+"""In a recording: how its odometry was made of ground truth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +56,7 @@ class Info:
         faults: What is wrong with it, one sentence each.
         topics: Of a bag, with types and numbers of messages.
         notes: What was left out, or concluded where nothing said it.
+        robots: Of a bag, which topics belong together.
     """
 
     path: Path
@@ -59,6 +72,7 @@ class Info:
     faults: tuple[str, ...]
     topics: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
 
 
 def info(path: Path, format_name: str | None = None, form: str | None = None) -> Info:
@@ -74,6 +88,8 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
     """
     if is_bag(path):
         return _bag_info(path)
+    if is_video(path):
+        return _video_info(path)
     source = read_source(path, format_name, form=form)
     travelled = source.truth or source.odometry
     return Info(
@@ -115,6 +131,7 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
     yield "images", f"{found.images}, from {found.from_s:.3f} s to {found.to_s:.3f} s{covered}"
     if found.format == "bag":
         yield from (("topic", topic) for topic in found.topics)
+        yield from (("robot", robot) for robot in found.robots)
     else:
         yield "camera", "none" if camera is None else _told(camera)
         yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
@@ -131,6 +148,7 @@ def _told(camera: CameraModel) -> str:
 def _bag_info(path: Path) -> Info:
     with Bag(path) as bag:
         images = [topic.count for topic in bag.topics.values() if topic.type in IMAGE_TYPES and topic.count is not None]
+        robots, faults = _robots_of(Layout.of(bag))
         return Info(
             path=path,
             format="bag",
@@ -142,9 +160,65 @@ def _bag_info(path: Path) -> Info:
             odometry_poses=None,
             truth_poses=None,
             length_m=None,
-            faults=(bag.damage,) if bag.damage else (),
+            faults=((bag.damage,) if bag.damage else ()) + tuple(faults),
             topics=tuple(str(topic) for topic in bag.topics.values()),
+            robots=tuple(robots),
         )
+
+
+def _robots_of(layout: Layout) -> tuple[list[str], list[str]]:
+    """Which topics belong together, one sentence for each robot, and why a bag cannot be converted as it is."""
+    try:
+        robots = layout.robots()
+    except DatasetError as error:
+        return [], [str(error)]
+    sentences, faults = [], []
+    for robot in robots:
+        sentences.append(str(robot))
+        try:
+            layout.mounting(robot)
+        except DatasetError as error:
+            faults.append(str(error))
+    return sentences, faults
+
+
+def _video_info(path: Path) -> Info:
+    head, odometry, lens = read_head(path), odometry_beside(path), lens_beside(path)
+    trajectory = None if odometry is None else read_trajectory(odometry)[0]
+    lacks = [
+        *([f"{path}: {WHAT_ODOMETRY}"] if odometry is None else []),
+        *([f"{path}: intrinsics are missing; name a camera file with --camera"] if lens is None else []),
+    ]
+    return Info(
+        path=path,
+        format="video",
+        images=head.frames,
+        posed=None,
+        from_s=0.0,
+        to_s=head.frames / head.rate_hz if head.rate_hz > 0 else 0.0,
+        camera=lens.camera if lens else None,
+        odometry_poses=None if trajectory is None else len(trajectory),
+        truth_poses=None,
+        length_m=None if trajectory is None else trajectory.length_m(),
+        faults=tuple(lacks),
+    )
+
+
+def infos(path: Path, format_name: str | None = None, form: str | None = None) -> Iterator[Info]:
+    """Look at what a path holds: one data set, bag or video, or those of a team in a folder.
+
+    Raises:
+        DatasetError: Nothing that is known is there.
+    """
+    team = team_folder(path) if format_name is None else {}
+    if not team:
+        yield info(path, format_name, form)
+        return
+    for entry in team.values():
+        yield info(entry, None, form)
+    others = [entry.name for entry in sorted(path.iterdir()) if entry not in team.values() and entry.name[0] != "."]
+    if others:
+        logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
 
 
 def convert(
@@ -162,6 +236,7 @@ def convert(
     every: int = 1,
     jpeg: bool = False,
     form: str | None = None,
+    robot: str | None = None,
     view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -181,6 +256,7 @@ def convert(
         every: Of a bag, keeps one image of so many.
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
         view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
@@ -191,14 +267,30 @@ def convert(
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
     if is_bag(path):
-        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg, form=form)
+        options = BagOptions(
+            image_topic,
+            odometry_topic,
+            camera,
+            odometry,
+            truth,
+            every,
+            jpeg,
+            form=form,
+            robot=robot,
+            view_rad=None if view_deg is None else math.radians(view_deg),
+        )
         return convert_bag(path, out, options, progress)
+    if is_video(path):
+        for note in convert_video(path, out, camera, odometry, form, every, progress):
+            logger.warning("%s", note)
+        return out
     source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
     _tell(source)
     identity = _identity("convert", path, source, drift, seed)
     given = None if odometry is None else _given_odometry(source, odometry, form)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
+    _note_drift(out, drift if given is None else None)
     _complain(source, out, len(source.images))
     return out
 
@@ -214,6 +306,7 @@ def split(
     format_name: str | None = None,
     camera: Path | None = None,
     form: str | None = None,
+    kind: DriftKind | None = None,
     view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -227,7 +320,8 @@ def split(
         out: Gets one folder per robot: alpha, bravo, charlie.
         robots: How many parts.
         seed: Of the drift; each robot has its own.
-        drift: Makes odometry from the ground truth; None takes the data set's own, else `HANDHELD_DRIFT`.
+        drift: Makes odometry from the ground truth; None takes the data set's own, else `needed_drift`.
+        kind: What carried the camera, where odometry is made; None tells it by the data set and the motion.
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
@@ -245,16 +339,36 @@ def split(
     _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
-    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift, seed)
+    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift or needed_drift(source, kind), seed)
     folders = []
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, drift or needed_drift(part), rng)
+        spec = drift or needed_drift(part, kind)
+        moved = _odometry(part, spec, rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
+        _note_drift(out / name, spec)
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
+
+
+def needed_drift(source: Source, kind: DriftKind | None = None) -> DriftSpec | None:
+    """How odometry is made of ground truth where a data set has none of its own; None where it has.
+
+    Args:
+        source: The data set, or a robot's part of it.
+        kind: What carried the camera; None tells it by the data set and the motion.
+    """
+    if source.odometry is not None or source.truth is None:
+        return None
+    return fitted(kind or kind_of(source.format, source.truth), source.truth.length_m())
+
+
+def _note_drift(recording: Path, spec: DriftSpec | None) -> None:
+    """Say in a recording how its odometry was made, for the report of a run."""
+    if spec is not None:
+        (recording / ODOMETRY_MADE).write_text(summary(spec) + "\n", encoding="utf-8")
 
 
 def _viewed(source: Source, view_deg: float | None) -> Source:
@@ -262,11 +376,6 @@ def _viewed(source: Source, view_deg: float | None) -> Source:
     if view_deg is None or source.lens is None:
         return source
     return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
-
-
-def needed_drift(source: Source) -> DriftSpec | None:
-    """How odometry is made of ground truth where a data set has none of its own."""
-    return HANDHELD_DRIFT if source.odometry is None and source.truth is not None else None
 
 
 def _tell(source: Source) -> None:

@@ -17,6 +17,7 @@ from flocc_launch.datasets.folders import (
 )
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
+from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder
 from flocc_launch.datasets.pixels import size_of, usable_images
 from flocc_launch.datasets.plain import is_plain, read_plain
@@ -61,7 +62,9 @@ def detect_format(path: Path) -> str:
     other = kind_of_folder(path) if path.is_dir() else kind_of_file(path)
     if other is not None:
         raise DatasetError(f"{path}: {other}")
-    inside = [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry)] if path.is_dir() else []
+    inside = (
+        [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry) or is_bag(entry)] if path.is_dir() else []
+    )
     raise DatasetError(
         f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
         f"(odometry.tum or groundtruth.tum) and camera.yaml; {_what_is_there(path)}"
@@ -81,6 +84,24 @@ def _what_is_there(path: Path) -> str:
 def is_dataset(path: Path) -> bool:
     """Whether a reader knows what a folder is."""
     return path.is_dir() and _known_format(path) is not None
+
+
+def team_folder(path: Path) -> dict[str, Path]:
+    """Data sets, bags and videos in a folder that is none itself, by the robot's name; empty where it is one.
+
+    Raises:
+        DatasetError: Two would have one name.
+    """
+    if not path.is_dir() or is_bag(path) or is_dataset(path):
+        return {}
+    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    found: dict[str, Path] = {}
+    for folder in (entry for entry in entries if is_bag(entry) or is_dataset(entry) or is_video(entry)):
+        name = robot_name(folder.stem if folder.is_file() else folder.name)
+        if name in found:
+            raise DatasetError(f"{folder}: its robot would be called {name}, as that of {found[name]}")
+        found[name] = folder
+    return found
 
 
 def _known_format(path: Path) -> str | None:

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,7 +17,11 @@ from flocc_launch.datasets.source import DatasetError, Lens
 T = TypeVar("T")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
-CAMERA_FILES = ("camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "intrinsics.yaml", "sensor.yaml")
+CAMERA_FILES = (
+    "camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "intrinsics.yaml",
+    "intrinsics.yml", "sensor.yaml", "camera_info.yaml", "camchain.yaml", "ost.yaml", "camera.json", "calibration.json",
+    "intrinsics.json", "cameras.txt", "camera.txt", "intrinsics.txt", "calibration.txt", "ost.txt", "camera_matrix.csv",
+)  # fmt: skip
 
 
 def unequal(folder: Path, images: int, stamps_file: Path, stamps: int, poses: int) -> tuple[str, ...]:
@@ -111,5 +116,10 @@ def camera_file(
     path: Path, images: Sequence[tuple[float, Path]] = (), size: tuple[int, int] | None = None
 ) -> Lens | None:
     """The camera that a file in a folder describes, or None; a file without a size takes that of the images."""
-    file = next((path / name for name in CAMERA_FILES if (path / name).exists()), None)
-    return None if file is None else read_lens(file, size_of(images) if images else size)
+    files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+    files += sorted(path.glob("*-camchain.yaml")) if path.is_dir() else []
+    if not files:
+        return None
+    lens = read_lens(files[0], size_of(images) if images else size)
+    others = ", ".join(file.name for file in files[1:])
+    return replace(lens, notes=(*lens.notes, f"{files[0]}: was taken as the camera, not {others}")) if others else lens

@@ -186,7 +186,7 @@ def rejected_all(loaded: LoadedRun, a: str, b: str) -> Finding | None:
         "registrations-rejected",
         f"All {len(rejected)} registrations between {a} and {b} were rejected ({'; '.join(reasons)}); "
         f"the best match ratios{limit} are {examples}.",
-        "If these pairs do show one place, lower core.loop_closing.match_ratio_threshold or use the mast3r back-end; "
+        "If these pairs do show one place, use the learned or the mast3r front end, which see further; "
         "else raise core.place_recognition.similarity_threshold to save the work.",
         a,
         b,

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from flocc_agent.core.reports import ClosureAccepted, PeerRefused, RoundSolved
 from flocc_agent.runtime.event_lines import UnknownFact, of_kind
 from flocc_agent.runtime.facts import AgentDied, BytesCounted
 from flocc_agent.stages import BOUNDS_S
+from flocc_launch.datasets.commands import ODOMETRY_MADE
 from flocc_launch.report.accounts import links_of, stages_by_robot, stages_of
 from flocc_launch.report.model import (
     Closures,
@@ -22,12 +24,26 @@ from flocc_launch.report.model import (
     TrackError,
 )
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
+from flocc_launch.runs.timeline import (
+    corrections_of,
+    deaths_unasked,
+    ends,
+    how_it_died,
+    leader_changes,
+    merged_after_s,
+    terms_led,
+)
 from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.runs.version import flocc_version
 
 Float = NDArray[np.float64]
+
+
+def _odometry_made(recordings: Mapping[str, str]) -> dict[str, str]:
+    """What recordings say of odometry that was made; one that is no longer there says nothing."""
+    files = {robot: Path(folder) / ODOMETRY_MADE for robot, folder in recordings.items()}
+    return {robot: file.read_text(encoding="utf-8").strip() for robot, file in files.items() if file.is_file()}
 
 
 def build(loaded: LoadedRun) -> RunReport:
@@ -45,6 +61,7 @@ def build(loaded: LoadedRun) -> RunReport:
         duration_s=loaded.end_s,
         wall_s=run.wall_s,
         robots=list(loaded.robots),
+        odometry_made=_odometry_made(run.recordings),
         map_frames=frames,
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
@@ -68,6 +85,7 @@ def build(loaded: LoadedRun) -> RunReport:
         optimisations=optimisations_part(loaded),
         expectations=[],
         robot_details=robots,
+        deaths_unasked=deaths_unasked(loaded.events),
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
@@ -250,5 +268,6 @@ def measured(report: RunReport, registered: Mapping[str, int]) -> dict[str, floa
         "bytes_max": sum(report.bytes.values()),
         "wall_max_s": report.wall_s,
         "leader": leader,
+        "deaths_max": len(report.deaths_unasked),
         "leader_registered_ratio_min": None if leader is None or not closures else registered.get(leader, 0) / closures,
     }

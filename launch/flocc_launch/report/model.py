@@ -5,7 +5,7 @@ The keys that other programs rely on stand in DESIGN.md section 8, all of them i
 
 from pydantic import Field
 
-from flocc_launch.runs.run_records import Record
+from flocc_agent.runtime.robot_result import Record
 
 SCHEMA_VERSION = 1
 
@@ -152,6 +152,8 @@ class RunReport(Record):
     """Length of the run on its own clock."""
     wall_s: float | None
     robots: list[str]
+    odometry_made: dict[str, str] = Field(default_factory=dict)
+    """Robot -> how its odometry was made of ground truth, where its data set had none."""
     map_frames: list[str]
     """Frames at the end, each named once; a robot that was never corrected adds none."""
     merged_after_s: float | None
@@ -185,4 +187,6 @@ class RunReport(Record):
     optimisations: Optimisations
     expectations: list[Expectation]
     robot_details: list[RobotReport]
+    deaths_unasked: list[str] = Field(default_factory=list)
+    """Robots whose agents died without a fault of the scenario or an operator's order, once for each death."""
     warnings: list[str]

@@ -14,7 +14,7 @@ from flocc_agent.core.reports import (
     NeighbourUp,
 )
 from flocc_agent.runtime.event_lines import Reported, is_of, of_kind
-from flocc_agent.runtime.facts import AgentDied, AgentStopped
+from flocc_agent.runtime.facts import AgentDied, AgentStopped, KilledByOrder
 
 Events = Iterable[Reported[Fact]]
 End = Reported[AgentDied] | Reported[AgentStopped]
@@ -156,3 +156,9 @@ def how_it_died(event: Reported[AgentDied]) -> str:
     if event.fact.exit_code is None:
         return "no reason known"
     return f"exit code {event.fact.exit_code}; robots/{event.robot}/agent.log says why"
+
+
+def deaths_unasked(events: Events) -> list[str]:
+    """Robots that died without a fault of the scenario or an operator's order, once for each death, in order."""
+    ordered = {event.robot for event in of_kind(events, KilledByOrder)}
+    return [e.robot for e in of_kind(events, AgentDied) if not e.fact.scripted and e.robot not in ordered]

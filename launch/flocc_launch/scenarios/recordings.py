@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,18 +10,13 @@ from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, SensorsScenario, TracksScenario, WorldScenario
 from flocc_launch.scenarios.sensors import sense
+from flocc_launch.setup.cache import cache_folder
 
 if TYPE_CHECKING:
     from flocc_launch.scenarios.walks import Walk
 
 RECORDING_FILES = ("images.txt", "odometry.tum", "camera.toml")
 Progress = Callable[[int, int], None]
-
-
-def cache_folder() -> Path:
-    """Where generated data is kept: FLOCC_CACHE, or flocc's folder in the user's cache."""
-    given = os.environ.get("FLOCC_CACHE")
-    return Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "flocc"
 
 
 def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str, Path]:
@@ -40,7 +34,7 @@ def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str
         made = _tracks(scenario.tracks)
     found = {f"r{i + 1}": path for i, path in enumerate(made)}
     given = {
-        name: _recording(robot.recording, progress, seed)
+        name: _recording(robot.recording, progress, seed, name)
         for seed, (name, robot) in enumerate(scenario.robots.items())
         if robot.recording is not None
     }
@@ -82,26 +76,37 @@ def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:
 def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
     from flocc_launch.datasets.bag_reader import is_bag
     from flocc_launch.datasets.commands import split
+    from flocc_launch.datasets.video import is_video
 
-    source = _recording(dataset.source, progress) if is_bag(dataset.source) else dataset.source.resolve()
-    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed}")
-    return split(source, out, dataset.robots, seed=dataset.seed, progress=progress)
+    is_stream = is_bag(dataset.source) or is_video(dataset.source)
+    source = _recording(dataset.source, progress) if is_stream else dataset.source.resolve()
+    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed} {dataset.drift}")
+    return split(source, out, dataset.robots, seed=dataset.seed, kind=dataset.drift, progress=progress)
 
 
-def _recording(path: Path, progress: Progress | None, seed: int = 0) -> Path:
-    """The folder itself where it is a recording, else one made of the data set or bag; `seed` is that of drift."""
+def _recording(path: Path, progress: Progress | None, seed: int = 0, robot: str | None = None) -> Path:
+    """The folder itself where it is a recording, else one made of the data set, bag or video.
+
+    Args:
+        path: Where the data is.
+        progress: Called with images done and images in all.
+        seed: Of drift.
+        robot: Whose part of a bag of several robots is taken.
+    """
     from flocc_launch.datasets.bag_reader import is_bag
     from flocc_launch.datasets.commands import convert, needed_drift
     from flocc_launch.datasets.detect import read_source
     from flocc_launch.datasets.source import DatasetError
+    from flocc_launch.datasets.video import is_video
 
     if all((path / name).exists() for name in RECORDING_FILES):
         return path
-    out = _dataset_folder(path.resolve(), f"whole {seed}")
-    if not is_bag(path):
+    if not is_bag(path) and not is_video(path):
+        out = _dataset_folder(path.resolve(), f"whole {seed}")
         return convert(path, out, drift=needed_drift(read_source(path)), seed=seed, progress=progress)
+    out = _dataset_folder(path.resolve(), f"whole {robot}")
     try:
-        return convert(path, out, progress=progress)
+        return convert(path, out, progress=progress, robot=robot)
     except DatasetError as error:
         raise DatasetError(f"{error}; make a recording with 'flocc dataset convert', and run that") from error
 

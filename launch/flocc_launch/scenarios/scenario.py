@@ -27,6 +27,7 @@ from flocc_agent.config import (
     validated,
 )
 from flocc_agent.core.parameters import CoreParameters
+from flocc_launch.datasets.drift import DriftKind
 from flocc_protocol.ids import checked_name
 
 RobotName = Annotated[str, AfterValidator(checked_name)]
@@ -80,6 +81,8 @@ class DatasetScenario(Section):
     """Pieces it is cut into."""
     seed: int = Field(7, ge=0)
     """Seed of the odometry drift."""
+    drift: DriftKind | None = None
+    """What carried the camera, where odometry is made: handheld, wheeled, car or drone; None tells it by the data."""
 
 
 class TracksScenario(Section):
@@ -256,6 +259,8 @@ class Expectations(Section):
     """Who leads at the end."""
     leader_registered_ratio_min: float | None = Field(None, ge=0, le=1)
     """Share of the accepted closures that the leader of the end registered."""
+    deaths_max: int = Field(0, ge=0)
+    """Agents that died without a fault of the scenario or an operator's order."""
 
     def limits(self) -> dict[str, float | str]:
         """What was asked for, by name."""

@@ -91,7 +91,7 @@ class Swarm:
         if station.running:
             station.kill()
             self._fetcher.forget(name)
-            self.report(name, AgentDied(signal=9))
+            self.report(name, AgentDied(signal=9, scripted=True))
 
     def leave(self, name: str) -> None:
         """A robot stops in order."""

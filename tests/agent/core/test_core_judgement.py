@@ -39,12 +39,12 @@ def test_few_correspondences_are_refused_whatever_their_ratio() -> None:
 
 
 def test_what_its_front_end_judged_needs_no_ratio() -> None:
-    few = replace(GOOD, correspondences=18, is_judged=True)
+    few = replace(GOOD, correspondences=18, judged_ratio=1.2)
 
     record = judged(QUERY, MATCH, few, LIMITS)
 
     assert isinstance(record, ClosureRecord)
-    assert record.match_ratio == 0.18
+    assert (record.match_ratio, record.correspondences) == (1.2, 18)
 
 
 def test_a_failed_registration_is_refused_with_its_reason() -> None:

@@ -150,6 +150,18 @@ def test_a_thermal_cameras_narrow_range_is_stretched() -> None:
     assert np.ptp(levels.eight_bits(thermal)) > 130
 
 
+@pytest.mark.parametrize(("largest", "kind"), [(4095, ">u2"), (1023, ">u2"), (127, "u1")])
+def test_white_is_what_a_pnm_says(largest: int, kind: str) -> None:
+    values = (GREY.astype(np.float64) * largest / 255).round().astype(kind)
+    found = read_picture(b"P5\n%d %d\n%d\n" % (WIDTH, HEIGHT, largest) + values.tobytes())
+    np.testing.assert_allclose(found[..., 0].astype(int), GREY.astype(int), atol=2)
+
+
+def test_black_pictures_stay_black() -> None:
+    assert levels_of([np.zeros((4, 4), np.uint16)]) == Levels(0, 255)
+    assert levels_of([np.full((4, 4), 300, np.uint16)]) == Levels(0, 1023)
+
+
 def write_pictures(folder: Path, count: int, suffix: str = ".jpg", pixels: NDArray[Any] = RGB) -> list[Path]:
     folder.mkdir(exist_ok=True)
     files = [folder / f"{k:03d}{suffix}" for k in range(count)]

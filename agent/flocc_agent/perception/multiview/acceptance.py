@@ -24,6 +24,8 @@ RATIO_CORRESPONDENCES_MIN = 20
 ROTATION_AGREES_RAD = float(np.radians(5.0))
 """Both pairs' rotations are right within 1 to 3 degrees where they are right at all."""
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
+NEVER = 100_000
+"""More correspondences than any picture has features."""
 
 
 class OdometryNeighbour(Enum):
@@ -104,17 +106,21 @@ class Acceptance:
 
     def accepts(self, evidence: Evidence) -> bool:
         """Whether the evidence suffices."""
-        if self.has_ratio(evidence):
-            return True
+        return self.ratio(evidence) >= 1.0
+
+    def ratio(self, evidence: Evidence) -> float:
+        """Evidence over what suffices: Eq. (1) over its threshold, or correspondences over those needed."""
         needed = self.needed(evidence)
-        agrees = evidence.neighbour is OdometryNeighbour.AGREES
-        enough = needed.agreeing if agrees else needed.alone
-        return evidence.correspondences >= enough and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
+        enough = needed.agreeing if evidence.neighbour is OdometryNeighbour.AGREES else needed.alone
+        is_certain = evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
+        by_count = evidence.correspondences / enough if is_certain else 0.0
+        by_ratio = evidence.match_ratio / self.match_ratio_min if self.has_ratio(evidence) else 0.0
+        return max(by_count, by_ratio)
 
     def judged(self, result: Registration, evidence: Evidence) -> Registration | RegistrationFailed:
-        """The registration, marked as judged, or why it is not trusted."""
+        """The registration with its ratio, or why it is not trusted."""
         if self.accepts(evidence):
-            return replace(result, is_judged=True)
+            return replace(result, judged_ratio=self.ratio(evidence))
         needed = self.needed(evidence)
         kind = "with" if evidence.has_scale else "without"
         found_deg, most_deg = np.degrees([evidence.rotation_sigma_rad, needed.rotation_sigma_max_rad])

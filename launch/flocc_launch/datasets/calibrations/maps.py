@@ -39,7 +39,7 @@ def _has(*names: str) -> Callable[[Map], bool]:
 
 def _kalibr(document: Map) -> Cameras:
     rest = {key: value for key, value in document.items() if not _is_camera(key, value)}
-    return {key: {**rest, **value} for key, value in document.items() if _is_camera(key, value)}
+    return {key: _tidied({**rest, **value}) for key, value in document.items() if _is_camera(key, value)}
 
 
 def _is_camera(key: str, value: Any) -> bool:
@@ -99,7 +99,8 @@ CAMODOCAL = {"pinhole": "radtan", "pinholefull": "rational_polynomial", "mei": "
 
 def _camodocal(document: Map) -> Cameras:
     """VINS-Mono and VINS-Fusion, by camodocal: parameters in maps of their own, whose names depend on the model."""
-    camera = {key: value for key, value in document.items() if not key.endswith("_parameters")}
+    mask = "fisheye"  # whether VINS puts a round mask on features
+    camera = {key: value for key, value in document.items() if not key.endswith("_parameters") and key != mask}
     model = plain(str(document.get("model_type", "")))
     if model in ("scaramuzza", "ocam"):
         raise ValueError(
@@ -139,41 +140,70 @@ def _basalt(document: Map) -> Cameras:
     return cameras
 
 
+SCENE = (
+    "frames", "scale", "offset", "aabb", "aabb_scale", "applied_scale", "applied_transform", "orientation_override",
+    "integer_depth_scale", "depth_unit_scale_factor", "ply_file_path", "from_na", "render_aabb", "up", "sharpness",
+)  # fmt: skip
+"""What transforms.json says of the scene, not of the camera."""
+NERF_MODELS = {"opencv": "opencv", "opencvfisheye": "equidistant", "pinhole": "none", "simplepinhole": "none"}
+
+
 def _nerfstudio(document: Map) -> Cameras:
     """Nerfstudio and instant-ngp: one camera for all frames, or one in each, which must be the same."""
-    rest = {key: value for key, value in document.items() if key != "frames"}
     names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "camera_angle_x")
     frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
     own = [{name: frame[name] for name in names if name in frame} for frame in frames]
     if any(each != own[0] for each in own[1:]):
         raise ValueError("has frames of different cameras; flocc takes one camera per robot")
-    camera = {**rest, **(own[0] if own else {})}
+    camera = {key: value for key, value in document.items() if key not in SCENE} | (own[0] if own else {})
     fisheye = camera.pop("is_fisheye", None)
-    model = plain(str(camera.get("camera_model") or ("OPENCV_FISHEYE" if fisheye else "OPENCV")))
-    known = {"opencv": "opencv", "opencvfisheye": "equidistant", "pinhole": "none", "simplepinhole": "none"}
-    if model not in known:
-        raise ValueError(
-            f"the camera model is {camera['camera_model']!r}; flocc reads OPENCV, OPENCV_FISHEYE and PINHOLE"
-        )
-    camera["camera_model"] = None
-    camera["distortion_model"] = (
-        known[model] if model != "opencv" or any(k in camera for k in ("k1", "k2", "p1")) else None
-    )
+    given = camera.pop("camera_model", None)
+    model = plain(str(given or ("OPENCV_FISHEYE" if fisheye else "OPENCV")))
+    if model not in NERF_MODELS:
+        raise ValueError(f"the camera model is {given!r}; flocc reads OPENCV, OPENCV_FISHEYE and PINHOLE of nerfstudio")
+    if model != "opencv" or any(key in camera for key in ("k1", "k2", "p1")):
+        camera["distortion_model"] = NERF_MODELS[model]
     return {"camera": _with_angles(camera)}
 
 
 def _with_angles(camera: Map) -> Map:
-    """Focal lengths from fields of view, where the file has only those."""
+    """Focal lengths and principal point of files that have only fields of view."""
     angles = {axis: camera.pop(f"camera_angle_{axis}", None) for axis in "xy"}
-    if "fl_x" not in camera and angles["x"] is not None:
-        if "w" not in camera or "h" not in camera:
-            raise ValueError("has a field of view (camera_angle_x) but no w and h: add them")
-        width, height = float(camera["w"]), float(camera["h"])
-        focal = width / 2 / float(np.tan(float(angles["x"]) / 2))
-        camera |= {"fl_x": focal, "fl_y": focal, "cx": camera.get("cx", width / 2), "cy": camera.get("cy", height / 2)}
-    elif "fl_x" in camera and "fl_y" not in camera:
-        camera["fl_y"] = camera["fl_x"]
-    return camera
+    sides = {"x": camera.get("w"), "y": camera.get("h")}
+    for axis, side in sides.items():
+        angle = angles[axis]
+        if f"fl_{axis}" not in camera and angle is not None and side is not None:
+            camera[f"fl_{axis}"] = float(side) / 2 / float(np.tan(float(angle) / 2))
+    if angles["x"] is not None and "fl_x" not in camera:
+        raise ValueError("has a field of view (camera_angle_x) but no w and h: add them")
+    for axis, side in sides.items():
+        if f"c{axis}" not in camera and side is not None:
+            camera[f"c{axis}"] = float(side) / 2
+    return {**camera, "fl_y": camera.get("fl_y", camera.get("fl_x"))}
+
+
+def _vikit(document: Map) -> Cameras:
+    """Rpg's vikit (SVO 1, FAST-LIVO): keys that begin with cam_; ATAN has lengths in units of the size."""
+    camera = {key.removeprefix("cam_"): value for key, value in document.items() if key != "scale"}
+    kind = plain(str(camera.pop("model", "")))
+    models = {"pinhole": "opencv", "atan": "fov", "equidistantcamera": "equidistant", "equidistant": "equidistant"}
+    if kind not in models:
+        raise ValueError(
+            f"the camera model is {document.get('cam_model')!r}; flocc reads Pinhole, ATAN and Equidistant of vikit"
+        )
+    coefficients = [camera.pop(f"d{k}") for k in range(8) if f"d{k}" in camera]
+    if kind == "atan":
+        width, height = float(camera["width"]), float(camera["height"])
+        camera |= {"fx": camera["fx"] * width, "fy": camera["fy"] * height}
+        camera |= {"cx": camera["cx"] * width - 0.5, "cy": camera["cy"] * height - 0.5}
+        coefficients = coefficients[:1]
+    return {"camera": {**camera, "distortion": coefficients, "distortion_model": models[kind]}}
+
+
+def _record3d(document: Map) -> Cameras:
+    """Record3D's metadata: one matrix by columns; the small changes of focus in each frame are not used."""
+    told = ("poses", "initPose", "perFrameIntrinsicCoeffs", "frameTimestamps", "dw", "dh", "cameraType")
+    return {"camera": {key: value for key, value in document.items() if key not in told}}
 
 
 def _opensfm(document: Map) -> Cameras:
@@ -238,18 +268,66 @@ def _stereo(document: Map) -> Cameras:
     }
 
 
+FOCAL = {plain(name) for name in (
+    "fx", "fl_x", "fu", "Camera.fx", "cam_fx", "focal_length", "focalLengthX", "camera_matrix", "K", "intrinsic_matrix",
+    "cam_K", "camera_intrinsics", "camera_intrinsic",
+)}  # fmt: skip
+"""Plain names of keys by which a map is one of a camera."""
+
+
+def _is_of_camera(values: Map) -> bool:
+    if any(plain(key) in FOCAL for key in values):
+        return True
+    listed = values.get("intrinsics", values.get("calibration"))
+    return isinstance(listed, list) or (isinstance(listed, dict) and "data" in listed)
+
+
+OF_OTHERS = ("type", "model", "name", "id", "label")
+"""Keys that, above a camera's map, are of what it stands in."""
+
+
+def _nested(document: Map, path: tuple[str, ...] = (), above: Map | None = None) -> Cameras:
+    """Maps of cameras inside of others, each with the plain values that stand above it."""
+    own = {key: value for key, value in document.items() if not isinstance(value, dict) and plain(key) not in OF_OTHERS}
+    around = {**(above or {}), **own}
+    found: Cameras = {}
+    for key, value in document.items():
+        if not isinstance(value, dict):
+            continue
+        if _is_of_camera(value):
+            twice = next((name for name in value if name in around and around[name] != value[name]), None)
+            if twice is not None:
+                raise ValueError(f"the keys {twice!r} and '{key}.{twice}' say different things")
+            found[".".join((*path, key))] = {**around, **value}
+        else:
+            found |= _nested(value, (*path, key), around)
+    return found
+
+
 def _plain(document: Map) -> Cameras:
     """All in one map: EuRoC, Kimera, ROS, OpenCV, RTAB-Map, MASt3R-SLAM, flocc's own, and whoever is like them."""
+    if _is_of_camera(document):
+        return {"camera": _tidied(document)}
+    inner = _nested(document)
+    return {name: _tidied(camera) for name, camera in inner.items()} if inner else {"camera": _tidied(document)}
+
+
+def _tidied(document: Map) -> Map:
+    """What single tools write in a way of their own."""
+    if "cam_fx" in document and "cam_model" in document:
+        return _vikit(document)["camera"]
     camera = dict(document)
-    for name in ("camera", "intrinsics", "calibration", "intrinsic", "cam", "camera_info", "color", "rgb"):
-        inner = camera.get(name)
-        if isinstance(inner, dict) and "data" not in inner and "rows" not in inner:
-            del camera[name]
-            twice = next((key for key in inner if key in camera and camera[key] != inner[key]), None)
-            if twice is not None:
-                raise ValueError(f"the keys {twice!r} and '{name}.{twice}' say different things")
-            camera |= inner
-    if isinstance(document.get("camera"), dict) and isinstance(camera.get("scale"), int | float):
+    if camera.pop("distorted", True) is False and any(camera.get(key) for key in ("k1", "k2", "p1", "p2", "k3")):
+        raise ValueError("says distorted: false, but has distortion coefficients")
+    if isinstance(camera.get("scale"), int | float) and set(map(plain, camera)) <= {
+        "w",
+        "h",
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+        "scale",
+    }:
         camera["depth_scale"] = camera.pop("scale")  # Replica's renderings
     if isinstance(listed := camera.get("calibration"), list):
         del camera["calibration"]
@@ -261,12 +339,14 @@ def _plain(document: Map) -> Cameras:
     flags = camera.get("flags")
     if isinstance(flags, str) and "fisheye" in flags.lower() and "distortion_model" not in camera:
         camera["distortion_model"] = "fisheye"
-    return {"camera": camera}
+    return camera
 
 
 FORMS: tuple[Form, ...] = (
     Form("Basalt", lambda d: isinstance(d.get("value0"), dict) and "intrinsics" in d["value0"], _basalt),
     Form("nerfstudio transforms.json", lambda d: isinstance(d.get("frames"), list), _nerfstudio),
+    Form("vikit (SVO 1, FAST-LIVO)", _has("cam_fx", "cam_model"), _vikit),
+    Form("Record3D", _has("K", "poses"), _record3d),
     Form("DepthAI", lambda d: isinstance(d.get("cameraData"), list), _depthai),
     Form("Gyroflow", _has("fisheye_params", "calib_dimension"), _gyroflow),
     Form("SVO, maplab or OKVIS", lambda d: isinstance(d.get("cameras"), list), _listed_cameras),
@@ -283,7 +363,7 @@ FORMS: tuple[Form, ...] = (
 )
 
 REFUSED_MAPS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], str], ...] = (
-    ("a Meshroom scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
+    ("a Meshroom or OpenMVG scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
     ("a Kalibr target", lambda d: "target_type" in d, "give the camchain file that Kalibr writes"),
     ("Kalibr's IMU file", lambda d: "accelerometer_noise_density" in d and "fx" not in d and "intrinsics" not in d,
      "give the camchain file that Kalibr writes"),

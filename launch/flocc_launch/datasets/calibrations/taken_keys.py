@@ -82,6 +82,10 @@ class Keys:
         value = self.take(*names)
         return None if value is None else flat_numbers(value, names[0])
 
+    def value(self, key: str) -> Any:
+        """What stands under a key, as it is spelled."""
+        return self._values[key]
+
     def left(self) -> list[str]:
         """Keys that nobody took, and that hold something."""
         return [key for key, value in self._values.items() if plain(key) not in self.used and value is not None]

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from flocc_lab.graph_family.graphs import Member, member
-from flocc_lab.graph_family.judge import Verdict, judged
-from flocc_lab.graph_family.methods import Answer, Method, NoAnswer, oracle
+from flocc_lab.graph_family.judge import GraphVerdict, judged
+from flocc_lab.graph_family.methods import Method, MethodAnswer, NoAnswer, oracle
 
 
-def run(seeds: Iterable[int], methods: Mapping[str, Method], rows: Path | None, limit_s: float) -> list[Verdict]:
+def run(seeds: Iterable[int], methods: Mapping[str, Method], rows: Path | None, limit_s: float) -> list[GraphVerdict]:
     """Judge every method on every seed, until the time is over; rows that the file has are not run again."""
     done = read_rows(rows) if rows is not None else []
     known, began = {(v.seed, v.method) for v in done}, time.monotonic()
@@ -37,7 +37,7 @@ def run(seeds: Iterable[int], methods: Mapping[str, Method], rows: Path | None, 
     return done
 
 
-def verdict_of(graph: Member, name: str, method: Method, best: Answer) -> Verdict:
+def verdict_of(graph: Member, name: str, method: Method, best: MethodAnswer) -> GraphVerdict:
     """One answer, judged; a method without an answer fails."""
     try:
         return judged(graph, name, method(graph), best)
@@ -46,16 +46,16 @@ def verdict_of(graph: Member, name: str, method: Method, best: Answer) -> Verdic
     right = int(np.count_nonzero(graph.is_right))
     of_oracle = judged(graph, name, best, best).oracle_m
     groups, never = graph.spec.groups, float("inf")
-    return Verdict(graph.spec.seed, name, never, of_oracle, False, 0, right, right, False, True, groups, 0.0, lost)
+    return GraphVerdict(graph.spec.seed, name, never, of_oracle, False, 0, right, right, False, True, groups, 0.0, lost)
 
 
-def read_rows(path: Path) -> list[Verdict]:
+def read_rows(path: Path) -> list[GraphVerdict]:
     """Rows of an earlier campaign; none where there is no file."""
     if not path.exists():
         return []
-    names = {field.name for field in fields(Verdict)}
+    names = {field.name for field in fields(GraphVerdict)}
     lines = path.read_text(encoding="utf-8").splitlines()
-    return [Verdict(**{k: v for k, v in json.loads(line).items() if k in names}) for line in lines]
+    return [GraphVerdict(**{k: v for k, v in json.loads(line).items() if k in names}) for line in lines]
 
 
 HEAD = (
@@ -64,7 +64,7 @@ HEAD = (
 )
 
 
-def table(verdicts: Sequence[Verdict]) -> str:
+def table(verdicts: Sequence[GraphVerdict]) -> str:
     """A row per method, as Markdown. Ratios are ATE over the oracle's, without groups of wrong closures."""
     names = list(dict.fromkeys(v.method for v in verdicts))
     return "\n".join(
@@ -72,7 +72,7 @@ def table(verdicts: Sequence[Verdict]) -> str:
     )
 
 
-def _row(name: str, of_method: Sequence[Verdict]) -> str:
+def _row(name: str, of_method: Sequence[GraphVerdict]) -> str:
     plain = [v for v in of_method if not v.groups] or list(of_method)
     grouped = [v for v in of_method if v.groups]
     ratios = np.array([v.ratio for v in plain])
@@ -85,6 +85,6 @@ def _row(name: str, of_method: Sequence[Verdict]) -> str:
     )
 
 
-def _share(verdicts: Sequence[Verdict]) -> str:
+def _share(verdicts: Sequence[GraphVerdict]) -> str:
     failed = sum(v.failed for v in verdicts)
     return f"{failed}/{len(verdicts)} ({failed / len(verdicts):.1%})" if verdicts else "none"
