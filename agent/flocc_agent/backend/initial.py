@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
 from flocc_agent.backend.bent_odometry import straightened
 from flocc_agent.backend.screening import first_not_rigid
-from flocc_agent.backend.straightening import straightened
 from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, inverse
 from flocc_protocol.ids import LogId
