@@ -43,7 +43,7 @@ def optimise(
 ) -> None:
     """Optimise the pose graph of a file, with any formulation and solver."""
     from flocc_agent.config import Formulation, ScaleInitial, Solver
-    from flocc_launch.graph_files.optimise import Noise, optimise_file
+    from flocc_launch.graph_files.optimise import NoiseModel, optimise_file
 
     result = optimise_file(
         file,
@@ -55,7 +55,7 @@ def optimise(
         unit_scale=unit_scale,
         drop_labelled_outliers=drop_outliers,
         from_file_initialisation=from_file,
-        noise=_chosen(Noise, noise, "--noise") or Noise.GAUSSIAN,
+        noise=_chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
         seed=seed,
     )
     for key in ("formulation", "solver", "cost_initial", "cost", "ate_m", "iterations", "solve_s"):
