@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
-from flocc_agent.backend.bending import bent_along_fixes
+from flocc_agent.backend.bent_odometry import bent_along_fixes
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, inverse

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from flocc_agent.backend.clusters import votes
 from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.descent import Objective
 from flocc_agent.backend.edges import state_of
@@ -198,7 +199,8 @@ def _solve_connected(
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     objective = Objective(problem.edges, problem.closure_rows, linear, config)
     trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None
-    places = Places(problem, trajectories, closures, config.steepness)
+    says = votes([closures[k] for k in problem.closure_ids], config.cluster_keyframes_max)
+    places = Places(problem, trajectories, closures, says, config.steepness)
     solved = solve(objective, state, trusted, places)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
