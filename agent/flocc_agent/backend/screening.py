@@ -166,11 +166,14 @@ def _missing(keyframe: KeyframeId, trajectories: Mapping[LogId, Trajectory]) -> 
 
 
 def _duplicates(closures: Sequence[LoopClosure], excluded: Mapping[int, str]) -> dict[int, str]:
-    """Exclude all but the best closure of each pair: the highest match ratio, then the first."""
+    """Exclude all but the best closure of each pair: the highest match ratio, then the first.
+
+    Metric closures with a covariance of their own are measurements in their own right: every one counts.
+    """
     best: dict[tuple[KeyframeId, KeyframeId], int] = {}
     reasons: dict[int, str] = {}
     for k, closure in enumerate(closures):
-        if k in excluded:
+        if k in excluded or (closure.metric and closure.covariance is not None):
             continue
         low, high = sorted((closure.query, closure.match))
         other = best.setdefault((low, high), k)
