@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
-from flocc_agent.backend.bent_odometry import straightened
+from flocc_agent.backend.bent_odometry import bent_along_fixes
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, Trajectory
 from flocc_agent.geometry import Float, inverse
@@ -38,7 +38,7 @@ def initial_poses(
     if warm and all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
         return warm, True
     rigid = {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}
-    return straightened(rigid, closures), False
+    return bent_along_fixes(rigid, closures), False
 
 
 def by_pair(closures: Mapping[int, LoopClosure]) -> list[list[LoopClosure]]:
