@@ -23,7 +23,6 @@ from flocc_agent.core.interfaces import Camera, Image, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
-from flocc_agent.geometry import is_rigid
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
@@ -38,6 +37,7 @@ from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_faults import network_faults
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
+from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
 from flocc_agent.runtime.robot_result import RobotResult
@@ -92,6 +92,7 @@ class Agent:
             perception: What it sees with; None builds what `config.perception` names.
 
         Raises:
+            BadKeyframe: `T_body_camera` is no pose.
             FloccError: The recording, the store, a checkpoint or the network cannot be used.
         """
         started_s = time.monotonic()
@@ -101,9 +102,10 @@ class Agent:
         self._perception = perception
         self._recording = _recording(config)
         self._camera = self._recording.camera if self._recording else camera
-        given = np.eye(4) if T_body_camera is None else T_body_camera
+        given = np.eye(4) if T_body_camera is None else _mounting(T_body_camera, config.name)
         self._T_body_camera = self._recording.T_body_camera if self._recording else given
         self._selector = KeyframeSelector(config.keyframes)
+        self._gate = PoseGate()
         self._kept = True
         self._driver: Driver | None = None
         self._store: Store | None = None
@@ -167,18 +169,11 @@ class Agent:
             stamp_s: Time of the image on the robot's clock, seconds.
 
         Raises:
-            BadKeyframe: The pose is not finite and rigid, the image does not fit the camera, or there is no camera.
+            BadKeyframe: The pose is not finite and rigid, over 10000 km from the origin, faster than 1 km/s or not
+                newer than the one before; the image does not fit the camera, or there is no camera.
         """
-        if self._camera is None:
-            raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
-        if not is_rigid(np.asarray(T_odom_body)) or not np.isfinite(stamp_s):
-            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: its pose is not finite and rigid")
-        try:
-            image = Image(pixels, self._camera)
-        except ValueError as error:
-            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
-        await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
-        self._kept = True
+        self._check(T_odom_body, stamp_s)
+        await self._add(pixels, np.asarray(T_odom_body, dtype=float), stamp_s)
 
     async def add_frame(
         self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float, keep: bool = False
@@ -187,13 +182,36 @@ class Agent:
 
         Returns:
             Whether it became one; `keep` what something was seen in.
+
+        Raises:
+            BadKeyframe: As `add_keyframe`, of every frame.
         """
+        self._check(T_odom_body, stamp_s)
+        T_odom_body = np.asarray(T_odom_body, dtype=float)
         if not keep and not self._selector.wants(T_odom_body):
+            self._gate.let_in(T_odom_body, stamp_s, kept=False)
             self._kept = False
             return False
-        await self.add_keyframe(pixels, T_odom_body, stamp_s)
+        await self._add(pixels, T_odom_body, stamp_s)
         self._selector.took(T_odom_body)
         return True
+
+    def _check(self, T_odom_body: Float, stamp_s: float) -> None:
+        if self._camera is None:
+            raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
+        if (fault := self._gate.fault(T_odom_body, stamp_s)) is not None:
+            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {fault}")
+
+    async def _add(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
+        """Take in a keyframe whose pose can be."""
+        assert self._camera is not None
+        try:
+            image = Image(pixels, self._camera)
+        except ValueError as error:
+            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
+        self._gate.let_in(T_odom_body, stamp_s, kept=True)
+        await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+        self._kept = True
 
     def add_fix(self, position_m: Float, covariance_m2: Float, stamp_s: float | None = None) -> None:
         """Give the agent an absolute position of the camera: `add_measurement(Fix(position_m, covariance_m2))`.
@@ -400,6 +418,20 @@ class Agent:
 
 class BadKeyframe(FloccError):
     """A keyframe that cannot be used; the agent goes on without it."""
+
+
+def _mounting(T_body_camera: Float, robot: str) -> Float:
+    """Where a camera sits, (4, 4).
+
+    Raises:
+        BadKeyframe: That is no pose, or over 1 km from the body.
+    """
+    fault = pose_fault(T_body_camera)
+    if fault is None and float(np.linalg.norm(T_body_camera[:3, 3])) > MOUNT_MAX_M:
+        fault = f"the camera sits over {MOUNT_MAX_M:g} m from the body"
+    if fault is not None:
+        raise BadKeyframe(f"robot {robot}: T_body_camera: {fault}")
+    return np.asarray(T_body_camera, dtype=float)
 
 
 def stored_result(config: AgentConfig) -> RobotResult:

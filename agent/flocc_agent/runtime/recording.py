@@ -23,6 +23,7 @@ from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, read_measurements
 from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
+from flocc_agent.runtime.pose_limits import MOUNT_MAX_M
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_tum
@@ -224,4 +225,7 @@ def _extrinsics(rows: object, path: Path) -> Float:
         T = np.empty(0)
     if T.shape != (4, 4):
         raise RecordingError(f"{path}: camera.T_body_camera must be four rows of four numbers")
-    return checked_pose(T, f"{path}: camera.T_body_camera")
+    T = checked_pose(T, f"{path}: camera.T_body_camera")
+    if float(np.linalg.norm(T[:3, 3])) > MOUNT_MAX_M:
+        raise RecordingError(f"{path}: camera.T_body_camera: the camera sits over {MOUNT_MAX_M:g} m from the body")
+    return T

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
 from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, position_fault, possible
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
 from flocc_agent.runtime.text_tables import RecordingError, Table, is_number, read_table
@@ -327,7 +328,7 @@ def _damage(fields: list[str], columns: Columns) -> str | None:
         return "the pose has a number that is not finite"
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
         return f"the pose is not rigid (its quaternion has length {norm:.4g}, not 1)"
-    return None
+    return position_fault(np.array(numbers[1:4]))
 
 
 def _matrices(table: Table) -> Poses:
@@ -341,7 +342,7 @@ def _matrices(table: Table) -> Poses:
             if len(numbers) == count and count in (12, 13, 16, 17)
             else np.full((4, 4), np.nan)
         )
-        if is_rigid(T, tolerance=1e-2) and np.isfinite(numbers[0]):
+        if is_rigid(T, tolerance=1e-2) and position_fault(T[:3, 3]) is None and np.isfinite(numbers[0]):
             poses.append(pose(nearest_rotation(T[:3, :3]), T[:3, 3]))
             stamps.append(float(numbers[0]))
             lines.append(line)
@@ -425,4 +426,20 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
         unlike = sum(not np.allclose(T[k], T[k - 1], atol=1e-6) for k in index[:10000])
         if unlike:
             notes.append(f"{path}: {unlike} rows repeat a stamp with another pose; the first of each was taken")
-    return Trajectory(stamps_s[moved], T[moved]), tuple(notes)
+    stamps_s, T, lines = stamps_s[moved], T[moved], lines[moved]
+    good = possible(stamps_s, T[:, :3, 3])
+    if not np.all(good):
+        notes.append(_too_fast(path, lines[~good], len(lines)))
+    return Trajectory(stamps_s[good], T[good]), tuple(notes)
+
+
+def _too_fast(path: Path, lines: NDArray[np.int64], count: int) -> str:
+    """Say how many poses lie out of reach of the others.
+
+    Raises:
+        RecordingError: They are too many.
+    """
+    fault = f"{len(lines)} of {count} poses lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
+    if len(lines) > DAMAGED_RATIO_MAX * count:
+        raise RecordingError(f"{path}:{lines[0]}: {fault}: is the length in metres, and the stamp in its unit?")
+    return f"{path}:{lines[0]}: {fault} and were left out"

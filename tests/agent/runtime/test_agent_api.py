@@ -31,7 +31,7 @@ def camera() -> Camera:
 def bad_poses() -> list[Float]:
     reflection, stretched, endless = np.eye(4), 2.0 * np.eye(4), np.eye(4)
     reflection[0, 0], endless[0, 3], stretched[3, 3] = -1.0, np.nan, 1.0
-    return [reflection, stretched, endless, np.eye(3)]
+    return [reflection, stretched, endless, np.eye(3), np.eye(4)[:3], at_m(1e12)]
 
 
 async def test_what_cannot_be_used_is_refused_and_the_agent_goes_on() -> None:
@@ -40,6 +40,8 @@ async def test_what_cannot_be_used_is_refused_and_the_agent_goes_on() -> None:
         for T in bad_poses():
             with pytest.raises(BadKeyframe, match="robot r1: keyframe at"):
                 await agent.add_keyframe(pixels, T, 1.0)
+            with pytest.raises(BadKeyframe, match="robot r1: keyframe at"):
+                await agent.add_frame(pixels, T, 1.0)
         with pytest.raises(BadKeyframe, match="its camera says"):
             await agent.add_keyframe(np.zeros((7, 5, 3), np.uint8), np.eye(4), 1.0)
         with pytest.raises(BadMeasurement, match="no position"):
@@ -95,6 +97,23 @@ async def test_a_frame_becomes_a_keyframe_when_the_robot_moved_enough() -> None:
         steps_m = [0.0, 0.1, 0.49, 0.51, 0.6, 1.02]
         took = [await agent.add_frame(pixels, pose(np.eye(3), np.array([x, 0.0, 0.0])), x) for x in steps_m]
     assert took == [True, False, False, True, False, True]
+
+
+async def test_a_frame_that_is_too_fast_or_not_newer_is_refused_and_the_agent_goes_on() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        assert await agent.add_frame(pixels, at_m(0.0), 10.0)
+        for x, stamp_s, said in [(2000.0, 11.0, "faster than"), (1.0, 10.0, "not newer"), (1.0, 9.0, "not newer")]:
+            with pytest.raises(BadKeyframe, match=said):
+                await agent.add_frame(pixels, at_m(x), stamp_s)
+        assert await agent.add_frame(pixels, at_m(1.0), 11.0)
+        assert [x for _, _, x in await recorded(agent, 2)] == [0.0, 1.0]
+
+
+def test_a_mounting_that_is_no_pose_is_refused() -> None:
+    for T_body_camera in (2.0 * np.eye(4), at_m(1e6), np.eye(3)):
+        with pytest.raises(BadKeyframe, match="robot r1: T_body_camera"):
+            Agent(CONFIG, camera(), T_body_camera)
 
 
 async def test_an_agent_without_a_camera_says_so() -> None:

@@ -59,6 +59,24 @@ def test_images_outside_of_the_odometry_are_left_out(tmp_path: Path) -> None:
     assert [frame.stamp_s for frame in recording.frames] == [1.0, 4.01]
 
 
+def test_two_poses_that_cannot_be_cost_their_images_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_recording(tmp_path / "r", tuple(np.linspace(0.0, 9.5, 20)))
+    long = motion(20, 0.5)
+    long.T_fixed_body[[4, 11], 0, 3] = (1e12, 9e6)
+    write_tum(path / "odometry.tum", long)
+    frames = Recording.open(path).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([0.5 * k for k in range(20)])
+    assert "1 of 20 rows were left out" in caplog.text
+    assert "1 of 19 poses lie out of reach of the others" in caplog.text
+
+
+def test_a_camera_that_sits_far_from_its_body_is_refused(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "r")
+    write_camera(path / "camera.toml", CAMERA, pose(np.eye(3), np.array([1e12, 0.0, 0.0])))
+    with pytest.raises(RecordingError, match="T_body_camera: the camera sits over 1000 m"):
+        Recording.open(path)
+
+
 def test_a_long_gap_is_not_bridged() -> None:
     sparse = motion(step_s=10.0)
     assert sparse.at(4.0) is None

@@ -23,6 +23,7 @@ from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, step_fault
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
@@ -192,12 +193,25 @@ class Ros2Adapter:
     def _take_odometry(self, payload: bytes) -> None:
         config = self._config
         sample = odometry_of(self._types.read(payload, ODOMETRY), config.odom_frame, config.base_frame)
+        self._check_step(*sample)
         if not self._synchroniser.add_odometry(*sample):
             self._complain("odometry", BACK_IN_TIME)
             return
         self._posed.set()
         if self._teller is not None:
             self._teller.place(*sample)
+
+    def _check_step(self, stamp_ns: int, T_odom_body: Float) -> None:
+        """Refuse odometry that lies out of reach of the newest.
+
+        Raises:
+            BadMessage: It moved faster than any robot.
+        """
+        if self._synchroniser.latest is None or stamp_ns <= self._synchroniser.latest[0]:
+            return
+        last_ns, T_odom_last = self._synchroniser.latest
+        if step_fault(T_odom_body[:3, 3] - T_odom_last[:3, 3], (stamp_ns - last_ns) * 1e-9) is not None:
+            raise BadMessage(f"odometry jumps out of reach (faster than {SPEED_MAX_M_S:g} m/s)")
 
     def _take_image(self, payload: bytes) -> None:
         stamp_ns, frame = header_of(payload)

@@ -56,8 +56,8 @@ class Robot:
             self.advertised.add(topic)
         self.node.publish(topic, payload)
 
-    def odometry(self, t_ms: int, frame: str = "odom") -> None:
-        sample = Stamped(stamp(t_ms), frame, "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    def odometry(self, t_ms: int, frame: str = "odom", off_m: float = 0.0) -> None:
+        sample = Stamped(stamp(t_ms), frame, "base_link", (1e-3 * t_ms + off_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         self._publish("/r1/odom", "nav_msgs/msg/Odometry", cdr_by_hand.odometry(sample))
 
     def image(self, t_ms: int, encoding: str = "mono8", frame: str = "optical") -> None:
@@ -301,6 +301,7 @@ async def test_what_cannot_be_used_is_said_once_counted_and_left_out() -> None:
                 t = next(depth_ms)
                 robot.odometry(t, frame="world")
                 robot.odometry(t)
+                robot.odometry(t + 1, off_m=2e6)
                 robot.odometry(5)
                 robot.image(t, encoding="16UC1")
                 robot.image(t, frame="left")
@@ -324,7 +325,8 @@ async def test_what_cannot_be_used_is_said_once_counted_and_left_out() -> None:
     assert "images are in frame 'left', but the configuration says 'optical'" in said
     assert said.count("time goes backwards") == 2
     assert "are no nav_msgs/msg/Odometry" in said
-    assert len(agent.problems()) == len(set(agent.problems())) == 6
+    assert "odometry jumps out of reach (faster than 1000 m/s)" in said
+    assert len(agent.problems()) == len(set(agent.problems())) == 7
 
 
 async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None:

@@ -1,0 +1,112 @@
+"""Which odometry can be: near enough for the wire, slower than any robot, and newer than what came before.
+
+What cannot be is refused where it comes in; behind this gate every pose fits a record.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.geometry import is_rigid
+from flocc_protocol.codec import COORDINATE_MAX
+
+Float = NDArray[np.float64]
+
+SPEED_MAX_M_S = 1000.0
+"""No robot moves faster: what does is a broken pose, or a stamp in another unit."""
+
+MOUNT_MAX_M = 1000.0
+"""How far from the body a camera may sit."""
+
+POSITION_MAX_M = COORDINATE_MAX - MOUNT_MAX_M
+"""Largest coordinate of a body, so that its camera's pose fits a record."""
+
+STAMP_MAX_S = 1e12
+"""Largest stamp that a record takes."""
+
+
+class PoseGate:
+    """Remembers the last pose that was let in, and says what is wrong with the next."""
+
+    def __init__(self) -> None:
+        self._last: tuple[float, Float] | None = None
+        self._kept = False
+
+    def fault(self, T_odom_body: Float, stamp_s: float) -> str | None:
+        """What is wrong with a pose, or None; a frame that did not become a keyframe may be given once more.
+
+        Args:
+            T_odom_body: What should be a (4, 4) pose, metres.
+            stamp_s: When, seconds.
+        """
+        if (fault := pose_fault(T_odom_body)) is not None:
+            return fault
+        if not abs(stamp_s) <= STAMP_MAX_S:
+            return f"its stamp is not within {STAMP_MAX_S:g} s"
+        if self._last is None:
+            return None
+        last_s, T_odom_last = self._last
+        if stamp_s < last_s or (stamp_s == last_s and self._kept):
+            return f"it is not newer than the one before, at {last_s} s"
+        return step_fault(np.asarray(T_odom_body)[:3, 3] - T_odom_last[:3, 3], stamp_s - last_s)
+
+    def let_in(self, T_odom_body: Float, stamp_s: float, kept: bool) -> None:
+        """A pose without fault came; `kept` says whether it became a keyframe."""
+        self._last, self._kept = (stamp_s, np.array(T_odom_body, dtype=float)), kept
+
+
+def pose_fault(T: Float) -> str | None:
+    """Why an array is no pose (4, 4) of a body, or None."""
+    try:
+        T = np.asarray(T, dtype=float)
+    except (TypeError, ValueError):
+        return "its pose is no array of numbers"
+    if T.shape != (4, 4):
+        return f"its pose has the shape {T.shape}, not (4, 4)"
+    if not is_rigid(T):
+        return "its pose is not finite and rigid"
+    return position_fault(T[:3, 3])
+
+
+def position_fault(position_m: Float) -> str | None:
+    """Why a body cannot be at a finite position (3,), or None."""
+    farthest_m = float(np.max(np.abs(position_m)))
+    if farthest_m > POSITION_MAX_M:
+        return f"its position {farthest_m:.6g} m is over 10000 km from the origin"
+    return None
+
+
+def step_fault(moved_m: Float, after_s: float) -> str | None:
+    """Why a body cannot have moved so far (3, metres) in that time, or None."""
+    far_m = float(np.linalg.norm(moved_m))
+    if far_m > SPEED_MAX_M_S * after_s:
+        return f"it lies {far_m:.6g} m from the pose {after_s:.6g} s before, which is faster than {SPEED_MAX_M_S:g} m/s"
+    return None
+
+
+def possible(stamps_s: Float, positions_m: Float) -> NDArray[np.bool_]:
+    """Which poses of a trajectory can be, where some lie farther from the others than a robot gets in the time.
+
+    The longest part without such a step is believed; from its ends each pose must be in reach of the last good one.
+
+    Args:
+        stamps_s: (N,) increasing, seconds.
+        positions_m: (N, 3).
+
+    Returns:
+        (N,) bool.
+    """
+    steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+    breaks = np.flatnonzero(steps_m > SPEED_MAX_M_S * np.diff(stamps_s)) + 1
+    good = np.ones(len(stamps_s), dtype=bool)
+    if not len(breaks):
+        return good
+    bounds = np.concatenate([[0], breaks, [len(stamps_s)]])
+    longest = int(np.argmax(np.diff(bounds)))
+    first, end = int(bounds[longest]), int(bounds[longest + 1])
+    for way in (range(end, len(stamps_s)), range(first - 1, -1, -1)):
+        last = end - 1 if way.step > 0 else first
+        for k in way:
+            reach_m = SPEED_MAX_M_S * abs(stamps_s[k] - stamps_s[last])
+            good[k] = np.linalg.norm(positions_m[k] - positions_m[last]) <= reach_m
+            last = k if good[k] else last
+    return good

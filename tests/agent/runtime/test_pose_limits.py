@@ -1,0 +1,91 @@
+"""Odometry that cannot be is refused where it comes in: at the call, or as a row of a file."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flocc_agent.geometry import Float, pose, so3_exp
+from flocc_agent.runtime.pose_limits import POSITION_MAX_M, PoseGate, possible
+from flocc_agent.runtime.text_tables import RecordingError
+from flocc_agent.runtime.trajectory_text import read_trajectory
+
+
+def at_m(x: float) -> Float:
+    return pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def stretched() -> Float:
+    T = at_m(1.0)
+    T[0, 0] = 1.1
+    return T
+
+
+REFUSED: dict[str, tuple[Callable[[], object], float, str]] = {
+    "far": (lambda: at_m(1e12), 2.0, "over 10000 km"),
+    "just too far": (lambda: at_m(np.nextafter(POSITION_MAX_M, np.inf)), 2.0, "over 10000 km"),
+    "fast": (lambda: at_m(1001.0), 2.0, "faster than 1000 m/s"),
+    "nan": (lambda: at_m(np.nan), 2.0, "finite and rigid"),
+    "not rigid": (stretched, 2.0, "finite and rigid"),
+    "3 by 4": (lambda: at_m(1.0)[:3], 2.0, "shape (3, 4)"),
+    "list of words": (lambda: ["a"], 2.0, "no array of numbers"),
+    "same stamp": (lambda: at_m(0.0), 1.0, "not newer"),
+    "older": (lambda: at_m(0.0), 0.5, "not newer"),
+    "no stamp": (lambda: at_m(0.0), np.nan, "stamp"),
+    "stamp too large for a record": (lambda: at_m(0.0), 1e30, "stamp"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_pose_that_cannot_be_has_a_fault_and_the_next_has_none(name: str) -> None:
+    make, stamp_s, said = REFUSED[name]
+    gate = PoseGate()
+    gate.let_in(at_m(0.0), 1.0, kept=True)
+    fault = gate.fault(make(), stamp_s)  # type: ignore[arg-type]
+    assert fault is not None
+    assert said in fault
+    assert gate.fault(at_m(1.0), 2.0) is None
+
+
+def test_a_frame_that_became_no_keyframe_may_be_given_once_more() -> None:
+    gate = PoseGate()
+    gate.let_in(at_m(0.0), 1.0, kept=False)
+    assert gate.fault(at_m(0.0), 1.0) is None
+
+
+def line(stamp_s: float, T: Float) -> str:
+    x, y, z = T[:3, 3]
+    return f"{stamp_s} {x} {y} {z} 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(("bad", "note"), [(1e12, "over 10000 km"), (9e6, "out of reach"), (-5e4, "out of reach")])
+@pytest.mark.parametrize("places", [(0,), (3, 9), (19,), (7, 8)])
+def test_rows_that_cannot_be_are_left_out_and_counted(
+    tmp_path: Path, bad: float, note: str, places: tuple[int, ...]
+) -> None:
+    xs = [bad if k in places else 0.5 * k for k in range(20)]
+    (tmp_path / "odometry.tum").write_text("".join(line(0.1 * k, at_m(x)) for k, x in enumerate(xs)))
+    trajectory, notes = read_trajectory(tmp_path / "odometry.tum")
+    assert trajectory.T_fixed_body[:, 0, 3].tolist() == [0.5 * k for k in range(20) if k not in places]
+    assert any(note in each and f"{len(places)} of 20" in each for each in notes), notes
+
+
+def test_a_trajectory_faster_than_any_robot_is_refused_with_a_question(tmp_path: Path) -> None:
+    (tmp_path / "odometry.tum").write_text("".join(line(0.1 * k, at_m(1e3 * k)) for k in range(20)))
+    with pytest.raises(RecordingError, match="in metres"):
+        read_trajectory(tmp_path / "odometry.tum")
+
+
+def test_a_jump_of_the_origin_is_let_in_once_a_robot_could_have_gone_there() -> None:
+    stamps_s = np.linspace(0.0, 9.9, 100)
+    positions_m = np.zeros((100, 3))
+    positions_m[60:, 0] = 2000.0
+    good = possible(stamps_s, positions_m)
+    assert np.flatnonzero(~good).tolist() == list(range(60, 79))
+
+
+def test_rotations_alone_are_never_too_fast() -> None:
+    gate = PoseGate()
+    gate.let_in(at_m(5.0), 1.0, kept=True)
+    assert gate.fault(pose(so3_exp(np.array([0.0, 0.0, 3.0])), np.array([5.0, 0.0, 0.0])), 1.0 + 1e-6) is None
