@@ -1,5 +1,6 @@
 """ATE and RPE, held against evo."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -107,10 +108,27 @@ def test_evo_opens_our_tum_files(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(read.poses_se3), poses, atol=1e-9)
 
 
+def program(folder: Path, text: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "evo_ape"
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def test_evo_is_found_beside_this_python_before_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(program(tmp_path / "path", "true").parent))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "bin" / "python"))
+    assert evaluation.evo_program() == str(tmp_path / "path" / "evo_ape")
+    beside = program(tmp_path / "bin", "true")
+    assert evaluation.evo_program() == str(beside)
+
+
 def test_evo_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     with pytest.raises(evaluation.EvaluationError, match=r"flocc\[eval\]"):
-        evaluation.evo_ape(tmp_path / "a.tum", tmp_path / "b.tum")
+        evaluation.evo_program()
 
 
 def test_inverse_places_the_first_pose_at_the_origin() -> None:

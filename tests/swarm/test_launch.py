@@ -96,12 +96,15 @@ def test_a_robot_comes_back_from_its_disk_with_its_numbering(tmp_path: Path) -> 
     assert known["r1"]["logs"] == known["r2"]["logs"]
 
 
-def test_ctrl_c_stops_every_agent_in_order_and_still_reports(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["ctrl-c", "closed terminal"])
+def test_an_end_from_outside_stops_every_agent_in_order_and_still_reports(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     out = tmp_path / "run"
     command = [sys.executable, "-m", "flocc_launch.commands.main", "launch", "meeting", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     wait_until(lambda: any(out.glob("robots/*/events.jsonl")) and '"leader"' in events_of(out), 60.0)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     text, _ = process.communicate(timeout=60.0)
     assert "Traceback" not in text
     report = json.loads((out / "report.json").read_text())

@@ -7,6 +7,7 @@ from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.runs.closure_table import Pair
+from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import seconds
 from flocc_launch.runs.timeline import how_it_died
@@ -100,6 +101,16 @@ def weak_links(loaded: LoadedRun) -> list[Finding]:
     return findings
 
 
+def odd_truths(loaded: LoadedRun) -> list[Finding]:
+    """Ground truth on another clock, or in frames of its own."""
+    clock = "Shift its stamps by that, or put a file with the right ones into groundtruth/ of the run."
+    frame = "Look at the map in the report; put truths of one frame into groundtruth/ of the run and evaluate it again."
+    return [
+        *(Finding("truth-clock", Severity.HINDERS, sentence, clock) for sentence in other_clocks(loaded.tracks)),
+        *(Finding("truth-frames", Severity.HINDERS, sentence, frame) for sentence in frame_sentences(loaded.tracks)),
+    ]
+
+
 def robots_of(pair: Pair) -> set[str]:
     """The two robots of a pair."""
     return {pair.query.log.robot, pair.match.log.robot}
@@ -112,4 +123,5 @@ GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     solver_warnings,
     encoding_failures,
     unsteady_leaders,
+    odd_truths,
 )

@@ -23,6 +23,7 @@ from flocc_launch.report.model import (
     RunReport,
     TrackError,
 )
+from flocc_launch.runs.ground_truth import frame_sentences, in_separate_frames, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.timeline import (
     corrections_of,
@@ -52,6 +53,7 @@ def build(loaded: LoadedRun) -> RunReport:
     frames = sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
     by_robot = bytes_by_robot(loaded)
+    apart = in_separate_frames(tracks)
     report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
@@ -68,7 +70,7 @@ def build(loaded: LoadedRun) -> RunReport:
         ate_joint_m=ate_joint_m(tracks),
         ate_joint_odometry_m=ate_joint_odometry_m(tracks, aligned=False),
         ate_joint_odometry_aligned_m=ate_joint_odometry_m(tracks, aligned=True),
-        ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames},
+        ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames if not apart},
         ate_m={robot.robot: robot.corrected.ate_m for robot in robots},
         ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
         bytes=total_bytes(by_robot),
@@ -102,6 +104,8 @@ def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:
     frames = {track.map_frame for track in moved}
     if len(frames) != 1 or None in frames or not all(len(track.corrected_and_true()[1]) for track in moved):
         return None
+    if in_separate_frames(tracks):
+        return None
     return ate_in_frame_m(moved, frames.pop() or "")
 
 
@@ -115,7 +119,7 @@ def ate_joint_odometry_m(tracks: Mapping[str, RobotTrack], aligned: bool) -> flo
     """Joint ATE of odometry placed at its true starts, or None unless every robot has ground truth."""
     moved = with_keyframes(tracks.values())
     pairs = [track.odometry_and_true() for track in moved]
-    if not all(len(truth) for _, truth in pairs):
+    if not all(len(truth) for _, truth in pairs) or in_separate_frames(tracks):
         return None
     error = ate_m if aligned else unaligned_ate_m
     return error([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
@@ -208,13 +212,14 @@ def total_bytes(by_robot: Mapping[str, RobotBytes]) -> dict[str, int]:
 
 
 def warnings_of(loaded: LoadedRun) -> list[str]:
-    """Sentences that a reader should see: deaths, refusals, missing results, unknown events, the solver's last."""
+    """What a reader should see: deaths, refusals, missing results, odd truths, unknown events, the solver's last."""
     events = loaded.events
     found = [f"{e.robot} died after {e.t:.1f} s ({how_it_died(e)})." for e in of_kind(events, AgentDied)]
     found += sorted({f"{e.robot} refused {e.fact.peer}: {e.fact.reason}." for e in of_kind(events, PeerRefused)})
     for robot in loaded.robots:
         if robot not in loaded.results:
             found.append(f"{robot} left no result; its trajectory is odometry only.")
+    found += [*other_clocks(loaded.tracks), *frame_sentences(loaded.tracks)]
     unknown = Counter(event.fact.name for event in of_kind(events, UnknownFact))
     for name, count in sorted(unknown.items()):
         found.append(f"This version does not know events of the kind {name} ({count} in this run).")

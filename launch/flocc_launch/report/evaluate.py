@@ -5,7 +5,7 @@ from pathlib import Path
 from flocc_launch.report.finish import finish
 from flocc_launch.report.text import sentences
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.trajectory_errors import evo_ape
+from flocc_launch.runs.trajectory_errors import EvaluationError, evo_ape, evo_program
 
 
 def evaluate(run: Path, with_evo: bool = False, as_json: bool = False) -> str:
@@ -25,13 +25,17 @@ def evaluate(run: Path, with_evo: bool = False, as_json: bool = False) -> str:
         return report.model_dump_json(indent=1)
     lines = sentences(report)
     if with_evo:
-        lines += [evo_of(run, robot) for robot in report.robots]
+        program = evo_program()
+        lines += [evo_of(run, robot, program) for robot in report.robots]
     return "\n".join([*lines, f"report: {(run / 'report.html').resolve()}"])
 
 
-def evo_of(run: Path, robot: str) -> str:
-    """What evo says of one robot, or why it says nothing."""
+def evo_of(run: Path, robot: str, program: str) -> str:
+    """What evo says of one robot, or why it says nothing; a robot that it refuses costs itself."""
     truth, estimate = run / "groundtruth" / f"{robot}.tum", run / "trajectories" / f"{robot}.tum"
     if not truth.exists() or not estimate.exists():
         return f"{robot}: evo has nothing to compare ({'no ground truth' if not truth.exists() else 'no correction'})"
-    return f"{robot}: evo_ape\n{evo_ape(truth, estimate)}"
+    try:
+        return f"{robot}: evo_ape\n{evo_ape(truth, estimate, program)}"
+    except EvaluationError as error:
+        return f"{robot}: {error}"

@@ -7,6 +7,7 @@ from flocc_launch.report.build import build
 from flocc_launch.report.html import write_html
 from flocc_launch.report.model import SCHEMA_VERSION, RunReport
 from flocc_launch.report.run_graph import write_pose_graph
+from flocc_launch.runs.ground_truth import write_truth
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, read_record, write_json
 from flocc_launch.runs.tracks import Float, Mask
@@ -40,12 +41,13 @@ def read_report(path: Path) -> RunReport:
 
 
 def write_trajectories(path: Path, loaded: LoadedRun) -> None:
-    """Write the .tum files of every robot; a file without any pose is not written."""
+    """Write the .tum files of every robot; a file without any pose is not written, nor a truth that a person gave."""
     for robot, track in loaded.tracks.items():
         everything = track.stamps_s == track.stamps_s
         write_poses(path / "odometry" / f"{robot}.tum", track.stamps_s, track.T_odom_body, everything)
         write_poses(path / "trajectories" / f"{robot}.tum", track.stamps_s, track.T_map_body, track.corrected)
-        write_poses(path / "groundtruth" / f"{robot}.tum", track.stamps_s, track.T_world_body, track.true)
+        truth = Trajectory(track.stamps_s[track.true], track.T_world_body[track.true])
+        write_truth(path / "groundtruth" / f"{robot}.tum", truth)
 
 
 def write_poses(path: Path, stamps_s: Float, poses: Float, chosen: Mask) -> None:

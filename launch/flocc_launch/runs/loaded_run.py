@@ -7,6 +7,7 @@ from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.robot_result import RobotResult
 from flocc_launch.runs.closure_table import Pair, pairs_of
+from flocc_launch.runs.ground_truth import ground_truth
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.run_records import Run
 from flocc_launch.runs.timeline import Following, Link, end_s, followings, links
@@ -42,7 +43,7 @@ def load(folder: RunFolder) -> LoadedRun:
         robots=tuple(sorted(run.robots)),
         events=events,
         results=results,
-        tracks=tracks_of(folder, results, events),
+        tracks=tracks_of({robot: ground_truth(folder, robot) for robot in run.robots}, results, events),
         pairs=tuple(pairs_of(events, results.values())),
         followings=tuple(followings(events, end)),
         links=tuple(links(events, end)),

@@ -10,7 +10,9 @@ missing or of another type, is a `RunFolderError` that names the file.
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -102,10 +104,17 @@ class RunFolder:
         return list(self.iterate_events())
 
     def iterate_events(self) -> Iterator[Reported[Fact]]:
-        """Read `events.jsonl` line by line; as `events`."""
+        """Read `events.jsonl` line by line, as `events`; where a run was cut short, its agents' files instead."""
         path = self.path / "events.jsonl"
+        if not path.exists() and (parts := self._parts()):
+            yield from sorted(chain.from_iterable(map(_whole_lines, parts)), key=lambda event: (event.t, event.robot))
+            return
         for number, line in enumerate(read_text(path).splitlines(), start=1):
             yield event_from_line(line, f"{path}:{number}")
+
+    def _parts(self) -> list[Path]:
+        """Files of events that the launcher and the agents write while a run goes on."""
+        return [*sorted(self.path.glob("*.events.jsonl")), *sorted(self.path.glob("robots/*/events.jsonl"))]
 
     def result(self, robot: str) -> RobotResult | None:
         """Read a robot's `result.json`; None where it left none.
@@ -125,6 +134,13 @@ class RunFolder:
         """Folder of a robot's recording, or None where the run names none."""
         name = self.run().recordings.get(robot)
         return None if name is None else (self.path / name)
+
+
+def _whole_lines(path: Path) -> Iterator[Reported[Fact]]:
+    """Events of a file whose last line may be cut off."""
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        with suppress(RunFolderError):
+            yield event_from_line(line, f"{path}:{number}")
 
 
 def event_from_line(line: str, where: str) -> Reported[Fact]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,6 @@ from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.robot_result import RobotResult, stacked_poses
 from flocc_agent.runtime.trajectory import Trajectory
-from flocc_agent.runtime.trajectory_text import read_tum
-from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.trajectory_errors import associate, placed_at_true_start
 
 Float = NDArray[np.float64]
@@ -34,6 +31,7 @@ class RobotTrack:
         T_map_body: (N, 4, 4); the rows that are not corrected are NaN.
         true: (N,) which keyframes have ground truth.
         T_world_body: (N, 4, 4) ground truth; the rows without it are NaN.
+        truth: All of the ground truth, on whatever clock it is.
     """
 
     robot: str
@@ -45,6 +43,7 @@ class RobotTrack:
     T_map_body: Float
     true: Mask
     T_world_body: Float
+    truth: Trajectory | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_s)
@@ -65,13 +64,12 @@ class RobotTrack:
 
 
 def tracks_of(
-    folder: RunFolder, results: Mapping[str, RobotResult], events: Sequence[Reported[Fact]]
+    truths: Mapping[str, Trajectory | None], results: Mapping[str, RobotResult], events: Sequence[Reported[Fact]]
 ) -> dict[str, RobotTrack]:
     """Put together every robot's track; one that left no result has the odometry of its `keyframe` events."""
     taken = of_kind(events, KeyframeTaken)
     tracks = {}
-    for robot in sorted(folder.run().robots):
-        truth = ground_truth(folder, robot)
+    for robot, truth in sorted(truths.items()):
         if robot in results:
             tracks[robot] = track_of_result(results[robot], truth)
         else:
@@ -116,14 +114,6 @@ def completed(
         true, poses = associate(stamps_s, truth)
         T_world_body[true] = poses
     corrected: Mask = np.asarray(np.isfinite(T_map_body).all(axis=(1, 2)))
-    return RobotTrack(robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
-
-
-def ground_truth(folder: RunFolder, robot: str) -> Trajectory | None:
-    """True body poses of a robot, from its recording or as its driver left them; None if unknown."""
-    recording = folder.recording(robot)
-    places = [folder.path / "groundtruth" / f"{robot}.tum"]
-    if recording is not None:
-        places.insert(0, recording / "groundtruth.tum")
-    found: Path | None = next((place for place in places if place.is_file()), None)
-    return None if found is None else read_tum(found)
+    return RobotTrack(
+        robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body, truth
+    )

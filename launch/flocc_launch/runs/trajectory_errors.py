@@ -5,6 +5,7 @@ without ground truth do not count. The tests hold these few lines against evo to
 """
 
 import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,18 +116,28 @@ def relative_pose_error(estimate: Float, truth: Float, delta: int = 1) -> Relati
     return RelativePoseError(rmse_m(errors[:, :3, 3]), float(np.rad2deg(rotation_rmse_rad)))
 
 
-def evo_ape(truth_tum: Path, estimate_tum: Path) -> str:
+def evo_program() -> str:
+    """Where `evo_ape` is: beside this Python, activated or not, or on the path.
+
+    Raises:
+        EvaluationError: evo is not installed.
+    """
+    beside = Path(sys.executable).parent
+    program = which("evo_ape", path=str(beside)) or which("evo_ape")
+    if program is None:
+        raise EvaluationError("--evo needs evo: pip install 'flocc[eval]'")
+    return program
+
+
+def evo_ape(truth_tum: Path, estimate_tum: Path, program: str) -> str:
     """Run evo's own `evo_ape tum --align` on two files of a run folder and return what it prints.
 
     Raises:
-        EvaluationError: evo is not installed, or it refused the files.
+        EvaluationError: It refused the files.
     """
-    program = which("evo_ape")
-    if program is None:
-        raise EvaluationError("--evo needs evo: pip install 'flocc[eval]'")
     command = [program, "tum", str(truth_tum), str(estimate_tum), "--align"]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     if ran.returncode != 0:
         reason = (ran.stderr or ran.stdout).strip().splitlines() or ["no reason given"]
-        raise EvaluationError(f"{estimate_tum}: evo_ape refused it: {reason[-1]}")
+        raise EvaluationError(f"evo_ape refused {estimate_tum}: {reason[-1]}")
     return ran.stdout

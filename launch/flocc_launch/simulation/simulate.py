@@ -18,10 +18,10 @@ from flocc_agent.runtime.facts import AccountKept, AgentStopped, BytesCounted
 from flocc_agent.runtime.measurement_file import rows_of
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
-from flocc_agent.runtime.trajectory import write_tum
 from flocc_agent.stages import counts_of
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
+from flocc_launch.runs.ground_truth import truth_path, write_truth
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.scenario import Scenario
@@ -123,9 +123,7 @@ def write(
     for name, station in swarm.stations.items():
         _write_robot(folder, swarm, name)
         if station.playback.truth is not None:
-            truth = folder.path / "groundtruth" / f"{name}.tum"
-            truth.parent.mkdir(exist_ok=True)
-            write_tum(truth, station.playback.truth)
+            write_truth(truth_path(folder, name), station.playback.truth)
     folder.write_events(line_of(told) for told in swarm.told)
     folder.write_run(
         Run(

@@ -105,7 +105,7 @@ async def _run(
 
     agent = Agent(config, on_report=on_report, clock_s=lambda: time.monotonic() - epoch_s)
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending_signals():
         loop.add_signal_handler(number, agent.stop)
     background: list[asyncio.Task[None]] = []
     try:
@@ -122,6 +122,12 @@ async def _run(
         _write_result(config.folder, agent.result())
         lines.write(Reported(time.monotonic() - epoch_s, config.name, AgentStopped()))
         lines.close()
+
+
+def ending_signals() -> list[signal.Signals]:
+    """Signals that end a run in order: also that of a closed terminal, unless `nohup` has it ignored."""
+    ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
 
 
 @contextmanager

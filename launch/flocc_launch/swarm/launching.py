@@ -26,7 +26,7 @@ from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault, Scenario, agent_config
 from flocc_launch.setup.credentials import make_keys
-from flocc_launch.swarm.agent_process import Lines, recover_result
+from flocc_launch.swarm.agent_process import Lines, ending_signals, recover_result
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
 
@@ -150,7 +150,7 @@ class _Launch:
         """Start, watch, stop, write."""
         self._folder.write_run(self._run_record())
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ending_signals():
             loop.add_signal_handler(number, self._interrupt)
         self._epoch_s = time.monotonic()
         try:
