@@ -73,6 +73,23 @@ def read(path: Path) -> bytes:
         raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
 
 
+def is_operator(tls: TlsConfig) -> bool:
+    """Whether a folder of keys is of somebody who may ask for status and inject faults.
+
+    Raises:
+        TransportError: A file is missing or not what it should be.
+    """
+    _check_installed()
+    from cryptography import x509
+
+    try:
+        subject = x509.load_pem_x509_certificate(read(tls.folder / CERTIFICATE)).subject
+    except ValueError as error:
+        raise TransportError(f"{tls.folder / CERTIFICATE}: is no certificate: {error}") from error
+    names = {str(each.value) for each in subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)}
+    return not names.isdisjoint(read_members(tls.folder / MEMBERS).operators)
+
+
 def secure_settings(tls: TlsConfig, swarm: str, robot: str) -> dict[str, Any]:
     """Give zenoh's settings for mutual TLS, nothing but TLS, and one writer per key.
 

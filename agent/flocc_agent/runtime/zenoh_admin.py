@@ -5,16 +5,20 @@ and opaque here; a few may wait, the rest go unanswered.
 """
 
 import asyncio
+import json
 import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import zenoh
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.security import is_operator
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
 from flocc_protocol import keys
 from flocc_protocol.errors import DecodeError
@@ -29,6 +33,8 @@ REQUEST_BYTES_MAX = 64 * 1024
 ANSWER_BYTES_MAX = 1024 * 1024
 OPERATOR = "operator"
 LOOK_PERIOD_S = 0.05
+TOKENS_S = 1.0
+SCOUT_S = 1.0
 
 
 class AdminService:
@@ -93,7 +99,37 @@ async def ask(
     robot: str = "*",
     timeout_s: float = 3.0,
 ) -> dict[str, bytes]:
-    """Ask agents in reach, as an operator.
+    """Ask agents in reach once, as an operator; arguments and errors as of `survey`."""
+    return (await survey(config, swarm, admin, request, robot, timeout_s, tries=1)).answers
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What came of asking a swarm.
+
+    Attributes:
+        answers: Answer by robot.
+        present: Robots of the swarm that are there, whether they answered or not.
+        others: Other swarms that are there.
+        refuses: There are agents that speak to holders of keys only, and these are none, or not an operator's.
+    """
+
+    answers: dict[str, bytes]
+    present: tuple[str, ...]
+    others: tuple[str, ...]
+    refuses: bool
+
+
+async def survey(
+    config: TransportConfig,
+    swarm: str,
+    admin: keys.Admin,
+    request: bytes = b"",
+    robot: str = "*",
+    timeout_s: float = 3.0,
+    tries: int = 2,
+) -> Survey:
+    """Ask agents in reach, as an operator, and once more where one that is there has not answered.
 
     Args:
         config: How to reach the swarm: its roster, or scouting; with TLS the operator's folder.
@@ -101,36 +137,80 @@ async def ask(
         admin: What is asked.
         request: Its content.
         robot: Whom to ask, '*' for everybody.
-        timeout_s: Time for finding agents, and again for their answers.
-
-    Returns:
-        Answer by robot; who did not answer is not in it.
+        timeout_s: Time for finding agents, and again for the answers to each try.
+        tries: How often who is silent is asked.
 
     Raises:
         TransportError: The network cannot be used as configured.
     """
-    return await asyncio.to_thread(_ask_blocking, config, swarm, admin, request, robot, timeout_s)
+    return await asyncio.to_thread(_ask_blocking, config, swarm, admin, request, robot, timeout_s, tries)
 
 
 def _ask_blocking(
-    config: TransportConfig, swarm: str, admin: keys.Admin, request: bytes, robot: str, timeout_s: float
-) -> dict[str, bytes]:
+    config: TransportConfig, swarm: str, admin: keys.Admin, request: bytes, robot: str, timeout_s: float, tries: int
+) -> Survey:
     settings = session_settings(config, swarm, OPERATOR, Plane.CONTROL, dials_all=True)
     dialled = endpoints_to_dial(config, settings)
     session = open_session(settings | {"listen/endpoints": [], "connect/endpoints": dialled}, OPERATOR)
     try:
         _find(session, len(dialled), timeout_s)
-        replies = session.get(
-            keys.admin_key(swarm, robot, admin),
-            zenoh.handlers.FifoChannel(256),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-            payload=request,
-        )
-        return dict(sorted(answer for answer in map(_read, replies) if answer is not None))
+        answers: dict[str, bytes] = {}
+        for _ in range(tries):
+            answers |= _answers(session, keys.admin_key(swarm, robot, admin), request, timeout_s)
+            there = _present(session)
+            present = {presence.robot for presence in there if presence.swarm == swarm}
+            if answers and present <= answers.keys():
+                break
+        others = {presence.swarm for presence in there} - {swarm}
+        refuses = not answers and _refuses(config, bool(present))
+        return Survey(dict(sorted(answers.items())), tuple(sorted(present)), tuple(sorted(others)), refuses)
     finally:
         session.close()
+
+
+def _answers(session: zenoh.Session, key: str, request: bytes, timeout_s: float) -> dict[str, bytes]:
+    replies = session.get(
+        key,
+        zenoh.handlers.FifoChannel(256),
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=timeout_s,
+        payload=request,
+    )
+    return dict(answer for answer in map(_read, replies) if answer is not None)
+
+
+def _present(session: zenoh.Session) -> list[keys.Presence]:
+    """Whose liveliness tokens are seen; sessions answer for their agents, however busy those are."""
+    found = []
+    for reply in session.liveliness().get(keys.presence_pattern(), timeout=TOKENS_S):
+        if reply.ok is not None:
+            with suppress(DecodeError):
+                found.append(keys.parse_alive_key(str(reply.ok.key_expr)))
+    return found
+
+
+def _refuses(config: TransportConfig, present: bool) -> bool:
+    """Whether those who are silent want keys: a robot's are not an operator's, and without any nobody is linked."""
+    if config.tls is not None:
+        return present and not is_operator(config.tls)
+    return not present and any(locator.startswith("tls/") for locator in _scouted(config))
+
+
+def _scouted(config: TransportConfig) -> list[str]:
+    """Where agents say that they listen, to whoever scouts."""
+    if not config.multicast:
+        return []
+    zenoh_config = zenoh.Config()
+    zenoh_config.insert_json5("scouting/multicast/address", json.dumps(config.multicast_group(True)))
+    zenoh_config.insert_json5("scouting/multicast/interface", json.dumps(config.interface))
+    scout = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=zenoh_config)
+    time.sleep(SCOUT_S)
+    found: list[str] = []
+    while (hello := scout.try_recv()) is not None:
+        found += map(str, hello.locators)
+    scout.stop()
+    return found
 
 
 def endpoints_to_dial(config: TransportConfig, settings: dict[str, Any]) -> list[str]:

@@ -20,6 +20,10 @@ ConfigOption = Annotated[Path | None, typer.Option(help="An agent's configuratio
 SwarmOption = Annotated[str | None, typer.Option(help="Name of a running swarm, found by scouting.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
+TimeoutOption = Annotated[
+    float, typer.Option(min=0.1, help="Seconds for finding agents, and for each of two tries to be answered.")
+]
+
 
 def add_tools(app: typer.Typer) -> None:
     """Register the commands."""
@@ -36,6 +40,7 @@ def doctor(
     swarm: SwarmOption = None,
     installation: Annotated[bool, typer.Option("--installation", help="Check this machine for --config.")] = False,
     json_out: JsonOption = False,
+    timeout: TimeoutOption = 3.0,
 ) -> None:
     """Say why maps have or have not merged: of a run folder, of a running swarm, or check this installation."""
     from flocc_agent.config import AgentConfig
@@ -51,7 +56,7 @@ def doctor(
         read = AgentConfig.read(config)
         findings = check_installation(read.folder, read.transport, read.perception)
     elif config is not None or swarm is not None:
-        findings = diagnose_live(status_of_swarm(*_reach(config, swarm)))
+        findings = diagnose_live(status_of_swarm(*_reach(config, swarm), timeout_s=timeout))
     else:
         findings = check_installation()
     _print_findings(findings, json_out)
@@ -62,6 +67,7 @@ def status(
     config: ConfigOption = None,
     swarm: SwarmOption = None,
     json_out: JsonOption = False,
+    timeout: TimeoutOption = 3.0,
     watch_s: Annotated[float | None, typer.Option("--watch", min=0.2, help="Ask again after so many seconds.")] = None,
 ) -> None:
     """Show every robot of a running swarm, or of a run folder, in one table."""
@@ -73,7 +79,7 @@ def status(
     if not console.is_terminal:
         console = Console(width=WIDTH_PIPE)
     while True:
-        rows = status_of_run(run) if run is not None else status_of_swarm(*_reach(config, swarm))
+        rows = status_of_run(run) if run is not None else status_of_swarm(*_reach(config, swarm), timeout_s=timeout)
         if json_out:
             typer.echo(status_json(rows))
         else:

@@ -7,7 +7,7 @@ import asyncio
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationError
 from rich.box import SIMPLE_HEAD
@@ -20,7 +20,11 @@ from flocc_launch.dashboard.snapshot import RobotView
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
+if TYPE_CHECKING:
+    from flocc_agent.runtime.zenoh_admin import Survey
+
 OPTIONAL = frozenset({"waiting", "lost %", "refused"})
+NO_ANSWER = "no answer"
 LEFT = frozenset({"robot", "state", "leader", "map frame", "hears"})
 
 
@@ -55,23 +59,40 @@ def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0)
     Args:
         config: How to reach the swarm: its roster, or scouting.
         swarm: Name of the swarm.
-        timeout_s: Time for finding agents, and again for their answers.
+        timeout_s: Time for finding agents, and again for their answers, for which they are asked twice.
 
     Returns:
         One status per robot that answered, sorted.
 
     Raises:
-        StatusError: No agent answered.
+        StatusError: No agent answered; it says which of three reasons it has.
         TransportError: The network cannot be used as configured.
     """
-    from flocc_agent.runtime.zenoh_admin import ask
+    from flocc_agent.runtime.zenoh_admin import survey
     from flocc_protocol.keys import Admin
 
-    answers = asyncio.run(ask(config, swarm, Admin.STATUS, timeout_s=timeout_s))
-    if not answers:
-        where = f"{len(config.roster)} robots of the roster" if config.roster else "anybody that scouting finds"
-        raise StatusError(f"swarm {swarm}: no agent answered within {timeout_s:g} s; asked {where}")
-    return [status_from(robot, answers[robot]) for robot in sorted(answers)]
+    found = asyncio.run(survey(config, swarm, Admin.STATUS, timeout_s=timeout_s))
+    if not found.answers:
+        raise StatusError(f"swarm {swarm}: {why_silent(found, config, timeout_s)}")
+    late = [RobotStatus(robot=robot, state=NO_ANSWER) for robot in found.present if robot not in found.answers]
+    rows = [status_from(robot, answer) for robot, answer in found.answers.items()]
+    return sorted([*rows, *late], key=lambda row: row.robot)
+
+
+def why_silent(found: "Survey", config: TransportConfig, timeout_s: float) -> str:
+    """Why nobody answered: they want keys, they are late, or nobody is there."""
+    if found.refuses:
+        held = "no keys were given" if config.tls is None else f"{config.tls.folder} holds a robot's keys"
+        return f"there are agents, but they answer only to operators, and {held}; give --config with an operator's keys"
+    if found.present:
+        are = "is" if len(found.present) == 1 else "are"
+        return (
+            f"{', '.join(found.present)} {are} there, but did not answer within {timeout_s:g} s, asked twice; "
+            "a machine under load answers late: give a longer --timeout"
+        )
+    where = f"{len(config.roster)} robots of the roster" if config.roster else "anybody that scouting finds"
+    there = f" (there: swarm {', '.join(found.others)})" if found.others else ""
+    return f"nobody is there: in {timeout_s:g} s no agent of it was found{there}; asked {where}"
 
 
 def status_from(robot: str, answer: bytes) -> RobotStatus:

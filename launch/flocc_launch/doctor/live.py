@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from flocc_launch.dashboard.status_table import RobotStatus
+from flocc_launch.dashboard.status_table import NO_ANSWER, RobotStatus
 from flocc_launch.doctor.finding import Finding, Severity, blocked
 from flocc_launch.doctor.live_steps import apart, is_server
 from flocc_launch.doctor.merge_evidence import named
@@ -11,6 +11,20 @@ from flocc_launch.doctor.merge_evidence import named
 
 def diagnose_live(rows: Sequence[RobotStatus]) -> list[Finding]:
     """Say why the maps of a running swarm have or have not merged, as far as its agents' states show."""
+    silent = [row.robot for row in rows if row.state == NO_ANSWER]
+    return [*_answered([row for row in rows if row.robot not in silent]), *late(silent)]
+
+
+def late(silent: Sequence[str]) -> list[Finding]:
+    """Robots that are there and did not answer in time."""
+    if not silent:
+        return []
+    sentence = f"{named(silent)} did not answer in time, asked twice, so nothing more is said of them."
+    advice = "A machine under load answers late: give a longer --timeout."
+    return [Finding("no-answer", Severity.NOTE, sentence, advice, tuple(silent))]
+
+
+def _answered(rows: Sequence[RobotStatus]) -> list[Finding]:
     checks = (lonely, unheard, without_keyframes, leaderless, refusing)
     found = [finding for check in checks for finding in check(rows)]
     first = merging(rows, bool(found))
