@@ -54,14 +54,14 @@ def test_a_missed_expectation_fails_the_test_and_says_why(pytester: pytest.Pytes
 
         @pytest.mark.flocc("hangar.toml", faults=APART)
         def test_it_merges(flocc_run):
-            raise AssertionError("the fixture fails before")
+            raise AssertionError("the check fails before")
         """,
     )
-    result.assert_outcomes(errors=1)
+    result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         ["*merged_within_s: expected 20.0, was None*", "*heard nobody at all*", "*report.html*"]
     )
-    result.stdout.no_fnmatch_line("*the fixture fails before*")
+    result.stdout.no_fnmatch_line("*the check fails before*")
 
 
 def test_one_test_runs_several_scenarios(pytester: pytest.Pytester) -> None:

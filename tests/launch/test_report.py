@@ -7,13 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
 from flocc_agent.runtime.event_lines import Reported, UnknownFact
 from flocc_agent.runtime.trajectory_text import read_tum
+from flocc_launch.commands.common import show_report
 from flocc_launch.report import RunReport, evaluate, finish, read_report
 from flocc_launch.report.build import judged
+from flocc_launch.report.text import sentences
+from flocc_launch.report.verdict import verdict
+from flocc_launch.runs.plain_numbers import plain
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line
 from flocc_launch.runs.timeline import merged_after_s
 from flocc_launch.runs.trajectory_errors import ate_m
@@ -156,6 +161,24 @@ def test_evaluate_says_what_the_report_holds(folder: RunFolder) -> None:
     assert RunReport.model_validate_json(evaluate(folder.path, as_json=True)) == read_report(
         folder.path / "report.json"
     )
+
+
+def test_what_was_missed_stands_in_the_first_line_in_red_on_a_terminal(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = finish(folder)
+    assert not sentences(report)[0].startswith("MISSED")
+    limits = {"ate_max_m": 0.01, "merged_within_s": 60.0}
+    missed = report.model_copy(update={"expectations": judged(limits, report)})
+    assert sentences(missed)[0] == f"MISSED: ate_max_m {plain(0.01)} ({plain(report.ate_joint_m)})"
+
+    told: list[str] = []
+    monkeypatch.setattr("typer.secho", lambda text, **how: told.append(typer.style(text, **how)))
+    with pytest.raises(SystemExit) as left:
+        show_report(missed, folder.path)
+    assert left.value.code == 1
+    assert told[0].startswith("\x1b[31m\x1b[1mMISSED: ")
+    assert verdict(missed) in told[1]
 
 
 @pytest.mark.slow

@@ -102,6 +102,6 @@ async def test_a_swarm_with_keys_is_recognised_without_any(tmp_path: Path) -> No
     scouted = {"multicast": True, "multicast_address": f"224.0.0.224:{free_ports(1)[0]}", "interface": "lo"}
     config = loopback_configs(("r1",), tls=TlsConfig(folder=folders["r1"]), **scouted)["r1"]
     async with agent(config):
-        bare = TransportConfig(control_listen=("tcp/127.0.0.1:0",), gossip=False, **scouted)  # type: ignore[arg-type]
+        bare = TransportConfig(control_listen=("tcp/127.0.0.1:0",), gossip=False, **scouted)
         with pytest.raises(StatusError, match="they answer only to operators, and no keys were given"):
             await asked(bare, 0.5)

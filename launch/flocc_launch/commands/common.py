@@ -52,11 +52,12 @@ class ProgressLines:
 
 
 def show_report(report: "RunReport", out: Path) -> None:
-    """Print what came of a run; leave with exit code 1 when an expectation is missed or unknown, or no robot lived."""
-    from flocc_launch.report.text import sentences
+    """Print what came of a run, what was missed in red; exit code 1 where something was, or where no robot lived."""
+    from flocc_launch.report.text import MISSED, sentences
 
     for sentence in sentences(report):
-        typer.echo(sentence)
+        is_missed = sentence.startswith(MISSED)
+        typer.secho(sentence, fg="red" if is_missed else None, bold=is_missed or None)
     typer.echo(f"report: {(out / 'report.html').resolve()}")
     none_lived = bool(report.robot_details) and all(robot.end == "died" for robot in report.robot_details)
     if none_lived or any(expectation.met is not True for expectation in report.expectations):

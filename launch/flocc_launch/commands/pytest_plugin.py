@@ -8,9 +8,9 @@
         first, second = (flocc.simulate("hangar.toml", seed=seed).check() for seed in (1, 2))
         assert first.report.closures != second.report.closures
 
-`flocc_run` has run the scenario of its marker and has failed the test where an expectation was missed; `flocc` runs any
-number of scenarios. A scenario is a file, relative to the test's own, or the name of a shipped one. This module imports
-nothing of flocc before a test asks for it, so that other tests do not wait for it.
+`flocc_run` has run the scenario of its marker, and the test fails before its first line where an expectation was
+missed; `flocc` runs any number of scenarios. A scenario is a file, relative to the test's own, or the name of a shipped
+one. This module imports nothing of flocc before a test asks for it, so that other tests do not wait for it.
 """
 
 from collections.abc import Mapping
@@ -60,6 +60,9 @@ class ScenarioRun:
         return "\n".join(
             [f"scenario {self.report.scenario} missed", *asked, *found, f"report: {self.folder}/report.html"]
         )
+
+
+RUN = pytest.StashKey[ScenarioRun]()
 
 
 class ScenarioRunner:
@@ -140,11 +143,20 @@ def flocc(request: pytest.FixtureRequest, tmp_path: Path) -> ScenarioRunner:
 
 @pytest.fixture
 def flocc_run(request: pytest.FixtureRequest, flocc: ScenarioRunner) -> ScenarioRun:
-    """The run of the test's `flocc` marker, whose expectations were met."""
+    """The run of the test's `flocc` marker; the test fails before its first line where an expectation was missed."""
     marker = request.node.get_closest_marker("flocc")
     if marker is None or len(marker.args) != 1:
         pytest.fail("flocc_run needs @pytest.mark.flocc(SCENARIO)", pytrace=False)
-    return run_marked(flocc, marker.args[0], **marker.kwargs).check()
+    run = request.node.stash[RUN] = run_marked(flocc, marker.args[0], **marker.kwargs)
+    return run
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_call(item: pytest.Item) -> None:
+    """Check the run of the marker here, so that a miss is a failure of the test and no error of its set-up."""
+    __tracebackhide__ = True
+    if RUN in item.stash:
+        item.stash[RUN].check()
 
 
 def run_marked(

@@ -4,11 +4,15 @@ from flocc_launch.report.model import RunReport
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
 
+MISSED = "MISSED: "
+"""How the first line begins where an expectation was missed."""
+
 
 def sentences(report: RunReport) -> list[str]:
-    """Lines that a person reads after a run: the verdict, the figures, the robots, what was expected."""
+    """Lines that a person reads after a run: what was missed, the verdict, the figures, the robots, expectations."""
     closures, bytes_sent = report.closures, sum(report.bytes.values())
     lines = [
+        *missed_lines(report),
         verdict(report),
         "",
         f"map frames    {', '.join(report.map_frames) or 'none'}",
@@ -28,6 +32,13 @@ def sentences(report: RunReport) -> list[str]:
         f"expected      {e.name} {plain(e.limit)}: {plain(e.value)}, {judged(e.met)}" for e in report.expectations
     ]
     return lines + [f"note          {warning}" for warning in report.warnings]
+
+
+def missed_lines(report: RunReport) -> list[str]:
+    """One line of the expectations that were missed or not measured; none where all were met."""
+    missed = [e for e in report.expectations if e.met is not True]
+    told = [f"{e.name} {plain(e.limit)} ({plain(e.value) if e.met is False else 'not measured'})" for e in missed]
+    return [f"{MISSED}{', '.join(told)}"] if told else []
 
 
 def judged(met: bool | None) -> str:
