@@ -127,7 +127,8 @@ def test_a_killed_robot_is_reported_and_the_rest_go_on(tmp_path: Path) -> None:
     r1 = report.robot_details[0]
     assert (r1.end, r1.ended_s, r1.map_frame) == ("died", 50.0, None)
     assert r1.keyframes > 10
-    assert report.ate_joint_m is None
+    assert report.ate_joint_m == report.ate_by_frame_m["map/r1"]
+    assert report.ate_dead_m == {}
     assert report.ate_by_frame_m["map/r1"] is not None
 
 

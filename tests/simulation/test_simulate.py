@@ -10,6 +10,7 @@ import pytest
 from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, KeyframeTaken, LeaderFollowed
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.report.text import sentences
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
@@ -96,3 +97,17 @@ def test_a_robot_without_images_of_its_own_serves_the_others(tmp_path: Path) -> 
     events = RunFolder.open(tmp_path / "run").iterate_events()
     by = Counter(event.fact.by for event in of_kind(events, ClosureAccepted))
     assert by["server"] > 0.8 * by.total()
+
+
+def test_after_a_scripted_kill_the_error_is_of_the_survivors_and_of_the_dead_until_it_died(tmp_path: Path) -> None:
+    kill = {"at_s": 25.0, "kind": "kill", "robots": ["r2"]}
+    report = simulate(scenario(faults=[kill], expectations={"ate_max_m": 2.0}), tmp_path / "run")
+    assert report.ate_joint_m is not None
+    assert [(e.name, e.met) for e in report.expectations] == [("ate_max_m", True), ("deaths_max", True)]
+    assert list(report.ate_dead_m) == ["r2"]
+    assert report.ate_dead_m["r2"] < 2.0
+    assert "of the survivors, r2 until it died" in next(line for line in sentences(report) if "joint ATE" in line)
+    result = RunFolder.open(tmp_path / "run").result("r2")
+    assert result is not None
+    taken = of_kind(RunFolder.open(tmp_path / "run").events(), KeyframeTaken)
+    assert len(result.keyframes) == sum(event.robot == "r2" and event.t <= 25.0 for event in taken)

@@ -35,7 +35,7 @@ from flocc_launch.runs.timeline import (
     terms_led,
 )
 from flocc_launch.runs.tracks import RobotTrack
-from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
+from flocc_launch.runs.trajectory_errors import alignment, ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.runs.version import flocc_version
 
 Float = NDArray[np.float64]
@@ -54,6 +54,7 @@ def build(loaded: LoadedRun) -> RunReport:
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
     by_robot = bytes_by_robot(loaded)
     apart = in_separate_frames(tracks)
+    living = survivors(tracks, [robot.robot for robot in robots if robot.end == "died"])
     report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
@@ -67,9 +68,10 @@ def build(loaded: LoadedRun) -> RunReport:
         map_frames=frames,
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
-        ate_joint_m=ate_joint_m(tracks),
-        ate_joint_odometry_m=ate_joint_odometry_m(tracks, aligned=False),
-        ate_joint_odometry_aligned_m=ate_joint_odometry_m(tracks, aligned=True),
+        ate_joint_m=ate_joint_m(living),
+        ate_dead_m=ate_dead_m(living, tracks),
+        ate_joint_odometry_m=ate_joint_odometry_m(living, aligned=False),
+        ate_joint_odometry_aligned_m=ate_joint_odometry_m(living, aligned=True),
         ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames if not apart},
         ate_m={robot.robot: robot.corrected.ate_m for robot in robots},
         ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
@@ -96,6 +98,28 @@ def build(loaded: LoadedRun) -> RunReport:
 def with_keyframes(tracks: Iterable[RobotTrack]) -> list[RobotTrack]:
     """The tracks that have keyframes at all."""
     return [track for track in tracks if len(track)]
+
+
+def survivors(tracks: Mapping[str, RobotTrack], died: Iterable[str]) -> dict[str, RobotTrack]:
+    """Tracks of the robots that lived to the end; of all where none did."""
+    dead = set(died)
+    return {robot: track for robot, track in tracks.items() if robot not in dead} or dict(tracks)
+
+
+def ate_dead_m(living: Mapping[str, RobotTrack], tracks: Mapping[str, RobotTrack]) -> dict[str, float]:
+    """Error of each dead robot until it died, placed in the world by the survivors, whose map it was in."""
+    if ate_joint_m(living) is None:
+        return {}
+    moved = with_keyframes(living.values())
+    estimates, truths = zip(*(track.corrected_and_true() for track in moved), strict=True)
+    T_world_map = alignment(estimates, truths)
+    pairs = {
+        robot: track.corrected_and_true()
+        for robot, track in tracks.items()
+        if robot not in living and track.map_frame == moved[0].map_frame
+    }
+    errors = {robot: unaligned_ate_m([T_world_map @ pair[0]], [pair[1]]) for robot, pair in pairs.items()}
+    return {robot: error_m for robot, error_m in errors.items() if error_m is not None}
 
 
 def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:

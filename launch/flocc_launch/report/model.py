@@ -160,7 +160,10 @@ class RunReport(Record):
     """When all living robots first were in one map frame (two robots at least)."""
     closures: Closures
     ate_joint_m: float | None
-    """All robots, one SE(3) alignment for all; null unless every robot is in one map frame and has truth."""
+    """All robots that lived to the end (all, where none did), one SE(3) alignment for all; null unless each of them is
+    in one map frame and has truth."""
+    ate_dead_m: dict[str, float] = Field(default_factory=dict)
+    """Robot that died in that map -> its error until it died, placed in the world by the survivors."""
     ate_joint_odometry_m: float | None
     """The same of odometry alone, each robot placed at its true first pose and not aligned further."""
     ate_joint_odometry_aligned_m: float | None

@@ -19,7 +19,7 @@ def sentences(report: RunReport) -> list[str]:
         f"merged after  {seconds(report.merged_after_s)}",
         f"closures      {count_of(closures.accepted)} accepted ({count_of(closures.accepted_inter_robot)} between "
         f"robots), {count_of(closures.rejected)} rejected of {count_of(closures.candidates)} candidates",
-        f"joint ATE     {number(report.ate_joint_m, 'm')}; odometry at its true starts "
+        f"joint ATE     {number(report.ate_joint_m, 'm')}{of_the_dead(report)}; odometry at its true starts "
         f"{number(report.ate_joint_odometry_m, 'm')}, aligned {number(report.ate_joint_odometry_aligned_m, 'm')}",
         f"sent          {size_of(bytes_sent) if report.bytes else '–'}"
         + "".join(f", {kind} {size_of(n)}" for kind, n in sorted(report.bytes.items(), key=lambda item: -item[1])),
@@ -39,6 +39,14 @@ def missed_lines(report: RunReport) -> list[str]:
     missed = [e for e in report.expectations if e.met is not True]
     told = [f"{e.name} {plain(e.limit)} ({plain(e.value) if e.met is False else 'not measured'})" for e in missed]
     return [f"{MISSED}{', '.join(told)}"] if told else []
+
+
+def of_the_dead(report: RunReport) -> str:
+    """That the joint error is of the survivors, and how far off the others were until they died."""
+    if all(robot.end != "died" for robot in report.robot_details):
+        return ""
+    dead = (f", {robot} until it died {number(error_m, 'm')}" for robot, error_m in sorted(report.ate_dead_m.items()))
+    return f" of the survivors{''.join(dead)}"
 
 
 def judged(met: bool | None) -> str:

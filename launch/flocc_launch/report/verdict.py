@@ -51,9 +51,10 @@ def error_sentence(report: RunReport) -> str:
         return "There is no ground truth, so the error is not known."
     if after is None or before is None:
         return ""
+    whose = " of the survivors" if any(robot.end == "died" for robot in report.robot_details) else ""
     if after < before:
-        return f"The joint error fell from {number(before, 'm')} (odometry alone) to {number(after, 'm')}."
-    return f"The joint error is {number(after, 'm')}, not better than odometry alone ({number(before, 'm')})."
+        return f"The joint error{whose} fell from {number(before, 'm')} (odometry alone) to {number(after, 'm')}."
+    return f"The joint error{whose} is {number(after, 'm')}, not better than odometry alone ({number(before, 'm')})."
 
 
 def sentence(text: str) -> str:

@@ -148,8 +148,10 @@ def _write_robot(folder: RunFolder, swarm: Swarm, name: str) -> None:
         swarm.report(name, BytesCounted(sent=sent, received=received))
     links, stages = swarm.network.links.tables(name), counts_of(station.workers.stages.snapshot())
     swarm.report(name, AccountKept(since_s=0.0, **links, stages=stages))
-    if station.core is not None:
-        folder.write_result(result_of(station.core, station.playback.T_body_camera, station.solution))
+    core = station.known(swarm.scenario.core)
+    if core is not None:
+        folder.write_result(result_of(core, station.playback.T_body_camera, station.solution))
+    if station.running:
         swarm.report(name, AgentStopped())
 
 

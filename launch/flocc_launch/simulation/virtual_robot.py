@@ -137,6 +137,12 @@ class Station:
         self._tick_s = self._due_s = float("inf")
         self._arm()
 
+    def known(self, parameters: CoreParameters) -> Robot | None:
+        """The core at the end; of a dead robot as its disk would bring it back, None where the disk holds nothing."""
+        if self.core is not None or not self.disk.records.get(self.log):
+            return self.core
+        return Robot(self.log, self._compute_class, 0, parameters, self.now_s(), self.disk.restored())
+
     def kill(self) -> None:
         """Lose everything but the disk."""
         self.core = None
