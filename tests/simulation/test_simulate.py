@@ -12,6 +12,7 @@ from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.report.text import sentences
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
+from flocc_launch.scenarios.leader_faults import FaultError
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
@@ -111,3 +112,21 @@ def test_after_a_scripted_kill_the_error_is_of_the_survivors_and_of_the_dead_unt
     assert result is not None
     taken = of_kind(RunFolder.open(tmp_path / "run").events(), KeyframeTaken)
     assert len(result.keyframes) == sum(event.robot == "r2" and event.t <= 25.0 for event in taken)
+
+
+def test_a_fault_may_name_whoever_leads_when_it_happens(tmp_path: Path) -> None:
+    kills = [{"at_s": at_s, "kind": "kill", "robots": ["leader"]} for at_s in (10.0, 25.0)]
+    report = simulate(scenario(faults=kills), tmp_path / "run")
+    died = [event.robot for event in of_kind(RunFolder.open(tmp_path / "run").events(), AgentDied)]
+    assert died == ["r1", "r2"]
+    assert report.leaders[-1].leader == "r3"
+    assert (len(report.map_frames), sorted(report.ate_dead_m)) == (1, ["r1", "r2"])
+    apart = {"at_s": 5.0, "kind": "partition", "groups": [["leader"], ["r2", "r3"]]}
+    alone = simulate(scenario(faults=[apart], duration_s=20.0), tmp_path / "apart")
+    assert {span.leader for span in alone.leaders} == {"r1", "r2"}
+
+
+def test_a_fault_of_the_leader_where_nobody_leads_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
+    kill = {"at_s": 0.1, "kind": "kill", "robots": ["leader"]}
+    with pytest.raises(FaultError, match=r"'kill' at 0\.1 s concerns the leader, but nobody leads then"):
+        simulate(scenario(faults=[kill]), tmp_path / "run")

@@ -50,7 +50,7 @@ def _odometry_made(recordings: Mapping[str, str]) -> dict[str, str]:
 def build(loaded: LoadedRun) -> RunReport:
     """Compute the report of a run."""
     run, tracks = loaded.run, loaded.tracks
-    frames = sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
+    frames = frames_of(tracks)
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
     by_robot = bytes_by_robot(loaded)
     apart = in_separate_frames(tracks)
@@ -65,7 +65,7 @@ def build(loaded: LoadedRun) -> RunReport:
         wall_s=run.wall_s,
         robots=list(loaded.robots),
         odometry_made=_odometry_made(run.recordings),
-        map_frames=frames,
+        map_frames=frames_of(living),
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
         ate_joint_m=ate_joint_m(living),
@@ -106,20 +106,23 @@ def survivors(tracks: Mapping[str, RobotTrack], died: Iterable[str]) -> dict[str
     return {robot: track for robot, track in tracks.items() if robot not in dead} or dict(tracks)
 
 
+def frames_of(tracks: Mapping[str, RobotTrack]) -> list[str]:
+    """Map frames of these robots, each once."""
+    return sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
+
+
 def ate_dead_m(living: Mapping[str, RobotTrack], tracks: Mapping[str, RobotTrack]) -> dict[str, float]:
-    """Error of each dead robot until it died, placed in the world by the survivors, whose map it was in."""
-    if ate_joint_m(living) is None:
-        return {}
+    """Error of each dead robot until it died: placed by the survivors where it was in their map, else by itself."""
+    dead = {robot: track for robot, track in tracks.items() if robot not in living}
     moved = with_keyframes(living.values())
-    estimates, truths = zip(*(track.corrected_and_true() for track in moved), strict=True)
-    T_world_map = alignment(estimates, truths)
-    pairs = {
-        robot: track.corrected_and_true()
-        for robot, track in tracks.items()
-        if robot not in living and track.map_frame == moved[0].map_frame
-    }
-    errors = {robot: unaligned_ate_m([T_world_map @ pair[0]], [pair[1]]) for robot, pair in pairs.items()}
-    return {robot: error_m for robot, error_m in errors.items() if error_m is not None}
+    known = ate_joint_m(living) is not None
+    T_world_map = alignment(*zip(*(track.corrected_and_true() for track in moved), strict=True)) if known else np.eye(4)
+    errors_m = {}
+    for robot, track in dead.items():
+        estimate, truth = track.corrected_and_true()
+        shared = known and track.map_frame == moved[0].map_frame
+        errors_m[robot] = unaligned_ate_m([T_world_map @ estimate], [truth]) if shared else ate_m([estimate], [truth])
+    return {robot: error_m for robot, error_m in errors_m.items() if error_m is not None}
 
 
 def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:

@@ -155,7 +155,7 @@ class RunReport(Record):
     odometry_made: dict[str, str] = Field(default_factory=dict)
     """Robot -> how its odometry was made of ground truth, where its data set had none."""
     map_frames: list[str]
-    """Frames at the end, each named once; a robot that was never corrected adds none."""
+    """Frames of the robots that lived to the end, each named once; a robot that was never corrected adds none."""
     merged_after_s: float | None
     """When all living robots first were in one map frame (two robots at least)."""
     closures: Closures
@@ -163,7 +163,8 @@ class RunReport(Record):
     """All robots that lived to the end (all, where none did), one SE(3) alignment for all; null unless each of them is
     in one map frame and has truth."""
     ate_dead_m: dict[str, float] = Field(default_factory=dict)
-    """Robot that died in that map -> its error until it died, placed in the world by the survivors."""
+    """Robot that died -> its error until it died, placed in the world by the survivors where it was in their map, else
+    after its own alignment."""
     ate_joint_odometry_m: float | None
     """The same of odometry alone, each robot placed at its true first pose and not aligned further."""
     ate_joint_odometry_aligned_m: float | None

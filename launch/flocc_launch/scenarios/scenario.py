@@ -191,6 +191,10 @@ LinkFault = Literal[
 """Faults that concern links; the others concern robots."""
 
 
+LEADER = "leader"
+"""As a robot of a fault: whom most robots follow when it happens, unless a robot bears the name."""
+
+
 class Fault(Section):
     """One entry of the timeline."""
 
@@ -199,7 +203,7 @@ class Fault(Section):
     kind: FaultKind
     """What happens."""
     robots: tuple[RobotName, ...] = ()
-    """Whom it concerns: kill, restart, blackout, slow."""
+    """Whom it concerns: kill, restart, blackout, slow, start, leave; `leader` is whom most robots follow then."""
     groups: tuple[tuple[RobotName, ...], ...] = ()
     """Groups of a partition; robots that no group names are one more group."""
     value: float | None = None
@@ -225,6 +229,18 @@ class Fault(Section):
         if self.kind is FaultKind.MUTE and self.message is None:
             raise ValueError("a mute names the kind of message that it swallows")
         return self
+
+    def names_leader(self, robots: Sequence[str]) -> bool:
+        """Whether it concerns whoever leads; a robot of that name is meant where the scenario has one."""
+        return LEADER not in robots and LEADER in {name for names in (self.robots, *self.groups) for name in names}
+
+    def with_leader(self, name: str) -> Self:
+        """The same fault of a robot that is known to lead."""
+
+        def named(robots: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(dict.fromkeys(name if robot == LEADER else robot for robot in robots))
+
+        return self.model_copy(update={"robots": named(self.robots), "groups": tuple(map(named, self.groups))})
 
 
 class SimulationScenario(Section):
@@ -337,7 +353,7 @@ class Scenario(Section):
             ("expectations.leader", leader),
             ("[sensors]", sensing),
         ):
-            unknown = named - set(self.names())
+            unknown = named - set(self.names()) - ({LEADER} if named is faults else set())
             if unknown:
                 raise ValueError(f"{what} names robot '{min(map(str, unknown))}', which is not in the scenario")
 

@@ -5,8 +5,10 @@ from dataclasses import replace
 from typing import assert_never
 
 from flocc_agent.radio import Blackout, LinkParameters, Partition, RadioParameters
+from flocc_launch.scenarios.leader_faults import placed_fault
 from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault
 from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.simulation.virtual_robot import Station
 
 
 def schedule(swarm: Swarm, faults: Iterable[Fault]) -> None:
@@ -16,7 +18,12 @@ def schedule(swarm: Swarm, faults: Iterable[Fault]) -> None:
 
 
 def inject(swarm: Swarm, fault: Fault) -> None:
-    """Let one fault happen now."""
+    """Let one fault happen now.
+
+    Raises:
+        FaultError: It concerns the leader, and nobody leads.
+    """
+    fault = placed_fault(fault, swarm.scenario.names(), map(leader_of, swarm.running()))
     match fault.kind:
         case FaultKind.KILL:
             for name in fault.robots:
@@ -40,6 +47,13 @@ def inject(swarm: Swarm, fault: Fault) -> None:
                 swarm.stations[name].workers.slowness = fault.value or 1.0
         case _:
             swarm.radio.parameters = changed(swarm.radio.parameters, fault.kind, fault, swarm.agenda.now_s)
+
+
+def leader_of(station: Station) -> str | None:
+    """Whom a running robot follows."""
+    assert station.core is not None
+    term = station.core.election.term
+    return None if term is None else term.leader.robot
 
 
 def kill(swarm: Swarm, name: str, effects: float | None) -> None:

@@ -23,6 +23,7 @@ from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
+from flocc_launch.scenarios.leader_faults import placed_fault
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault, Scenario, agent_config
 from flocc_launch.setup.credentials import make_keys
@@ -226,7 +227,8 @@ class _Launch:
 
     async def _inject(self) -> None:
         while self._faults and self._faults[0].at_s <= self._now_s():
-            fault = self._faults.pop(0)
+            followed = (agent.said.leader for agent in self._watch.agents if agent.running)
+            fault = placed_fault(self._faults.pop(0), self._scenario.names(), followed)
             self._note(f"{fault.kind.value} {' '.join(fault.robots) or fault.groups or fault.value or ''}".strip())
             await self._do(fault)
 
