@@ -11,7 +11,7 @@ import signal
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
@@ -261,7 +262,7 @@ class Agent:
             for task in done:
                 task.result()
 
-    def result(self) -> dict[str, Any] | None:
+    def result(self) -> RobotResult | None:
         """What this robot knows (`result.json`), None before it started."""
         return None if self._driver is None else self._driver.result()
 
@@ -334,9 +335,9 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        evidence = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
         status = self.status().model_dump(mode="json")
-        return json.dumps({**status, "compute_class": self.config.compute_class, **evidence}).encode()
+        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""
@@ -401,7 +402,7 @@ class BadKeyframe(FloccError):
     """A keyframe that cannot be used; the agent goes on without it."""
 
 
-def stored_result(config: AgentConfig) -> dict[str, Any]:
+def stored_result(config: AgentConfig) -> RobotResult:
     """What a robot knew when it was killed (`result.json`), from its store."""
     recording = _recording(config)
     T_body_camera = np.eye(4) if recording is None else recording.T_body_camera

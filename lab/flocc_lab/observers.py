@@ -109,7 +109,7 @@ def _attached(
         threads[-1].start()
 
     def show(watch: Watch) -> None:
-        if witnesses or not all(agent.spoke for agent in watch.agents):
+        if witnesses or not all(agent.status is not None for agent in watch.agents):
             return
         transport = AgentConfig.read(watch.agents[-1].folder / "config.json").transport
         witnesses.append(Witness(Observer(transport, scenario.name, (Kind.HEARTBEAT,))))

@@ -44,6 +44,8 @@ CROWD_AREA_M = 2000.0
 """Every keyframe is compared with every other robot's: in so large a town one in six has a partner after 5 minutes, two
 in three after 20; in one of 60 m each has three all the time, which makes four records of each keyframe."""
 LOOK_S = 0.1
+NOTHING = (0, 0)
+"""Records and checksum of a log that a robot does not hold."""
 CLOCK_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 MEBIBYTE = 1024 * 1024
@@ -104,7 +106,7 @@ class LiveSwarm:
         deadline_s = self.now_s() + timeout_s
         while not is_true():
             if self.now_s() > deadline_s:
-                states = {agent.name: agent.status.model_dump(mode="json") for agent in self.agents}
+                states = {agent.name: agent.said.model_dump(mode="json") for agent in self.agents}
                 raise NotReached(f"not within {timeout_s:g} s: {what}; {json.dumps(states)[:2000]}")
             await asyncio.sleep(LOOK_S)
         return self.now_s()
@@ -120,23 +122,23 @@ def events(agent: AgentProcess, kind: type[F], after_s: float) -> list[Reported[
 
 def follow(agents: Iterable[AgentProcess], leader: str) -> bool:
     """Whether all follow one robot."""
-    return all(agent.status.leader == leader for agent in agents)
+    return all(agent.said.leader == leader for agent in agents)
 
 
 def one_frame(agents: Iterable[AgentProcess]) -> bool:
     """Whether all have a correction in one map frame."""
-    frames = {agent.status.map_frame for agent in agents}
+    frames = {agent.said.map_frame for agent in agents}
     return len(frames) == 1 and None not in frames
 
 
 def hold(agents: Iterable[AgentProcess], counts: Mapping[str, int]) -> bool:
     """Whether each holds at least so many records of each log."""
-    return all(agent.status.logs.get(log, [0])[0] >= count for agent in agents for log, count in counts.items())
+    return all(agent.said.logs.get(log, NOTHING)[0] >= count for agent in agents for log, count in counts.items())
 
 
 def agree(agents: Sequence[AgentProcess]) -> bool:
     """Whether all hold the same logs and have one map frame."""
-    states = [(agent.status.logs, agent.status.map_frame) for agent in agents]
+    states = [(agent.said.logs, agent.said.map_frame) for agent in agents]
     return states[0][1] is not None and all(state == states[0] for state in states)
 
 
@@ -215,7 +217,7 @@ async def _healed_after_s(folder: Path, outage_s: float) -> float:
         await asyncio.sleep(max(outage_s - (swarm.now_s() - parted_s), 0.0))
         await swarm.order(RadioConfig())
         healed_s = swarm.now_s()
-        parts = {agent.name: agent.status.logs[agent.name][0] for agent in swarm.agents}
+        parts = {agent.name: agent.said.logs[agent.name][0] for agent in swarm.agents}
         one = "one leader, one frame, every log everywhere as long as it was at the healing"
         return (
             await swarm.until(
@@ -296,9 +298,9 @@ class WatchedSwarm:
     def look(self, agents: Sequence[AgentProcess], at_s: float) -> None:
         """Take in everybody's state, and once in `RESIDENT_PERIOD_S` the memory."""
         for agent in agents:
-            for which, gap_s in agent.status.heartbeat_gap_s.items():
+            for which, gap_s in agent.said.heartbeat_gap_s.items():
                 self.gaps_s[which] = max(self.gaps_s[which], gap_s)
-            for queue, (size, size_max) in agent.status.sizes.items():
+            for queue, (size, size_max) in agent.said.sizes.items():
                 self._sizes[queue] = max(self._sizes.get(queue, (0, size_max)), (size, size_max))
         if at_s >= len(self.resident) * RESIDENT_PERIOD_S:
             self.resident.append({"at_s": round(at_s), **_resident(agents)})
@@ -325,10 +327,10 @@ def _records_behind(agents: Sequence[AgentProcess]) -> int:
     """How many records of one log the robot that is furthest behind lacks, as of everybody's last state."""
     longest: dict[str, int] = {}
     for agent in agents:
-        for log, (count, _) in agent.status.logs.items():
+        for log, (count, _) in agent.said.logs.items():
             longest[log] = max(longest.get(log, 0), count)
-    held = [agent.status.logs for agent in agents]
-    return max(count - int(logs.get(log, [0])[0]) for logs in held for log, count in longest.items())
+    held = [agent.said.logs for agent in agents]
+    return max(count - logs.get(log, NOTHING)[0] for logs in held for log, count in longest.items())
 
 
 def crowd(robots: int, duration_s: float) -> Scenario:
@@ -346,7 +348,7 @@ def crowd(robots: int, duration_s: float) -> Scenario:
 
 def _sums(agents: Iterable[AgentProcess]) -> dict[str, int]:
     """Keyframes of all together, and closures as far as everybody knows them."""
-    states = [agent.status for agent in agents]
+    states = [agent.said for agent in agents]
     return {
         "keyframes": sum(state.keyframes for state in states),
         "closures": min(state.closures for state in states),
@@ -357,7 +359,7 @@ def _refused(agents: Iterable[AgentProcess]) -> dict[str, int]:
     """What all agents refused or dropped, by reason."""
     refused: dict[str, int] = {}
     for agent in agents:
-        for reason, count in agent.status.refused.items():
+        for reason, count in agent.said.refused.items():
             refused[reason] = refused.get(reason, 0) + count
     return refused
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import between, inverse, pose, se3_exp, so3_exp, tq_from_pose
+from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureKnown, KeyframeResult, RobotResult, Run
+from flocc_launch.runs.run_records import Run
 
 Float = NDArray[np.float64]
 

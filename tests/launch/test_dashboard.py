@@ -16,7 +16,7 @@ from tests.launch.synthetic_run import Synthetic
 
 from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard
 from flocc_launch.dashboard.page_source import RunSource
-from flocc_launch.dashboard.snapshot import LinkView, MapGroup, RobotView, Snapshot
+from flocc_launch.dashboard.snapshot import LinkView, MapGroup, RobotView, Said, Snapshot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import LineTail
 from flocc_launch.runs.run_folder import RunFolder, event_from_line
@@ -107,6 +107,12 @@ def test_a_partition_shows_as_two_ranges() -> None:
     for robot, peer in (("r1", "r2"), ("r4", "r3")):
         state.apply(event_from_line(f'{{"t": 1, "robot": "{robot}", "event": "neighbour_up", "peer": "{peer}"}}', ""))
     assert state.snapshot(None, "test").ranges == [["r1", "r2"], ["r3", "r4"]]
+
+
+def test_an_event_of_a_later_version_is_shown_as_it_stands() -> None:
+    state = SwarmState(["r1"])
+    state.apply(event_from_line('{"t": 1, "robot": "r1", "event": "teleported", "where": "mars"}', ""))
+    assert state.snapshot(2.0, "test").recent == [Said(1.0, "r1", "teleported where=mars")]
 
 
 def test_the_snapshot_of_a_finished_run_agrees_with_its_report(tmp_path: Path) -> None:

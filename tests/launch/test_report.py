@@ -235,6 +235,15 @@ def test_an_event_of_a_later_version_is_kept_as_it_is() -> None:
     assert event == Reported(2.5, "r1", UnknownFact("teleported", {"where": "mars"}))
 
 
+def test_events_of_a_later_version_are_counted_in_the_report(folder: RunFolder) -> None:
+    path = folder.path / "events.jsonl"
+    later = '{"t": 2.5, "robot": "r1", "event": "teleported", "where": "mars"}\n'
+    path.write_text(path.read_text() + 2 * later)
+    report = finish(folder)
+    assert "This version does not know events of the kind teleported (2 in this run)." in report.warnings
+    assert "of the kind teleported" in (folder.path / "report.html").read_text()
+
+
 def test_a_run_without_any_event_has_a_report(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
     folder.write_run(synthetic_run.run_of(Synthetic(with_truth=False)))

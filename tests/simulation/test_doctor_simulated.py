@@ -174,7 +174,7 @@ def answers(swarm: Swarm) -> list[RobotStatus]:
             "closures": core.assembly.closures,
             "logs": {str(digest.log): [digest.count, digest.checksum] for digest in core.gossip.digests()},
             "compute_class": swarm.scenario.robot(name).compute_class,
-            **evidence_of(core, swarm.scenario.core, station.solution).model_dump(mode="json"),
+            **evidence_of(core, swarm.scenario.core, station.solution).model_dump(),
         }
         rows.append(status_from(name, json.dumps(fields).encode()))
     return rows

@@ -46,7 +46,7 @@ class Looks:
 
 
 def states(watch: Watch, key: str) -> list[object]:
-    return [getattr(agent.status, key) for agent in watch.agents if agent.name != "r1"]
+    return [getattr(agent.said, key) for agent in watch.agents if agent.name != "r1"]
 
 
 def text_of(html: str) -> str:

@@ -1,6 +1,6 @@
 """Descent to the nearest optimum of weighted squares: Gauss-Newton steps, shortened, then damped.
 
-Closures carry weights in [0, 1] that multiply their information; odometry and fixes always weigh 1. A closure of
+Closures carry weights in [0, 1] that multiply their information; odometry always weighs 1. A closure of
 weight 0 takes no part at all.
 """
 
@@ -60,11 +60,11 @@ class Objective:
         prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
         return float(0.5 * (weights @ at.squared() + prior))
 
-    def truncated_cost(self, state: State) -> float:
-        """The cost in which no closure counts more than one at its bound: what robust solvers are compared by."""
+    def truncated_cost(self, state: State, votes: Float | float = 1.0) -> float:
+        """The cost in which no closure counts more than one at its bound, times its votes (L,)."""
         at = residuals(self.edges, state)
         squared = at.squared()
-        squared[self.closures] = np.minimum(squared[self.closures], self.bounds())
+        squared[self.closures] = votes * np.minimum(squared[self.closures], self.bounds())
         prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
         return float(0.5 * (np.sum(squared) + prior))
 

@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from flocc_agent.backend.clusters import votes
 from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.descent import Objective
 from flocc_agent.backend.edges import state_of
-from flocc_agent.backend.initial import initial_poses, initial_world, trusted_closures
+from flocc_agent.backend.initial import initial_poses, trusted_closures
 from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.measured import with_factors, without_factors
@@ -26,7 +27,6 @@ from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
-    AbsoluteFix,
     ClosureResult,
     ClosureState,
     GraphSolution,
@@ -50,7 +50,7 @@ def optimise(
     """Optimise every connected component of a pose graph.
 
     Args:
-        graph: Odometry, closures, fixes and measured factors; nothing in it is trusted.
+        graph: Odometry, closures and measured factors; nothing in it is trusted.
         config: Formulation, solver, noise model and priors.
         initial: An earlier solution to start from; keyframes that it lacks follow their odometry.
         covariance_of: Keyframes whose marginal covariance is wanted, beside every robot's `T_map_odom`.
@@ -66,7 +66,7 @@ def optimise(
 def _optimise(
     graph: PoseGraph, config: BackendConfig, initial: GraphSolution | None, covariance_of: Sequence[KeyframeId]
 ) -> GraphSolution | OptimisationFailed:
-    """Optimise a graph of odometry, closures and fixes."""
+    """Optimise a graph of odometry and closures."""
     began = time.perf_counter()
     screened = screen(graph)
     if not screened.trajectories:
@@ -102,12 +102,11 @@ def _solve_group(
     """Solve logs that closures connect; where that fails, every log keeps its odometry."""
     trajectories = {log: screened.trajectories[log] for log in logs}
     closures = {k: c for k, c in usable.items() if c.query.log in trajectories and c.match.log in trajectories}
-    fixes = [fix for fix in screened.fixes if fix.keyframe.log in trajectories]
-    if not closures and not fixes:
+    if not closures:
         return SolvedLogs(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
     wanted = [keyframe for keyframe in covariance_of if keyframe.log in trajectories]
     try:
-        return _solve_and_split(trajectories, closures, fixes, config, initial, wanted)
+        return _solve_and_split(trajectories, closures, config, initial, wanted)
     except (SingularSystem, np.linalg.LinAlgError, FloatingPointError) as error:
         reason = f"the component of robot {logs[0]} could not be solved and keeps its odometry: {error}"
         logger.error("%s", reason)
@@ -118,7 +117,6 @@ def _solve_group(
 def _solve_and_split(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
-    fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
@@ -132,7 +130,7 @@ def _solve_and_split(
     groups = _groups(trajectories, closures, turned_away)
     if len(groups) == 1:
         kept = {k: c for k, c in closures.items() if k not in turned_away}
-        outcome = _solve_connected(trajectories, kept, fixes, config, initial, wanted)
+        outcome = _solve_connected(trajectories, kept, config, initial, wanted)
         turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
         turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
         groups = _groups(trajectories, closures, turned_away)
@@ -140,7 +138,7 @@ def _solve_and_split(
         timings_s = {"consistency": time.perf_counter() - began - sum(outcome.timings_s.values()), **outcome.timings_s}
         return replace(outcome, closures={**outcome.closures, **turned_away}, timings_s=timings_s)
     left = {k: c for k, c in closures.items() if k not in turned_away}
-    screened = Screened(dict(trajectories), {}, tuple(fixes), ())
+    screened = Screened(dict(trajectories), {}, ())
     plain = config.model_copy(update={"pairwise_consistency": False})
     parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in groups]
     return _joined(parts, turned_away, outcome)
@@ -189,22 +187,20 @@ def summed_timings(outcomes: Sequence[SolvedLogs]) -> dict[str, float]:
 def _solve_connected(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
-    fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
 ) -> SolvedLogs:
     times = [time.perf_counter()]
     T_initial, warm = initial_poses(trajectories, closures, config.steepness, initial)
-    T_map_world = initial_world(T_initial, fixes)
     times.append(time.perf_counter())
-    problem = build(trajectories, closures, fixes, config, T_initial, T_map_world)
-    poses = [T_initial[log] for log in problem.logs] + ([T_map_world[None]] if fixes else [])
-    state = state_of(np.concatenate(poses), problem.clusters)
+    problem = build(trajectories, closures, config)
+    state = state_of(np.concatenate([T_initial[log] for log in problem.logs]), problem.clusters)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     objective = Objective(problem.edges, problem.closure_rows, linear, config)
     trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None
-    places = Places(problem, trajectories, closures, config.steepness)
+    says = votes([closures[k] for k in problem.closure_ids], config.cluster_keyframes_max)
+    places = Places(problem, trajectories, closures, says, config.steepness)
     solved = solve(objective, state, trusted, places)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")

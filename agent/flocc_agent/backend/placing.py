@@ -22,6 +22,9 @@ Bool = NDArray[np.bool_]
 Float = NDArray[np.float64]
 
 AGREEING_MIN = 2
+HYPOTHESES_MAX = 200
+KEPT_RATIO_MAX = 0.5
+"""A place with which more of the used closures agree is the one where the body is, told less exactly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +43,7 @@ class Places:
     problem: Problem
     trajectories: Mapping[LogId, Trajectory]
     closures: Mapping[int, LoopClosure]
+    votes: Float
     steepness: float
 
     def proposals(self, state: State, chosen: Bool) -> Iterator[Placement]:
@@ -52,9 +56,10 @@ class Places:
                 continue
             crossing = self._crossing(body)
             agreeing = np.isin(self.problem.closure_ids, found.agreeing)
-            if np.count_nonzero(agreeing & ~chosen) == 0:
-                continue
-            if np.count_nonzero(agreeing) > np.count_nonzero(chosen & crossing):
+            here = chosen & crossing
+            more = self.votes[agreeing].sum() > self.votes[here].sum()
+            elsewhere = self.votes[here & agreeing].sum() <= KEPT_RATIO_MAX * self.votes[here].sum()
+            if more and elsewhere:
                 yield Placement(body, self._moved(state, body, found.T_a_b), (chosen & ~crossing) | agreeing)
 
     def _poses(self, state: State) -> dict[LogId, Float]:
@@ -85,7 +90,9 @@ class Places:
             query, match = self.closures[k].query, self.closures[k].match
             ends[k] = (match, query) if query.log in body else (query, match)
         rays = rays_from(ids, self.closures, ends, T, path_m, self.steepness)
-        found = align_pair(replace(rays, travelled_a_m=np.zeros(len(ids))), HYPOTHESES_MAX)
+        votes = self.votes[np.isin(self.problem.closure_ids, ids)]
+        judges = replace(rays, weight=rays.weight * votes, travelled_a_m=np.zeros(len(ids)))
+        found = align_pair(judges, HYPOTHESES_MAX)
         return found if len(found.agreeing) >= AGREEING_MIN else None
 
     def _moved(self, state: State, body: frozenset[LogId], T_move: Float) -> State:
@@ -94,6 +101,3 @@ class Places:
             rows = slice(self.problem.offsets[log], self.problem.offsets[log] + len(self.trajectories[log]))
             T[rows] = T_move @ T[rows]
         return State(quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), state.scale)
-
-
-HYPOTHESES_MAX = 200

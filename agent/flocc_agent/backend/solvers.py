@@ -46,14 +46,15 @@ def solve(objective: Objective, state: State, trusted: Bool | None = None, place
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
     """GNC by several schedules from one state; the lowest truncated cost wins."""
+    says = places.votes if places is not None else 1.0
     found = [scheduled(objective, state, ratio) for ratio in START_RATIOS]
-    solved = min(found, key=lambda solved: objective.truncated_cost(solved.state))
+    solved = min(found, key=lambda solved: objective.truncated_cost(solved.state, says))
     return replaced(objective, solved, places) if places is not None else solved
 
 
 def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     """Try other places for robots as long as one lowers the truncated cost."""
-    cost, tried = objective.truncated_cost(solved.state), 0
+    cost, tried = objective.truncated_cost(solved.state, places.votes), 0
     for _ in range(PLACEMENTS_MAX):
         chosen = solved.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN
         better = None
@@ -61,8 +62,8 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
             tried += 1
             moved = descend(objective, placement.state, objective.weights(placement.chosen.astype(float)), 5)
             there = selected(objective, moved.state, moved.iterations)
-            if objective.truncated_cost(there.state) < cost:
-                better, cost = there, objective.truncated_cost(there.state)
+            if objective.truncated_cost(there.state, places.votes) < cost:
+                better, cost = there, objective.truncated_cost(there.state, places.votes)
                 break
         if better is None:
             break

@@ -8,7 +8,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any, assert_never
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import DiskQueue, Persist
 from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.sending import Sender
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.telemetry import Sizes, Telemetry
@@ -174,7 +175,7 @@ class Driver:
         """What a scrape of the metrics sees."""
         return self._telemetry.look()
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> RobotResult:
         """What this robot knows, for `result.json`."""
         return result_of(self.robot, self._T_body_camera, self.last_solution)
 

@@ -19,11 +19,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 
 import flocc_agent.runtime.facts  # noqa: F401  # its facts belong to the kinds
 from flocc_agent.core.reports import KINDS, Fact, name_of
+from flocc_agent.runtime.robot_result import with_direction
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId, Term
-
-QUATERNION_TOLERANCE = 1e-3
 
 F = TypeVar("F", bound=Fact)
 G_co = TypeVar("G_co", bound=Fact, covariant=True)
@@ -161,7 +160,7 @@ def _written(kind: Any) -> Any:
     if kind in (KeyframeId, LogId, Term):
         return Annotated[Any, PlainValidator(partial(_parsed, kind))]
     if kind == Pose7:
-        return Annotated[kind, AfterValidator(_with_direction)]
+        return Annotated[kind, AfterValidator(with_direction)]
     parts = tuple(_written(each) for each in get_args(kind))
     if not parts:
         return kind
@@ -173,10 +172,3 @@ def _parsed(kind: type[KeyframeId] | type[LogId] | type[Term], text: object) -> 
     if not isinstance(text, str):
         raise ValueError(f"{text!r} is no text")
     return kind.parse(text)
-
-
-def _with_direction(pose7: Pose7) -> Pose7:
-    """Seven numbers of a pose, if their quaternion is one."""
-    if abs(sum(q * q for q in pose7[3:]) - 1.0) > QUATERNION_TOLERANCE:
-        raise ValueError(f"quaternion {list(pose7[3:])} is not of unit length")
-    return pose7

@@ -4,7 +4,6 @@ The core knows camera poses only; users know the body. Both speak of the body.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from flocc_agent.core.reports import ClosureAccepted, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse, pose7, pose_from_tq
 from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -50,7 +50,7 @@ class Reporter:
         return fact
 
 
-def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None = None) -> dict[str, Any]:
+def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None = None) -> RobotResult:
     """What a robot knows at its end: its trajectory before and after correction, closures, sizes of logs."""
     records = [r for r in robot.gossip.logs[robot.log].records if isinstance(r, KeyframeRecord)]
     T_odom_camera = np.array([pose_from_tq(np.array(r.T_odom_camera)) for r in records]).reshape(-1, 4, 4)
@@ -58,25 +58,25 @@ def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None
     T_camera_body = inverse(T_body_camera)
     _, T_map_body = corrected_bodies(robot, T_body_camera)
     keyframes = [
-        {
-            "index": record.index,
-            "stamp_s": record.stamp_s,
-            "T_odom_body": list(pose7(T_odom_camera[i] @ T_camera_body)),
-            "T_map_body": None if applied is None else list(pose7(T_map_body[i])),
-        }
+        KeyframeResult(
+            index=record.index,
+            stamp_s=record.stamp_s,
+            T_odom_body=list(pose7(T_odom_camera[i] @ T_camera_body)),
+            T_map_body=None if applied is None else list(pose7(T_map_body[i])),
+        )
         for i, record in enumerate(records)
     ]
-    return {
-        "robot": robot.log.robot,
-        "incarnation": robot.log.incarnation,
-        "map_frame": None if applied is None else map_frame(applied.anchor),
-        "T_map_odom": None if applied is None else list(applied.T_map_odom),
-        "T_body_camera": list(pose7(T_body_camera)),
-        "keyframes": keyframes,
-        "closures": closures_known(robot, solution),
-        "logs": {str(digest.log): digest.count for digest in robot.gossip.digests()},
-        "best_similarities": best_similarities(robot),
-    }
+    return RobotResult(
+        robot=robot.log.robot,
+        incarnation=robot.log.incarnation,
+        map_frame=None if applied is None else map_frame(applied.anchor),
+        T_map_odom=None if applied is None else list(applied.T_map_odom),
+        T_body_camera=list(pose7(T_body_camera)),
+        keyframes=keyframes,
+        closures=closures_known(robot, solution),
+        logs={str(digest.log): digest.count for digest in robot.gossip.digests()},
+        best_similarities=best_similarities(robot),
+    )
 
 
 def corrected_bodies(robot: Robot, T_body_camera: Float) -> tuple[list[float], Float]:
@@ -94,7 +94,7 @@ def best_similarities(robot: Robot) -> dict[str, float]:
     return {name: round(best, 4) for name, best in sorted(robot.recognition.best_similarities.items())}
 
 
-def closures_known(robot: Robot, solution: GraphSolution | None) -> list[dict[str, Any]]:
+def closures_known(robot: Robot, solution: GraphSolution | None) -> list[ClosureKnown]:
     """Every closure in a robot's logs, each pair once, with the scale of the last solution it made."""
     scales = {} if solution is None else {CandidatePair.of(c.query, c.match): c.scale for c in solution.closures}
     found: dict[CandidatePair, ClosureRecord] = {}
@@ -103,13 +103,13 @@ def closures_known(robot: Robot, solution: GraphSolution | None) -> list[dict[st
             if isinstance(record, ClosureRecord):
                 found.setdefault(CandidatePair.of(record.query, record.match), record)
     return [
-        {
-            "query": str(record.query),
-            "match": str(record.match),
-            "T_query_match_unscaled": list(record.T_query_match_unscaled),
-            "match_ratio": record.match_ratio,
-            "scale_initial": record.scale_initial,
-            "scale": scales.get(pair),
-        }
+        ClosureKnown(
+            query=str(record.query),
+            match=str(record.match),
+            T_query_match_unscaled=list(record.T_query_match_unscaled),
+            match_ratio=record.match_ratio,
+            scale_initial=record.scale_initial,
+            scale=scales.get(pair),
+        )
         for pair, record in sorted(found.items())
     ]

@@ -79,7 +79,15 @@ class AgentStatus(BaseModel):
 
 
 class PairStatus(BaseModel):
-    """What came of pairs of keyframes of two robots, as one robot's logs tell."""
+    """What came of the pairs of keyframes of two robots, as the logs that one robot holds tell.
+
+    Attributes:
+        robots: The two, sorted.
+        accepted: Pairs that became closures.
+        rejected: Pairs that were registered, or given up, and refused.
+        best_ratio: Best match ratio of those that were refused, Eq. (1).
+        reason: Why the best one was refused.
+    """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -91,7 +99,14 @@ class PairStatus(BaseModel):
 
 
 class SolverStatus(BaseModel):
-    """What the last solution that a robot made used and warned of."""
+    """What the last solution that a robot made used and warned of.
+
+    Attributes:
+        components: Robots of each part that closures join.
+        closures_used: Closures that the solver kept.
+        closures_rejected: All others.
+        warnings: Its first sentences.
+    """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -101,21 +116,21 @@ class SolverStatus(BaseModel):
     warnings: list[str] = []
 
 
-class MergeEvidence(BaseModel):
-    """What one robot can tell of maps that have not merged.
+class MergeStatus(BaseModel):
+    """What a robot can tell an operator who asks why maps have not merged.
 
     Attributes:
-        best_similarities: Robot -> best cosine similarity of any of its keyframes with one of this robot's.
-        similarity_threshold: What a candidate needs.
-        match_ratio_threshold: What a closure needs, R_thr.
-        pairs: What came of pairs of keyframes, by pair of robots.
-        solver: What its last solution said, None where it made none.
+        best_similarities: Robot -> best similarity of its keyframes with one of this robot, below the threshold too.
+        similarity_threshold: Of place recognition.
+        match_ratio_threshold: R_thr.
+        pairs: By two robots.
+        solver: Of the last own solution, None where it made none.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     best_similarities: dict[str, float] = {}
-    similarity_threshold: float
-    match_ratio_threshold: float
-    pairs: tuple[PairStatus, ...] = ()
+    similarity_threshold: float | None = None
+    match_ratio_threshold: float | None = None
+    pairs: list[PairStatus] = []
     solver: SolverStatus | None = None

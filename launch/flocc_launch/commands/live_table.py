@@ -54,7 +54,7 @@ def table_of(watch: Watch) -> Table:
 def cells_of(agent: AgentProcess) -> list[str]:
     """One robot's line."""
     status = agent.status
-    if not agent.spoke:
+    if status is None:
         return [agent.name, state_of(agent), *[""] * (len(COLUMNS) - 2)]
     return [
         agent.name,
@@ -76,7 +76,7 @@ def state_of(agent: AgentProcess) -> str:
         return "not started"
     if agent.exit_code is not None:
         return "stopped" if agent.exit_code == 0 else "died"
-    if not agent.spoke:
+    if agent.status is None:
         return "starting"
     if agent.status.playing:
         return "playing"
@@ -87,7 +87,7 @@ def line_of(watch: Watch) -> str:
     """One line for logs."""
     parts = []
     for agent in watch.agents:
-        status = agent.status
-        counts = f"{status.keyframes} keyframes, {status.closures} closures, {status.map_frame or '-'}"
+        said = agent.said
+        counts = f"{said.keyframes} keyframes, {said.closures} closures, {said.map_frame or '-'}"
         parts.append(f"{agent.name} {state_of(agent)}: {counts}")
     return f"{watch.elapsed_s:6.0f} s  " + "; ".join(parts)

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import Field, ValidationError
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from flocc_agent.config import TransportConfig
-from flocc_agent.runtime.status import PairStatus, SolverStatus
+from flocc_agent.runtime.status import MergeStatus
 from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.snapshot import RobotView
 from flocc_launch.runs.run_folder import RunFolder
@@ -28,32 +28,25 @@ class StatusError(FloccError):
     """Nobody answered; one sentence says who was asked."""
 
 
-class RobotStatus(BaseModel):
-    """What one robot says of itself; what it does not say is null."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
+class RobotStatus(MergeStatus):
+    """What one robot says of itself, or its events tell; what is not known is null."""
 
     robot: str
     state: str = "running"
     leader: str | None = None
-    term: int | str | None = None
-    neighbours: list[str] = []
+    term: int | None = None
+    neighbours: tuple[str, ...] = ()
     map_frame: str | None = None
     keyframes: int | None = None
     closures: int | None = None
     candidates: int | None = None
     sent_bytes: int | None = None
     received_bytes: int | None = None
-    refused: dict[str, int] = {}
+    refused: dict[str, int] = Field(default_factory=dict)
     compute_class: int = 0
-    logs: dict[str, Any] = {}
-    loss: dict[str, float] = {}
-    queues: dict[str, int] = {}
-    best_similarities: dict[str, float] = {}
-    similarity_threshold: float | None = None
-    match_ratio_threshold: float | None = None
-    pairs: list[PairStatus] = []
-    solver: SolverStatus | None = None
+    logs: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    loss: dict[str, float] = Field(default_factory=dict)
+    queues: dict[str, int] = Field(default_factory=dict)
 
 
 def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0) -> list[RobotStatus]:
@@ -107,7 +100,7 @@ def status_of_robot(robot: RobotView) -> RobotStatus:
         state=robot.state,
         leader=robot.leader,
         term=robot.term,
-        neighbours=list(robot.neighbours),
+        neighbours=tuple(robot.neighbours),
         map_frame=robot.map_frame,
         keyframes=robot.keyframes,
         closures=robot.accepted,

@@ -72,8 +72,10 @@ def _has_trajectory(path: Path) -> bool:
 
 
 def _trajectory_file(path: Path, stems: tuple[str, ...]) -> Path | None:
+    """The first file of one of the names, whatever their capitals; nothing in what is no folder."""
+    there = {entry.name.lower(): entry for entry in sorted(path.iterdir())} if path.is_dir() else {}
     names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
-    return next((path / name for name in names if (path / name).exists()), None)
+    return next((there[name] for name in names if name in there and there[name].is_file()), None)
 
 
 def _first_trajectory(

@@ -5,7 +5,7 @@ The keys that other programs rely on stand in DESIGN.md section 8, all of them i
 
 from pydantic import Field
 
-from flocc_launch.runs.run_records import Record
+from flocc_agent.runtime.robot_result import Record
 
 SCHEMA_VERSION = 1
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import between, inverse, pose_from_tq
+from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_launch.graph_files.g2o import edge_line, vertex_line
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.run_records import ClosureKnown
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected, Fact
 from flocc_agent.runtime.event_lines import Reported
-from flocc_launch.runs.run_records import RobotResult
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_protocol.ids import KeyframeId
 
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_launch.runs.closure_table import Pair, pairs_of
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import RobotResult, Run
+from flocc_launch.runs.run_records import Run
 from flocc_launch.runs.timeline import Following, Link, end_s, followings, links
 from flocc_launch.runs.tracks import RobotTrack, tracks_of
 

@@ -18,7 +18,8 @@ from pydantic import ValidationError
 
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import BadLine, Reported, reported_of
-from flocc_launch.runs.run_records import RUN_VERSION, Record, RobotResult, Run
+from flocc_agent.runtime.robot_result import Record, RobotResult
+from flocc_launch.runs.run_records import RUN_VERSION, Run
 from flocc_protocol.errors import FloccError
 
 __all__ = ["Run", "RobotResult", "RunFolder", "RunFolderError"]

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from flocc_agent.core.reports import Fact, KeyframeTaken
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_agent.runtime.robot_result import RobotResult, stacked_poses
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import RobotResult, stacked_poses
 from flocc_launch.runs.trajectory_errors import associate, placed_at_true_start
 
 Float = NDArray[np.float64]

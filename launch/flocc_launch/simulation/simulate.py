@@ -22,7 +22,7 @@ from flocc_agent.runtime.trajectory import write_tum
 from flocc_agent.stages import counts_of
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
-from flocc_launch.runs.run_folder import RobotResult, Run, RunFolder
+from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.sensors import sense
@@ -151,8 +151,7 @@ def _write_robot(folder: RunFolder, swarm: Swarm, name: str) -> None:
     links, stages = swarm.network.links.tables(name), counts_of(station.workers.stages.snapshot())
     swarm.report(name, AccountKept(since_s=0.0, **links, stages=stages))
     if station.core is not None:
-        fields = result_of(station.core, station.playback.T_body_camera, station.solution)
-        folder.write_result(RobotResult.model_validate(fields))
+        folder.write_result(result_of(station.core, station.playback.T_body_camera, station.solution))
         swarm.report(name, AgentStopped())
 
 

@@ -20,6 +20,8 @@ from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped
+from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.status import AgentStatus
 from flocc_launch.setup.world_faults import sentence_of
 
 if TYPE_CHECKING:
@@ -65,7 +67,7 @@ class Lines:
 async def run_agent(
     config: AgentConfig,
     epoch_s: float,
-    on_status: Callable[[dict[str, Any]], None],
+    on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
 ) -> None:
@@ -89,7 +91,7 @@ async def run_agent(
 async def _run(
     config: AgentConfig,
     epoch_s: float,
-    on_status: Callable[[dict[str, Any]], None],
+    on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None,
     lines: Lines,
     source: "AgentSource | None",
@@ -150,16 +152,16 @@ def recover_result(config: AgentConfig) -> None:
         _write_result(config.folder, stored_result(config))
 
 
-def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
+def _write_result(folder: Path | None, result: RobotResult | None) -> None:
     if folder is not None and result is not None:
         path = folder / "result.json"
-        path.with_suffix(".tmp").write_text(json.dumps(result, allow_nan=False), encoding="utf-8")
+        path.with_suffix(".tmp").write_text(result.model_dump_json(), encoding="utf-8")
         path.with_suffix(".tmp").replace(path)
 
 
-async def _tell(agent: Any, on_status: Callable[[dict[str, Any]], None]) -> None:
+async def _tell(agent: Any, on_status: Callable[[AgentStatus], None]) -> None:
     while True:
-        on_status(agent.status().model_dump(mode="json"))
+        on_status(agent.status())
         await asyncio.sleep(STATUS_PERIOD_S)
 
 
@@ -184,8 +186,8 @@ async def _standard_input() -> asyncio.StreamReader:
     return reader
 
 
-def _print_status(status: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(status, separators=(",", ":")) + "\n")
+def _print_status(status: AgentStatus) -> None:
+    sys.stdout.write(status.model_dump_json() + "\n")
     sys.stdout.flush()
 
 

@@ -30,6 +30,8 @@ from flocc_launch.swarm.agent_process import Lines, recover_result
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
 
+Seen = tuple[dict[str, tuple[int, int]], str | None, int | None, str | None, bool]
+"""Logs, map frame, round, leader, and whether it plays: a run goes on while they change."""
 LAUNCHER_EVENTS = "launcher.events.jsonl"
 PERIOD_S = 0.25
 UNSETTLED_MAX_S = 120.0
@@ -141,7 +143,7 @@ class _Launch:
         self._interrupted = False
         self._killed: set[str] = set()
         self._changed_s = 0.0
-        self._seen: dict[str, Any] = {}
+        self._seen: dict[str, Seen] = {}
         self._watch = Watch(scenario, self._agents())
 
     async def run(self) -> RunReport:
@@ -206,16 +208,16 @@ class _Launch:
             return True
         self._note_changes(alive)
         quiet_s = self._now_s() - self._changed_s
-        if any(not agent.spoke or agent.status.playing for agent in alive):
+        if any(agent.status is None or agent.status.playing for agent in alive):
             return False
-        settled = _agree(alive) and not any(agent.status.busy for agent in alive)
+        settled = _agree(alive) and not any(agent.said.busy for agent in alive)
         return quiet_s >= (self._scenario.settle_s if settled else UNSETTLED_MAX_S)
 
     def _note_changes(self, alive: Iterable[AgentProcess]) -> None:
         """Remember when any robot's logs, frame or leader changed last."""
         for agent in alive:
-            status = agent.status
-            seen = (status.logs, status.map_frame, status.round, status.leader, status.playing)
+            said = agent.said
+            seen = (said.logs, said.map_frame, said.round, said.leader, said.playing)
             if seen != self._seen.get(agent.name):
                 self._seen[agent.name] = seen
                 self._changed_s = self._now_s()
@@ -278,7 +280,7 @@ class _Launch:
             self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
-        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.spoke]
+        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and agent.status is None]
         if died and self._now_s() < START_S:
             raise LaunchError(f"robot {died[0].name} could not start: {_sentence(died[0].last_words())}")
 
@@ -346,7 +348,7 @@ def changed_radio(radio: RadioConfig, kind: LinkFault, fault: Fault, now_s: floa
 
 def _agree(alive: list[AgentProcess]) -> bool:
     """Whether all running robots hold the same logs."""
-    logs = [agent.status.logs for agent in alive]
+    logs = [agent.said.logs for agent in alive]
     return all(log == logs[0] for log in logs)
 
 

@@ -9,7 +9,7 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ class AgentProcess:
         config: Its configuration.
         folder: Where its files are.
         process: The process, None before it was started.
-        status: What it said last.
+        status: Its last state, None before the first.
         heard_s: When that came, on the monotonic clock.
         asked: Whether it was told to stop or killed on purpose.
         exit_code: How it ended; negative for a signal.
@@ -39,24 +39,21 @@ class AgentProcess:
     config: AgentConfig
     folder: Path
     process: asyncio.subprocess.Process | None = None
-    status: AgentStatus = field(init=False)
+    status: AgentStatus | None = None
     heard_s: float = 0.0
     asked: bool = False
     exit_code: int | None = None
     reader: asyncio.Task[None] | None = None
 
-    def __post_init__(self) -> None:
-        self.status = AgentStatus(robot=self.name)
-
-    @property
-    def spoke(self) -> bool:
-        """Whether it said anything since it was started."""
-        return bool(self.status.log)
-
     @property
     def name(self) -> str:
         """The robot's name."""
         return self.config.name
+
+    @property
+    def said(self) -> AgentStatus:
+        """Its last state; before the first one, that it holds nothing."""
+        return self.status or AgentStatus(robot=self.name)
 
     @property
     def running(self) -> bool:
@@ -79,7 +76,7 @@ class AgentProcess:
                 start_new_session=True,
                 limit=4 * 1024 * 1024,
             )
-        self.exit_code, self.asked, self.status = None, False, AgentStatus(robot=self.name)
+        self.exit_code, self.asked, self.status = None, False, None
         self.reader = asyncio.create_task(self._read())
 
     async def order(self, order: dict[str, Any]) -> None:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_launch.report.figure_charts import errors_after
 from flocc_launch.report.figure_map import MapScene, scenes
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureKnown
 from flocc_launch.view.drawing import COLOURS, GREY, TIMELINE, Colour, Drawing, confidence_colour
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId

@@ -1,0 +1,98 @@
+"""Claims about GNC: every stage lowers its own objective or rests, and a rejected closure does not pull."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flocc_agent.backend.descent import Objective, descend
+from flocc_agent.backend.edges import State, state_of
+from flocc_agent.backend.graduated import Graduated, graduated
+from flocc_agent.backend.initial import initial_poses
+from flocc_agent.backend.linear import LinearSolver
+from flocc_agent.backend.optimiser import optimise
+from flocc_agent.backend.problem import build
+from flocc_agent.config import BackendConfig, Solver
+from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
+from flocc_agent.geometry import inverse, pose
+from flocc_lab.graph_family.graphs import Member, member
+from flocc_protocol.ids import KeyframeId
+
+LONG_WEAK_CHAIN = 42
+"""Four robots with 880 to 1,830 keyframes, joined by a handful of right closures, one in five wrong."""
+SMALL = (4, 9, 12, 13)
+
+
+def objective_of(drawn: Member, solver: Solver) -> tuple[Objective, State]:
+    config = BackendConfig(solver=solver, weight_by_probability=False)
+    closures = dict(enumerate(drawn.graph.closures))
+    T, _ = initial_poses(drawn.graph.trajectories, closures, config.steepness, None)
+    problem = build(drawn.graph.trajectories, closures, config)
+    linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
+    state = state_of(np.concatenate([T[log] for log in problem.logs]), problem.clusters)
+    return Objective(problem.edges, problem.closure_rows, linear, config), state
+
+
+def run(seed: int, solver: Solver = Solver.GNC_TLS) -> Graduated:
+    objective, state = objective_of(member(seed), solver)
+    return graduated(objective, state, 1e-4)
+
+
+@pytest.mark.parametrize("solver", [Solver.GNC_TLS, Solver.GNC_GM])
+@pytest.mark.parametrize("seed", SMALL)
+def test_every_stage_lowers_its_own_objective_or_rests(seed: int, solver: Solver) -> None:
+    stages = run(seed, solver).stages
+    assert len(stages) > 3
+    assert all(stage.cost_after < stage.cost_before or stage.resting for stage in stages)
+
+
+def test_stages_move_where_a_whole_step_overshoots() -> None:
+    stages = run(LONG_WEAK_CHAIN).stages
+    assert all(stage.cost_after < stage.cost_before or stage.resting for stage in stages)
+    assert stages[0].cost_after < 0.9 * stages[0].cost_before
+
+
+def test_a_step_that_overshoots_is_shortened_before_it_is_damped() -> None:
+    objective, state = objective_of(member(LONG_WEAK_CHAIN), Solver.GNC_TLS)
+    weights = objective.weights()
+    once = descend(objective, state, weights, steps_max=1)
+    assert once.iterations == 1
+    assert once.cost < objective.cost(state, weights, hold=False)
+
+
+def test_rejected_closures_leave_the_solution_as_if_they_were_not_there() -> None:
+    drawn = member(7)
+    config = BackendConfig(weight_by_probability=False, relative_tolerance=1e-12)
+    with_them = solved(drawn.graph, config)
+    used = [k for k, c in enumerate(with_them.closures) if c.state is ClosureState.USED]
+    assert len(drawn.graph.closures) - len(used) > 0
+    without = PoseGraph(drawn.graph.trajectories, [drawn.graph.closures[k] for k in used])
+    alone = solved(without, replace_solver(config, Solver.LM))
+    for of_all, of_used in zip(with_them.components, alone.components, strict=True):
+        for log, T in of_all.T_map_keyframe.items():
+            assert np.allclose(T, of_used.T_map_keyframe[log], atol=1e-4)
+
+
+def test_a_far_off_rejected_closure_does_not_pull() -> None:
+    drawn = member(7)
+    config = BackendConfig(weight_by_probability=False)
+    first, last = KeyframeId(sorted(drawn.graph.trajectories)[0], 0), sorted(drawn.graph.trajectories)[-1]
+    far = pose(np.eye(3), np.array([3e5, 0.0, 0.0]))
+    wrong = LoopClosure(first, KeyframeId(last, 0), far, covariance=1e-4 * np.eye(6), metric=True)
+    before = solved(drawn.graph, config)
+    after = solved(replace(drawn.graph, closures=[*drawn.graph.closures, wrong]), config)
+    assert after.closures[-1].state is ClosureState.REJECTED
+    (a,), (b,) = before.components, after.components
+    for log in a.logs:
+        apart = inverse(a.T_map_keyframe[log]) @ b.T_map_keyframe[log]
+        assert np.max(np.linalg.norm(apart[:, :3, 3], axis=1)) < 0.01
+
+
+def replace_solver(config: BackendConfig, solver: Solver) -> BackendConfig:
+    return config.model_copy(update={"solver": solver})
+
+
+def solved(graph: PoseGraph, config: BackendConfig) -> GraphSolution:
+    solution = optimise(graph, config)
+    assert isinstance(solution, GraphSolution)
+    return solution
