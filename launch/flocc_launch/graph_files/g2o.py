@@ -22,6 +22,7 @@ from flocc_launch.graph_files.graph_file import (
     GraphFileError,
     Measurement,
     distinct,
+    isotropic_of,
     log_of,
     pose_graph,
 )
@@ -36,15 +37,15 @@ KNOWN = {*EDGES, *VERTICES, "FIX"}
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
-def read_g2o(path: Path) -> GraphFile:
-    """Read a g2o file, or all robots' files of a folder.
+def read_g2o(path: Path, isotropic: bool = False) -> GraphFile:
+    """Read a g2o file, or all robots' files of a folder; with `isotropic` noise as SE-Sync reduces it.
 
     Raises:
         GraphFileError: A file is missing or a line is damaged; the message names both.
     """
     files = _robot_files(path) if path.is_dir() else [path]
     lines = [line for file in files for line in _lines(file)]
-    measurements = distinct((m for line in lines if (m := _measurement(line)) is not None), add_up=True)
+    measurements = distinct((m for line in lines if (m := _measurement(line, isotropic)) is not None), add_up=True)
     if not measurements:
         raise GraphFileError(f"{path}: has no edges")
     graph = pose_graph(measurements, str(path))
@@ -86,13 +87,13 @@ def _lines(path: Path) -> Iterable[Line]:
             yield Line(path, number, words)
 
 
-def _measurement(line: Line) -> Measurement | None:
+def _measurement(line: Line, isotropic: bool) -> Measurement | None:
     """The edge of a line; None where it has none."""
     kind, *numbers = line.words
     if kind not in EDGES:
         return None
     try:
-        return _se3(numbers) if kind == "EDGE_SE3:QUAT" else _se2(numbers)
+        return _se3(numbers, isotropic) if kind == "EDGE_SE3:QUAT" else _se2(numbers)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
 
@@ -145,12 +146,12 @@ def _symmetric(upper: Float, size: int) -> Float:
     return np.asarray(out + np.triu(out, 1).T)
 
 
-def _se3(words: list[str]) -> Measurement:
+def _se3(words: list[str], isotropic: bool) -> Measurement:
     """One `EDGE_SE3:QUAT`: quaternion x y z w, information with translation first."""
     first, second, v = _numbers(words, SE3_NUMBERS)
     T = pose(R_from_q_wxyz(v[[6, 3, 4, 5]]), v[:3])
     information = _symmetric(v[7:], 6)[np.ix_(ROTATION_FIRST, ROTATION_FIRST)]
-    return Measurement(first, second, T, _covariance(information))
+    return Measurement(first, second, T, isotropic_of(information) if isotropic else _covariance(information))
 
 
 def _covariance(information: Float) -> Float:

@@ -110,8 +110,18 @@ def isotropic(covariance: Float, planar: bool = False) -> Float:
     An edge of a planar file takes `kappa` of its one angle and
     `tau = 2 / tr`. The back end's rotation residual is half of SE-Sync's squared, hence variance `1 / (2 kappa)`.
     """
-    information = np.linalg.inv(covariance)
+    return isotropic_of(np.asarray(np.linalg.inv(covariance), dtype=np.float64), planar)
+
+
+def isotropic_of(information: Float, planar: bool = False) -> Float:
+    """The same of an information matrix, which need not be positive definite: only traces of its blocks count.
+
+    Raises:
+        ValueError: A trace is not positive.
+    """
     rotation, translation = np.linalg.inv(information[:3, :3]), np.linalg.inv(information[3:, 3:])
+    if np.trace(rotation) <= 0.0 or np.trace(translation) <= 0.0:
+        raise ValueError("the information matrix is not positive definite")
     if planar:
         kappa, tau = information[2, 2], 2.0 / np.trace(translation[:2, :2])
     else:

@@ -82,7 +82,7 @@ def optimise_file(
         GraphFileError: The file cannot be read, or lacks what was asked for.
         OptimiseError: There is no solution, or the folder cannot be written.
     """
-    file = read_graph_file(path)
+    file = read_graph_file(path, isotropic=noise is NoiseModel.ISOTROPIC)
     file = file.with_isotropic_noise() if noise is NoiseModel.ISOTROPIC else file
     file = prepared(file, path, unit_scale, drop_labelled_outliers, scale_initial)
     config = file_config(formulation, solver, scale_initial, pairwise_consistency)
