@@ -1,16 +1,22 @@
 """Claims on the project as a whole: who imports whom, what starts fast, what a wheel holds, what is pinned."""
 
+import ast
 import os
 import re
 import subprocess
 import sys
 import tomllib
 import zipfile
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from flocc_agent.core.effects import Effect
+from flocc_agent.core.events import Event
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -121,3 +127,70 @@ def test_every_requirement_is_pinned_within_its_range() -> None:
             continue
         assert name in pins, f"{name} is not in constraints.txt; run `make constraints`"
         assert requirement.specifier.contains(pins[name]), f"{name} {pins[name]} is outside {requirement.specifier}"
+
+
+def test_the_agents_page_names_every_file_of_the_core_and_every_effect() -> None:
+    page = (ROOT / "agent/README.md").read_text(encoding="utf-8")
+    files = {path.name for path in (ROOT / "agent/flocc_agent/core").glob("*.py")} - {"__init__.py"}
+    kinds = {kind.__name__ for kind in (*get_args(Effect), *get_args(Event))}
+    assert [name for name in sorted(files | kinds) if f"`{name}`" not in page] == []
+    named = {name for row in page.splitlines() if row.startswith("| `") for name in re.findall(r"`(\w+\.py)`", row)}
+    assert named - files == set(), "files that are no longer there"
+
+
+def product_files() -> list[Path]:
+    """Every module of the four source roots."""
+    return [path for root in ("protocol", "agent", "launch", "lab") for path in sorted((ROOT / root).rglob("*.py"))]
+
+
+def places_of(names: Iterable[tuple[str, Path]], allowed: Mapping[str, str]) -> dict[str, list[str]]:
+    """Names that stand in more than one place -> these places, but for those with a reason."""
+    places: dict[str, list[str]] = {}
+    for name, path in names:
+        places.setdefault(name, []).append(str(path.relative_to(ROOT)))
+    return {name: where for name, where in places.items() if len(where) > 1 and name not in allowed}
+
+
+FILES_TWICE = {"__init__.py": "Python's", "__main__.py": "Python's"}
+CLASSES_TWICE = {
+    "Trajectory": "of a log in a pose graph, and of stamped poses in a file: the word of the field for both",
+}
+"""Names that may stand twice, and why; take one out when its reason is gone."""
+
+
+def test_no_two_files_have_one_name() -> None:
+    assert places_of(((path.name, path) for path in product_files()), FILES_TWICE) == {}
+
+
+def test_no_two_classes_have_one_name() -> None:
+    classes = [
+        (node.name, path)
+        for path in product_files()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+    ]
+    assert places_of(classes, CLASSES_TWICE) == {}
+    assert CLASSES_TWICE.keys() <= {name for name, _ in classes}, "a name that is allowed twice is not there at all"
+
+
+SHELL = {"asyncio", "zenoh", "rclpy"}
+SHELL_RATIO_MAX = 0.10
+
+
+def imported(path: Path) -> set[str]:
+    """Top names of all that a module imports, also inside of functions."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+def test_the_asyncio_and_zenoh_shell_is_a_tenth_of_the_product_at_most() -> None:
+    """Every line of a module counts that imports one of them anywhere."""
+    product = [path for path in product_files() if path.relative_to(ROOT).parts[0] != "lab"]
+    lines = {path: path.read_text(encoding="utf-8").count("\n") for path in product}
+    shell = sum(count for path, count in lines.items() if imported(path) & SHELL)
+    assert shell < SHELL_RATIO_MAX * sum(lines.values()), f"{shell} of {sum(lines.values())} lines"

@@ -10,12 +10,12 @@ Both names are imported on first use, so that `import flocc_agent` stays fast.
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flocc_agent.composition import Agent
+    from flocc_agent.agent import Agent
     from flocc_agent.config import AgentConfig
 
 __all__ = ["Agent", "AgentConfig"]
 
-_HOMES = {"Agent": "flocc_agent.composition", "AgentConfig": "flocc_agent.config"}
+_HOMES = {"Agent": "flocc_agent.agent", "AgentConfig": "flocc_agent.config"}
 
 
 def __getattr__(name: str) -> Any:

@@ -7,10 +7,14 @@ ordered as GTSAM's: rotation (rad), then translation (m).
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
+
 Float = NDArray[np.float64]
 
 SMALL_ANGLE_RAD = 1e-9
 RIGID_TOLERANCE = 1e-3
+_UPPER = np.triu_indices(6)
 
 
 def pose(R: Float, t: Float) -> Float:
@@ -183,24 +187,51 @@ def poses_from_tq(tq: Float) -> Float:
     return T
 
 
-def tq_from_poses(T: Float) -> Float:
-    """Rows (N, 7) of poses (N, 4, 4): translation x y z, unit quaternion w x y z, w not negative."""
-    m = T[:, :3, :3]
-    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+def quaternions(R: Float) -> Float:
+    """Unit quaternions (N, 4), w first and not negative, of rotations (N, 3, 3); stable at every angle."""
+    xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], axis=1)
-    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    wx, wy, wz = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
     s0, s1, s2, s3 = squares.T
     rows = np.array([[s0, wx, wy, wz], [wx, s1, xy, xz], [wy, xy, s2, yz], [wz, xz, yz, s3]])
-    largest = np.argmax(squares, axis=1)
-    q_wxyz = rows[largest, :, np.arange(len(T))]
-    q_wxyz *= np.where(q_wxyz[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q_wxyz, axis=1, keepdims=True)
-    return np.concatenate([T[:, :3, 3], q_wxyz], axis=1)
+    q = rows[np.argmax(squares, axis=1), :, np.arange(len(R))]
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(np.where(q[:, :1] < 0, -q, q))
+
+
+def tq_from_poses(T: Float) -> Float:
+    """Rows (N, 7) of poses (N, 4, 4): translation x y z, unit quaternion w x y z, w not negative."""
+    return np.concatenate([T[:, :3, 3], quaternions(T[:, :3, :3])], axis=1)
 
 
 def tq_from_pose(T: Float) -> Float:
     """Seven numbers of a pose: translation x y z, quaternion w x y z."""
     return np.concatenate([T[:3, 3], q_wxyz_from_R(T[:3, :3])])
+
+
+def pose7(T: Float) -> Pose7:
+    """A pose (4, 4) as the wire has it: translation x y z, quaternion w x y z."""
+    x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
+    return (x, y, z, qw, qx, qy, qz)
+
+
+def interpolated(T_a_b: Float, T_a_c: Float, share: float) -> Float:
+    """Pose on the way from b (share 0) to c (share 1), along one twist."""
+    return np.asarray(T_a_b @ se3_exp(share * se3_log(between(T_a_b, T_a_c))))
+
+
+def symmetric(upper: Float) -> Float:
+    """Covariance (6, 6) of its upper triangle (21,)."""
+    out = np.empty((6, 6))
+    out[_UPPER] = upper
+    out.T[_UPPER] = upper
+    return out
+
+
+def upper_triangle(covariance: Float) -> Array:
+    """Upper triangle (21,) of a covariance (6, 6), as the wire has it: float32."""
+    return Array.of(covariance[_UPPER], "f4")
 
 
 def umeyama(source: Float, target: Float, with_scale: bool = False) -> tuple[float, Float]:

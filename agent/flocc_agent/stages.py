@@ -66,6 +66,15 @@ class Histogram:
         return self.max_s
 
 
+@dataclass(frozen=True, slots=True)
+class StageCounts:
+    """A histogram as it stands in files; its attributes are those of `Histogram`."""
+
+    counts: tuple[int, ...]
+    total_s: float
+    max_s: float
+
+
 class StageTimes:
     """One robot's histograms by stage; any thread may count."""
 
@@ -85,12 +94,9 @@ class StageTimes:
             return {name: Histogram(list(h.counts), h.total_s, h.max_s) for name, h in sorted(self._stages.items())}
 
 
-def fields_of(stages: Mapping[str, Histogram]) -> dict[str, dict[str, object]]:
-    """Histograms as they stand in files: numbers and lists only."""
-    return {
-        name: {"counts": h.counts, "total_s": round(h.total_s, 6), "max_s": round(h.max_s, 6)}
-        for name, h in stages.items()
-    }
+def counts_of(stages: Mapping[str, Histogram]) -> dict[str, StageCounts]:
+    """Histograms as they stand in files."""
+    return {name: StageCounts(tuple(h.counts), round(h.total_s, 6), round(h.max_s, 6)) for name, h in stages.items()}
 
 
 def brief_of(stages: Mapping[str, Histogram]) -> dict[str, dict[str, float]]:

@@ -18,7 +18,7 @@ from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParamete
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.campaign import prepared
 from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
-from flocc_launch.simulation.invariants import Invariant, Watch
+from flocc_launch.simulation.invariants import Invariant, InvariantWatch
 from flocc_launch.simulation.liveness import not_everywhere
 from flocc_launch.simulation.safety import Once
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
@@ -73,7 +73,7 @@ def twice(seeds: int) -> dict[str, Any]:
     pairs = again = 0
     for seed in range(seeds):
         swarm, once = prepared(drawn_scenario(seed)), Once(separated=True)
-        Watch(swarm, [Invariant("registered once", step=once.step)])
+        InvariantWatch(swarm, [Invariant("registered once", step=once.step)])
         swarm.run_until(FAULTS_END_S + SETTLE_S)
         pairs, again = pairs + once.pairs, again + once.again
     return {"seeds": seeds, "pairs": pairs, "registered_twice": again}

@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from flocc_agent.config import AgentConfig, BackendConfig
+from flocc_agent.runtime.event_lines import of_kind
+from flocc_agent.runtime.facts import AccountKept
 from flocc_agent.runtime.zenoh_observer import Observer
 from flocc_launch.dashboard import live_dashboard
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import AccountKept, of_kind
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.swarm.launching import Watch, launch
@@ -78,7 +79,7 @@ class Watched:
     intervals_s: list[float]
     sent_bytes: int
     observer_bytes: int
-    report: Report
+    report: RunReport
 
 
 def watched(scenario: Scenario, folder: Path, observed: bool) -> Watched:
@@ -89,7 +90,7 @@ def watched(scenario: Scenario, folder: Path, observed: bool) -> Watched:
     """
     with _attached(scenario, folder, observed) as (show, witness, view):
         report = launch(scenario, folder, show)
-    accounts = {account.robot: account for account in of_kind(RunFolder(folder).events(), AccountKept)}
+    accounts = {account.robot: account.fact for account in of_kind(RunFolder(folder).events(), AccountKept)}
     sent = sum(size for account in accounts.values() for kinds in account.sent_to.values() for size in kinds.values())
     intervals_s = witness[0].intervals_s() if witness else []
     return Watched(intervals_s, sent, view[0].payload_bytes if view else 0, report)
@@ -108,7 +109,7 @@ def _attached(
         threads[-1].start()
 
     def show(watch: Watch) -> None:
-        if witnesses or not all(agent.status for agent in watch.agents):
+        if witnesses or not all(agent.status is not None for agent in watch.agents):
             return
         transport = AgentConfig.read(watch.agents[-1].folder / "config.json").transport
         witnesses.append(Witness(Observer(transport, scenario.name, (Kind.HEARTBEAT,))))

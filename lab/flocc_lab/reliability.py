@@ -19,14 +19,18 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig, SourceConfig
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
+from flocc_agent.core.reports import CorrectionApplied, Fact, LeaderFollowed, NeighbourDown
+from flocc_agent.runtime.event_lines import Reported, of_kind, reported_of
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario, TracksScenario, agent_config
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
+
+F = TypeVar("F", bound=Fact)
 
 START_S = 60.0
 CROWD_START_S = 120.0
@@ -40,6 +44,8 @@ CROWD_AREA_M = 2000.0
 """Every keyframe is compared with every other robot's: in so large a town one in six has a partner after 5 minutes, two
 in three after 20; in one of 60 m each has three all the time, which makes four records of each keyframe."""
 LOOK_S = 0.1
+NOTHING = (0, 0)
+"""Records and checksum of a log that a robot does not hold."""
 CLOCK_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 MEBIBYTE = 1024 * 1024
@@ -49,7 +55,7 @@ class NotReached(FloccError):
     """What was waited for did not happen in time."""
 
 
-class Swarm:
+class LiveSwarm:
     """Agent processes on one folder, with one clock."""
 
     def __init__(self, scenario: Scenario, folder: Path, with_recordings: bool = True, start_s: float = 0.0) -> None:
@@ -100,39 +106,39 @@ class Swarm:
         deadline_s = self.now_s() + timeout_s
         while not is_true():
             if self.now_s() > deadline_s:
-                states = {agent.name: agent.status for agent in self.agents}
+                states = {agent.name: agent.said.model_dump(mode="json") for agent in self.agents}
                 raise NotReached(f"not within {timeout_s:g} s: {what}; {json.dumps(states)[:2000]}")
             await asyncio.sleep(LOOK_S)
         return self.now_s()
 
 
-def events(agent: AgentProcess, name: str, after_s: float) -> list[dict[str, Any]]:
-    """An agent's events of one name after a time, from its file."""
+def events(agent: AgentProcess, kind: type[F], after_s: float) -> list[Reported[F]]:
+    """An agent's events of one kind after a time, from its file."""
     path = agent.folder / "events.jsonl"
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    found = (json.loads(line) for line in lines if f'"{name}"' in line and line.endswith("}"))
-    return [event for event in found if event.get("event") == name and event["t"] >= after_s]
+    whole = [reported_of(line) for line in lines if line.endswith("}")]
+    return [event for event in of_kind(whole, kind) if event.t >= after_s]
 
 
 def follow(agents: Iterable[AgentProcess], leader: str) -> bool:
     """Whether all follow one robot."""
-    return all(agent.status.get("leader") == leader for agent in agents)
+    return all(agent.said.leader == leader for agent in agents)
 
 
 def one_frame(agents: Iterable[AgentProcess]) -> bool:
     """Whether all have a correction in one map frame."""
-    frames = {agent.status.get("map_frame") for agent in agents}
+    frames = {agent.said.map_frame for agent in agents}
     return len(frames) == 1 and None not in frames
 
 
 def hold(agents: Iterable[AgentProcess], counts: Mapping[str, int]) -> bool:
     """Whether each holds at least so many records of each log."""
-    return all(agent.status["logs"].get(log, [0])[0] >= count for agent in agents for log, count in counts.items())
+    return all(agent.said.logs.get(log, NOTHING)[0] >= count for agent in agents for log, count in counts.items())
 
 
 def agree(agents: Sequence[AgentProcess]) -> bool:
     """Whether all hold the same logs and have one map frame."""
-    states = [(agent.status.get("logs"), agent.status.get("map_frame")) for agent in agents]
+    states = [(agent.said.logs, agent.said.map_frame) for agent in agents]
     return states[0][1] is not None and all(state == states[0] for state in states)
 
 
@@ -157,7 +163,7 @@ def meeting(robots: int = 3, rate: float = 4.0, length_m: float = 40.0) -> Scena
 
 async def failover(folder: Path, runs: int) -> dict[str, Any]:
     """Kill the leader again and again: seconds until all others follow the next one, and until its first correction."""
-    swarm = Swarm(meeting(), folder)
+    swarm = LiveSwarm(meeting(), folder)
     times_s: list[tuple[float, float]] = []
     await swarm.start()
     try:
@@ -179,18 +185,18 @@ async def failover(folder: Path, runs: int) -> dict[str, Any]:
     }
 
 
-async def _failed_over(swarm: Swarm) -> tuple[float, float]:
+async def _failed_over(swarm: LiveSwarm) -> tuple[float, float]:
     """Kill r1, and give the seconds until the others follow r2, and until each has its first correction."""
     rest, killed_s = swarm.agents[1:], swarm.now_s()
     swarm.agents[0].kill()
 
-    def told(name: str) -> list[float]:
+    def told(kind: type[LeaderFollowed] | type[CorrectionApplied]) -> list[float]:
         """When each heard of r2 first."""
-        found = [[e["t"] for e in events(agent, name, killed_s) if e["leader"] == "r2"] for agent in rest]
+        found = [[e.t for e in events(agent, kind, killed_s) if e.fact.leader == "r2"] for agent in rest]
         return [min(times) - killed_s for times in found if times]
 
-    await swarm.until(lambda: len(told("correction")) == len(rest), START_S, "r2 leads and corrects")
-    return max(told("leader")), max(told("correction"))
+    await swarm.until(lambda: len(told(CorrectionApplied)) == len(rest), START_S, "r2 leads and corrects")
+    return max(told(LeaderFollowed)), max(told(CorrectionApplied))
 
 
 async def partition(folder: Path, runs: int, outage_s: float) -> dict[str, Any]:
@@ -200,7 +206,7 @@ async def partition(folder: Path, runs: int, outage_s: float) -> dict[str, Any]:
 
 
 async def _healed_after_s(folder: Path, outage_s: float) -> float:
-    swarm = Swarm(meeting(robots=4, rate=2.0, length_m=160.0), folder)
+    swarm = LiveSwarm(meeting(robots=4, rate=2.0, length_m=160.0), folder)
     await swarm.start()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1") and one_frame(swarm.agents), START_S, "one map")
@@ -211,7 +217,7 @@ async def _healed_after_s(folder: Path, outage_s: float) -> float:
         await asyncio.sleep(max(outage_s - (swarm.now_s() - parted_s), 0.0))
         await swarm.order(RadioConfig())
         healed_s = swarm.now_s()
-        parts = {agent.name: agent.status["logs"][agent.name][0] for agent in swarm.agents}
+        parts = {agent.name: agent.said.logs[agent.name][0] for agent in swarm.agents}
         one = "one leader, one frame, every log everywhere as long as it was at the healing"
         return (
             await swarm.until(
@@ -227,7 +233,7 @@ async def _healed_after_s(folder: Path, outage_s: float) -> float:
 
 async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
     """CPU and memory of agents that have nothing to do, children included, once the warm-up is over."""
-    swarm = Swarm(meeting(), folder, with_recordings=False)
+    swarm = LiveSwarm(meeting(), folder, with_recordings=False)
     await swarm.start()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1"), START_S, "r1 leads")
@@ -244,9 +250,9 @@ async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
 async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
     """Many agents with two keyframes per second each, once all have started: CPU, memory, queues, late heartbeats."""
     start_s = CROWD_START_PER_AGENT_S * agents
-    swarm = Swarm(crowd(agents, duration_s), folder, start_s=start_s)
+    swarm = LiveSwarm(crowd(agents, duration_s), folder, start_s=start_s)
     await swarm.start()
-    watched = Watched()
+    watched = WatchedSwarm()
     try:
         await swarm.until(lambda: follow(swarm.agents, "r1"), CROWD_START_S, "r1 leads")
         await asyncio.sleep(max(start_s + SETTLE_S - swarm.now_s(), 0.0))
@@ -255,7 +261,7 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
             await asyncio.sleep(LOAD_LOOK_S)
             watched.look(swarm.agents, swarm.now_s() - began_s)
         lasted_s, used_s = swarm.now_s() - began_s, sum(map(cpu_s, swarm.agents)) - used_s
-        lost = sum(len(events(agent, "neighbour_down", began_s)) for agent in swarm.agents)
+        lost = sum(len(events(agent, NeighbourDown, began_s)) for agent in swarm.agents)
         after, refused = _sums(swarm.agents), _refused(swarm.agents)
         behind = _records_behind(swarm.agents)
     finally:
@@ -276,7 +282,7 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
     }
 
 
-class Watched:
+class WatchedSwarm:
     """What was seen of a crowd over time.
 
     Attributes:
@@ -292,9 +298,9 @@ class Watched:
     def look(self, agents: Sequence[AgentProcess], at_s: float) -> None:
         """Take in everybody's state, and once in `RESIDENT_PERIOD_S` the memory."""
         for agent in agents:
-            for which, gap_s in agent.status.get("heartbeat_gap_s", {}).items():
+            for which, gap_s in agent.said.heartbeat_gap_s.items():
                 self.gaps_s[which] = max(self.gaps_s[which], gap_s)
-            for queue, (size, size_max) in agent.status.get("sizes", {}).items():
+            for queue, (size, size_max) in agent.said.sizes.items():
                 self._sizes[queue] = max(self._sizes.get(queue, (0, size_max)), (size, size_max))
         if at_s >= len(self.resident) * RESIDENT_PERIOD_S:
             self.resident.append({"at_s": round(at_s), **_resident(agents)})
@@ -321,10 +327,10 @@ def _records_behind(agents: Sequence[AgentProcess]) -> int:
     """How many records of one log the robot that is furthest behind lacks, as of everybody's last state."""
     longest: dict[str, int] = {}
     for agent in agents:
-        for log, (count, _) in agent.status["logs"].items():
+        for log, (count, _) in agent.said.logs.items():
             longest[log] = max(longest.get(log, 0), count)
-    held = [agent.status["logs"] for agent in agents]
-    return max(count - int(logs.get(log, [0])[0]) for logs in held for log, count in longest.items())
+    held = [agent.said.logs for agent in agents]
+    return max(count - logs.get(log, NOTHING)[0] for logs in held for log, count in longest.items())
 
 
 def crowd(robots: int, duration_s: float) -> Scenario:
@@ -342,10 +348,10 @@ def crowd(robots: int, duration_s: float) -> Scenario:
 
 def _sums(agents: Iterable[AgentProcess]) -> dict[str, int]:
     """Keyframes of all together, and closures as far as everybody knows them."""
-    states = [agent.status for agent in agents]
+    states = [agent.said for agent in agents]
     return {
-        "keyframes": sum(state.get("keyframes", 0) for state in states),
-        "closures": min(state.get("closures", 0) for state in states),
+        "keyframes": sum(state.keyframes for state in states),
+        "closures": min(state.closures for state in states),
     }
 
 
@@ -353,7 +359,7 @@ def _refused(agents: Iterable[AgentProcess]) -> dict[str, int]:
     """What all agents refused or dropped, by reason."""
     refused: dict[str, int] = {}
     for agent in agents:
-        for reason, count in agent.status.get("refused", {}).items():
+        for reason, count in agent.said.refused.items():
             refused[reason] = refused.get(reason, 0) + count
     return refused
 

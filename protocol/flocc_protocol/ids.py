@@ -17,7 +17,7 @@ INCARNATION_MAX = 2**53 - 1
 INDEX_MAX = 2**31 - 1
 TERM_COUNTER_MAX = 2**48
 
-Identifier = TypeVar("Identifier", "LogId", "KeyframeId")
+Identifier = TypeVar("Identifier", "LogId", "KeyframeId", "Term")
 
 
 class BadName(FloccError, ValueError):
@@ -130,6 +130,16 @@ class Term(_TermFields):
 
     def __str__(self) -> str:
         return f"{self.counter}:{self.leader}"
+
+    @classmethod
+    def parse(cls, text: str) -> "Term":
+        """Read what `str()` wrote.
+
+        Raises:
+            ValueError: The text is not a term.
+        """
+        counter, _, leader = text.partition(":")
+        return _as_written(cls(int(counter), LogId.parse(leader)), text)
 
 
 def _as_written(identifier: Identifier, text: str) -> Identifier:

@@ -131,7 +131,7 @@ def test_the_install_steps_of_the_image_leave_an_agent_that_runs(installed: Path
         return subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
 
     assert "Run one robot's agent" in run("flocc", "agent", "--help").stdout
-    ours = "flocc_agent.composition, flocc_agent.runtime.ros2, flocc_launch.setup.credentials"
+    ours = "flocc_agent.agent, flocc_agent.runtime.ros2, flocc_launch.setup.credentials"
     needed = f"import {ours}, gtsam, cryptography, xxhash"
     assert run("python", "-c", needed).returncode == 0
     assert run("python", "-c", "import torch").returncode != 0

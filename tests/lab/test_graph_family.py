@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flocc_lab.graph_family.campaign import read_rows, run, table
+from flocc_lab.graph_family.family_campaign import read_rows, run, table
+from flocc_lab.graph_family.family_spec import CLOSURES, KEYFRAMES, OUTLIERS_MAX, ROBOTS, WEAK_CLOSURES, drawn
 from flocc_lab.graph_family.graphs import made, member
 from flocc_lab.graph_family.judge import judged
 from flocc_lab.graph_family.methods import NoAnswer, flocc, oracle, settings
-from flocc_lab.graph_family.spec import CLOSURES, KEYFRAMES, OUTLIERS_MAX, ROBOTS, WEAK_CLOSURES, drawn
 
 TEN = (2, 3, 4, 5, 7, 9, 12, 13, 14, 15)
 """The first ten with fewer than a thousand keyframes."""

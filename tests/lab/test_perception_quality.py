@@ -7,14 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import PerceptionConfig
-from flocc_agent.core.interfaces import Camera
+from flocc_agent.core.interfaces import Camera, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose, so3_exp
+from flocc_agent.perception.backends import build_perception
 from flocc_lab.bench import perception_quality as evaluation
-from flocc_lab.bench.perception_quality import Outcome, Pair, best_matches, chosen, outcome, ratio_row, recall_at_one
-from flocc_lab.bench.registration_scenes import Scene, View, fountain, sevenscenes
+from flocc_lab.bench.perception_quality import (
+    PairOutcome,
+    ScoredPair,
+    best_matches,
+    chosen,
+    outcome,
+    ratio_row,
+    recall_at_one,
+)
+from flocc_lab.bench.registration_scenes import RegistrationScene, SceneView, fountain, sevenscenes
 
 SHARED = Path(os.environ.get("FLOCC_SHARED", Path(__file__).resolve().parents[3] / "shared")) / "data"
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -32,19 +40,19 @@ def classical() -> Perception:
     return build_perception(PerceptionConfig())
 
 
-def line_of(*robots: str) -> Scene:
+def line_of(*robots: str) -> RegistrationScene:
     """Views 1 m apart along x, looking along z."""
     views = []
     for k, robot in enumerate(robots):
         T = pose(np.eye(3), np.array([float(k), 0.0, 0.0]))
-        views.append(View(robot, Path(f"{k}.jpg"), CAMERA, T, T))
-    return Scene("line", tuple(views), 1.5, 0.5, 0.2)
+        views.append(SceneView(robot, Path(f"{k}.jpg"), CAMERA, T, T))
+    return RegistrationScene("line", tuple(views), 1.5, 0.5, 0.2)
 
 
 def test_a_registration_is_held_against_the_truth_with_its_length_made_the_true_one() -> None:
     T = pose(so3_exp(np.array([0.0, 0.1, 0.0])), np.array([4.0, 0.0, 0.0]))
 
-    found = outcome(line_of("r1", "r2"), Pair(0, 1, 0.5, True), Registration(T, 30, 60, 0.5))
+    found = outcome(line_of("r1", "r2"), ScoredPair(0, 1, 0.5, True), Registration(T, 30, 60, 0.5))
 
     assert found.rotation_error_deg == pytest.approx(np.degrees(0.1))
     assert (found.direction_error_deg, found.position_error_m) == (0.0, 0.0)
@@ -57,13 +65,13 @@ def test_a_registration_is_held_against_the_truth_with_its_length_made_the_true_
 def test_a_wrong_rotation_or_direction_is_not_correct(angle_rad: float, y: float) -> None:
     T = pose(so3_exp(np.array([0.0, angle_rad, 0.0])), np.array([1.0, y, 0.0]))
 
-    assert not outcome(line_of("r1", "r2"), Pair(0, 1, 0.5, True), Registration(T, 30, 60, None)).correct
+    assert not outcome(line_of("r1", "r2"), ScoredPair(0, 1, 0.5, True), Registration(T, 30, 60, None)).correct
 
 
 def test_best_matches_are_those_of_each_view_and_other_robot() -> None:
     scene = line_of("r1", "r1", "r2", "r3")
     similarities = {(0, 2): 0.9, (0, 3): 0.2, (1, 2): 0.1, (1, 3): 0.3, (2, 3): 0.5}
-    pairs = [Pair(i, j, similarity, False) for (i, j), similarity in similarities.items()]
+    pairs = [ScoredPair(i, j, similarity, False) for (i, j), similarity in similarities.items()]
 
     best = best_matches(pairs, scene)
 
@@ -76,14 +84,14 @@ def test_best_matches_are_those_of_each_view_and_other_robot() -> None:
 
 def test_recall_at_one_counts_views_that_another_robot_saw_the_place_of() -> None:
     scene = line_of("r1", "r1", "r2")
-    pairs = [Pair(0, 2, 0.3, False), Pair(1, 2, 0.2, True)]
+    pairs = [ScoredPair(0, 2, 0.3, False), ScoredPair(1, 2, 0.2, True)]
 
     assert recall_at_one(pairs, scene) == pytest.approx(0.5)  # right for view 1, wrong for view 2, view 0 has no place
 
 
 def test_large_scenes_keep_best_matches_and_a_repeatable_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation, "PAIRS_MAX", 20)
-    pairs = [Pair(0, k, 0.0, k % 2 == 0) for k in range(1, 101)]
+    pairs = [ScoredPair(0, k, 0.0, k % 2 == 0) for k in range(1, 101)]
 
     kept = chosen(pairs, {(0, 77)})
 
@@ -94,8 +102,8 @@ def test_large_scenes_keep_best_matches_and_a_repeatable_sample(monkeypatch: pyt
 
 
 def test_precision_and_recall_count_accepted_and_correct() -> None:
-    def at(ratio: float, correct: bool, failure: str | None = None) -> Outcome:
-        return Outcome(0, 1, 0.5, True, 40, ratio, failure, 1.0, 2.0, 0.1, 1.1, correct)
+    def at(ratio: float, correct: bool, failure: str | None = None) -> PairOutcome:
+        return PairOutcome(0, 1, 0.5, True, 40, ratio, failure, 1.0, 2.0, 0.1, 1.1, correct)
 
     outcomes = [at(0.5, True), at(0.4, True), at(0.3, False), at(0.1, True), at(0.9, False, "few correspondences")]
 
@@ -110,7 +118,7 @@ def test_precision_and_recall_count_accepted_and_correct() -> None:
 def test_a_failure_has_counts_and_a_reason() -> None:
     result = RegistrationFailed(RegistrationFailure.FEW_CORRESPONDENCES, "", 7, 70)
 
-    found = outcome(line_of("r1", "r2"), Pair(0, 1, 0.5, True), result)
+    found = outcome(line_of("r1", "r2"), ScoredPair(0, 1, 0.5, True), result)
 
     assert (found.failure, found.correspondences, found.correct) == ("few correspondences", 7, False)
     assert found.ratio == pytest.approx(0.1)

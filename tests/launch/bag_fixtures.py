@@ -9,7 +9,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ZERO_NS = 1_600_000_000 * 10**9
 WIDTH, HEIGHT = 32, 24
@@ -21,7 +21,12 @@ class BagScript:
     def __init__(self, ros1: bool) -> None:
         self.ros1 = ros1
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        if ros1:
+            self.store.register(
+                get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+            )
         self.messages: list[tuple[str, str, int, Any]] = []
+        self.frame, self.child = "camera", "body"
 
     def type(self, name: str) -> Any:
         return self.store.types[name]
@@ -32,7 +37,7 @@ class BagScript:
     def header(self, stamp_ns: int) -> Any:
         time = self.type("builtin_interfaces/msg/Time")(stamp_ns // 10**9, stamp_ns % 10**9)
         make = self.type("std_msgs/msg/Header")
-        return make(0, time, "camera") if self.ros1 else make(time, "camera")
+        return make(0, time, self.frame) if self.ros1 else make(time, self.frame)
 
     def pose(self, x: float, q_xyzw: tuple[float, float, float, float] = (0, 0, 0, 1)) -> Any:
         point = self.type("geometry_msgs/msg/Point")(x, 2.0, 0.5)
@@ -73,11 +78,31 @@ class BagScript:
         kind = "nav_msgs/msg/Odometry"
         message = self.type(kind)(
             self.header(stamp_ns),
-            "body",
+            self.child,
             self.type("geometry_msgs/msg/PoseWithCovariance")(self.pose(x, q_xyzw), covariance),
             self.type("geometry_msgs/msg/TwistWithCovariance")(twist, covariance),
         )
         self.add(topic, kind, stamp_ns, message)
+
+    def transform(
+        self,
+        topic: str,
+        stamp_ns: int,
+        edge: tuple[str, str],
+        t: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        q_xyzw: tuple[float, float, float, float] = (0, 0, 0, 1),
+    ) -> None:
+        """A TFMessage with one transform, from the first frame of the edge to the second."""
+        vector, quaternion = (
+            self.type("geometry_msgs/msg/Vector3")(*t),
+            self.type("geometry_msgs/msg/Quaternion")(*q_xyzw),
+        )
+        stamped = self.type("geometry_msgs/msg/TransformStamped")
+        before, self.frame = self.frame, edge[0]
+        header, self.frame = self.header(stamp_ns), before
+        moved = stamped(header, edge[1], self.type("geometry_msgs/msg/Transform")(vector, quaternion))
+        kind = "tf2_msgs/msg/TFMessage"
+        self.add(topic, kind, stamp_ns, self.type(kind)([moved]))
 
     def pose_stamped(self, topic: str, stamp_ns: int, x: float) -> None:
         kind = "geometry_msgs/msg/PoseStamped"

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import between, inverse, pose, se3_exp, so3_exp, tq_from_pose
+from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureKnown, KeyframeResult, RobotResult, Run
+from flocc_launch.runs.run_records import Run
 
 Float = NDArray[np.float64]
 
@@ -210,8 +211,9 @@ def fill_corrections(made: Synthetic) -> None:
     for k, t in enumerate(np.arange(6.0, end, 5.0)):
         leader = "r1" if made.died is None or t < made.died[1] + 3 else "r2"
         merged = made.merged_s is not None and t >= made.merged_s
+        parts = [["r1", "r2", "r3"]] if merged else [["r1"], ["r2"], ["r3"]]
         say(
-            made, float(t), leader, "optimised", term=2, round=k, components=1 if merged else 3, keyframes=30 + 9 * k,
+            made, float(t), leader, "optimised", term=2, round=k, components=parts, keyframes=30 + 9 * k,
             closures_used=3 * k, closures_rejected=k // 6, cost=40.0 / (k + 1), solve_s=0.02 + 0.004 * k,
             warnings=["the scale of one closure is unobservable"] if k % 7 == 0 else [],
         )  # fmt: skip

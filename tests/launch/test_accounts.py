@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 from tests.launch import synthetic_run
 
+from flocc_agent.runtime.event_lines import line_of
 from flocc_agent.stages import BOUNDS_S, Histogram
-from flocc_launch.report import Report, finish
+from flocc_launch.report import RunReport, finish
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import playbacks_of, simulate, swarm_of
@@ -30,7 +31,7 @@ def scenario(radio: dict[str, Any], **more: Any) -> Scenario:
     )
 
 
-def simulated(path: Path, radio: dict[str, Any], **more: Any) -> Report:
+def simulated(path: Path, radio: dict[str, Any], **more: Any) -> RunReport:
     return simulate(scenario(radio, **more), path / "run")
 
 
@@ -111,11 +112,11 @@ def account(robot: str, since_s: float, t: float, sent: int, stage_s: float) -> 
     }
 
 
-def report_of(path: Path, lines: list[dict[str, Any]]) -> tuple[Report, RunFolder]:
+def report_of(path: Path, lines: list[dict[str, Any]]) -> tuple[RunReport, RunFolder]:
     folder = synthetic_run.write(path / "run")
     made = synthetic_run.Synthetic()
-    events = [*(event.model_dump() for event in folder.events()), *lines]
-    folder.write_events(sorted(events, key=lambda line: line["t"]))
+    events = [*(line_of(event) for event in folder.events()), *lines]
+    folder.write_events(events)
     assert made is not None
     return finish(folder), folder
 

@@ -16,6 +16,7 @@ from tests.launch.synthetic_run import Synthetic
 
 from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard
 from flocc_launch.dashboard.page_source import RunSource
+from flocc_launch.dashboard.snapshot import LinkView, MapGroup, RobotView, Said, Snapshot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import LineTail
 from flocc_launch.runs.run_folder import RunFolder, event_from_line
@@ -54,27 +55,26 @@ def kill_the_leader(folder: RunFolder) -> None:
         add(folder, 32.0, robot, "leader", term=2, leader="r2")
 
 
-def robot_of(snapshot: dict[str, Any], robot: str) -> dict[str, Any]:
-    found: dict[str, Any] = next(r for r in snapshot["robots"] if r["robot"] == robot)
-    return found
+def robot_of(snapshot: Snapshot, robot: str) -> RobotView:
+    return next(r for r in snapshot.robots if r.robot == robot)
 
 
 def test_a_growing_folder_is_read_as_it_grows(tmp_path: Path) -> None:
     folder = growing(tmp_path / "run")
     now_s = START_S + 4.0
     source = RunSource(folder, clock_s=lambda: now_s)
-    assert source.snapshot()["leaders"] == []
+    assert source.snapshot().leaders == []
     start_swarm(folder)
     before = source.snapshot()
-    assert (before["leaders"], before["ranges"]) == (["r1"], [["r1", "r2", "r3"]])
-    assert before["maps"] == [{"frame": "map/r1", "robots": ["r1", "r2", "r3"]}]
+    assert (before.leaders, before.ranges) == (["r1"], [["r1", "r2", "r3"]])
+    assert before.maps == [MapGroup("map/r1", ["r1", "r2", "r3"])]
     kill_the_leader(folder)
     now_s = START_S + 33.0
     after = source.snapshot()
-    assert [robot_of(after, r)["leader"] for r in ("r2", "r3")] == ["r2", "r2"]
-    assert robot_of(after, "r1")["state"] == "silent"
-    assert (after["leaders"], after["ranges"]) == (["r2"], [["r2", "r3"]])
-    assert (after["t"], after["running"]) == (33.0, True)
+    assert [robot_of(after, r).leader for r in ("r2", "r3")] == ["r2", "r2"]
+    assert robot_of(after, "r1").state == "silent"
+    assert (after.leaders, after.ranges) == (["r2"], [["r2", "r3"]])
+    assert (after.t, after.running) == (33.0, True)
 
 
 def test_the_merged_file_replaces_what_was_read_before(tmp_path: Path) -> None:
@@ -85,9 +85,9 @@ def test_the_merged_file_replaces_what_was_read_before(tmp_path: Path) -> None:
     lines = [json.loads(line) for p in folder.path.glob("robots/*/events.jsonl") for line in p.read_text().splitlines()]
     folder.write_events([*lines, {"t": 4.0, "robot": "r1", "event": "agent_died", "signal": 9}])
     snapshot = source.snapshot()
-    assert not snapshot["running"]
-    assert robot_of(snapshot, "r1")["state"] == "died"
-    assert robot_of(snapshot, "r2")["keyframes"] == 1
+    assert not snapshot.running
+    assert robot_of(snapshot, "r1").state == "died"
+    assert robot_of(snapshot, "r2").keyframes == 1
 
 
 def test_a_torn_line_waits_for_its_end_and_a_broken_one_is_left_out(tmp_path: Path) -> None:
@@ -106,16 +106,22 @@ def test_a_partition_shows_as_two_ranges() -> None:
     state = SwarmState(["r1", "r2", "r3", "r4"])
     for robot, peer in (("r1", "r2"), ("r4", "r3")):
         state.apply(event_from_line(f'{{"t": 1, "robot": "{robot}", "event": "neighbour_up", "peer": "{peer}"}}', ""))
-    assert state.snapshot()["ranges"] == [["r1", "r2"], ["r3", "r4"]]
+    assert state.snapshot(None, "test").ranges == [["r1", "r2"], ["r3", "r4"]]
+
+
+def test_an_event_of_a_later_version_is_shown_as_it_stands() -> None:
+    state = SwarmState(["r1"])
+    state.apply(event_from_line('{"t": 1, "robot": "r1", "event": "teleported", "where": "mars"}', ""))
+    assert state.snapshot(2.0, "test").recent == [Said(1.0, "r1", "teleported where=mars")]
 
 
 def test_the_snapshot_of_a_finished_run_agrees_with_its_report(tmp_path: Path) -> None:
     folder = synthetic_run.write(tmp_path / "run")
     snapshot = RunSource(folder).snapshot()
-    assert [r["keyframes"] for r in snapshot["robots"]] == [63, 60, 66]
-    assert sum(r["accepted"] for r in snapshot["robots"]) == len(snapshot["closures"]) == 63
-    assert {r["map_frame"] for r in snapshot["robots"]} == {"map/r1"}
-    json.dumps(snapshot, allow_nan=False)
+    assert [r.keyframes for r in snapshot.robots] == [63, 60, 66]
+    assert sum(r.accepted for r in snapshot.robots) == len(snapshot.closures) == 63
+    assert {r.map_frame for r in snapshot.robots} == {"map/r1"}
+    json.dumps(snapshot.as_json(), allow_nan=False)
 
 
 def test_links_have_loss_and_bytes_and_robots_have_queues(tmp_path: Path) -> None:
@@ -125,14 +131,14 @@ def test_links_have_loss_and_bytes_and_robots_have_queues(tmp_path: Path) -> Non
     links = {"sent_to": {"r2": {"records": 100, "heartbeat": 20}}, "received_from": {"r2": {"latent": 7}}}
     add(folder, 4.0, "r1", "account", since_s=0.0, lost_from={}, repeated_from={}, stages={}, **links)
     r1 = robot_of(RunSource(folder, clock_s=lambda: START_S + 5.0).snapshot(), "r1")
-    assert r1["queues"] == {"inbox": 3}
-    assert r1["links"] == {
-        "r2": {"hears": True, "loss_ratio": 0.25, "sent_bytes": 120, "received_bytes": 7},
-        "r3": {"hears": True, "loss_ratio": None, "sent_bytes": None, "received_bytes": None},
+    assert r1.queues == {"inbox": 3}
+    assert r1.links == {
+        "r2": LinkView(hears=True, loss_ratio=0.25, sent_bytes=120, received_bytes=7),
+        "r3": LinkView(hears=True, loss_ratio=None, sent_bytes=None, received_bytes=None),
     }
     add(folder, 5.0, "r1", "neighbour_down", peer="r2")
     later = robot_of(RunSource(folder, clock_s=lambda: START_S + 6.0).snapshot(), "r1")
-    assert later["links"]["r2"] == {"hears": False, "loss_ratio": None, "sent_bytes": 120, "received_bytes": 7}
+    assert later.links["r2"] == LinkView(hears=False, loss_ratio=None, sent_bytes=120, received_bytes=7)
 
 
 def test_a_server_is_in_no_map_and_nobody_waits_for_it(tmp_path: Path) -> None:
@@ -140,14 +146,14 @@ def test_a_server_is_in_no_map_and_nobody_waits_for_it(tmp_path: Path) -> None:
     folder.write_run(Run(scenario="growing", robots=["r1", "r2", "r3"], servers=["r3"], start=START_S))
     start_swarm(folder)
     snapshot = RunSource(folder, clock_s=lambda: START_S + 5.0).snapshot()
-    assert snapshot["maps"] == [{"frame": "map/r1", "robots": ["r1", "r2"]}]
-    assert [robot["server"] for robot in snapshot["robots"]] == [False, False, True]
+    assert snapshot.maps == [MapGroup("map/r1", ["r1", "r2"])]
+    assert [robot.server for robot in snapshot.robots] == [False, False, True]
 
 
 def test_a_run_that_is_over_is_drawn_as_it_was_corrected(tmp_path: Path) -> None:
     folder = synthetic_run.write(tmp_path / "run")
     corrected = [keyframe.T_map_body for keyframe in folder.results()["r2"].keyframes]
-    drawn = robot_of(RunSource(folder).snapshot(), "r2")["path_m"]
+    drawn = robot_of(RunSource(folder).snapshot(), "r2").path_m
     known = [[round(v, 3) for v in pose[:3]] for pose in corrected if pose is not None]
     assert drawn[: len(known)] == known
     assert len(drawn) == len(corrected), "a keyframe after the last correction moves with the odom frame"

@@ -11,9 +11,10 @@ from pydantic import BaseModel
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_launch.doctor import Finding, Severity, diagnose
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureKnown, KeyframeResult, RobotResult, Run
+from flocc_launch.runs.run_records import Run
 from flocc_launch.scenarios.scenario import Scenario
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]

@@ -10,7 +10,7 @@ from flocc_agent.config import Formulation, Solver
 from flocc_agent.core.pose_graph import LoopClosure
 from flocc_agent.geometry import pose, so3_exp
 from flocc_launch.graph_files import GraphFileError, read_g2o, read_graph_file, write_g2o
-from flocc_launch.graph_files.optimise import Noise, OptimiseError, optimise_file
+from flocc_launch.graph_files.optimise import NoiseModel, OptimiseError, optimise_file
 from flocc_protocol.ids import KeyframeId, LogId
 
 Positions = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -110,14 +110,14 @@ def test_result_json_holds_the_documented_keys(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", OPTIMA)
 def test_the_listed_g2o_optima_are_met_to_six_digits(shared: Path, tmp_path: Path, name: str) -> None:
     path = data(shared, "g2o", f"{name}.g2o")
-    result = optimise_file(path, tmp_path, formulation=Formulation.BASE, solver=Solver.LM, noise=Noise.ISOTROPIC)
+    result = optimise_file(path, tmp_path, formulation=Formulation.BASE, solver=Solver.LM, noise=NoiseModel.ISOTROPIC)
     assert result["cost"] == pytest.approx(OPTIMA[name], rel=1e-5 / 2)
 
 
 @pytest.mark.data
 def test_kitti_00_in_five_robots(shared: Path, tmp_path: Path) -> None:
     folder = data(shared, "g2o", "lajoie_splits", "kitti00")
-    result = optimise_file(folder, tmp_path, formulation=Formulation.BASE, solver=Solver.LM, noise=Noise.ISOTROPIC)
+    result = optimise_file(folder, tmp_path, formulation=Formulation.BASE, solver=Solver.LM, noise=NoiseModel.ISOTROPIC)
     assert len(result["components"]) == 1
     assert result["ate_m"] <= 3.0
 
@@ -165,7 +165,7 @@ def vertex(k: int, x: float, y: float, yaw: float = 0.0) -> str:
 
 
 def positions_of(
-    tmp_path: Path, text: str, noise: Noise = Noise.GAUSSIAN
+    tmp_path: Path, text: str, noise: NoiseModel = NoiseModel.GAUSSIAN
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     (tmp_path / "g.g2o").write_text(text)
     optimise_file(tmp_path / "g.g2o", tmp_path / "out", formulation=Formulation.BASE, solver=Solver.LM, noise=noise)
@@ -180,7 +180,7 @@ def test_the_whole_information_of_an_edge_counts(tmp_path: Path) -> None:
     x = (2 / (2 / 100) + 3 / 1) / (1 / (2 / 100) + 1)
     y = (1 / 0.01) / (1 / 2 + 100)
     np.testing.assert_allclose(positions_of(tmp_path, text)[2, :2], [x, y], atol=1e-3)
-    assert abs(positions_of(tmp_path, text, Noise.ISOTROPIC)[2, 0] - x) > 0.3
+    assert abs(positions_of(tmp_path, text, NoiseModel.ISOTROPIC)[2, 0] - x) > 0.3
 
 
 def test_terms_between_rotation_and_translation_count(tmp_path: Path) -> None:

@@ -10,8 +10,9 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.runtime.event_lines import Reported, UnknownFact
 from flocc_agent.runtime.trajectory_text import read_tum
-from flocc_launch.report import Report, evaluate, finish, read_report
+from flocc_launch.report import RunReport, evaluate, finish, read_report
 from flocc_launch.report.build import judged
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line
 from flocc_launch.runs.timeline import merged_after_s
@@ -152,7 +153,9 @@ def test_evaluate_says_what_the_report_holds(folder: RunFolder) -> None:
     assert text.startswith("All three robots found one common map")
     assert "joint ATE     0.134 m; odometry at its true starts 1.64 m, aligned 1.46 m" in text
     assert "expected      merged_within_s 60: 41.3, met" in text
-    assert Report.model_validate_json(evaluate(folder.path, as_json=True)) == read_report(folder.path / "report.json")
+    assert RunReport.model_validate_json(evaluate(folder.path, as_json=True)) == read_report(
+        folder.path / "report.json"
+    )
 
 
 @pytest.mark.slow
@@ -229,7 +232,16 @@ def test_a_run_is_not_written_over_another(folder: RunFolder) -> None:
 
 def test_an_event_of_a_later_version_is_kept_as_it_is() -> None:
     event = event_from_line('{"t": 2.5, "robot": "r1", "event": "teleported", "where": "mars"}', "here")
-    assert (event.t, event.robot, event.event) == (2.5, "r1", "teleported")
+    assert event == Reported(2.5, "r1", UnknownFact("teleported", {"where": "mars"}))
+
+
+def test_events_of_a_later_version_are_counted_in_the_report(folder: RunFolder) -> None:
+    path = folder.path / "events.jsonl"
+    later = '{"t": 2.5, "robot": "r1", "event": "teleported", "where": "mars"}\n'
+    path.write_text(path.read_text() + 2 * later)
+    report = finish(folder)
+    assert "This version does not know events of the kind teleported (2 in this run)." in report.warnings
+    assert "of the kind teleported" in (folder.path / "report.html").read_text()
 
 
 def test_a_run_without_any_event_has_a_report(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
-from flocc_launch.report import Report, finish
+from flocc_launch.report import RunReport, finish
 from flocc_launch.report.html import page
 from flocc_launch.report.svg import Axis, thinned
 from flocc_launch.report.verdict import verdict
@@ -37,7 +37,7 @@ class Balance(HTMLParser):
         assert self.open.pop() == tag
 
 
-def html_of(path: Path, options: Synthetic | None = None) -> tuple[str, Report]:
+def html_of(path: Path, options: Synthetic | None = None) -> tuple[str, RunReport]:
     folder = synthetic_run.write(path / "run", options)
     report = finish(folder)
     return (folder.path / "report.html").read_text(), report

@@ -64,7 +64,7 @@ def test_the_status_of_a_run_folder_is_that_of_its_robots(tmp_path: Path) -> Non
 def test_an_agents_answer_is_read_and_a_strange_one_is_shown_as_such() -> None:
     answer = {"robot": "r2", "leader": "r1", "term": 3, "neighbours": ["r1"], "sent_bytes": 12, "new": [1]}
     known = status_from("r2", json.dumps(answer).encode())
-    assert (known.leader, known.term, known.neighbours, known.closures) == ("r1", 3, ["r1"], None)
+    assert (known.leader, known.term, known.neighbours, known.closures) == ("r1", 3, ("r1",), None)
     for strange in (b"\xff", b"[]", b"null", b'{"neighbours": 3}'):
         assert status_from("r2", strange) == RobotStatus(robot="r2", state="answers in another format")
 

@@ -11,9 +11,9 @@ from tests.launch import synthetic_run
 from tests.launch.test_dashboard import growing, kill_the_leader, start_swarm
 
 from flocc_agent.geometry import pose, so3_exp
+from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_launch.runs.loaded_run import load
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureKnown
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.simulation.simulate import simulate

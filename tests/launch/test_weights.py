@@ -145,10 +145,10 @@ def test_a_local_file_can_be_fetched(tmp_path: Path) -> None:
 def test_status_names_files_licences_and_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "m.pth").write_bytes(b"123")
     rows = status(Mast3rConfig(weights=tmp_path / "m.pth"))
-    assert [row["kind"] for row in rows] == ["mast3r", "cosplace"]
-    assert "CC BY-NC-SA 4.0" in str(rows[0]["licence"])
+    assert [row.kind for row in rows] == ["mast3r", "cosplace"]
+    assert "CC BY-NC-SA 4.0" in str(rows[0].licence)
     assert "unclear" in NEEDED[1].licence
-    assert (rows[0]["present"], rows[0]["size_bytes"], rows[1]["present"]) == (True, 3, False)
+    assert (rows[0].present, rows[0].size_bytes, rows[1].present) == (True, 3, False)
 
 
 def test_synthesized_weights_pass_the_check_and_are_the_same_every_time(tmp_path: Path) -> None:

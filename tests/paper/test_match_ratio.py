@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flocc_agent.core.judgement import judged, judgement_report
+from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.registration import Registration, closure_probability, match_ratio
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected
 from flocc_agent.runtime.evidence import PairEvidence
 from flocc_launch.runs.heard import Heard
-from flocc_launch.runs.run_records import ClosureAccepted, ClosureRejected
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import ClosureRecord, RejectionRecord
 
@@ -68,10 +68,11 @@ def test_judge_log_evidence_event_and_page_read_one_ratio(loop: int, odometry: i
     """A pair of 21 over 3 correspondences was "rejected, best ratio 7" by R_thr 1.1: Eq. (1) says 21 / 20."""
     expected, record = match_ratio(loop, odometry), judgement(loop, odometry)
     assert isinstance(record, ClosureRecord) is (expected >= 1.1)
-    assert judgement_report(record, LogId("alpha")).fields["ratio"] == round(expected, 4)
+    assert told(record, LogId("alpha")).ratio == round(expected, 4)
     heard = Heard(4.0).record(LogId("alpha"), record, 1.0)
-    assert isinstance(heard, ClosureAccepted | ClosureRejected)
-    assert heard.ratio == expected
+    assert heard is not None
+    assert isinstance(heard.fact, ClosureAccepted | ClosureRejected)
+    assert heard.fact.ratio == round(expected, 4)
     if isinstance(record, ClosureRecord):
         assert record.match_ratio == expected
         return

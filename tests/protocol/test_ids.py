@@ -28,9 +28,14 @@ def test_a_keyframe_identifier_reads_back(keyframe: KeyframeId) -> None:
     assert KeyframeId.parse(str(keyframe)) == keyframe
 
 
-@given(st.text(max_size=60) | st.from_regex(r"\A[a-z0-9~/+_ -]{0,20}\Z"))
+@given(st.integers(0, TERM_COUNTER_MAX), log_ids)
+def test_a_term_reads_back(counter: int, log: LogId) -> None:
+    assert Term.parse(str(Term(counter, log))) == Term(counter, log)
+
+
+@given(st.text(max_size=60) | st.from_regex(r"\A[a-z0-9~:/+_ -]{0,20}\Z"))
 def test_any_other_text_is_a_value_error(text: str) -> None:
-    for parse in (LogId.parse, KeyframeId.parse):
+    for parse in (LogId.parse, KeyframeId.parse, Term.parse):
         try:
             identifier = parse(text)
         except ValueError:

@@ -1,11 +1,9 @@
 """Campaigns: seeds that hold, replay exactly, and shrink."""
 
-import json
-
 import pytest
 
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
-from flocc_launch.simulation.campaign import Campaign, Outcome, campaign, prepared, shrink
+from flocc_launch.simulation.campaign import Campaign, SeedOutcome, campaign, prepared, shrink
 from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
 from flocc_launch.simulation.invariants import Violation
 
@@ -18,12 +16,12 @@ def test_a_small_campaign_on_two_processes_holds() -> None:
 
 
 def test_a_seed_replays_exactly() -> None:
-    lines = []
+    told = []
     for _ in range(2):
         swarm = prepared(drawn_scenario(7))
         swarm.run_until(20.0)
-        lines.append(json.dumps(swarm.lines))
-    assert lines[0] == lines[1]
+        told.append(swarm.told)
+    assert told[0] == told[1]
 
 
 def test_other_seeds_draw_other_faults() -> None:
@@ -49,7 +47,7 @@ def test_shrinking_leaves_the_fault_that_matters() -> None:
 
 
 def test_the_json_of_a_campaign_names_seed_invariant_and_time() -> None:
-    outcome = Outcome(9, (Violation("agreement", 92.5, "two lead"),), None)
-    fields = Campaign((outcome, Outcome(10, (), 2.5))).as_json()
+    outcome = SeedOutcome(9, (Violation("agreement", 92.5, "two lead"),), None)
+    fields = Campaign((outcome, SeedOutcome(10, (), 2.5))).as_json()
     assert fields["runs"] == 2
     assert fields["violations"] == [{"seed": 9, "invariant": "agreement", "at_s": 92.5, "detail": "two lead"}]

@@ -140,7 +140,7 @@ def test_two_robots_with_one_name_are_named(tmp_path: Path) -> None:
     swarm.add_twin("r2")
     swarm.run_until(15.0)
     del swarm.stations["r2-twin"]  # it belongs to somebody else, and so do its files
-    swarm.lines = [line for line in swarm.lines if line["robot"] != "r2-twin"]
+    swarm.told = [told for told in swarm.told if told.robot != "r2-twin"]
     folder = RunFolder.create(tmp_path / "run")
     write(folder, swarm, scenario.seed, 15.0)
     assert [(finding.cause, finding.robots) for finding in diagnose(folder)] == [
@@ -174,7 +174,7 @@ def answers(swarm: Swarm) -> list[RobotStatus]:
             "closures": core.assembly.closures,
             "logs": {str(digest.log): [digest.count, digest.checksum] for digest in core.gossip.digests()},
             "compute_class": swarm.scenario.robot(name).compute_class,
-            **evidence_of(core, swarm.scenario.core, station.solution),
+            **evidence_of(core, swarm.scenario.core, station.solution).model_dump(),
         }
         rows.append(status_from(name, json.dumps(fields).encode()))
     return rows

@@ -8,7 +8,7 @@ import pytest
 
 from flocc_agent.core import corrections as corrections_module
 from flocc_agent.core.corrections import Corrections, correction_of
-from flocc_agent.core.effects import Broadcast, Effect, Unicast
+from flocc_agent.core.effects import Broadcast, Deliver, Effect, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.latents import Latents
 from flocc_agent.core.loop_closing import LoopClosing
@@ -83,8 +83,7 @@ def test_a_robot_that_applies_whatever_comes_breaks_fencing(monkeypatch: pytest.
 
 
 def test_a_jump_that_is_not_told_breaks_fencing(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = corrections_module.delivered
-    monkeypatch.setattr(corrections_module, "delivered", lambda message, frame_changed: original(message, False))
+    monkeypatch.setattr(corrections_module, "Deliver", lambda message, frame_changed: Deliver(message, False))
     assert "fencing" in broken(scenario())
 
 

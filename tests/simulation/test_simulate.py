@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
+from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, KeyframeTaken, LeaderFollowed
+from flocc_agent.runtime.event_lines import of_kind
+from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
-from flocc_launch.runs.run_records import ClosureAccepted
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
@@ -47,7 +49,8 @@ def test_a_run_folder_is_whole(tmp_path: Path) -> None:
     names = {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*") if path.is_file()}
     wanted = {"run.json", "events.jsonl", "report.json", "report.html", "pose_graph.g2o", "groundtruth/r1.tum"}
     assert wanted <= names
-    assert {event.event for event in RunFolder.open(tmp_path / "run").events()} >= {"keyframe", "leader", "correction"}
+    told = {type(event.fact) for event in RunFolder.open(tmp_path / "run").events()}
+    assert told >= {KeyframeTaken, LeaderFollowed, CorrectionApplied}
 
 
 def test_no_wall_clock_is_in_the_events(tmp_path: Path) -> None:
@@ -59,7 +62,7 @@ def test_no_wall_clock_is_in_the_events(tmp_path: Path) -> None:
 def test_a_killed_robot_is_reported_and_the_rest_goes_on(tmp_path: Path) -> None:
     report = simulate(scenario(faults=[{"at_s": 20.0, "kind": "kill", "robots": ["r1"]}]), tmp_path / "run")
     events = RunFolder.open(tmp_path / "run").events()
-    assert [(event.robot, event.t) for event in events if event.event == "agent_died"] == [("r1", 20.0)]
+    assert [(event.robot, event.t) for event in of_kind(events, AgentDied)] == [("r1", 20.0)]
     assert [span.leader for span in report.leaders][-1] == "r2"
 
 
@@ -91,5 +94,5 @@ def test_a_robot_without_images_of_its_own_serves_the_others(tmp_path: Path) -> 
     report = simulate(scenario(robots=robots), tmp_path / "run")
     assert {span.leader for span in report.leaders} == {"server"}
     events = RunFolder.open(tmp_path / "run").iterate_events()
-    by = Counter(event.by for event in events if isinstance(event, ClosureAccepted))
+    by = Counter(event.fact.by for event in of_kind(events, ClosureAccepted))
     assert by["server"] > 0.8 * by.total()

@@ -2,6 +2,7 @@
 
 from tests.agent.core.virtual_time import Robots
 
+from flocc_agent.core.reports import LogForked, PeerRefused
 from flocc_agent.core.robot import Restored, Robot
 from flocc_protocol.codec import to_bytes
 from flocc_protocol.ids import LogId
@@ -53,7 +54,8 @@ def test_records_of_a_later_version_travel_byte_for_byte_and_closures_are_unharm
     ] == [encode_record(later(k)) for k in range(6)]
     assert closures(r1) == closures(r2) == closures(r3) >= 12
     assert robots.frames() == {"r1": "map/r1", "r2": "map/r1", "r3": "map/r1"}
-    assert robots.reports("r1", "peer_refused") == robots.reports("r1", "log_forked") == []
+    assert robots.facts("r1", PeerRefused) == []
+    assert robots.facts("r1", LogForked) == []
 
 
 def test_a_robot_starts_again_with_records_of_a_later_version_on_its_disk() -> None:

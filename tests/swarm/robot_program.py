@@ -4,16 +4,14 @@ Usage: CONFIG.json KEYFRAMES PERIOD_S PHASE_RAD. Runs until its standard input e
 """
 
 import asyncio
-import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.config import AgentConfig
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.perception.synthetic import pose_image
@@ -47,15 +45,14 @@ async def drive(agent: Agent, name: str, keyframes: int, period_s: float, phase_
 async def tell(agent: Agent) -> None:
     """Print the agent's state again and again."""
     while True:
-        print(json.dumps(agent.status()), flush=True)
+        print(agent.status().model_dump_json(), flush=True)
         await asyncio.sleep(STATUS_PERIOD_S)
 
 
 async def main(path: Path, keyframes: int, period_s: float, phase_rad: float) -> None:
     """Be a robot."""
     config = AgentConfig.model_validate_json(path.read_text(encoding="utf-8"))
-    lines: list[dict[str, Any]] = []
-    async with Agent(config, CAMERA, on_line=lines.append) as agent:
+    async with Agent(config, CAMERA) as agent:
         tasks = [
             asyncio.create_task(drive(agent, config.name, keyframes, period_s, phase_rad)),
             asyncio.create_task(tell(agent)),

@@ -56,7 +56,7 @@ def test_three_agents_account_for_the_same_bytes_and_tell_prometheus(tmp_path: P
 
     def scrape(seen: Watch) -> None:
         for k, agent in enumerate(seen.agents):
-            if agent.running and agent.status.get("closures"):
+            if agent.running and agent.said.closures:
                 pages[agent.name] = read(f"http://127.0.0.1:{port + k}/metrics") or pages.get(agent.name, "")
 
     report = launch(meeting(), tmp_path / "run", scrape, metrics=str(port))

@@ -46,7 +46,7 @@ class Looks:
 
 
 def states(watch: Watch, key: str) -> list[object]:
-    return [agent.status.get(key) for agent in watch.agents if agent.name != "r1"]
+    return [getattr(agent.said, key) for agent in watch.agents if agent.name != "r1"]
 
 
 def text_of(html: str) -> str:
@@ -71,7 +71,7 @@ def test_a_browser_sees_the_new_leader_the_partition_and_the_merged_map(tmp_path
         tmp_path,
         {
             "killed": lambda watch: watch.elapsed_s > KILL_S and states(watch, "leader") == ["r2", "r2"],
-            "partition": lambda watch: watch.elapsed_s > PARTITION_S and states(watch, "neighbours") == [[], []],
+            "partition": lambda watch: watch.elapsed_s > PARTITION_S and states(watch, "neighbours") == [(), ()],
             "healed": lambda watch: (
                 watch.elapsed_s > HEAL_S
                 and states(watch, "leader") == ["r2", "r2"]

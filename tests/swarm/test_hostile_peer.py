@@ -9,14 +9,13 @@ import logging
 import os
 import random
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.agent.runtime.loopback import loopback_configs, until
 from tests.swarm.robot_program import CAMERA, T_world_camera_at
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
 from flocc_agent.config import AgentConfig, PerceptionConfig, TransportConfig
 from flocc_agent.perception.synthetic import pose_image
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
@@ -93,11 +92,10 @@ def attack(rng: random.Random, material: list[tuple[str, bytes]]) -> tuple[str, 
 async def test_mutated_bytes_change_nothing(caplog: pytest.LogCaptureFixture) -> None:
     rng = random.Random(SEED)
     configs = loopback_configs(("r1", "r2", "r3"))
-    lines: list[dict[str, Any]] = []
-    async with Agent(agent_config("r1", configs["r1"]), CAMERA, on_line=lines.append) as agent:
+    async with Agent(agent_config("r1", configs["r1"]), CAMERA) as agent:
         material = await overheard(agent, configs["r3"])
-        await until(lambda: agent.status()["keyframes"] == 6 and not agent.status()["busy"], 20.0)
-        own_log = agent.status()["logs"]["r1"]
+        await until(lambda: agent.status().keyframes == 6 and not agent.status().busy, 20.0)
+        own_log = agent.status().logs["r1"]
         caplog.clear()
         rogue = open_session(session_settings(configs["r2"], "test", "r2", Plane.CONTROL), "rogue")
         try:
@@ -109,16 +107,16 @@ async def test_mutated_bytes_change_nothing(caplog: pytest.LogCaptureFixture) ->
                     rogue.put(key, payload)
                 if count % 100 == 0:
                     await asyncio.sleep(0)
-            await until(lambda: not agent.status()["busy"], 60.0)
+            await until(lambda: not agent.status().busy, 60.0)
             grown = resident_bytes() - before
         finally:
             rogue.close()
         status = agent.status()
-    refused = sum(count for reason, count in status["refused"].items() if reason.startswith("refused"))
-    figures = {"sent": MESSAGES, "refused": refused, "grown_bytes": grown, "counters": status["refused"]}
+    refused = sum(count for reason, count in status.refused.items() if reason.startswith("refused"))
+    figures = {"sent": MESSAGES, "refused": refused, "grown_bytes": grown, "counters": status.refused}
     print(json.dumps(figures))
-    assert status["logs"]["r1"] == own_log
-    assert np.isfinite(json.loads(json.dumps(status))["t"])
+    assert status.logs["r1"] == own_log
+    assert np.isfinite(json.loads(status.model_dump_json())["t"])
     assert refused > MESSAGES // 4
     assert grown < RSS_GROWTH_BYTES_MAX
     errors = [record for record in caplog.records if record.levelno >= logging.ERROR or record.exc_info]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.swarm.launching import Watch, launch
 
@@ -35,7 +35,7 @@ def meeting(**changes: object) -> Scenario:
     return Scenario.model_validate(fields)
 
 
-def results(out: Path, report: Report) -> dict[str, dict[str, object]]:
+def results(out: Path, report: RunReport) -> dict[str, dict[str, object]]:
     """What each robot knew at its end."""
     return {r: json.loads((out / "robots" / r / "result.json").read_text()) for r in report.robots}
 

@@ -45,7 +45,7 @@ def test_the_doctor_asks_a_running_swarm_why_nothing_merges(tmp_path: Path) -> N
     asking: list[threading.Thread] = []
 
     def show(watch: Watch) -> None:
-        told = [agent.status.get("keyframes", 0) > 10 and agent.status.get("leader") for agent in watch.agents]
+        told = [agent.said.keyframes > 10 and agent.said.leader for agent in watch.agents]
         if all(told) and not asking:
             asking.append(threading.Thread(target=ask, args=(watch.agents[0].folder / "config.json",)))
             asking[0].start()

@@ -4,9 +4,25 @@
 configuration; must not know images, messages or clocks of others.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
+
+Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+Iterator = Callable[[BlockProblem], BlockStep | OptimisationFailed]
+
+
+def build_optimiser(config: BackendConfig) -> Optimiser:
+    """Make the pose-graph optimiser; it can be sent to a worker process."""
+    return partial(optimise_graph, config)
+
+
+def build_iterator(config: BackendConfig) -> Iterator:
+    """Make what iterates on a robot's block in distributed mode; it can be sent to a worker process."""
+    return partial(iterate_own_block, config)
 
 
 def optimise_graph(

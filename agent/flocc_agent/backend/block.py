@@ -49,7 +49,7 @@ LEAVE_RATIO = 1.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredClosures:
     """Closures as arrays, all of them, usable now or not.
 
     Attributes:
@@ -205,7 +205,7 @@ def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopC
     )  # fmt: skip
 
 
-def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measured:
+def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> MeasuredClosures:
     """The block's closures as arrays, with the poses of others as last heard."""
     closures, log = problem.closures, problem.log
     alone = _without_others(config, closures, log)
@@ -219,7 +219,7 @@ def _measured(config: BackendConfig, problem: BlockProblem, rank: int) -> Measur
 
 
 @lru_cache(maxsize=CLOSURES_MAX)
-def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], log: LogId) -> Measured:
+def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], log: LogId) -> MeasuredClosures:
     """What does not change from one iteration to the next; `known` says only whether the covariance is one."""
     E = len(closures)
     scale = np.array([initial_scale(c, config) for c in closures])
@@ -231,7 +231,7 @@ def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], lo
     j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
     own = np.array([decides(c) == log for c in closures], dtype=bool)
     pairs = tuple(CandidatePair.of(c.query, c.match) for c in closures)
-    return Measured(pairs, i, j, T, kappa, tau, np.zeros((E, 4, config.rank)), known, own)
+    return MeasuredClosures(pairs, i, j, T, kappa, tau, np.zeros((E, 4, config.rank)), known, own)
 
 
 def _usable(others: Mapping[KeyframeId, Float], keyframe: KeyframeId, rank: int) -> bool:
@@ -253,7 +253,7 @@ def isotropic_weights(covariances: Float) -> tuple[Float, Float]:
     return 1.5 / np.trace(rotation, axis1=1, axis2=2), 3.0 / np.trace(translation, axis1=1, axis2=2)
 
 
-def _weighed(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> BlockState:
+def _weighed(config: BackendConfig, problem: BlockProblem, measured: MeasuredClosures, state: BlockState) -> BlockState:
     """Decide robust weights that are this robot's: at once for new closures, the others once per stage.
 
     A new closure that does not agree waits until the weights have been final for a while; then all robots of the
@@ -302,7 +302,7 @@ def _decided(state: BlockState, pairs: Sequence[CandidatePair], weights: Float, 
     return replace(state, weights=chosen, control=control, in_stage=0, age=0)
 
 
-def _weights_of(config: BackendConfig, problem: BlockProblem, measured: Measured, state: BlockState) -> Float:
+def _weights_of(config: BackendConfig, problem: BlockProblem, measured: MeasuredClosures, state: BlockState) -> Float:
     """Robust weights (E,): decided here, or heard; a closure that nobody decided yet does not count, except in LM."""
     if config.solver is Solver.LM:
         return measured.known.astype(float)
@@ -311,7 +311,7 @@ def _weights_of(config: BackendConfig, problem: BlockProblem, measured: Measured
     return np.where(measured.known, weights, 0.0)
 
 
-def _links(config: BackendConfig, problem: BlockProblem, measured: Measured, weights: Float) -> Links:
+def _links(config: BackendConfig, problem: BlockProblem, measured: MeasuredClosures, weights: Float) -> Links:
     """Closures with weight, then odometry, then what holds the anchor's first keyframe."""
     T_odom = np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)
     n, rank = len(T_odom), measured.fixed.shape[2]

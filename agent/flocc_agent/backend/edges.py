@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend import rotations
+from flocc_agent.geometry import quaternions
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -65,7 +66,7 @@ class State:
 
 def state_of(T: Float, clusters: int = 0) -> State:
     """State of poses (N, 4, 4) with every cluster at its initial scale."""
-    return State(rotations.quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), np.ones(clusters))
+    return State(quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), np.ones(clusters))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

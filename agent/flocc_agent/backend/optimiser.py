@@ -16,18 +16,17 @@ from flocc_agent.backend.clusters import votes
 from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.descent import Objective
 from flocc_agent.backend.edges import state_of
-from flocc_agent.backend.initial import initial_poses, initial_world, trusted_closures
+from flocc_agent.backend.initial import initial_poses, trusted_closures
 from flocc_agent.backend.joining import too_few
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import build
-from flocc_agent.backend.results import Outcome, Solution, collect, excluded, odometry_component, rejected
+from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component, rejected
 from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
-    AbsoluteFix,
     ClosureResult,
     ClosureState,
     GraphSolution,
@@ -51,7 +50,7 @@ def optimise(
     """Optimise every connected component of a pose graph.
 
     Args:
-        graph: Odometry, closures, fixes and measured factors; nothing in it is trusted.
+        graph: Odometry, closures and measured factors; nothing in it is trusted.
         config: Formulation, solver, noise model and priors.
         initial: An earlier solution to start from; keyframes that it lacks follow their odometry.
         covariance_of: Keyframes whose marginal covariance is wanted, beside every robot's `T_map_odom`.
@@ -67,7 +66,7 @@ def optimise(
 def _optimise(
     graph: PoseGraph, config: BackendConfig, initial: GraphSolution | None, covariance_of: Sequence[KeyframeId]
 ) -> GraphSolution | OptimisationFailed:
-    """Optimise a graph of odometry, closures and fixes."""
+    """Optimise a graph of odometry and closures."""
     began = time.perf_counter()
     screened = screen(graph)
     if not screened.trajectories:
@@ -99,41 +98,39 @@ def _solve_group(
     config: BackendConfig,
     initial: GraphSolution | None,
     covariance_of: Sequence[KeyframeId],
-) -> Outcome:
+) -> SolvedLogs:
     """Solve logs that closures connect; where that fails, every log keeps its odometry."""
     trajectories = {log: screened.trajectories[log] for log in logs}
     closures = {k: c for k, c in usable.items() if c.query.log in trajectories and c.match.log in trajectories}
-    fixes = [fix for fix in screened.fixes if fix.keyframe.log in trajectories]
-    if not closures and not fixes:
-        return Outcome(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
+    if not closures:
+        return SolvedLogs(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
     wanted = [keyframe for keyframe in covariance_of if keyframe.log in trajectories]
     try:
-        return _solve_and_split(trajectories, closures, fixes, config, initial, wanted)
+        return _solve_and_split(trajectories, closures, config, initial, wanted)
     except (SingularSystem, np.linalg.LinAlgError, FloatingPointError) as error:
         reason = f"the component of robot {logs[0]} could not be solved and keeps its odometry: {error}"
         logger.error("%s", reason)
         components = tuple(odometry_component(log, trajectories[log]) for log in logs)
-        return Outcome(components, {k: excluded(c, reason) for k, c in closures.items()}, (reason,))
+        return SolvedLogs(components, {k: excluded(c, reason) for k, c in closures.items()}, (reason,))
 
 
 def _solve_and_split(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
-    fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
-) -> Outcome:
+) -> SolvedLogs:
     """Solve; where too few closures join maps, or are left to, solve each component with the closures that it has."""
     began = time.perf_counter()
     dropped = inconsistent(trajectories, closures, config) if config.pairwise_consistency else {}
     turned_away = {k: rejected(closures[k], reason) for k, reason in dropped.items()}
     turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
-    outcome = Outcome((), {})
+    outcome = SolvedLogs((), {})
     groups = _groups(trajectories, closures, turned_away)
     if len(groups) == 1:
         kept = {k: c for k, c in closures.items() if k not in turned_away}
-        outcome = _solve_connected(trajectories, kept, fixes, config, initial, wanted)
+        outcome = _solve_connected(trajectories, kept, config, initial, wanted)
         turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
         turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
         groups = _groups(trajectories, closures, turned_away)
@@ -141,7 +138,7 @@ def _solve_and_split(
         timings_s = {"consistency": time.perf_counter() - began - sum(outcome.timings_s.values()), **outcome.timings_s}
         return replace(outcome, closures={**outcome.closures, **turned_away}, timings_s=timings_s)
     left = {k: c for k, c in closures.items() if k not in turned_away}
-    screened = Screened(dict(trajectories), {}, tuple(fixes), ())
+    screened = Screened(dict(trajectories), {}, ())
     plain = config.model_copy(update={"pairwise_consistency": False})
     parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in groups]
     return _joined(parts, turned_away, outcome)
@@ -168,11 +165,11 @@ def _groups(
     return components_of(list(trajectories), [c for k, c in closures.items() if k not in turned_away])
 
 
-def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], before: Outcome) -> Outcome:
+def _joined(parts: Sequence[SolvedLogs], turned_away: Mapping[int, ClosureResult], before: SolvedLogs) -> SolvedLogs:
     closures = dict(turned_away)
     for part in parts:
         closures.update(part.closures)
-    return Outcome(
+    return SolvedLogs(
         tuple(c for part in parts for c in part.components),
         closures,
         tuple(w for part in parts for w in part.warnings),
@@ -181,7 +178,7 @@ def _joined(parts: Sequence[Outcome], turned_away: Mapping[int, ClosureResult], 
     )
 
 
-def summed_timings(outcomes: Sequence[Outcome]) -> dict[str, float]:
+def summed_timings(outcomes: Sequence[SolvedLogs]) -> dict[str, float]:
     """Seconds of each stage, of all outcomes together."""
     names = sorted({name for outcome in outcomes for name in outcome.timings_s})
     return {name: sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes) for name in names}
@@ -190,18 +187,15 @@ def summed_timings(outcomes: Sequence[Outcome]) -> dict[str, float]:
 def _solve_connected(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
-    fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
-) -> Outcome:
+) -> SolvedLogs:
     times = [time.perf_counter()]
     T_initial, warm = initial_poses(trajectories, closures, config.steepness, initial)
-    T_map_world = initial_world(T_initial, fixes)
     times.append(time.perf_counter())
-    problem = build(trajectories, closures, fixes, config, T_initial, T_map_world)
-    poses = [T_initial[log] for log in problem.logs] + ([T_map_world[None]] if fixes else [])
-    state = state_of(np.concatenate(poses), problem.clusters)
+    problem = build(trajectories, closures, config)
+    state = state_of(np.concatenate([T_initial[log] for log in problem.logs]), problem.clusters)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     objective = Objective(problem.edges, problem.closure_rows, linear, config)
     trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None

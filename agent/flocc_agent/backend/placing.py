@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend import rotations
 from flocc_agent.backend.alignment import PairAlignment, align_pair, rays_from, travelled_m
 from flocc_agent.backend.edges import State
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory, components_of
+from flocc_agent.geometry import quaternions
 from flocc_protocol.ids import LogId
 
 Bool = NDArray[np.bool_]
@@ -102,4 +102,4 @@ class Places:
         for log in body:
             rows = slice(self.problem.offsets[log], self.problem.offsets[log] + len(self.trajectories[log]))
             T[rows] = T_move @ T[rows]
-        return State(rotations.quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), state.scale)
+        return State(quaternions(T[:, :3, :3]), T[:, :3, 3].copy(), state.scale)

@@ -18,7 +18,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SolvedLogs:
     """What solving some logs gave: their components, their closures' results by index, and sentences."""
 
     components: tuple[Component, ...]
@@ -56,14 +56,14 @@ def odometry_component(log: LogId, trajectory: Trajectory) -> Component:
     return Component((log,), {log: T}, {log: np.eye(4)}, {log: np.zeros((6, 6))})
 
 
-def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> Outcome:
+def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> SolvedLogs:
     """Component, closure results and warnings of a solved component; covariances where they are wanted."""
     results = closure_results(solution)
     component = _component(solution, wanted)
     warnings = scale_warnings(solution.problem, solution.solved, solution.closures)
     if not solution.solved.converged:
         warnings = (*warnings, f"{component.map_frame}: the solver stopped before it converged")
-    return Outcome((component,), results, warnings, solution.solved.iterations)
+    return SolvedLogs((component,), results, warnings, solution.solved.iterations)
 
 
 def closure_results(solution: Solution) -> dict[int, ClosureResult]:
@@ -107,7 +107,6 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         cost=solution.solved.cost,
         cost_initial=objective.cost(solution.start, solution.solved.weights, hold=True),
         covariance_keyframe=of_keyframes,
-        T_map_world=T_map_all @ T_all[-1] if problem.has_world else None,
     )
 
 

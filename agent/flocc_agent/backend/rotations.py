@@ -6,27 +6,6 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 
-def quaternions(R: Float) -> Float:
-    """Unit quaternions (N, 4), w first and not negative, of rotations (N, 3, 3); stable at every angle."""
-    xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
-    candidates = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], axis=1)
-    wx, wy, wz = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
-    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
-    c0, c1, c2, c3 = candidates.T
-    rows = np.stack(
-        [
-            np.stack([c0, wx, wy, wz], axis=1),
-            np.stack([wx, c1, xy, xz], axis=1),
-            np.stack([wy, xy, c2, yz], axis=1),
-            np.stack([wz, xz, yz, c3], axis=1),
-        ],
-        axis=1,
-    )
-    q = rows[np.arange(len(R)), np.argmax(candidates, axis=1)]
-    q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(np.where(q[:, :1] < 0, -q, q))
-
-
 def matrices(q: Float) -> Float:
     """Rotations (N, 3, 3) of unit quaternions (N, 4), w first."""
     w, x, y, z = q.T

@@ -1,7 +1,14 @@
 """The configuration of an agent, by noun; what other packages use stands here."""
 
-from flocc_agent.config.agent import AgentConfig, CoreSection, KeyframeConfig, SourceConfig, StoreConfig
+from flocc_agent.config.agent_config import AgentConfig, CoreSection, KeyframeConfig, SourceConfig, StoreConfig
 from flocc_agent.config.backend import BackendConfig, BackendMode, Formulation, ScaleInitial, Solver
+from flocc_agent.config.emulated_radio import (
+    BlackoutConfig,
+    LinkConfig,
+    LinkOverrideConfig,
+    PartitionConfig,
+    RadioConfig,
+)
 from flocc_agent.config.network import MetricsConfig, PeerEndpoints, TlsConfig, TransportConfig
 from flocc_agent.config.perception import (
     ClassicalConfig,
@@ -11,7 +18,6 @@ from flocc_agent.config.perception import (
     RecordedConfig,
     SyntheticConfig,
 )
-from flocc_agent.config.radio import BlackoutConfig, LinkConfig, LinkOverrideConfig, PartitionConfig, RadioConfig
 from flocc_agent.config.ros2 import Ros2Config
 from flocc_agent.config.section import (
     ConfigError,

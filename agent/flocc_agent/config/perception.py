@@ -1,7 +1,7 @@
 """The sections of the perception back-ends, and which of them is used."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -110,9 +110,12 @@ class Mast3rConfig(Section):
 class PerceptionConfig(Section):
     """Which perception back-end, and its parameters."""
 
-    method: Literal["classical", "synthetic", "recorded", "mast3r", "learned"] = "classical"
+    method: str = "classical"
     """classical: OpenCV, no weights; learned: ALIKED or XFeat with LightGlue; mast3r: CosPlace and MASt3R checkpoints;
-    synthetic: ground truth plus noise; recorded: looked up in a file."""
+    synthetic: ground truth plus noise; recorded: looked up in a file; or the name of one that an installed package
+    brings."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """What an installed package's perception is to know; flocc hands it on as it is."""
     classical: ClassicalConfig = ClassicalConfig()
     learned: LearnedConfig = LearnedConfig()
     synthetic: SyntheticConfig = SyntheticConfig()

@@ -2,6 +2,7 @@
 
 REMOVED: dict[str, str] = {
     "source.hold_s": "an agent runs until it is stopped",
+    "core.neighbours.heartbeat_period_s": "always 0.5; core.neighbours.timeout_s is the key for robots out of range",
     "core.neighbours.neighbours_max": "always 64",
     "core.election.startup_s": "always 1.5",
     "core.election.answer_timeout_s": "always 0.6",

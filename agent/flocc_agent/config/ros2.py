@@ -47,6 +47,8 @@ class Ros2Config(Section):
     takes as much as there is, up to 100."""
     odometry_topic: RosName = "odom"
     """nav_msgs/Odometry, of base_frame in odom_frame; empty where a program or a recording feeds the agent."""
+    fix_topic: RosName = ""
+    """sensor_msgs/NavSatFix of a GNSS receiver, whose fixes tie the map to the Earth; empty: there is none."""
     map_frame: str = Field("map", min_length=1)
     """Frame that odom_frame is placed in, on /tf (REP 105)."""
     odom_frame: str = Field("odom", min_length=1)
@@ -79,6 +81,8 @@ class Ros2Config(Section):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "Ros2Config":
+        if self.fix_topic and not self.image_topic:
+            raise ValueError("fix_topic needs images: fixes belong to their keyframes")
         if self.image_topic and not (self.odometry_topic and self.camera_info_topic):
             raise ValueError("images need odometry_topic and camera_info_topic")
         outputs = ("tf_topic", "path_topic", "pose_topic")

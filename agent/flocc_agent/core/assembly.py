@@ -6,19 +6,19 @@ matrices when somebody wants them.
 
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import pose7, symmetric
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import between, pose_from_tq, poses_from_tq
+from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord, UnknownRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, MeasurementRecord, RejectionRecord, UnknownRecord
 
 Float = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ class _Odometry:
 
 
 class GraphAssembly:
-    """Keyframes, closures and fixes of every known log.
+    """Keyframes, closures and measurements of every known log.
 
     Attributes:
         keyframes: Number of keyframes of all logs.
@@ -99,16 +99,20 @@ class GraphAssembly:
 
     def add(self, new: NewRecord) -> None:
         """Take in one record; records of a log come in their order, those of different logs in any."""
-        match new.record:
+        record = new.record
+        if isinstance(record, MeasurementRecord):
+            self.revision += 1
+            self._await(self._measured.add(new))
+            return
+        match record:
             case KeyframeRecord():
-                self._add_keyframe(new.log, new.record)
+                self._add_keyframe(new.log, record)
             case ClosureRecord():
-                self._add_closure(new, new.record)
+                self._add_closure(new, record)
             case RejectionRecord() | UnknownRecord():
                 pass
             case _:
-                self.revision += 1
-                self._await(self._measured.add(new))
+                assert_never(record)
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.

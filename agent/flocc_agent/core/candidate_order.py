@@ -48,7 +48,7 @@ GAIN_DIGITS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Edges:
+class NodeEdges:
     """Edges between nodes: `(N,)` ends and weights."""
 
     a: Indices
@@ -140,7 +140,7 @@ class Reduced:
     def add(self, pair: CandidatePair) -> None:
         """Take a pair in as an edge."""
         a, b = self._node(pair.low), self._node(pair.high)
-        self._add_edges(Edges(np.array([a]), np.array([b]), np.array([CLOSURE_WEIGHT])))
+        self._add_edges(NodeEdges(np.array([a]), np.array([b]), np.array([CLOSURE_WEIGHT])))
 
     def best(self, similarities: Mapping[CandidatePair, float]) -> CandidatePair:
         """The pair of the largest gain, weighed by how likely its similarity makes it."""
@@ -156,7 +156,7 @@ class Reduced:
         values, modes = spectrum(self._laplacian, self._masses)
         return uncertainty_removed(modes[a] - modes[b], np.maximum(values, 0.0) + PLACE_WEIGHT, CLOSURE_WEIGHT)
 
-    def _add_chain(self, log: LogId, ends: list[int], length: int) -> tuple[Float, Edges]:
+    def _add_chain(self, log: LogId, ends: list[int], length: int) -> tuple[Float, NodeEdges]:
         """The nodes of one log, each with its share of the keyframes, and the edges between them."""
         places = np.array(sorted({index // self._step for index in ends})) * self._step
         first = len(self._nodes)
@@ -165,12 +165,12 @@ class Reduced:
         last = max(length, ends[-1] + 1) - 0.5
         borders = np.concatenate([[-0.5], (places[1:] + places[:-1]) / 2, [last]])
         numbers = first + np.arange(len(places))
-        return np.maximum(np.diff(borders), 0.5), Edges(numbers[:-1], numbers[1:], 1.0 / np.diff(places))
+        return np.maximum(np.diff(borders), 0.5), NodeEdges(numbers[:-1], numbers[1:], 1.0 / np.diff(places))
 
     def _node(self, keyframe: KeyframeId) -> int:
         return self._nodes[keyframe.log, keyframe.index // self._step * self._step]
 
-    def _add_edges(self, edges: Edges) -> None:
+    def _add_edges(self, edges: NodeEdges) -> None:
         for a, b, weight in zip(edges.a, edges.b, edges.weights, strict=True):
             if a != b:
                 self._laplacian[[a, b], [a, b]] += weight

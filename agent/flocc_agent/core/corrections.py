@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
-from flocc_agent.core.effects import Broadcast, Correction, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
-from flocc_agent.geometry import pose_from_tq, poses_from_tq, tq_from_pose, tq_from_poses
+from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
+from flocc_agent.geometry import pose7, tq_from_poses, upper_triangle
 from flocc_protocol.arrays import Array
-from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import (
@@ -31,7 +31,6 @@ from flocc_protocol.messages import (
 
 Float = NDArray[np.float64]
 
-_UPPER = np.triu_indices(6)
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
 LISTED_MAX = 400
@@ -113,9 +112,9 @@ class Corrections:
         if held is not None and (message.term, message.round) <= (held.term, held.round):
             return []
         if held is None and len(self._newest) >= self._gossip.logs_max:
-            return [Report("peer_refused", {"peer": peer, "reason": "too many corrections"})]
+            return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
-            return [Report("peer_refused", {"peer": peer, "reason": "correction without its leader's signature"})]
+            return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
@@ -154,8 +153,8 @@ class Corrections:
             try:
                 message = correction_of(component, log, term, round_number, LISTED_MAX)
             except ValueError as error:
-                facts = {"term": str(term), "round": round_number, "reason": f"robot {log.robot}: {error}"}
-                effects.append(Report("optimisation_failed", facts))  # type: ignore[arg-type]
+                reason = f"robot {log.robot}: {error}"
+                effects.append(Report(RoundFailed(term=term, round=round_number, reason=reason)))
                 continue
             if self._changed(message):
                 message = self._signed(message)
@@ -188,16 +187,15 @@ class Corrections:
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
-        correction = delivered(message, changed)
-        facts = {
-            "term": message.term.counter,
-            "leader": message.term.leader.robot,
-            "round": message.round,
-            "map_frame": correction.map_frame,
-            "frame_changed": correction.frame_changed,
-            "T_map_odom": [float(x) for x in message.T_map_odom],
-        }
-        return [PersistCorrection(message, changed), Deliver(correction), Report("correction", facts)]  # type: ignore[arg-type]
+        fact = CorrectionApplied(
+            term=message.term.counter,
+            leader=message.term.leader.robot,
+            round=message.round,
+            map_frame=map_frame(message.anchor),
+            frame_changed=changed,
+            T_map_odom=message.T_map_odom,
+        )
+        return [PersistCorrection(message, changed), Deliver(message, changed), Report(fact)]
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:
@@ -212,42 +210,8 @@ def correction_of(component: Component, log: LogId, term: Term, round_number: in
         round=round_number,
         anchor=component.anchor,
         T_map_odom=pose7(component.T_map_odom[log]),
-        covariance=None if covariance is None else Array.of(covariance[_UPPER], "f4"),
+        covariance=None if covariance is None else upper_triangle(covariance),
         first=first,
         step=step,
         T_map_camera=Array.of(tq_from_poses(poses[first::step]), "f4"),
     )
-
-
-def delivered(message: LogCorrection, frame_changed: bool) -> Correction:
-    """A correction as consumers get it."""
-    return Correction(
-        term=message.term,
-        round=message.round,
-        map_frame=map_frame(message.anchor),
-        frame_changed=frame_changed,
-        T_map_odom=pose_from_tq(np.array(message.T_map_odom)),
-        covariance=None if message.covariance is None else symmetric(message.covariance.numpy()),
-        first=message.first,
-        step=message.step,
-        T_map_camera=poses_from_tq(message.T_map_camera.numpy()),
-    )
-
-
-def symmetric(upper: Float) -> Float:
-    """Covariance (6, 6) of its upper triangle (21)."""
-    out = np.empty((6, 6))
-    out[_UPPER] = upper
-    out.T[_UPPER] = upper
-    return out
-
-
-def upper_triangle(covariance: Float) -> Array:
-    """Upper triangle (21) of a covariance (6, 6), float32."""
-    return Array.of(covariance[_UPPER], "f4")
-
-
-def pose7(T: Float) -> Pose7:
-    """A pose as the wire has it."""
-    x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
-    return (x, y, z, qw, qx, qy, qz)

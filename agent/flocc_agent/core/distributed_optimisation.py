@@ -16,6 +16,7 @@ from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.reports import BlockMoved, RoundFailed
 from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
 from flocc_agent.geometry import inverse
 from flocc_protocol.arrays import Array
@@ -161,7 +162,7 @@ class DistributedOptimisation:
         self._failures = min(self._failures + 1, FAILURES_MAX)
         self._next_s = now + self._parameters.period_s * 2**self._failures
         self._has_news = True
-        return [Report("optimisation_failed", {"term": str(Term(0, self._own)), "round": number, "reason": reason})]
+        return [Report(RoundFailed(term=Term(0, self._own), round=number, reason=reason))]
 
     # Time
 
@@ -200,18 +201,18 @@ class DistributedOptimisation:
     def report(self) -> Report:
         """Where this robot's block stands, for people."""
         step, state = self._step, self._state
-        facts = {
-            "iteration": self.iteration,
-            "anchor": str(self.anchor),
-            "neighbours": len(self._sharing()),
-            "separators": len(self._separators),
-            "cost": None if step is None else step.cost,
-            "moved": None if step is None else step.moved,
-            "closures_rejected": 0 if step is None else step.rejected,
-            "weights_final": step is not None and step.finished,
-            "keyframes": 0 if state is None else len(state.X),
-        }
-        return Report("block", facts)  # type: ignore[arg-type]
+        fact = BlockMoved(
+            iteration=self.iteration,
+            anchor=self.anchor,
+            neighbours=len(self._sharing()),
+            separators=len(self._separators),
+            cost=None if step is None else step.cost,
+            moved=None if step is None else step.moved,
+            closures_rejected=0 if step is None else step.rejected,
+            weights_final=step is not None and step.finished,
+            keyframes=0 if state is None else len(state.X),
+        )
+        return Report(fact)
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""

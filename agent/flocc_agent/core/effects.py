@@ -1,19 +1,13 @@
 """What a robot wants done. The driver carries effects out in order: what is persisted comes before what is sent."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
 
 from flocc_agent.core.blocks import BlockProblem
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
+from flocc_agent.core.reports import Fact
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import CandidatePair, LogCorrection, Message
-
-Float = NDArray[np.float64]
-Fact = str | int | float | bool | None | list["Fact"] | dict[str, "Fact"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,38 +79,17 @@ class IterateBlock:
     problem: BlockProblem
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Correction:
-    """What a robot's consumer gets: its trajectory and odom frame in the map.
+@dataclass(frozen=True, slots=True)
+class Deliver:
+    """Tell the robot's consumers that a correction applies from now on.
 
     Attributes:
-        term: Term of the leader that made it.
-        round: Its optimisation round; (term, round) only grows.
-        map_frame: Name of the map frame.
+        correction: Of this robot's own log.
         frame_changed: The map frame differs from the last correction's: everything jumps.
-        T_map_odom: (4, 4) of the robot's odom frame.
-        covariance: (6, 6) of T_map_odom, rotation first, or None.
-        first: Number of the first corrected keyframe.
-        step: Every `step`-th keyframe is given.
-        T_map_camera: (N, 4, 4) corrected camera poses.
     """
 
-    term: Term
-    round: int
-    map_frame: str
+    correction: LogCorrection
     frame_changed: bool
-    T_map_odom: Float
-    covariance: Float | None
-    first: int
-    step: int
-    T_map_camera: Float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Deliver:
-    """Hand a correction to the robot's consumers."""
-
-    correction: Correction
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,10 +123,9 @@ class PersistCorrection:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A fact for people and files: the run's events."""
+    """Tell people and files a fact."""
 
-    event: str
-    fields: Mapping[str, Fact] = field(default_factory=dict)
+    fact: Fact
 
 
 Effect = (

@@ -6,13 +6,18 @@ Rules:
   hops it travelled; a leader whose beat stands still is lost, however often its name is repeated.
 - A term is (counter, leader). Whoever claims one takes a counter above all it heard of, and a leader that hears of
   a counter not below its own claims anew, so that what it says is never older than what its followers applied.
+
+`TRANSITIONS` is the whole machine: what may happen in which role, and which role follows. `LeaderElection.tick` says
+what a role does when its time is up.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
 from flocc_agent.core.parameters import ElectionParameters
+from flocc_agent.core.reports import LeaderFollowed, LeaderLost, PeerRefused
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
 from flocc_protocol.messages import (
     COUNTER_MAX,
@@ -43,6 +48,46 @@ class Role(Enum):
     WAITING = "waiting"
     FOLLOWING = "following"
     LEADING = "leading"
+
+
+class Turn(Enum):
+    """What moves a robot from one role to another."""
+
+    ASKS = "asks those who outrank it"
+    IS_ANSWERED = "one who outranks it is alive"
+    CLAIMS = "claims a term: nobody who outranks it is there, answered, or leads on time"
+    HEARS = "hears of a leader that it prefers"
+    LEAVES = "hands over"
+
+
+TRANSITIONS: Mapping[Role, Mapping[Turn, Role]] = {
+    Role.LISTENING: {
+        Turn.ASKS: Role.ELECTING,
+        Turn.CLAIMS: Role.LEADING,
+        Turn.HEARS: Role.FOLLOWING,
+    },
+    Role.ELECTING: {
+        Turn.IS_ANSWERED: Role.WAITING,
+        Turn.CLAIMS: Role.LEADING,
+        Turn.HEARS: Role.FOLLOWING,
+    },
+    Role.WAITING: {
+        Turn.ASKS: Role.ELECTING,
+        Turn.CLAIMS: Role.LEADING,
+        Turn.HEARS: Role.FOLLOWING,
+    },
+    Role.FOLLOWING: {
+        Turn.ASKS: Role.ELECTING,
+        Turn.CLAIMS: Role.LEADING,
+        Turn.HEARS: Role.FOLLOWING,
+    },
+    Role.LEADING: {
+        Turn.CLAIMS: Role.LEADING,
+        Turn.HEARS: Role.FOLLOWING,
+        Turn.LEAVES: Role.LISTENING,
+    },
+}
+"""Role -> what may happen in it -> the role that follows; anything else is a bug."""
 
 
 def rank(compute_class: int, log: LogId) -> Rank:
@@ -139,8 +184,7 @@ class LeaderElection:
         """A better-ranked robot is alive: wait for its claim."""
         peer = self._peers.get(sender.robot)
         if self._role is Role.ELECTING and peer is not None and peer.rank < self._rank:
-            self._role = Role.WAITING
-            self._due_s = now + COORDINATOR_TIMEOUT_S
+            self._turn(Turn.IS_ANSWERED, now + COORDINATOR_TIMEOUT_S)
         return []
 
     def on_coordinator(self, sender: LogId, message: Coordinator, now: float) -> list[Effect]:
@@ -177,9 +221,8 @@ class LeaderElection:
         if self._leader is None or not self.leading:
             return []
         handover = Handover(self._leader.term)
-        self._role = Role.LISTENING
         self._leader = None
-        self._due_s = float("inf")
+        self._turn(Turn.LEAVES, float("inf"))
         return [Broadcast(handover)]
 
     def tick(self, now: float) -> list[Effect]:
@@ -199,6 +242,11 @@ class LeaderElection:
     def deadline(self) -> float:
         """When `tick` is due next."""
         return self._due_s
+
+    def _turn(self, turn: Turn, due_s: float) -> None:
+        """Take the role that follows, until `due_s`."""
+        self._role = TRANSITIONS[self._role][turn]
+        self._due_s = due_s
 
     def _on_advert(self, advert: LeaderAdvert, now: float) -> list[Effect]:
         if advert.term.leader == self._own or advert.hops >= self._parameters.hops_max:
@@ -233,8 +281,7 @@ class LeaderElection:
 
     def _follow(self, heard: LeaderAdvert, now: float) -> list[Effect]:
         self._leader = heard
-        self._role = Role.FOLLOWING
-        self._due_s = now + self._parameters.leader_timeout_s
+        self._turn(Turn.HEARS, now + self._parameters.leader_timeout_s)
         return [_leader_report(heard.term)]
 
     def _lose_leader(self, why: str, now: float, beat: int | None = None) -> list[Effect]:
@@ -243,7 +290,7 @@ class LeaderElection:
         self._lost[self._leader.term] = self._leader.beat if beat is None else beat
         while len(self._lost) > LOST_MAX:
             del self._lost[min(self._lost)]
-        report = Report("leader_lost", {"term": str(self._leader.term), "reason": why})
+        report = Report(LeaderLost(term=self._leader.term, reason=why))
         self._leader = None
         return [report, *self._start(now)]
 
@@ -256,16 +303,14 @@ class LeaderElection:
         better = [self._peers[name] for name in sorted(self._peers) if self._peers[name].rank < self._rank]
         if not better:
             return self._claim()
-        self._role = Role.ELECTING
-        self._due_s = now + ANSWER_TIMEOUT_S
+        self._turn(Turn.ASKS, now + ANSWER_TIMEOUT_S)
         return [Unicast(peer.name, Election(self._counter_max)) for peer in better]
 
     def _claim(self) -> list[Effect]:
         self._counter_max = min(self._counter_max + 1, TERM_COUNTER_MAX)
         term = Term(self._counter_max, self._own)
         self._leader = LeaderAdvert(term, self._compute_class, beat=0, hops=0)
-        self._role = Role.LEADING
-        self._due_s = float("inf")
+        self._turn(Turn.CLAIMS, float("inf"))
         return [PersistTerm(term.counter), _leader_report(term), *self._announce()]
 
     def _announce(self) -> list[Effect]:
@@ -290,8 +335,8 @@ class LeaderElection:
 
 
 def _leader_report(term: Term) -> Report:
-    return Report("leader", {"term": term.counter, "leader": term.leader.robot, "leader_log": str(term.leader)})
+    return Report(LeaderFollowed(term=term.counter, leader=term.leader.robot, leader_log=term.leader))
 
 
 def _refused(sender: LogId, reason: str) -> Report:
-    return Report("peer_refused", {"peer": sender.robot, "reason": reason})
+    return Report(PeerRefused(peer=sender.robot, reason=reason))

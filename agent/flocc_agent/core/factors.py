@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import symmetric
 from flocc_agent.core.geodesy import Place
 from flocc_agent.core.measurements import (
     Fix,
@@ -22,22 +21,26 @@ from flocc_agent.core.measurements import (
     TagSighting,
 )
 from flocc_agent.core.pose_graph import EARTH, WORLD, MeasuredFactor, landmark
-from flocc_agent.geometry import adjoint, between, inverse, pose, pose_from_tq, se3_exp, se3_log
+from flocc_agent.geometry import adjoint, between, inverse, pose, pose_from_tq, se3_exp, se3_log, symmetric
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
+    ClosureRecord,
     FixRecord,
     GeodeticFixRecord,
     MetricClosureRecord,
     PoseFixRecord,
+    Record,
+    RejectionRecord,
     RobotBearingRecord,
     RobotSightingRecord,
     TagSightingRecord,
+    UnknownRecord,
 )
 
 Float = NDArray[np.float64]
 
 
-class Track(Protocol):
+class OdometryTrack(Protocol):
     """One log's odometry, as far as factors need it."""
 
     def stamp_s(self, index: int) -> float:
@@ -60,7 +63,7 @@ class Waiting(NamedTuple):
     stamp_s: float
 
 
-Tracks = Mapping[LogId, Track]
+Tracks = Mapping[LogId, OdometryTrack]
 Made = MeasuredFactor | Waiting | None
 
 
@@ -146,9 +149,13 @@ def factor_of(log: LogId, record: object, tracks: Tracks) -> Made:
     return None if maker is None else maker(log, record, tracks)
 
 
-def makes_factor(record: object) -> bool:
-    """Whether records of this type become factors."""
-    return type(record) in _MAKERS
+def made_at(log: LogId, record: Record) -> KeyframeId | None:
+    """The keyframe of its log at which a measurement was made; None where the record names its keyframes itself."""
+    match record:
+        case ClosureRecord() | RejectionRecord() | MetricClosureRecord() | UnknownRecord():
+            return None
+        case _:
+            return KeyframeId(log, record.index)
 
 
 def _seen(log: LogId, robot: str, stamp_s: float, tracks: Tracks) -> tuple[KeyframeId, Float, Float] | None:

@@ -16,6 +16,7 @@ from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, Pulls, remember
+from flocc_agent.core.reports import LogForked, PeerRefused
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import (
@@ -320,14 +321,14 @@ class Gossip:
         if (log, peer) in self._forked:
             return []
         remember(self._forked, (log, peer), None)
-        return [Report("log_forked", {"peer": peer, "log": str(log), "reason": reason})]
+        return [Report(LogForked(peer=peer, log=log, reason=reason))]
 
     def _refused(self, peer: str, reason: str) -> list[Effect]:
         """Say once per peer and reason what was refused."""
         if (peer, reason) in self._told:
             return []
         remember(self._told, (peer, reason), None)
-        return [Report("peer_refused", {"peer": peer, "reason": reason})]
+        return [Report(PeerRefused(peer=peer, reason=reason))]
 
 
 def _is_full(message: Records) -> bool:

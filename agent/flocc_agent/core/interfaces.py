@@ -1,4 +1,4 @@
-"""What the runtime asks of a perception back-end: Describer, Encoder, Registrar.
+"""What the runtime asks of a perception back-end: Describer, Encoder, Registrar, and `Perception`, all three.
 
 A latent travels as `bytes`: a back-end's own header (format version, model identity, sizes, intrinsics), then its
 arrays. Only the back-end that wrote a latent reads it, and it refuses another model's.
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]
 
@@ -127,3 +128,35 @@ class Registrar(Protocol):
             The relative pose up to scale, or why there is none. Raises nothing for bad latents of a peer.
         """
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Perception:
+    """A perception back-end, whole: what an agent sees with. Its three parts may be one object.
+
+    Workers call it, from one thread per kind of work; `describe` and `encode` come once per keyframe.
+    """
+
+    describer: Describer
+    encoder: Encoder
+    registrar: Registrar
+
+    def describe(self, image: Image) -> Array:
+        """Compute an image's place descriptor, as it travels: (D,) int8."""
+        return Array.int8(self.describer.describe(image))
+
+    def encode(self, image: Image) -> bytes:
+        """Compute the latent of an image."""
+        return self.encoder.encode(image)
+
+    def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
+        """Register the match's latent with the query's."""
+        return self.registrar.register(query, match, odometry)
+
+    def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
+        """Give what is sent of a stored latent; see `PictureEncoder.part`."""
+        return self.encoder.part(latent, encode_bytes) if isinstance(self.encoder, PictureEncoder) else latent
+
+    def encode_s(self) -> float | None:
+        """Tell how long encoding a received picture takes, seconds; None where pictures are not wanted."""
+        return self.encoder.encode_s if isinstance(self.encoder, PictureEncoder) else None

@@ -1,10 +1,9 @@
 """Judgement: whether a registration becomes a loop closure, by the ratio of Eq. (1) (Sec. III-B)."""
 
-from flocc_agent.core.corrections import pose7, upper_triangle
-from flocc_agent.core.effects import Report
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
-from flocc_agent.geometry import is_rigid
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected
+from flocc_agent.geometry import is_rigid, pose7, upper_triangle
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
     SCALE_INITIAL_MAX,
@@ -22,14 +21,24 @@ def judged(
     counts = (result.correspondences, result.odometry_correspondences)
     if isinstance(result, RegistrationFailed):
         return RejectionRecord(query, match, result.failure.value, *counts)
+    if result.judged_ratio is not None:
+        return _recorded(query, match, result, result.judged_ratio)
     ratio = match_ratio(*counts)
-    if not result.is_judged and result.correspondences < limits.correspondences_min:
+    if result.correspondences < limits.correspondences_min:
         return RejectionRecord(query, match, f"fewer than {limits.correspondences_min} correspondences", *counts)
-    if not result.is_judged and ratio < limits.match_ratio_threshold:
+    if ratio < limits.match_ratio_threshold:
         return RejectionRecord(query, match, f"match ratio below {limits.match_ratio_threshold}", *counts)
+    return _recorded(query, match, result, ratio)
+
+
+def _recorded(
+    query: KeyframeId, match: KeyframeId, result: Registration, ratio: float
+) -> ClosureRecord | RejectionRecord:
+    """The record of an accepted registration, or of why no log may hold it."""
     try:
         return _closure(query, match, result, ratio)
     except ValueError as error:
+        counts = (result.correspondences, result.odometry_correspondences)
         return RejectionRecord(query, match, f"no closure: {error}", *counts)
 
 
@@ -51,16 +60,25 @@ def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: 
     return record
 
 
-def judgement_report(record: ClosureRecord | RejectionRecord, by: LogId) -> Report:
-    """An accepted or refused registration, for people."""
-    facts = {
-        "query": str(record.query),
-        "match": str(record.match),
-        "correspondences": record.correspondences,
-        "odometry_correspondences": record.odometry_correspondences,
-        "ratio": round(match_ratio(record.correspondences, record.odometry_correspondences), 4),
-        "by": by.robot,
-    }
+def told(record: ClosureRecord | RejectionRecord, by: LogId) -> ClosureAccepted | ClosureRejected:
+    """An accepted or refused registration, for people; `by` is the log that its record stands in."""
     if isinstance(record, RejectionRecord):
-        return Report("closure_rejected", {**facts, "reason": record.reason})  # type: ignore[dict-item]
-    return Report("closure_accepted", {**facts, "scale_initial": record.scale_initial})  # type: ignore[dict-item]
+        ratio = round(match_ratio(record.correspondences, record.odometry_correspondences), 4)
+        return ClosureRejected(
+            query=record.query,
+            match=record.match,
+            correspondences=record.correspondences,
+            odometry_correspondences=record.odometry_correspondences,
+            ratio=ratio,
+            by=by.robot,
+            reason=record.reason,
+        )
+    return ClosureAccepted(
+        query=record.query,
+        match=record.match,
+        correspondences=record.correspondences,
+        odometry_correspondences=record.odometry_correspondences,
+        ratio=round(record.match_ratio, 4),
+        by=by.robot,
+        scale_initial=record.scale_initial,
+    )

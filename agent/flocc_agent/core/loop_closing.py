@@ -16,6 +16,7 @@ from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Rea
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.work import OdometryPairOf, WorkTable
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
@@ -91,12 +92,9 @@ class LoopClosing:
         for candidate in candidates:
             if self._knows(candidate.pair):
                 continue
-            facts = {
-                "query": str(candidate.pair.low),
-                "match": str(candidate.pair.high),
-                "similarity": round(candidate.similarity, 4),
-            }
-            effects.append(Report("candidate", facts))  # type: ignore[arg-type]
+            similarity = round(candidate.similarity, 4)
+            fact = CandidateFound(query=candidate.pair.low, match=candidate.pair.high, similarity=similarity)
+            effects.append(Report(fact))
             self._assign(candidate, now)
         return effects
 

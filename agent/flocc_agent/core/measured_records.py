@@ -5,16 +5,14 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import symmetric
-from flocc_agent.core.factors import Tracks, Waiting, factor_of
+from flocc_agent.core.factors import Tracks, Waiting, factor_of, made_at
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.pose_graph import MeasuredFactor, is_landmark
+from flocc_agent.geometry import symmetric
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
     MetricClosureRecord,
     OdometryCovarianceRecord,
-    RobotBearingRecord,
-    RobotSightingRecord,
 )
 
 Float = NDArray[np.float64]
@@ -54,17 +52,16 @@ class MeasuredRecords:
 
     def _make(self, new: NewRecord, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> bool:
         """Make a factor; whether the record need not be looked at again."""
-        record = new.record
-        sees = isinstance(record, RobotSightingRecord | RobotBearingRecord)
-        if sees and not known(KeyframeId(new.log, record.index)):  # type: ignore[union-attr]
+        keyframe = made_at(new.log, new.record)
+        if keyframe is not None and not known(keyframe):
             return False
-        made = factor_of(new.log, record, tracks)
+        made = factor_of(new.log, new.record, tracks)
         if isinstance(made, Waiting):
             self._waiting.setdefault(made.robot, []).append(made.stamp_s)
             return False
         if made is None:
             return True
-        if not all(is_landmark(end.log) or known(end) for end in (made.at, made.query, made.match)):
+        if not all(is_landmark(end.log) or known(end) for end in (made.query, made.match)):
             return False
         self._made[new.log, new.number] = made
         return True

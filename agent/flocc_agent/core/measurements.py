@@ -14,9 +14,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import Report
-from flocc_agent.geometry import adjoint, inverse, is_rigid, pose
+from flocc_agent.core.reports import MeasurementKept, MeasurementRefused
+from flocc_agent.geometry import adjoint, inverse, is_rigid, pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
@@ -406,12 +406,12 @@ def belongs_to(measurement: Measurement, own: LogId, index: int) -> KeyframeId:
 
 def measurement_report(measurement: Measurement, keyframe: KeyframeId) -> Report:
     """What was measured, for people."""
-    return Report("measured", {"kind": measurement.kind, "keyframe": str(keyframe), "of": name_of(measurement)})
+    return Report(MeasurementKept(kind=measurement.kind, keyframe=keyframe, of=name_of(measurement)))
 
 
 def measurement_refused(measurement: Measurement, keyframe: KeyframeId, reason: str) -> Report:
     """What cannot be kept, with the reason."""
-    return Report("measurement_refused", {"kind": measurement.kind, "keyframe": str(keyframe), "reason": reason})
+    return Report(MeasurementRefused(kind=measurement.kind, keyframe=keyframe, reason=reason))
 
 
 def name_of(measurement: Measurement) -> str:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.parameters import NeighbourParameters
+from flocc_agent.core.reports import NameTaken, NeighbourRestarted, NeighbourUp, PeerRefused
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Heartbeat
 
@@ -66,10 +67,10 @@ class Neighbours:
         known = self._by_name.get(sender.robot)
         if known is None:
             if len(self._by_name) >= self._parameters.neighbours_max:
-                return [Report("peer_refused", {"peer": sender.robot, "reason": "too many neighbours"})]
+                return [Report(PeerRefused(peer=sender.robot, reason="too many neighbours"))]
             self._by_name[sender.robot] = Neighbour(sender, heartbeat, now)
             self._due_s = min(self._due_s, self._expires_s(sender.robot))
-            return [Report("neighbour_up", {"peer": sender.robot, "log": str(sender)})]
+            return [Report(NeighbourUp(peer=sender.robot, log=sender))]
         effects = self._restarted(known, sender, heartbeat)
         known.count_lost(heartbeat)
         known.log, known.heartbeat, known.heard_s = sender, heartbeat, now
@@ -100,7 +101,7 @@ class Neighbours:
         returns = heartbeat.boot == known.previous_boot
         known.previous_boot = known.heartbeat.boot
         if not returns:
-            return [Report("neighbour_restarted", {"peer": sender.robot, "log": str(sender)})]
+            return [Report(NeighbourRestarted(peer=sender.robot, log=sender))]
         return self._report_duplicate(sender, "two robots run with this name")
 
     def _name_taken(self, sender: LogId, heartbeat: Heartbeat) -> list[Effect]:
@@ -112,4 +113,4 @@ class Neighbours:
         if sender.robot in self._duplicates:
             return []
         self._duplicates.add(sender.robot)
-        return [Report("duplicate_name", {"peer": sender.robot, "log": str(sender), "reason": sentence})]
+        return [Report(NameTaken(peer=sender.robot, log=sender, reason=sentence))]

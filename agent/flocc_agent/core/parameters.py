@@ -28,7 +28,7 @@ class NeighbourParameters:
 
     __pydantic_config__ = _FORBID
 
-    heartbeat_period_s: float = 0.5
+    heartbeat_period_s: float = _inner(0.5)
     """Time between heartbeats; shorter notices a lost robot sooner and costs more bytes."""
     timeout_s: float = 3.0
     """A robot that was silent for this long is out of range; six periods ride through 30 % loss."""
@@ -107,9 +107,9 @@ class LoopClosingParameters:
     __pydantic_config__ = _FORBID
 
     match_ratio_threshold: float = 0.3
-    """R_thr: a registration with a lower match ratio, Eq. (1), is refused."""
+    """R_thr: a registration with a lower match ratio, Eq. (1), is refused; not where perception judges itself."""
     correspondences_min: int = 20
-    """A registration with fewer correspondences is refused whatever its ratio."""
+    """A registration with fewer correspondences is refused whatever its ratio; not where perception judges itself."""
     fetches_max: int = _inner(2)
     """Latents fetched at one time."""
     fetch_timeout_s: float = 10.0

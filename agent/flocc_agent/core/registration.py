@@ -99,7 +99,8 @@ class Registration:
             match, or None where the method gives none.
         confidence: Mean confidence that the network gives the loop pair's points; None of other methods.
         odometry_confidence: The same of the odometry pair.
-        is_judged: Whether the front end accepted it by a rule of its own, so that R_thr does not decide.
+        judged_ratio: Evidence over what its front end's own rule asks, >= 1, where that accepted it; it then takes the
+            place of Eq. (1), so that R_thr does not decide and weights do not depend on how dense keyframes are.
     """
 
     T_query_match_unscaled: Float
@@ -109,7 +110,7 @@ class Registration:
     covariance: Float | None = None
     confidence: float | None = None
     odometry_confidence: float | None = None
-    is_judged: bool = False
+    judged_ratio: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ order. Same seed and same events give the same effects, on virtual time and on a
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import assert_never
 
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
@@ -32,7 +33,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
-from flocc_agent.core.judgement import judged, judgement_report
+from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.measurements import (
@@ -46,6 +47,16 @@ from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import (
+    EncodingFailed,
+    KeyframeTaken,
+    LatentArrived,
+    LatentFailed,
+    LatentLost,
+    NeighbourDown,
+    RoundFailed,
+    SolutionIgnored,
+)
 from flocc_agent.core.rounds import Rounds, solution_report
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
@@ -70,8 +81,10 @@ from flocc_protocol.messages import (
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
+    MeasurementRecord,
     Record,
     RejectionRecord,
+    UnknownRecord,
     encode_record,
 )
 
@@ -177,6 +190,10 @@ class Robot:
             self.rounds.deadline() if self.distributed is None else self.distributed.deadline(),
         )
 
+    def keyframes_given(self) -> int:
+        """Own keyframes that were captured, recorded or not: the next one's number."""
+        return self.gossip.logs[self.log].keyframes + len(self._pending)
+
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Every queue, table and cache: how much is in it, and its maximum."""
         neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
@@ -202,11 +219,11 @@ class Robot:
                 self.closing.on_held(keyframe)
                 return self._on_encoded(keyframe, descriptor, now)
             case KeyframeEncodingFailed(keyframe, reason):
-                report = Report("encoding_failed", {"keyframe": str(keyframe), "reason": reason})
+                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
                 return [report, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
-                return [Report("latent_fetched", {"keyframe": str(keyframe), "holder": holder})]
+                return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
             case LatentFetchFailed(keyframe, holder, reason):
                 return self._on_fetch_failed(keyframe, holder, reason, now)
             case PairRegistered(pair, result):
@@ -217,7 +234,7 @@ class Robot:
                 return self._on_optimised(event, now)
             case GraphOptimisationFailed(term, round_number, reason):
                 self.rounds.on_failed(term, round_number, now)
-                return [Report("optimisation_failed", {"term": str(term), "round": round_number, "reason": reason})]
+                return [Report(RoundFailed(term=term, round=round_number, reason=reason))]
             case BlockIterated(number, step):
                 return [] if self.distributed is None else self.distributed.on_step(number, step, now)
             case BlockIterationFailed(number, reason):
@@ -292,20 +309,20 @@ class Robot:
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""
         self.closing.on_fetch_failed(keyframe, now)
-        report = Report("latent_failed", {"keyframe": str(keyframe), "holder": holder, "reason": reason})
+        report = Report(LatentFailed(keyframe=keyframe, holder=holder, reason=reason))
         lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
         return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now)]
 
     def _reject_lost(self, pairs: list[CandidatePair], keyframe: KeyframeId, now: float) -> list[Effect]:
         """Pairs whose latent exists no more are rejected, so that nobody waits for them."""
-        effects: list[Effect] = [Report("latent_lost", {"keyframe": str(keyframe)})] if pairs else []
+        effects: list[Effect] = [Report(LatentLost(keyframe=keyframe))] if pairs else []
         for pair in pairs:
             record = RejectionRecord(pair.low, pair.high, "a latent was lost", 0, 0)
-            effects += [*self._append(record, now), judgement_report(record, self.log)]
+            effects += [*self._append(record, now), Report(told(record, self.log))]
         return effects
 
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
-        index = self.gossip.logs[self.log].keyframes + len(self._pending)
+        index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
         return [Encode(KeyframeId(self.log, index), event.image)]
 
@@ -333,7 +350,7 @@ class Robot:
         recorded = self.gossip.logs[self.log].keyframes
         if keyframe.index < recorded:
             return self._append_measurement(measurement, keyframe, now)
-        if keyframe.index >= max(recorded + len(self._pending), 1):
+        if keyframe.index >= max(self.keyframes_given(), 1):
             return [measurement_refused(measurement, keyframe, "there is no such keyframe")]
         waiting = self._waiting.setdefault(keyframe.index, [])
         if len(waiting) >= WAITING_MAX:
@@ -360,11 +377,11 @@ class Robot:
         if roles is None:
             return []
         record = judged(*roles, result, self._parameters.loop_closing)
-        return [*self._append(record, now), judgement_report(record, self.log)]
+        return [*self._append(record, now), Report(told(record, self.log))]
 
     def _on_optimised(self, event: GraphOptimised, now: float) -> list[Effect]:
         if not self.rounds.on_solution(event.term, event.round, event.solution, now):
-            return [Report("stale_solution", {"term": str(event.term), "round": event.round})]
+            return [Report(SolutionIgnored(term=event.term, round=event.round))]
         report = solution_report(event.term, event.round, event.solution)
         return [report, *self.corrections.publish(event.term, event.round, event.solution)]
 
@@ -379,7 +396,10 @@ class Robot:
         described: list[tuple[KeyframeId, Array]] = []
         for new in new_records:
             self.assembly.add(new)
-            match new.record:
+            record = new.record
+            if isinstance(record, MeasurementRecord | UnknownRecord):
+                continue
+            match record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
                     if descriptor is not None:
@@ -389,7 +409,7 @@ class Robot:
                 case RejectionRecord(query, match):
                     self.closing.on_resolved(CandidatePair.of(query, match))
                 case _:
-                    pass
+                    assert_never(record)
         return self._recognise(described, now) if described else []
 
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
@@ -463,7 +483,7 @@ class Robot:
             self.election.on_lost(name)
             self.gossip.on_lost(name)
             self.closing.on_lost(name, now)
-        return [Report("neighbour_down", {"peer": name}) for name in gone]
+        return [Report(NeighbourDown(peer=name)) for name in gone]
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
@@ -482,9 +502,5 @@ class Robot:
 
 
 def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:
-    keyframe = str(KeyframeId(log, record.index))
-    pose_facts = [float(x) for x in record.T_odom_camera]
-    return Report(
-        "keyframe",
-        {"keyframe": keyframe, "stamp_s": record.stamp_s, "T_odom_camera": pose_facts},  # type: ignore[dict-item]
-    )
+    keyframe = KeyframeId(log, record.index)
+    return Report(KeyframeTaken(keyframe=keyframe, stamp_s=record.stamp_s, T_odom_body=record.T_odom_camera))

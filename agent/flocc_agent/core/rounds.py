@@ -4,6 +4,7 @@ from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.effects import Effect, Optimise, Report
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
+from flocc_agent.core.reports import RoundSolved, RoundTimedOut
 from flocc_protocol.ids import Term
 
 FAILURES_MAX = 6
@@ -75,11 +76,13 @@ class Rounds:
 
     def tick(self, now: float) -> list[Effect]:
         """Give up a round that is overdue, start one that is wanted."""
+        if self._term is None:
+            return []
         effects: list[Effect] = []
         if self._running_until_s is not None and self._running_until_s <= now:
             self._try_again(now)
-            effects.append(Report("round_timeout", {"term": str(self._term), "round": self._round}))
-        if self._term is None or self._running_until_s is not None or self._next_s > now or not self._stale():
+            effects.append(Report(RoundTimedOut(term=self._term, round=self._round)))
+        if self._running_until_s is not None or self._next_s > now or not self._stale():
             return effects
         return [*effects, self._start(self._term, now)]
 
@@ -122,19 +125,19 @@ class Rounds:
 def solution_report(term: Term, round_number: int, solution: GraphSolution) -> Report:
     """What a round did, for people."""
     states = [result.state for result in solution.closures]
-    facts = {
-        "term": term.counter,
-        "leader": term.leader.robot,
-        "round": round_number,
-        "components": [[str(log) for log in component.logs] for component in solution.components],
-        "keyframes": sum(len(p) for c in solution.components for p in c.T_map_keyframe.values()),
-        "closures_used": states.count(ClosureState.USED),
-        "closures_rejected": states.count(ClosureState.REJECTED),
-        "closures_excluded": states.count(ClosureState.EXCLUDED),
-        "measured_used": sum(result.state is ClosureState.USED for result in solution.measured),
-        "measured_not_used": sum(result.state is not ClosureState.USED for result in solution.measured),
-        "cost": sum(component.cost for component in solution.components),
-        "solve_s": solution.solve_s,
-        "warnings": list(solution.warnings),
-    }
-    return Report("optimised", facts)  # type: ignore[arg-type]
+    fact = RoundSolved(
+        term=term.counter,
+        leader=term.leader.robot,
+        round=round_number,
+        components=tuple(component.logs for component in solution.components),
+        keyframes=sum(len(p) for c in solution.components for p in c.T_map_keyframe.values()),
+        closures_used=states.count(ClosureState.USED),
+        closures_rejected=states.count(ClosureState.REJECTED),
+        closures_excluded=states.count(ClosureState.EXCLUDED),
+        measured_used=sum(result.state is ClosureState.USED for result in solution.measured),
+        measured_not_used=sum(result.state is not ClosureState.USED for result in solution.measured),
+        cost=sum(component.cost for component in solution.components),
+        solve_s=solution.solve_s,
+        warnings=solution.warnings,
+    )
+    return Report(fact)

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import RecordedConfig
-from flocc_agent.core.corrections import symmetric
 from flocc_agent.core.interfaces import Camera, Image, OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
-from flocc_agent.geometry import hat, inverse, is_rigid, pose_from_tq
+from flocc_agent.geometry import hat, inverse, is_rigid, pose_from_tq, symmetric
 from flocc_agent.perception.latent import BadLatent
 from flocc_protocol.errors import FloccError
 

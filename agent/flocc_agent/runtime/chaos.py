@@ -5,7 +5,7 @@ Only agents whose configuration says `transport.chaos` take orders, and with TLS
 
 import math
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, assert_never
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -85,5 +85,7 @@ def disturbed(parameters: RadioParameters, order: Order, now_s: float) -> RadioP
             return parameters.healed()
         case "calm":
             return RadioParameters()
-        case _:
+        case "slow" | "kill":
             return parameters
+        case _:
+            assert_never(order.kind)

@@ -8,6 +8,8 @@ import re
 from dataclasses import dataclass
 
 UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+ROLES_MIN = 4
+"""A line that names fewer columns of a trajectory is a comment."""
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 _UNIT_NAMES = {
@@ -16,14 +18,15 @@ _UNIT_NAMES = {
     "microseconds": ("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
     "nanoseconds": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
 }
+_METRES = {"": 1.0, "m": 1.0, "meter": 1.0, "meters": 1.0, "metres": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3}
 _UNIT_OF = {name: unit for unit, names in _UNIT_NAMES.items() for name in names}
 _STAMP = re.compile(r"(.*[._/])?(t|ts|time|times|stamp|timestamp|time_stamp|unix_?time|epoch|utc|clock)")
 _HEADER_STAMP = re.compile(r"(.*[._/])?header[._/]stamp")
 _POSITION = re.compile(
-    r"|t|p|pos|position|trans|translation|loc|location|[pt]_\w+|(.*[._/])?(position|translation)(_\w+)?"
+    r"|t|p|pose|pos|position|trans|translation|loc|location|[pt]_\w+|(.*[._/])?(position|translation)(_\w+)?"
 )
 _QUATERNION = re.compile(
-    r"q|quat|quaternion|rot|rotation|ori|orient|orientation|q_\w+|(.*[._/])?(orientation|rotation|quaternion|quat)"
+    r"(.*[._/])?q|quat|quaternion|rot|rotation|ori|orient|orientation|q_\w+|(.*[._/])?(orientation|rotation|quaternion|quat)"
 )
 _ANGLES = re.compile(r"(.*[._/])?(roll|pitch|yaw|heading|azimuth|euler_?\w*|rx|ry|rz|phi|theta|psi)(_\w+)?")
 _ORDER = re.compile(
@@ -42,12 +45,14 @@ class Columns:
         pose: Columns of x y z qx qy qz qw.
         unit: What the stamp is in, one of `UNITS_S`, or None where nothing says so.
         nanoseconds: Column of the nanoseconds that are added to the stamp's seconds, or None.
+        metres: What one unit of the position is.
     """
 
     stamp: int | None
     pose: tuple[int, ...]
     unit: str | None = None
     nanoseconds: int | None = None
+    metres: float = 1.0
 
 
 class HeaderError(ValueError):
@@ -55,14 +60,14 @@ class HeaderError(ValueError):
 
 
 def columns_of(header: str, count: int | None = None) -> Columns | None:
-    """Columns that a line names, or None where the line names no position at all (it is a comment).
+    """Columns that a line names, or None where it names none (it is a comment).
 
     Args:
         header: The line, without its comment sign.
         count: How many fields a row has; words before that many are taken for an introduction.
 
     Raises:
-        HeaderError: It names positions, but not one column for each number of a stamped pose.
+        HeaderError: It names some, but not one column for each number of a stamped pose.
     """
     names = _names(header)
     roles = [_role(name) for name in names]
@@ -73,7 +78,7 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
         ]
     while count is not None and len(roles) > count and roles[0] is None:
         names, roles = names[1:], roles[1:]
-    if not {"x", "y", "z"} & set(roles) or sum(role is not None for role in roles) < 4:
+    if sum(role is not None for role in roles) < ROLES_MIN:
         return None
     if count is not None and len(roles) != count:
         raise HeaderError(f"the header names {len(roles)} columns, but rows have {count}")
@@ -89,7 +94,19 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
     stamp = roles.index("stamp")
     split = roles.index("nanoseconds") if "nanoseconds" in roles else None
     unit = "seconds" if split is not None else _unit(names[stamp])
-    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split)
+    metres = {_metres(names[roles.index(axis)]) for axis in "xyz"}
+    if len(metres) > 1:
+        raise HeaderError("the header gives positions in several units")
+    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split, metres.pop())
+
+
+def _metres(name: str) -> float:
+    """What one unit of a position is, by what stands in brackets behind its name."""
+    bracketed = re.search(r"[\[(](.*?)[\])]", name)
+    unit = bracketed[1].strip().lower() if bracketed else "m"
+    if unit not in _METRES:
+        raise HeaderError(f"the header gives positions in {unit!r}, not in metres")
+    return _METRES[unit]
 
 
 def _names(header: str) -> list[str]:
@@ -132,6 +149,8 @@ def _without_unit(bare: str) -> str:
 
 
 def _unit(name: str) -> str | None:
+    if _HEADER_STAMP.fullmatch(_bare(name)):
+        return "nanoseconds"  # as rostopic echo -p writes it
     bracketed = re.search(r"[\[(](.*?)[\])]", name)
     words = [bracketed[1].lower()] if bracketed else []
     return next((_UNIT_OF[word] for word in [*words, _bare(name).rpartition("_")[2]] if word in _UNIT_OF), None)

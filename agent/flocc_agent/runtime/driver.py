@@ -6,20 +6,16 @@ registration, optimisation, fetches and disk writes never run on the event loop.
 
 import asyncio
 import logging
-import time
-from collections import Counter, deque
-from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from collections import deque
+from collections.abc import Callable
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockProblem, BlockStep
-from flocc_agent.core.corrections import pose7
+from flocc_agent.core.corrected import Correction, Corrector
 from flocc_agent.core.effects import (
     Broadcast,
-    Correction,
     Deliver,
     Effect,
     Encode,
@@ -33,161 +29,72 @@ from flocc_agent.core.effects import (
     Report,
     Unicast,
 )
-from flocc_agent.core.events import (
-    BlockIterated,
-    BlockIterationFailed,
-    Event,
-    GraphOptimisationFailed,
-    GraphOptimised,
-    KeyframeCaptured,
-    KeyframeEncoded,
-    KeyframeEncodingFailed,
-    LatentFetched,
-    LatentFetchFailed,
-    LatentMissing,
-    Leaving,
-    Measured,
-    MessageReceived,
-    PairRegistered,
-)
-from flocc_agent.core.interfaces import Image, OdometryPair
+from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Leaving, Measured, MessageReceived
+from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement
-from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph, map_frame
-from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.reports import (
+    Fact,
+    LogForked,
+    NeighbourDown,
+    PeerRefused,
+)
 from flocc_agent.core.robot import Robot
-from flocc_agent.geometry import pose_from_tq
+from flocc_agent.geometry import pose7
+from flocc_agent.runtime.admission import Refusal, admitted
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
+from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, job_of
 from flocc_agent.runtime.metrics import Look
-from flocc_agent.runtime.outbox import Outbox
-from flocc_agent.runtime.persistence import Persist, write
+from flocc_agent.runtime.persistence import DiskQueue, Persist
 from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
-from flocc_agent.runtime.store import Store
-from flocc_agent.runtime.transport import Fetched, Transport, TransportCounters
-from flocc_agent.runtime.workers import Workers, WorkFailed
-from flocc_agent.stages import brief_of, fields_of
-from flocc_protocol.arrays import Array
-from flocc_protocol.errors import DecodeError, FloccError
+from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.sending import Sender
+from flocc_agent.runtime.status import AgentStatus
+from flocc_agent.runtime.telemetry import Sizes, Telemetry
+from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.keys import Kind
-from flocc_protocol.messages import (
-    BATCHES_MAX,
-    RECORDS_BATCH_MAX,
-    Envelope,
-    Message,
-    RecordBatch,
-    Records,
-    UnknownVersion,
-    decode,
-    encode,
-    kind_of,
-)
 
 logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
 INBOX_MAX = 8192
-COPIES_MAX = 256
-COPIES_PERIOD_S = 0.5
-"""Copies of others' records are written so many, and what one message adds, or so long at a time."""
-REFUSED_MAX = 512
-"""Refusals that are counted apart, by peer and reason."""
-IMAGES_MAX = 8
 CORRECTIONS_MAX = 16
-HEARTBEAT = Kind.HEARTBEAT.value
-BYTES_PERIOD_S = 1.0
-ACCOUNT_PERIOD_S = 10.0
-
-
-class Encoded(Protocol):
-    """What encoding an image gives."""
-
-    @property
-    def descriptor(self) -> Array:
-        """Place descriptor."""
-        ...
-
-    @property
-    def latent(self) -> bytes:
-        """Latent of the registrar."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Skills:
-    """What the driver's workers can do; named by the composition root.
-
-    Attributes:
-        encode: Image to descriptor and latent.
-        register: (query latent, match latent, odometry pair) to a relative pose up to scale.
-        optimise: Pose graph and last solution to a solution; must be importable by a worker process.
-        iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
-        part: (latent, what the link carries while the asker encodes) to what is sent; see `PictureEncoder.part`.
-        encode_s: See `PictureEncoder.encode_s`.
-    """
-
-    encode: Callable[[Image], Encoded]
-    register: Callable[[bytes, bytes, OdometryPair | None], Registration | RegistrationFailed]
-    optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
-    iterate: Callable[[BlockProblem], BlockStep | OptimisationFailed]
-    part: Callable[[bytes, int | None], bytes]
-    encode_s: Callable[[], float | None]
 
 
 class Driver:
     """Runs one robot's core on an event loop."""
 
     def __init__(
-        self,
-        robot: Robot,
-        transport: Transport,
-        store: Store,
-        workers: Workers,
-        skills: Skills,
-        reporter: Reporter,
-        on_line: Callable[[dict[str, Any]], None],
-        clock_s: Callable[[], float] = time.monotonic,
+        self, robot: Robot, tools: Tools, reporter: Reporter, on_report: Callable[[Reported[Fact]], None]
     ) -> None:
         """Prepare; `run` does the rest.
 
         Args:
             robot: The core, already restored from the store.
-            transport: Carries messages and latents; the driver opens and closes it.
-            store: Disk or memory.
-            workers: Pools off the loop.
-            skills: What the workers compute.
-            reporter: Turns the core's reports into lines.
-            on_line: Takes each line of `events.jsonl`; must not block.
-            clock_s: Seconds since the start of the run; the core's only clock.
+            tools: What its jobs work with; the driver opens and closes the transport, and closes the workers.
+            reporter: Says when and where facts happened.
+            on_report: Takes each fact; must not block.
         """
         self.robot = robot
-        self._transport = transport
-        self._store = store
-        self._workers = workers
-        self._skills = skills
-        self._reporter = reporter
-        self._on_line = on_line
-        self._clock_s = clock_s
+        self._tools = tools
+        self._clock_s = tools.clock_s
         self._inbox: deque[tuple[float, Event]] = deque()
         self._wake = asyncio.Event()
         self._opened = asyncio.Event()
-        self._images: dict[int, Image] = {}
-        self._image_count = 0
         self._given = GivenKeyframes.of(robot)
-        self._image_slots = asyncio.Semaphore(IMAGES_MAX)
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._jobs: set[asyncio.Task[Event]] = set()
         self._stopping = False
         self._subscribers: list[asyncio.Queue[Correction | None]] = []
-        self._refused: Counter[tuple[str, str]] = Counter()
-        self._last_graph: PoseGraph | None = None
-        self._began_s = clock_s()
-        self._bytes_due_s = self._began_s + BYTES_PERIOD_S
-        self._copied: list[Persist] = []
-        self._copies_due_s = self._began_s
-        self._account_due_s = self._began_s + ACCOUNT_PERIOD_S
-        self._outbox = Outbox()
-        self._gaps = {"sent": LongestGap(), "heard": LongestGap()}
+        self._disk = DiskQueue(tools.store, tools.clock_s())
+        self._sender = Sender(robot, tools.transport, tools.clock_s)
+        self._heard_gap = LongestGap()
+        gaps = {"sent": self._sender.heartbeat_gap, "heard": self._heard_gap}
+        self._telemetry = Telemetry(robot, tools, reporter, on_report, gaps, self._sizes)
+        self._corrector = Corrector(robot)
         self.last_correction: Correction | None = None
         self.last_solution: GraphSolution | None = None
 
@@ -203,11 +110,9 @@ class Driver:
 
     async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
         """Take a keyframe in; waits while too many images wait for the encoder."""
-        await self._image_slots.acquire()
-        self._image_count += 1
-        self._images[self._image_count] = image
+        number = await self._tools.images.put(image)
         self._given.add(stamp_s)
-        self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), self._image_count))
+        self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), number))
 
     def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
         """Take in what was measured at the keyframe that was given last, or at the one with this stamp.
@@ -217,6 +122,14 @@ class Driver:
         """
         index = self._given.index_of(measurement, stamp_s)
         self.put(Measured(measurement, index))
+
+    def keyframe_at(self, stamp_s: float) -> KeyframeId:
+        """The own keyframe with this stamp.
+
+        Raises:
+            BadMeasurement: There is none.
+        """
+        return KeyframeId(self.robot.log, self._given.at("closure", stamp_s))
 
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""
@@ -238,84 +151,33 @@ class Driver:
 
     def mount_camera(self, T_body_camera: Float) -> None:
         """Say where the camera sits on the body, where that was not known at the start."""
-        self._reporter = replace(self._reporter, T_body_camera=T_body_camera)
+        self._telemetry.mount_camera(T_body_camera)
 
     def corrected_bodies(self) -> tuple[list[float], Float]:
         """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes; may be called off the loop's thread."""
-        return corrected_bodies(self.robot, self._reporter.T_body_camera)
+        return corrected_bodies(self.robot, self._T_body_camera)
+
+    @property
+    def _T_body_camera(self) -> Float:
+        """Where the camera sits on the body, as it is known by now."""
+        return self._telemetry.reporter.T_body_camera
 
     def busy(self) -> bool:
         """Whether images, fetches, registrations or rounds are under way, or a leader still owes a round."""
         owes_round = self.robot.rounds.deadline() < float("inf")
-        return bool(self._inbox or self._images or self._tasks or self.robot.closing.load or owes_round)
+        return bool(self._inbox or self._tools.images or self._jobs or self.robot.closing.load or owes_round)
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> AgentStatus:
         """What this robot does now: leader, neighbours, sizes, map frame, bytes, refusals."""
-        robot, counters = self.robot, self._transport.counters()
-        applied, term = robot.corrections.applied, robot.election.term
-        digests = robot.gossip.digests()
-        return {
-            "t": round(self._clock_s(), 3),
-            "robot": robot.log.robot,
-            "log": str(robot.log),
-            "leader": None if term is None else term.leader.robot,
-            "term": None if term is None else term.counter,
-            "role": robot.election.role.value,
-            "neighbours": robot.neighbours.names(),
-            "keyframes": robot.gossip.logs[robot.log].keyframes,
-            "closures": robot.assembly.closures,
-            "candidates": robot.closing.load,
-            "map_frame": None if applied is None else map_frame(applied.anchor),
-            "round": None if applied is None else applied.round,
-            "logs": {str(digest.log): [digest.count, digest.checksum] for digest in digests},
-            "sent_bytes": sum(traffic.payload_bytes for traffic in counters.sent.values()),
-            "received_bytes": sum(traffic.payload_bytes for traffic in counters.received.values()),
-            "loss": self._losses(),
-            "queues": self._queues(),
-            "sizes": {name: list(size) for name, size in self._sizes().items()},
-            "heartbeat_gap_s": {which: round(gap.longest_s(self._clock_s()), 3) for which, gap in self._gaps.items()},
-            "links": {table: totals(peers) for table, peers in counters.links().items()},
-            "stages": brief_of(self._workers.stages.snapshot()),
-            "refused": {**counters.dropped, **self._refusals()},
-            "busy": self.busy(),
-        }
+        return self._telemetry.status(self.busy())
 
     def look(self) -> Look:
         """What a scrape of the metrics sees."""
-        robot = self.robot
-        applied, term = robot.corrections.applied, robot.election.term
-        return Look(
-            counters=self._transport.counters(),
-            stages=self._workers.stages.snapshot(),
-            refused=self._refusals(),
-            gauges={
-                "keyframes": robot.gossip.logs[robot.log].keyframes,
-                "closures": robot.assembly.closures,
-                "candidates": robot.closing.load,
-                "neighbours": len(robot.neighbours.names()),
-                "logs": len(robot.gossip.logs),
-                "leading": float(robot.election.leading),
-                "term": 0 if term is None else term.counter,
-                "round": 0 if applied is None else applied.round,
-            },
-            queues=self._sizes(),
-            info={"robot": robot.log.robot, "log": str(robot.log)},
-        )
+        return self._telemetry.look()
 
-    def counters(self) -> dict[str, int]:
-        """What was refused or dropped, by reason."""
-        return {**self._transport.counters().dropped, **self._refusals()}
-
-    def _refusals(self) -> dict[str, int]:
-        """Messages refused by reason, of all peers."""
-        refused = Counter[str]()
-        for (_, reason), count in self._refused.items():
-            refused[f"refused {reason}"] += count
-        return dict(refused)
-
-    def result(self) -> dict[str, Any]:
+    def result(self) -> RobotResult:
         """What this robot knows, for `result.json`."""
-        return result_of(self.robot, self._reporter.T_body_camera, self.last_solution)
+        return result_of(self.robot, self._T_body_camera, self.last_solution)
 
     # The loop
 
@@ -325,13 +187,13 @@ class Driver:
         Raises:
             TransportError: The network cannot be used as configured.
         """
-        self._transport.set_receiver(self._on_payload)
-        self._transport.serve_latents(self._latent_named)
+        self._tools.transport.set_receiver(self._on_payload)
+        self._tools.transport.serve_latents(self._latent_named)
         try:
-            await self._transport.open()
+            await self._tools.transport.open()
             self._opened.set()
             await self._live()
-            self._send_records()
+            self._sender.send_records()
             await self._carry_out(self.robot.handle(Leaving(), self._clock_s()))
         finally:
             await self._close()
@@ -344,11 +206,11 @@ class Driver:
             while self._inbox and self.robot.deadline() > self._clock_s():
                 put_s, event = self._inbox.popleft()
                 now = self._clock_s()
-                self._workers.stages.observe("inbox_wait", now - put_s)
+                self._tools.workers.stages.observe("inbox_wait", now - put_s)
                 await self._carry_out(self.robot.handle(event, now))
-            self._send_due_records()
-            self._count_bytes()
-            await self._write_copies()
+            self._sender.send_due_records()
+            self._telemetry.count_bytes()
+            await self._disk.write_due(self._clock_s())
             await self._sleep()
 
     async def _sleep(self) -> None:
@@ -357,8 +219,7 @@ class Driver:
             await asyncio.sleep(0)
             return
         self._wake.clear()
-        copies_due_s = self._copies_due_s if self._copied else float("inf")
-        due_s = min(self.robot.deadline(), self._bytes_due_s, copies_due_s, self._outbox.due_s())
+        due_s = min(self.robot.deadline(), self._telemetry.due_s(), self._disk.due_s(), self._sender.due_s())
         pause_s = due_s - self._clock_s()
         alarm = asyncio.get_running_loop().call_later(max(pause_s, 0.0), self._wake.set)
         try:
@@ -367,109 +228,77 @@ class Driver:
             alarm.cancel()
 
     async def _close(self) -> None:
-        for task in list(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self._flush()
-        self._count_bytes(last=True)
-        await self._transport.close()
-        await self._workers.close()
+        for job in list(self._jobs):
+            job.cancel()
+        await asyncio.gather(*self._jobs, return_exceptions=True)
+        await self._disk.flush()
+        self._telemetry.count_bytes(last=True)
+        await self._tools.transport.close()
+        await self._tools.workers.close()
         for queue in self._subscribers:
             _put_newest(queue, None)
+
+    def _sizes(self) -> Sizes:
+        """The driver's own queues: how much is in them, and their maximum."""
+        return {
+            "inbox": (len(self._inbox), INBOX_MAX),
+            "images": (len(self._tools.images), IMAGES_MAX),
+            "disk": self._disk.size(),
+        }
+
+    # What peers send
+
+    def _on_payload(self, sender: str, kind: str, payload: bytes) -> None:
+        """Put a message of a peer into the inbox; what is refused is counted, and told once per peer and reason."""
+        envelope = admitted(sender, kind, payload)
+        if isinstance(envelope, Refusal):
+            self._telemetry.refuse(sender, envelope.reason, envelope.detail)
+            return
+        if len(self._inbox) >= INBOX_MAX:
+            self._telemetry.refuse(sender, "too many messages wait")
+            return
+        if kind == Kind.HEARTBEAT.value:
+            self._heard_gap.mark(sender, self._clock_s())
+        self.put(MessageReceived(envelope))
 
     def _latent_named(self, key: str, encode_bytes: int | None) -> bytes | None:
         """A latent for the transport, by a name that a peer gave, or the part of it that reaches him sooner."""
         try:
-            latent = self._store.latent(KeyframeId.parse(key))
-            return None if latent is None else self._skills.part(latent, encode_bytes)
+            latent = self._tools.store.latent(KeyframeId.parse(key))
+            return None if latent is None else self._tools.perception.part(latent, encode_bytes)
         except (ValueError, FloccError):
             return None
-
-    # Messages
-
-    def _on_payload(self, sender: str, kind: str, payload: bytes) -> None:
-        """Check a payload of a peer; what is refused is counted, and logged once per peer and reason."""
-        try:
-            envelope = decode(payload)
-        except UnknownVersion as error:
-            self._refuse(sender, "another protocol version", str(error))
-            return
-        except DecodeError:
-            self._refuse(sender, "malformed message")
-            return
-        if envelope.sender.robot != sender or kind_of(envelope.message) != kind:
-            self._refuse(sender, "message of another robot or kind than its key")
-            return
-        if len(self._inbox) >= INBOX_MAX:
-            self._refuse(sender, "too many messages wait")
-            return
-        if kind == HEARTBEAT:
-            self._gaps["heard"].mark(sender, self._clock_s())
-        self.put(MessageReceived(envelope))
-
-    def _refuse(self, peer: str, reason: str, detail: str = "") -> None:
-        """Count what is refused of a peer by reason; the first is told, with what is special about it."""
-        if len(self._refused) >= REFUSED_MAX and (peer, reason) not in self._refused:
-            peer, reason = "others", "for more reasons than are kept"
-        self._refused[peer, reason] += 1
-        if self._refused[peer, reason] == 1:
-            self._report(Report("peer_refused", {"peer": peer, "reason": detail or reason}))
-
-    def _send(self, message: Message, to: str | None) -> None:
-        payload, kind = encode(Envelope(self.robot.log, message)), kind_of(message)
-        if kind == HEARTBEAT:
-            self._gaps["sent"].mark(HEARTBEAT, self._clock_s())
-        if to is None:
-            self._transport.broadcast(kind, payload)
-        else:
-            self._transport.unicast(to, kind, payload)
-
-    def _send_later(self, batch: RecordBatch) -> None:
-        """Broadcast own records, now or with those that follow."""
-        too_long = self._outbox.add(batch)
-        if too_long is not None:
-            self._send(too_long, None)
-        self._send_due_records()
-
-    def _send_due_records(self) -> None:
-        if self._outbox.due_s() <= self._clock_s():
-            self._send_records()
-
-    def _send_records(self) -> None:
-        """Broadcast own records that wait."""
-        waiting = self._outbox.take(len(self.robot.neighbours.names()), self._clock_s())
-        if waiting is not None:
-            self._send(waiting, None)
 
     # Effects
 
     async def _carry_out(self, effects: list[Effect]) -> None:
-        written: list[Persist] = []
+        """Carry effects out in order: what the robot keeps of its own is on disk before it sends or begins anything."""
+        kept: list[Persist] = []
         for effect in effects:
             match effect:
                 case PersistRecord(log=log) if log != self.robot.log:
-                    self._copied.append(effect)
-                    continue
+                    self._disk.put(effect)
                 case PersistRecord() | PersistTerm() | PersistCorrection():
-                    written.append(effect)
-                    continue
-                case Report("peer_refused", fields):
-                    self._refuse(str(fields["peer"]), str(fields["reason"]))
-                    continue
-                case Report("log_forked", fields) if fields["log"] == str(self.robot.log):
-                    self._end_log(str(fields["peer"]))
-                    self._report(effect)
-                    continue
-                case Report():
-                    if effect.event == "neighbour_down":
-                        self._gaps["heard"].forget(str(effect.fields["peer"]))
-                    self._report(effect)
-                    continue
-            await self._write(written)
-            self._do(effect)
-        await self._write(written)
-        if len(self._copied) >= COPIES_MAX:
-            await self._flush()
+                    kept.append(effect)
+                case Report(fact):
+                    self._tell(fact)
+                case _:
+                    await self._disk.write(kept)
+                    self._do(effect)
+        await self._disk.write(kept)
+        await self._disk.write_full()
+
+    def _tell(self, fact: Fact) -> None:
+        """Report what the core tells, and act on what concerns the driver."""
+        match fact:
+            case PeerRefused():
+                self._telemetry.refuse(fact.peer, fact.reason)
+                return
+            case LogForked() if fact.log == self.robot.log:
+                self._end_log(fact.peer)
+            case NeighbourDown():
+                self._heard_gap.forget(fact.peer)
+        self._telemetry.report(fact)
 
     def _end_log(self, peer: str) -> None:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
@@ -479,193 +308,44 @@ class Driver:
             self.robot.log,
             peer,
         )
-        self._store.end_log()
+        self._tools.store.end_log()
 
-    async def _write(self, written: list[Persist]) -> None:
-        """Bring what is to be kept onto the disk before anything is sent that depends on it."""
-        if written:
-            self._copied += written
-            written.clear()
-            await self._flush()
-
-    async def _write_copies(self) -> None:
-        """Bring copies of others' records onto the disk, many at a time: what a crash loses of them comes again."""
-        now = self._clock_s()
-        if now < self._copies_due_s:
-            return
-        self._copies_due_s = now + COPIES_PERIOD_S
-        if self._copied:
-            await self._flush()
-
-    async def _flush(self) -> None:
-        """Write whatever waits for the disk."""
-        batch, self._copied = self._copied, []
-        await asyncio.to_thread(write, self._store, batch)
-
-    def _do(self, effect: Effect) -> None:
+    def _do(self, effect: Broadcast | Unicast | Deliver | Job) -> None:
         match effect:
-            case Broadcast(Records(batches=(batch,))) if batch.log == self.robot.log:
-                self._send_later(batch)
             case Broadcast(message):
-                self._send_records()
-                self._send(message, None)
+                self._sender.broadcast(message)
             case Unicast(to, message):
-                self._send(message, to)
-            case Deliver(correction):
-                self._deliver(correction)
-            case Encode(keyframe, image):
-                self._start(self._encode(keyframe, image))
-            case FetchLatent():
-                self._start(self._fetch(effect))
-            case Register():
-                self._start(self._register(effect))
-            case Optimise():
-                self._start(self._optimise(effect))
-            case IterateBlock():
-                self._start(self._iterate(effect))
+                self._sender.unicast(to, message)
+            case Deliver(applied, frame_changed):
+                self._deliver(self._corrector.correction(applied, frame_changed, self._T_body_camera))
+            case Encode() | FetchLatent() | Register() | Optimise() | IterateBlock():
+                self._start(effect)
             case _:
-                raise AssertionError(f"no way to carry out {type(effect).__name__}")
-
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._done)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and task.exception() is not None:
-            logger.error("%s: a task failed", self.robot.log, exc_info=task.exception())
-            self.stop()
+                assert_never(effect)
 
     def _deliver(self, correction: Correction) -> None:
         self.last_correction = correction
         for queue in self._subscribers:
             _put_newest(queue, correction)
 
-    async def _encode(self, keyframe: KeyframeId, image: int) -> None:
-        result = await self._workers.run("encode", self._skills.encode, self._images[image])
-        del self._images[image]
-        self._image_slots.release()
-        if isinstance(result, WorkFailed):
-            self.put(KeyframeEncodingFailed(keyframe, result.reason))
+    def _start(self, effect: Job) -> None:
+        job = asyncio.create_task(job_of(effect, self._tools))
+        self._jobs.add(job)
+        job.add_done_callback(self._done)
+
+    def _done(self, job: asyncio.Task[Event]) -> None:
+        """A job's event goes into the inbox; a job that raised is a bug, and ends the agent."""
+        self._jobs.discard(job)
+        if job.cancelled():
             return
-        await asyncio.to_thread(self._store.put_latent, keyframe, result.value.latent)
-        self.put(KeyframeEncoded(keyframe, result.value.descriptor))
-
-    async def _fetch(self, effect: FetchLatent) -> None:
-        keyframe, holder = effect.keyframe, effect.holder
-        encode_s, began_s = self._skills.encode_s(), self._clock_s()
-        answer = await self._transport.fetch_latent(holder, str(keyframe), effect.deadline_s, encode_s=encode_s)
-        if not isinstance(answer, Fetched):
-            self.put(LatentFetchFailed(keyframe, holder, answer.problem.value))
+        if (error := job.exception()) is not None:
+            logger.error("%s: a job failed", self.robot.log, exc_info=error)
+            self.stop()
             return
-        self._workers.stages.observe("fetch", self._clock_s() - began_s)
-        await asyncio.to_thread(self._store.put_latent, keyframe, answer.latent)
-        self.put(LatentFetched(keyframe, holder))
-
-    async def _register(self, effect: Register) -> None:
-        keyframes = (effect.query, effect.match, effect.neighbour)
-        query, match, neighbour = await asyncio.to_thread(lambda: [self._store.latent(k) for k in keyframes])
-        if query is None or match is None or neighbour is None:
-            missing = keyframes[[query, match, neighbour].index(None)]
-            self.put(LatentMissing(effect.pair, missing))
-            return
-        T_neighbour_query = pose_from_tq(np.array(effect.T_neighbour_query))
-        pair = OdometryPair(neighbour, T_neighbour_query, f"{effect.neighbour} {effect.query}")
-        result = await self._workers.run("register", self._skills.register, query, match, pair)
-        if isinstance(result, WorkFailed):
-            self.put(PairRegistered(effect.pair, RegistrationFailed(RegistrationFailure.CRASHED, result.reason)))
-            return
-        self.put(PairRegistered(effect.pair, result.value))
-
-    async def _optimise(self, effect: Optimise) -> None:
-        result = await self._workers.run("optimise", self._skills.optimise, effect.graph, effect.initial)
-        solution = result if isinstance(result, WorkFailed) else result.value
-        if isinstance(solution, (WorkFailed, OptimisationFailed)):
-            self.put(GraphOptimisationFailed(effect.term, effect.round, solution.reason))
-            return
-        self.last_solution = solution
-        self.put(GraphOptimised(effect.term, effect.round, solution))
-
-    async def _iterate(self, effect: IterateBlock) -> None:
-        result = await self._workers.run("optimise", self._skills.iterate, effect.problem)
-        step = result if isinstance(result, WorkFailed) else result.value
-        if isinstance(step, (WorkFailed, OptimisationFailed)):
-            self.put(BlockIterationFailed(effect.number, step.reason))
-            return
-        self.put(BlockIterated(effect.number, step))
-
-    # Reports
-
-    def _report(self, report: Report) -> None:
-        line = self._reporter.line(report, self._clock_s())
-        if logger.isEnabledFor(level := _level(report)):
-            logger.log(level, "%s: %s %s", self.robot.log, report.event, _brief(report.fields))
-        self._on_line(line)
-
-    def _count_bytes(self, last: bool = False) -> None:
-        now = self._clock_s()
-        if now < self._bytes_due_s and not last:
-            return
-        self._bytes_due_s = now + BYTES_PERIOD_S
-        counters = self._transport.counters()
-        sent = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.sent.items())}
-        received = {kind: traffic.payload_bytes for kind, traffic in sorted(counters.received.items())}
-        facts = {"sent": sent, "received": received, "loss": self._losses(), "queues": self._queues()}
-        self._on_line(self._reporter.line(Report("bytes", facts), now))  # type: ignore[arg-type]
-        if now >= self._account_due_s or last:
-            self._account_due_s = now + ACCOUNT_PERIOD_S
-            self._on_line(self._account(counters, now))
-
-    def _losses(self) -> dict[str, float]:
-        """Share of each neighbour's last heartbeats that did not arrive."""
-        return {name: round(ratio, 3) for name, ratio in self.robot.neighbours.loss_ratios().items()}
-
-    def _queues(self) -> dict[str, int]:
-        """What waits: events for the core, images for the encoder, candidates for their registration."""
-        return {"inbox": len(self._inbox), "images": len(self._images), "candidates": self.robot.closing.load}
-
-    def _sizes(self) -> dict[str, tuple[int, int]]:
-        """Every queue, table and cache: how much is in it, and its maximum."""
-        return {
-            "inbox": (len(self._inbox), INBOX_MAX),
-            "images": (len(self._images), IMAGES_MAX),
-            "disk": (len(self._copied), COPIES_MAX + BATCHES_MAX * RECORDS_BATCH_MAX),
-            **self._transport.sizes(),
-            **self.robot.sizes(),
-        }
-
-    def _account(self, counters: TransportCounters, now: float) -> dict[str, Any]:
-        """Bytes by link and kind, and time by stage, since this start of the agent."""
-        return {
-            "t": round(now, 6),
-            "robot": self.robot.log.robot,
-            "event": "account",
-            "since_s": round(self._began_s, 6),
-            **counters.links(),
-            "stages": fields_of(self._workers.stages.snapshot()),
-        }
-
-
-_WARNINGS = frozenset({"peer_refused", "duplicate_name", "log_forked", "latent_lost", "optimisation_failed"})
-_INFOS = frozenset(
-    {"leader", "leader_lost", "neighbour_up", "neighbour_down", "closure_accepted", "correction", "optimised"}
-)
-
-
-def totals(peers: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
-    """Bytes by peer, all kinds together."""
-    return {peer: sum(kinds.values()) for peer, kinds in peers.items()}
-
-
-def _level(report: Report) -> int:
-    if report.event in _WARNINGS:
-        return logging.WARNING
-    return logging.INFO if report.event in _INFOS else logging.DEBUG
-
-
-def _brief(fields: Mapping[str, Any]) -> str:
-    return " ".join(f"{key}={value}" for key, value in fields.items() if not isinstance(value, (list, dict)))
+        event = job.result()
+        if isinstance(event, GraphOptimised):
+            self.last_solution = event.solution
+        self.put(event)
 
 
 def _put_newest(queue: "asyncio.Queue[Correction | None]", item: Correction | None) -> None:

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
 from flocc_agent.core.registration import match_ratio
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.reporting import best_similarities
+from flocc_agent.runtime.status import MergeStatus, PairStatus, SolverStatus
 from flocc_protocol.records import ClosureRecord, RejectionRecord
 
 PAIRS_MAX = 64
@@ -17,14 +17,7 @@ PAIRS_MAX = 64
 
 @dataclass(slots=True)
 class PairEvidence:
-    """What came of the pairs of keyframes of two robots, as the logs that a robot holds tell.
-
-    Attributes:
-        accepted: Pairs that became closures.
-        rejected: Pairs that were registered, or given up, and refused.
-        best_ratio: Best match ratio of those that were refused, Eq. (1).
-        reason: Why the best one was refused.
-    """
+    """What came of the pairs of keyframes of two robots so far; see `PairStatus`."""
 
     accepted: int = 0
     rejected: int = 0
@@ -38,26 +31,24 @@ class PairEvidence:
         if self.best_ratio is None or ratio > self.best_ratio:
             self.best_ratio, self.reason = ratio, record.reason
 
+    def status(self, robots: tuple[str, str]) -> PairStatus:
+        """All of it, for an answer."""
+        best = None if self.best_ratio is None else round(self.best_ratio, 4)
+        return PairStatus(
+            robots=robots, accepted=self.accepted, rejected=self.rejected, best_ratio=best, reason=self.reason
+        )
 
-def evidence_of(robot: Robot, parameters: CoreParameters, solution: GraphSolution | None) -> dict[str, Any]:
+
+def evidence_of(robot: Robot, parameters: CoreParameters, solution: GraphSolution | None) -> MergeStatus:
     """Similarities and thresholds, closures and refusals by pair of robots, and what the last own solution said."""
     found = sorted(pairs_of(robot).items(), key=lambda item: (item[1].accepted, item[0]))[:PAIRS_MAX]
-    return {
-        "best_similarities": best_similarities(robot),
-        "similarity_threshold": parameters.place_recognition.similarity_threshold,
-        "match_ratio_threshold": parameters.loop_closing.match_ratio_threshold,
-        "pairs": [
-            {
-                "robots": list(robots),
-                "accepted": pair.accepted,
-                "rejected": pair.rejected,
-                "best_ratio": None if pair.best_ratio is None else round(pair.best_ratio, 4),
-                "reason": pair.reason,
-            }
-            for robots, pair in found
-        ],
-        "solver": None if solution is None else solver_of(solution),
-    }
+    return MergeStatus(
+        best_similarities=best_similarities(robot),
+        similarity_threshold=parameters.place_recognition.similarity_threshold,
+        match_ratio_threshold=parameters.loop_closing.match_ratio_threshold,
+        pairs=[pair.status(robots) for robots, pair in found],
+        solver=None if solution is None else solver_of(solution),
+    )
 
 
 def pairs_of(robot: Robot) -> dict[tuple[str, str], PairEvidence]:
@@ -85,12 +76,12 @@ def judgements(robot: Robot) -> Iterator[ClosureRecord | RejectionRecord]:
     yield from (record for record in records if isinstance(record, RejectionRecord))
 
 
-def solver_of(solution: GraphSolution) -> dict[str, Any]:
+def solver_of(solution: GraphSolution) -> SolverStatus:
     """What the last solution of this robot used and warned of."""
     used = sum(closure.state is ClosureState.USED for closure in solution.closures)
-    return {
-        "components": [sorted({log.robot for log in component.logs}) for component in solution.components],
-        "closures_used": used,
-        "closures_rejected": len(solution.closures) - used,
-        "warnings": list(solution.warnings[:8]),
-    }
+    return SolverStatus(
+        components=[sorted({log.robot for log in component.logs}) for component in solution.components],
+        closures_used=used,
+        closures_rejected=len(solution.closures) - used,
+        warnings=list(solution.warnings[:8]),
+    )

@@ -58,8 +58,14 @@ class GivenKeyframes:
             return 0
         if not self._stamps_s:
             raise BadMeasurement(f"{kind}: no keyframe was given yet that it could belong to")
-        if stamp_s is None:
-            return len(self._stamps_s) - 1
+        return len(self._stamps_s) - 1 if stamp_s is None else self.at(kind, stamp_s)
+
+    def at(self, kind: str, stamp_s: float) -> int:
+        """Number of the keyframe with a stamp, for a measurement of this kind.
+
+        Raises:
+            BadMeasurement: There is none.
+        """
         if stamp_s < self._sorted[0][0] - STAMP_TOLERANCE_S:
             raise BadMeasurement(
                 f"{kind} at {stamp_s} s: is older than the map, which begins at {self._sorted[0][0]} s"

@@ -1,18 +1,76 @@
 """Between the core and the store: what a robot keeps, and what it finds when it starts."""
 
+import asyncio
 from collections.abc import Iterable
+from typing import assert_never
 
 from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.robot import Restored
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_agent.runtime.stored_correction import correction_in, stored
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import LogCorrection
+from flocc_protocol.messages import BATCHES_MAX, RECORDS_BATCH_MAX, LogCorrection
 
 Persist = PersistRecord | PersistTerm | PersistCorrection
 
 FRAME_CHANGED = "frame_changed"
 """Fact: the kept correction, or one that was about to be kept, changed the map frame."""
+COPIES_MAX = 256
+COPIES_PERIOD_S = 0.5
+"""Copies of others' records are written so many, and what one message adds, or so long at a time."""
+
+
+class DiskQueue:
+    """What is to be kept and is not on the disk yet.
+
+    What the robot itself says must be there before anybody hears of it; copies of others' records may wait and be
+    written many at a time, since what a crash loses of them comes again.
+    """
+
+    def __init__(self, store: Store, now_s: float) -> None:
+        self._store = store
+        self._waiting: list[Persist] = []
+        self._due_s = now_s
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def size(self) -> tuple[int, int]:
+        """How much waits, and at most."""
+        return len(self), COPIES_MAX + BATCHES_MAX * RECORDS_BATCH_MAX
+
+    def due_s(self) -> float:
+        """When what waits is to be written."""
+        return self._due_s if self._waiting else float("inf")
+
+    def put(self, copy: PersistRecord) -> None:
+        """Let a copy of another robot's record wait."""
+        self._waiting.append(copy)
+
+    async def write(self, kept: list[Persist]) -> None:
+        """Bring these, and what waits before them, onto the disk, and empty the list."""
+        if kept:
+            self._waiting += kept
+            kept.clear()
+            await self.flush()
+
+    async def write_due(self, now_s: float) -> None:
+        """Write what waits when it is due."""
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + COPIES_PERIOD_S
+        if self._waiting:
+            await self.flush()
+
+    async def write_full(self) -> None:
+        """Write what waits when it is much."""
+        if len(self._waiting) >= COPIES_MAX:
+            await self.flush()
+
+    async def flush(self) -> None:
+        """Write whatever waits."""
+        batch, self._waiting = self._waiting, []
+        await asyncio.to_thread(write, self._store, batch)
 
 
 def write(store: Store, effects: Iterable[Persist]) -> None:
@@ -33,6 +91,8 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
                     store.put_fact(FRAME_CHANGED, b"0")
             case PersistRecord():
                 pass
+            case _:
+                assert_never(effect)
 
 
 def restore(store: Store) -> Restored:

@@ -23,6 +23,10 @@ REFUSED = (
     (re.compile(rb"\xff\x0a|\0\0\0\x0cJXL "), "JPEG XL"),
     (re.compile(rb"\x76\x2f\x31\x01"), "OpenEXR"),
     (re.compile(rb"RIFF....AVI ", re.DOTALL), "an AVI video"),
+    (re.compile(rb"II\+\0|MM\0\+"), "BigTIFF"),
+    (re.compile(rb"P7\s"), "PAM"),
+    (re.compile(rb"#\?RADIANCE|#\?RGBE"), "Radiance HDR"),
+    (re.compile(rb"\0\0\x01\0"), "an icon"),
     (re.compile(rb"8BPS"), "a Photoshop file"),
     (re.compile(rb"\x93NUMPY"), "a numpy array"),
     (re.compile(rb"FUJIFILMCCD-RAW|II\x55\0|IIRO|IIRS"), "a camera's raw file"),
@@ -36,7 +40,7 @@ class PictureError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class PictureHead:
     """What is known of a picture before it is decoded.
 
     Attributes:
@@ -45,6 +49,7 @@ class Head:
         height: As it is stored.
         bits: Per channel.
         orientation: EXIF's, 1 (as stored) to 8.
+        largest: Value of white where the file says it (PNM), else None.
     """
 
     format: str
@@ -52,6 +57,7 @@ class Head:
     height: int
     bits: int = 8
     orientation: int = 1
+    largest: int | None = None
 
     @property
     def is_turned(self) -> bool:
@@ -59,7 +65,7 @@ class Head:
         return self.orientation >= 5
 
 
-def head_of(data: Encoded) -> Head:
+def head_of(data: Encoded) -> PictureHead:
     """Look at a picture.
 
     Raises:
@@ -67,7 +73,7 @@ def head_of(data: Encoded) -> Head:
     """
     if len(data) == 0:
         raise PictureError("the image is empty")
-    start = bytes(data[:16])
+    start = bytes(data[:32])
     reader = next((read for magic, read in _READERS if magic.match(start)), None)
     if reader is None:
         name = next((name for magic, name in REFUSED if magic.match(start)), None)
@@ -90,7 +96,7 @@ def _whole(condition: bool) -> None:
         raise PictureError("the image is cut off")
 
 
-def _jpeg(data: Encoded) -> Head:
+def _jpeg(data: Encoded) -> PictureHead:
     at, size, orientation = 2, None, 1
     while True:
         _whole(at + 4 <= len(data))
@@ -116,13 +122,13 @@ def _jpeg(data: Encoded) -> Head:
         raise PictureError(f"is a JPEG of {bits} bits, which flocc does not read; write PNG")
     if channels not in (1, 3, 4):
         raise PictureError(f"is a JPEG of {channels} channels, which flocc does not read")
-    return Head("JPEG", width, height, 8, orientation)
+    return PictureHead("JPEG", width, height, 8, orientation)
 
 
 _FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
 
 
-def _png(data: Encoded) -> Head:
+def _png(data: Encoded) -> PictureHead:
     at, orientation, ended = 8, 1, False
     width, height, bits = struct.unpack(">IIB", data[16:25])
     while at + 12 <= len(data) and not ended:
@@ -134,10 +140,10 @@ def _png(data: Encoded) -> Head:
         ended = kind == b"IEND"
         at += 12 + length
     _whole(ended)
-    return Head("PNG", width, height, max(bits, 8), orientation)
+    return PictureHead("PNG", width, height, max(bits, 8), orientation)
 
 
-def _webp(data: Encoded) -> Head:
+def _webp(data: Encoded) -> PictureHead:
     (length,) = struct.unpack("<I", data[4:8])
     _whole(8 + length <= len(data) + 1)
     at, orientation, size = 12, 1, None
@@ -159,17 +165,17 @@ def _webp(data: Encoded) -> Head:
         at = body + count + count % 2
     if size is None:
         raise PictureError("the image is damaged")
-    return Head("WebP", size[0], size[1], 8, orientation)
+    return PictureHead("WebP", size[0], size[1], 8, orientation)
 
 
-def _bmp(data: Encoded) -> Head:
+def _bmp(data: Encoded) -> PictureHead:
     (length,) = struct.unpack("<I", data[2:6])
     (width, height), (_, _) = struct.unpack("<ii", data[18:26]), struct.unpack("<HH", data[26:30])
     _whole(length <= len(data))
-    return Head("BMP", width, abs(height))
+    return PictureHead("BMP", width, abs(height))
 
 
-def _pnm(data: Encoded) -> Head:
+def _pnm(data: Encoded) -> PictureHead:
     fields = re.match(
         rb"P([1-7])(?:\s+|#[^\n]*\n)+?(\d+)(?:\s+|#[^\n]*\n)+?(\d+)(?:(?:\s+|#[^\n]*\n)+?(\d+))?\s", data[:4096]
     )
@@ -180,10 +186,12 @@ def _pnm(data: Encoded) -> Head:
     if kind in (5, 6):
         pixel_bytes = (3 if kind == 6 else 1) * (2 if largest > 255 else 1)
         _whole(len(data) >= fields.end() + width * height * pixel_bytes)
-    return Head("PNM", width, height, 16 if largest > 255 else 8)
+    return PictureHead(
+        "PNM", width, height, 16 if largest > 255 else 8, largest=largest if kind not in (1, 4) else None
+    )
 
 
-def _tiff(data: Encoded) -> Head:
+def _tiff(data: Encoded) -> PictureHead:
     pages = _tiff_pages(data)
     if not pages:
         raise PictureError("the image is damaged")
@@ -200,9 +208,22 @@ def _tiff(data: Encoded) -> Head:
         parts = zip(page.get(starts, ()), page.get(counts, ()), strict=False)
         _whole(all(start + count <= len(data) for start, count in parts))
     width, height = page.get(256, (0,))[0], page.get(257, (0,))[0]
-    return Head("TIFF", width, height, max(bits, 8), _orientation(page))
+    return PictureHead("TIFF", width, height, max(bits, 8), _orientation(page))
 
 
+def stored_tiff(data: Encoded) -> bytes:
+    """The same TIFF with orientation 1: OpenCV turns TIFFs even where it is told not to."""
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = struct.unpack(f"{order}I", data[4:8])
+    (count,) = struct.unpack(f"{order}H", data[at : at + 2])
+    patched = bytearray(data)
+    for place in range(at + 2, at + 2 + 12 * count, 12):
+        if struct.unpack(f"{order}H", data[place : place + 2])[0] == _ORIENTATION:
+            patched[place + 8 : place + 10] = struct.pack(f"{order}H", 1)
+    return bytes(patched)
+
+
+_ORIENTATION = 274
 _TIFF_PAGES_MAX = 64
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
 
@@ -241,11 +262,11 @@ def _exif_orientation(exif: bytes) -> int:
 
 
 def _orientation(page: dict[int, tuple[int, ...]]) -> int:
-    value = page.get(274, (1,))[0]
+    value = page.get(_ORIENTATION, (1,))[0]
     return value if 1 <= value <= 8 else 1
 
 
-_READERS: tuple[tuple[re.Pattern[bytes], Callable[[Encoded], Head]], ...] = (
+_READERS: tuple[tuple[re.Pattern[bytes], Callable[[Encoded], PictureHead]], ...] = (
     (re.compile(rb"\xff\xd8\xff"), _jpeg),
     (re.compile(rb"\x89PNG\r\n\x1a\n"), _png),
     (re.compile(rb"II\*\0|MM\0\*"), _tiff),

@@ -15,9 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.picture_heads import Encoded, Head, PictureError, head_of
+from flocc_agent.runtime.picture_heads import Encoded, PictureError, PictureHead, head_of, stored_tiff
 
-__all__ = ["FULL", "Head", "Levels", "PictureError", "good_pictures", "levels_of", "picture_head", "read_picture"]
+__all__ = [
+    "FULL",
+    "PictureHead",
+    "Levels",
+    "PictureError",
+    "good_pictures",
+    "levels_of",
+    "picture_head",
+    "read_picture",
+]
 
 Bytes = NDArray[np.uint8]
 Pixels = NDArray[Any]
@@ -29,6 +38,8 @@ SAMPLE_MAX = 32
 VALUES_MAX = 20_000
 FLAT_LEVELS = 32
 """Pictures whose values, brought to 8 bits by their largest one, would use fewer levels than this are stretched."""
+CONTRAST_MIN = 16
+"""Fewer values than this are noise, which is not stretched."""
 BAD_RATIO_MAX = 0.1
 
 
@@ -67,13 +78,13 @@ def levels_of(pictures: Iterable[NDArray[np.uint16]]) -> Levels:
         return FULL
     white = next(2**bits - 1 for bits in BITS if top < 2**bits)
     low, high = (int(value) for value in np.percentile(np.concatenate(values), (0.5, 99.5)))
-    if (high - low) * 256 >= FLAT_LEVELS * (white + 1):
+    if high - low < CONTRAST_MIN or (high - low) * 256 >= FLAT_LEVELS * (white + 1):
         return Levels(0, white)
     margin = max((high - low) // 4, 1)
     return Levels(max(low - margin, 0), min(high + margin, 65535))
 
 
-def picture_head(path: Path) -> Head:
+def picture_head(path: Path) -> PictureHead:
     """Look at a picture file without decoding it.
 
     Raises:
@@ -117,6 +128,8 @@ def decoded(encoded: Encoded, size: Size | None = None) -> Pixels:
     import cv2
 
     head = head_of(encoded)
+    if head.format == "TIFF" and head.orientation != 1:
+        encoded = stored_tiff(encoded)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
@@ -126,16 +139,24 @@ def decoded(encoded: Encoded, size: Size | None = None) -> Pixels:
         raise PictureError(f"the image cannot be read: it is a damaged {head.format}")
     if bgr.dtype not in (np.uint8, np.uint16):
         raise PictureError(f"the image has pixels of {bgr.dtype}; flocc reads 8 and 16 bits")
-    return _turned(bgr[..., ::-1], head, size)
+    return _turned(_to_full_range(bgr, head)[..., ::-1], head, size)
 
 
-def size_fault(head: Head, size: Size) -> str | None:
+def _to_full_range(pixels: Pixels, head: PictureHead) -> Pixels:
+    """Pixels whose file says that white is less than their type can hold, brought to the whole range."""
+    full = int(np.iinfo(pixels.dtype).max)
+    if head.largest in (None, full):
+        return pixels
+    return np.minimum(pixels.astype(np.uint64) * full // head.largest, full).astype(pixels.dtype)
+
+
+def size_fault(head: PictureHead, size: Size) -> str | None:
     """Why a picture does not fit intrinsics, or None."""
     fits = (head.width, head.height) == size or (head.is_turned and (head.height, head.width) == size)
     return None if fits else f"the image is {head.width}x{head.height}, but the intrinsics are for {size[0]}x{size[1]}"
 
 
-def _turned(pixels: Pixels, head: Head, size: Size | None) -> Pixels:
+def _turned(pixels: Pixels, head: PictureHead, size: Size | None) -> Pixels:
     if size is None or (head.width, head.height) == size:
         return pixels
     fault = size_fault(head, size)
@@ -173,7 +194,7 @@ def good_pictures(files: Sequence[Path], size: Size | None) -> Looked:
     Raises:
         PictureError: Hardly any, or too many of them, cannot be used; the sentence names the first one.
     """
-    heads: list[Head | str] = []
+    heads: list[PictureHead | str] = []
     for file in files:
         try:
             heads.append(picture_head(file))
@@ -189,13 +210,13 @@ def good_pictures(files: Sequence[Path], size: Size | None) -> Looked:
     told = first if bad < 2 else f"{first} (and {bad - 1} others)"
     if bad > max(1, BAD_RATIO_MAX * len(files)) or not good:
         raise PictureError(f"{told}: {bad} of {len(files)} images cannot be used")
-    deep = [files[k] for k in good if isinstance(head := heads[k], Head) and head.bits > 8]
+    deep = [files[k] for k in good if isinstance(head := heads[k], PictureHead) and head.bits > 8]
     fault = None if told is None else f"{told}: {bad} of {len(files)} images {'was' if bad == 1 else 'were'} left out"
     return Looked(good, fault, _sampled_levels(deep) if deep else FULL, bool(deep))
 
 
-def _usual_size(heads: list[Head | str]) -> Size:
-    sizes = Counter((head.width, head.height) for head in heads if isinstance(head, Head))
+def _usual_size(heads: list[PictureHead | str]) -> Size:
+    sizes = Counter((head.width, head.height) for head in heads if isinstance(head, PictureHead))
     return sizes.most_common(1)[0][0] if sizes else (0, 0)
 
 

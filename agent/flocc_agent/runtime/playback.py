@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from flocc_agent.config import SourceConfig
 from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.recording import Recording, RecordingError
 
 logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 AddKeyframe = Callable[[Image, Float, float], Awaitable[None]]
+AddMeasurement = Callable[[Stamped, float], None]
 
 READY_S = 1.0
 """Frames due before this are played at once: an agent needs a moment to start."""
@@ -31,6 +33,7 @@ async def play(
     config: SourceConfig,
     selector: KeyframeSelector,
     add_keyframe: AddKeyframe,
+    add_measurement: AddMeasurement,
     clock_s: Callable[[], float],
     on_position: Callable[[Float], None],
     resumed: bool = False,
@@ -42,6 +45,7 @@ async def play(
         config: Speed and start.
         selector: Decides which frames become keyframes.
         add_keyframe: Takes (image, T_odom_body, stamp_s); may wait.
+        add_measurement: Takes what was measured at the keyframe with this stamp.
         clock_s: Seconds since the start of the run.
         on_position: Takes the true position (3,) of each frame, where it is known, for emulated range.
         resumed: The agent was restarted: frames that were due before now are skipped.
@@ -56,7 +60,7 @@ async def play(
         truth = recording.ground_truth(frame.stamp_s)
         if truth is not None:
             on_position(truth[:3, 3])
-        if selector.wants(frame.T_odom_body):
+        if selector.wants(frame.T_odom_body) or recording.measurements.keeps(frame.stamp_s):
             try:
                 image = await asyncio.to_thread(recording.load_image, frame)
             except RecordingError as error:
@@ -64,3 +68,5 @@ async def play(
                 continue
             selector.took(frame.T_odom_body)
             await add_keyframe(image, frame.T_odom_body, frame.stamp_s)
+            for measured in recording.measurements.at(frame.stamp_s):
+                add_measurement(measured, frame.stamp_s)

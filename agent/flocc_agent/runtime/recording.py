@@ -5,6 +5,7 @@
     RECORDING/odometry.tum      T_odom_body at the images' stamps or denser
     RECORDING/groundtruth.tum   T_world_body, optional
     RECORDING/camera.toml       [camera] width height fx fy cx cy distortion T_body_camera
+    RECORDING/measurements.jsonl  what else was measured, optional (`measurement_file`)
 
 Odometry is interpolated to the images' stamps. Images outside of the odometry's time are left out. Pixels are read
 when they are asked for.
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import ConfigError, read_toml
 from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
+from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, read_measurements
 from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
@@ -57,6 +60,7 @@ class Recording:
         frames: Images that odometry covers, in order of time; at least one.
         truth: Ground truth `T_world_body` where the recording has one.
         levels: How images of 16 bits are brought to 8.
+        measurements: What else was measured.
     """
 
     path: Path
@@ -65,6 +69,7 @@ class Recording:
     frames: tuple[Frame, ...]
     truth: Trajectory | None
     levels: Levels = FULL
+    measurements: RecordedMeasurements = NOTHING
 
     @classmethod
     def open(cls, path: Path) -> "Recording":
@@ -86,7 +91,9 @@ class Recording:
             raise RecordingError(f"{error}; the intrinsics are in {path / 'camera.toml'}") from error
         if looked.fault is not None:
             logger.warning("%s", looked.fault)
-        return cls(path, camera, T_body_camera, tuple(frames[k] for k in looked.good), truth, looked.levels)
+        good = tuple(frames[k] for k in looked.good)
+        measurements = read_measurements(path / MEASUREMENTS, [frame.stamp_s for frame in good])
+        return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements)
 
     def ground_truth(self, stamp_s: float) -> Float | None:
         """True (4, 4) pose `T_world_body` at a time, or None where there is none."""

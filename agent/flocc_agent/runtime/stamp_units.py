@@ -13,6 +13,8 @@ Float = NDArray[np.float64]
 EPOCH_S = (8e8, 4.2e9)
 """1995 to 2103: stamps that count from 1970."""
 STEP_S = (5e-4, 5.0)
+EPOCH_STEP_S = (5e-5, 3600.0)
+"""Steps of stamps that count from 1970, whose size alone says their unit; nanoseconds from 0 s have other steps."""
 
 
 def since_1970(value: float) -> str | None:
@@ -22,14 +24,14 @@ def since_1970(value: float) -> str | None:
 
 def plausible_units(stamps: Float) -> list[str]:
     """Units in which stamps can be: one where they count from 1970, else all whose steps are those of a robot."""
-    epoch = since_1970(float(np.median(stamps)))
-    if epoch is not None:
-        return [epoch]
     steps = np.abs(np.diff(stamps))
     steps = steps[steps > 0]
+    epoch = since_1970(float(np.median(stamps)))
     if len(steps) == 0:
-        return ["seconds"]
+        return [epoch or "seconds"]
     step = float(np.median(steps))
+    if epoch is not None and EPOCH_STEP_S[0] <= step * UNITS_S[epoch] <= EPOCH_STEP_S[1]:
+        return [epoch]
     if not _whole(stamps):
         return ["seconds"] if _fits(step, "seconds") else [name for name in UNITS_S if _fits(step, name)]
     return [name for name in UNITS_S if _fits(step, name)]

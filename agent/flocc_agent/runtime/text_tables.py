@@ -14,7 +14,17 @@ from flocc_protocol.errors import FloccError
 COMMENTS = ("#", "%", "//")
 BYTES_MAX = 1 << 30
 
-_BOMS = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+_BOMS = (
+    (codecs.BOM_UTF32_LE, "utf-32-le"),
+    (codecs.BOM_UTF32_BE, "utf-32-be"),
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+)
+_CONTROLS = bytes([*range(1, 9), *range(14, 32)])
+CONTROLS_RATIO_MAX = 0.02
+_BRACKETS = str.maketrans("", "", "[](){}")
+"""Lists as programs print them."""
 
 
 class RecordingError(FloccError):
@@ -54,11 +64,11 @@ def read_text(path: Path) -> str:
         if encoded.startswith(mark):
             return _decoded(encoded[len(mark) :], encoding, path)
     head = encoded[:4096]
-    if b"\0" in head:
-        even, odd = head[0::2].count(b"\0"), head[1::2].count(b"\0")
-        if max(even, odd) < 0.4 * len(head) / 2 or min(even, odd) > 0.1 * len(head) / 2:
-            raise RecordingError(f"{path}: is no text")
+    even, odd = head[0::2].count(b"\0"), head[1::2].count(b"\0")
+    if max(even, odd) >= 0.4 * len(head) / 2 and min(even, odd) <= 0.1 * len(head) / 2 and head:
         return _decoded(encoded, "utf-16-le" if odd > even else "utf-16-be", path)
+    if len(head) - len(head.translate(None, _CONTROLS)) > CONTROLS_RATIO_MAX * len(head):
+        raise RecordingError(f"{path}: is no text")
     try:
         return encoded.decode("utf-8")
     except UnicodeDecodeError:
@@ -130,11 +140,17 @@ def read_table(path: Path) -> Table:
                 headers.append((number, text.lstrip("#%/ \t")))
         elif bare := re.sub(r"\s*(?:#|//).*", "", text):
             lines.append((number, bare))
-    if lines and not any(is_number(word.replace(",", ".")) for word in re.split(r"[\s;,]+", lines[0][1]) if word):
+    while lines and _is_words(lines[0][1]):
         headers.append(lines.pop(0))
     split = _Splitter(lines[0][1] if lines else "")
     rows = [(number, split(text)) for number, text in lines]
     return Table(path, tuple(headers), rows, bool(lines) and lines[0][1].rstrip().endswith((",", ";")))
+
+
+def _is_words(text: str) -> bool:
+    """Whether most of a line is no numbers, as of one that names columns."""
+    words = [word.strip("\"'") for word in re.split(r"[\s;,]+", text) if word]
+    return sum(is_number(word) for word in words) < len(words) / 2
 
 
 class _Splitter:
@@ -149,6 +165,7 @@ class _Splitter:
         self._commas = "," in first and not self._decimal_comma
 
     def __call__(self, text: str) -> list[str]:
+        text = text.translate(_BRACKETS)
         if self._semicolons:
             fields = [field.strip(" \t\"'") for field in text.split(";")]
         elif self._commas:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import is_rigid
+from flocc_agent.geometry import is_rigid, nearest_rotation, pose
 from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
@@ -37,6 +37,9 @@ FORMS = {
 MATRIX_FORM = "kitti"
 DAMAGED_RATIO_MAX = 0.2
 ROWS_TRIED_MAX = 2000
+STRAY_STEPS_MIN = 20.0
+SAID_STEP_MAX_S = 600.0
+"""Stamps whose steps would be longer are not in the unit that is said."""
 WAY_OUT = "name the columns in a first line such as '# timestamp tx ty tz qx qy qz qw', or with --trajectory-format"
 
 
@@ -111,6 +114,7 @@ def read_poses(path: Path, form: str | None = None, otherwise: str | None = None
     if columns is None:
         return _matrices(table)
     values, lines, notes = _values(table, columns)
+    values[:, 1:4] *= columns.metres
     q = values[:, 4:8] / np.linalg.norm(values[:, 4:8], axis=1, keepdims=True)
     T = np.tile(np.eye(4), (len(q), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = rotations(q[:, [3, 0, 1, 2]]), values[:, 1:4]
@@ -132,6 +136,8 @@ def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns |
             raise RecordingError(f"{table.path}:{line}: {error}; {WAY_OUT}") from None
         if found is not None:
             return found
+        if len(words := header.split(",")) >= 7 and not any(is_number(word.strip()) for word in words):
+            raise RecordingError(f"{table.path}:{line}: the header is not understood ({header[:80]}); {WAY_OUT}")
     return _by_numbers(table, count) if otherwise is None else _named_form(otherwise, table.path)
 
 
@@ -159,7 +165,7 @@ def _by_numbers(table: Table, count: int) -> Columns | None:
     rows = rows[np.all(np.isfinite(rows), axis=1)] if rows.size else rows
     if len(rows) == 0:
         raise _of_first_row(table, count)
-    if count in (12, 16) and _are_matrices(rows):
+    if (count in (12, 16) and _are_matrices(rows)) or (count in (13, 17) and _are_matrices(rows[:, 1:])):
         return None
     if table.path.suffix == ".tum":
         return _declared_tum(table, rows, count)
@@ -325,23 +331,31 @@ def _damage(fields: list[str], columns: Columns) -> str | None:
 
 
 def _matrices(table: Table) -> Poses:
-    poses, lines, damaged = [], [], []
+    """Poses of 12 or 16 numbers row by row, with a stamp before them where there is one more."""
+    count = _usual_count(table)
+    poses, stamps, lines, damaged = [], [], [], []
     for line, fields in table.rows:
         numbers = np.array(_numbers(fields))
-        T = _matrix(numbers) if len(numbers) in (12, 16) else np.full((4, 4), np.nan)
-        if is_rigid(T, tolerance=1e-2):
-            U, _, Vt = np.linalg.svd(T[:3, :3])
-            T[:3, :3] = U @ Vt
-            poses.append(T)
+        T = (
+            _matrix(numbers[count % 4 :])
+            if len(numbers) == count and count in (12, 13, 16, 17)
+            else np.full((4, 4), np.nan)
+        )
+        if is_rigid(T, tolerance=1e-2) and np.isfinite(numbers[0]):
+            poses.append(pose(nearest_rotation(T[:3, :3]), T[:3, 3]))
+            stamps.append(float(numbers[0]))
             lines.append(line)
         else:
             damaged.append(line)
-    if damaged:
-        raise RecordingError(
-            f"{table.path}:{damaged[0]}: is no rigid pose of 12 numbers, row by row; {len(damaged)} of "
-            f"{len(table.rows)} rows are not, and poses without stamps cannot be left out"
-        )
-    return Poses(None, np.array(poses), np.array(lines))
+    fault = f"{len(damaged)} of {len(table.rows)} rows are no rigid poses of {count} numbers, the first at line "
+    if damaged and (count in (12, 16) or len(damaged) > DAMAGED_RATIO_MAX * len(table.rows)):
+        alone = ", and poses without stamps cannot be left out" if count in (12, 16) else ""
+        raise RecordingError(f"{table.path}:{damaged[0]}: {fault}{damaged[0]}{alone}")
+    if count in (12, 16):
+        return Poses(None, np.array(poses), np.array(lines))
+    unit, notes = _unit(np.array(stamps), Columns(0, ()), None, table.path)
+    told = (f"{table.path}: {fault}{damaged[0]}; they were left out",) if damaged else ()
+    return Poses(np.array(stamps) * UNITS_S[unit], np.array(poses), np.array(lines), (*told, *notes))
 
 
 def _unit(stamps: Float, columns: Columns, form: str | None, path: Path) -> tuple[str, tuple[str, ...]]:
@@ -351,10 +365,12 @@ def _unit(stamps: Float, columns: Columns, form: str | None, path: Path) -> tupl
     if said is not None and (form is not None or said in possible or not possible):
         return said, ()
     if said is not None:
-        epoch = since_1970(float(np.median(stamps)))
-        if epoch is None:
+        is_far = float(np.median(np.abs(np.diff(stamps)))) * UNITS_S[said] > SAID_STEP_MAX_S
+        if len(possible) == 1 and (is_far or possible[0] == since_1970(float(np.median(stamps)))):
+            note = f"{path}: stamps are said to be in {said}, but can only be in {possible[0]}, and were read so"
+            return possible[0], (note,)
+        if not is_far:
             return said, ()
-        return epoch, (f"{path}: stamps are said to be in {said}, but can only be in {epoch}, and were read so",)
     if len(possible) < 2:
         return (possible or ["seconds"])[0], ()
     readings = " or ".join(f"{unit} ({_duration_s(stamps) * UNITS_S[unit]:.3g} s in all)" for unit in possible)
@@ -366,6 +382,17 @@ def _duration_s(stamps: Float) -> float:
     return float(np.max(stamps) - np.min(stamps))
 
 
+def _strays(stamps_s: Float) -> NDArray[np.bool_]:
+    """Rows whose stamp is far ahead, while the row behind goes on where the row before was."""
+    found = np.zeros(len(stamps_s), dtype=bool)
+    if len(stamps_s) < 4:
+        return found
+    before, here, after = stamps_s[:-2], stamps_s[1:-1], stamps_s[2:]
+    step_s = float(np.median(np.abs(np.diff(stamps_s))))
+    found[1:-1] = (here - before > STRAY_STEPS_MIN * step_s) & (after < here) & (after > before)
+    return found
+
+
 def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     """A trajectory of poses; those that go back in time are left out and counted."""
     stamps_s, T, lines, notes = poses.stamps_s, poses.T_fixed_body, poses.lines, list(poses.notes)
@@ -373,6 +400,12 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     if len(stamps_s) > 2 and np.all(np.diff(stamps_s) <= 0) and stamps_s[0] > stamps_s[-1]:
         stamps_s, T, lines = stamps_s[::-1], T[::-1], lines[::-1]
         notes.append(f"{path}: rows stand in reversed order of time, and were turned round")
+    stray = _strays(stamps_s)
+    if np.any(stray):
+        first = int(np.argmax(stray))
+        note = f"{np.count_nonzero(stray)} rows with a stamp far ahead of those around them were left out"
+        notes.append(f"{path}:{lines[first]}: {note}")
+        stamps_s, T, lines = stamps_s[~stray], T[~stray], lines[~stray]
     highest_s = np.maximum.accumulate(stamps_s)
     later = np.concatenate([[True], stamps_s[1:] > highest_s[:-1]])
     back = np.concatenate([[False], stamps_s[1:] < highest_s[:-1]])

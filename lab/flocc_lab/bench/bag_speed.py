@@ -42,7 +42,7 @@ def write_bag(path: Path, messages: int = MESSAGES) -> Path:
         ]
         for k in range(messages):
             which, stamp_ns = int(k % IMAGE_EVERY == 0), 10**18 + k * 10**7
-            message = _image(store, stamp_ns, jpeg) if which else _odometry(store, stamp_ns)
+            message = image(store, stamp_ns, jpeg) if which else odometry(store, stamp_ns)
             writer.write(connections[which], stamp_ns, store.serialize_cdr(message, kinds[which]))
     return path
 
@@ -52,11 +52,14 @@ def _header(store: Any, stamp_ns: int) -> Any:
     return store.types["std_msgs/msg/Header"](stamp, "odom")
 
 
-def _image(store: Any, stamp_ns: int, jpeg: Any) -> Any:
+def image(store: Any, stamp_ns: int, jpeg: Any) -> Any:
+    """A compressed image."""
     return store.types["sensor_msgs/msg/CompressedImage"](_header(store, stamp_ns), "jpeg", jpeg)
 
 
-def _odometry(store: Any, stamp_ns: int) -> Any:
+def odometry(store: Any, stamp_ns: int, _: Any = None) -> Any:
+    """A pose of odometry."""
+
     def make(name: str, *values: Any) -> Any:
         return store.types[f"geometry_msgs/msg/{name}"](*values)
 

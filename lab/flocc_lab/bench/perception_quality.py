@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import KeyframeConfig, PerceptionConfig
-from flocc_agent.core.interfaces import Describer, OdometryPair
+from flocc_agent.core.interfaces import Describer, OdometryPair, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
 from flocc_agent.geometry import angle_rad
+from flocc_agent.perception.backends import build_perception
 from flocc_lab.bench.registration_scenes import (
-    Scene,
+    RegistrationScene,
     corridor,
     fountain,
     from_recordings,
@@ -51,7 +51,7 @@ CORRESPONDENCES_MIN = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class ScoredPair:
     """Two views of different robots.
 
     Attributes:
@@ -68,7 +68,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class PairOutcome:
     """What registering one pair gave, against the truth.
 
     Attributes:
@@ -140,7 +140,7 @@ def run(
     return report
 
 
-def judge(scene: Scene, skills: Perception) -> dict[str, Any]:
+def judge(scene: RegistrationScene, skills: Perception) -> dict[str, Any]:
     """Register pairs of a scene's robots and put the outcomes into tables.
 
     Returns:
@@ -165,7 +165,9 @@ def judge(scene: Scene, skills: Perception) -> dict[str, Any]:
     }
 
 
-def encoded(scene: Scene, skills: Perception) -> tuple[list[NDArray[np.float32]], list[bytes], dict[str, float]]:
+def encoded(
+    scene: RegistrationScene, skills: Perception
+) -> tuple[list[NDArray[np.float32]], list[bytes], dict[str, float]]:
     """Descriptors and latents of all views, and the median seconds of each."""
     images = (view.image() for view in scene.views)
     timed = [(_timed(skills.describer.describe, image), _timed(skills.encoder.encode, image)) for image in images]
@@ -174,16 +176,16 @@ def encoded(scene: Scene, skills: Perception) -> tuple[list[NDArray[np.float32]]
     return [described[0] for described, _ in timed], [latent[0] for _, latent in timed], seconds
 
 
-def cross_pairs(scene: Scene, descriptors: NDArray[np.float32]) -> list[Pair]:
+def cross_pairs(scene: RegistrationScene, descriptors: NDArray[np.float32]) -> list[ScoredPair]:
     """All unordered pairs of views of different robots."""
     similarity = descriptors @ descriptors.T
     robots = [view.robot for view in scene.views]
     numbers = range(len(robots))
     unlike = [(i, j) for i in numbers for j in numbers if i < j and robots[i] != robots[j]]
-    return [Pair(i, j, float(similarity[i, j]), is_same_place(scene, i, j)) for i, j in unlike]
+    return [ScoredPair(i, j, float(similarity[i, j]), is_same_place(scene, i, j)) for i, j in unlike]
 
 
-def is_same_place(scene: Scene, i: int, j: int) -> bool:
+def is_same_place(scene: RegistrationScene, i: int, j: int) -> bool:
     """Whether the true poses of two views are near and look the same way."""
     truth = relative(scene.views[i].T_world_camera, scene.views[j].T_world_camera)
     viewing_angle_rad = float(np.arccos(np.clip(truth[2, 2], -1.0, 1.0)))
@@ -191,33 +193,33 @@ def is_same_place(scene: Scene, i: int, j: int) -> bool:
     return near and viewing_angle_rad < scene.place_angle_rad
 
 
-def best_by_view(pairs: Sequence[Pair], scene: Scene) -> dict[tuple[int, str], Pair]:
+def best_by_view(pairs: Sequence[ScoredPair], scene: RegistrationScene) -> dict[tuple[int, str], ScoredPair]:
     """Each view's most similar view of every other robot, by view and robot."""
-    best: dict[tuple[int, str], Pair] = {}
+    best: dict[tuple[int, str], ScoredPair] = {}
     for key, pair in _by_view_and_robot(pairs, scene):
         if key not in best or pair.similarity > best[key].similarity:
             best[key] = pair
     return best
 
 
-def best_matches(pairs: Sequence[Pair], scene: Scene) -> set[tuple[int, int]]:
+def best_matches(pairs: Sequence[ScoredPair], scene: RegistrationScene) -> set[tuple[int, int]]:
     """The pairs that the core's place recognition would choose as candidates."""
     return {(pair.query, pair.match) for pair in best_by_view(pairs, scene).values()}
 
 
-def recall_at_one(pairs: Sequence[Pair], scene: Scene) -> float | None:
+def recall_at_one(pairs: Sequence[ScoredPair], scene: RegistrationScene) -> float | None:
     """Share of best matches at one place, of the views and robots where that robot was at the view's place."""
     return _ratio(*recalled(pairs, scene))
 
 
-def recalled(pairs: Sequence[Pair], scene: Scene) -> tuple[int, int]:
+def recalled(pairs: Sequence[ScoredPair], scene: RegistrationScene) -> tuple[int, int]:
     """Numerator and denominator of `recall_at_one`."""
     possible = {key for key, pair in _by_view_and_robot(pairs, scene) if pair.same_place}
     best = best_by_view(pairs, scene)
     return sum(best[key].same_place for key in possible), len(possible)
 
 
-def chosen(pairs: Sequence[Pair], best: set[tuple[int, int]]) -> list[Pair]:
+def chosen(pairs: Sequence[ScoredPair], best: set[tuple[int, int]]) -> list[ScoredPair]:
     """The pairs to register: all, or where they are too many the best matches and a sample of the rest."""
     if len(pairs) <= PAIRS_MAX:
         return list(pairs)
@@ -230,8 +232,8 @@ def chosen(pairs: Sequence[Pair], best: set[tuple[int, int]]) -> list[Pair]:
 
 
 def registered(
-    scene: Scene, pairs: Sequence[Pair], latents: Sequence[bytes], skills: Perception
-) -> tuple[list[Outcome], float]:
+    scene: RegistrationScene, pairs: Sequence[ScoredPair], latents: Sequence[bytes], skills: Perception
+) -> tuple[list[PairOutcome], float]:
     """Register pairs; their outcomes and the median seconds."""
     outcomes, seconds = [], []
     for pair in pairs:
@@ -243,7 +245,7 @@ def registered(
     return outcomes, round(float(np.median(seconds)), 4) if seconds else 0.0
 
 
-def odometry_pair(scene: Scene, i: int, latents: Sequence[bytes]) -> OdometryPair | None:
+def odometry_pair(scene: RegistrationScene, i: int, latents: Sequence[bytes]) -> OdometryPair | None:
     """The query's consecutive view: the one before, or the one after a robot's first.
 
     Where a robot has this view only, the views beside it in the scene stand in.
@@ -259,21 +261,21 @@ def odometry_pair(scene: Scene, i: int, latents: Sequence[bytes]) -> OdometryPai
     return OdometryPair(latents[k], relative(views[k].T_odom_camera, views[i].T_odom_camera), f"{scene.name} {k}-{i}")
 
 
-def outcome(scene: Scene, pair: Pair, result: Registration | RegistrationFailed) -> Outcome:
+def outcome(scene: RegistrationScene, pair: ScoredPair, result: Registration | RegistrationFailed) -> PairOutcome:
     """Hold one result against the truth."""
     truth = relative(scene.views[pair.query].T_world_camera, scene.views[pair.match].T_world_camera)
     distance_m = float(np.linalg.norm(truth[:3, 3]))
     given = (pair.query, pair.match, pair.similarity, pair.same_place, result.correspondences)
     ratio = match_ratio(result.correspondences, result.odometry_correspondences)
     if isinstance(result, RegistrationFailed):
-        return Outcome(*given, ratio, result.failure.value)
+        return PairOutcome(*given, ratio, result.failure.value)
     T = result.T_query_match_unscaled
     length = max(float(np.linalg.norm(T[:3, 3])), 1e-9)
     rotation_deg = float(np.degrees(angle_rad(T[:3, :3].T @ truth[:3, :3])))
     cosine = float(T[:3, 3] @ truth[:3, 3]) / (length * max(distance_m, 1e-9))
     position_error_m = float(np.linalg.norm(T[:3, 3] * (distance_m / length) - truth[:3, 3]))
     scale = None if result.scale_initial is None else result.scale_initial * length / max(distance_m, 1e-9)
-    return Outcome(
+    return PairOutcome(
         *given,
         ratio,
         None,
@@ -294,7 +296,7 @@ def confidence_ratio(result: Registration) -> float | None:
     return result.confidence / result.odometry_confidence
 
 
-def ratio_row(outcomes: Sequence[Outcome], ratio_min: float) -> dict[str, Any]:
+def ratio_row(outcomes: Sequence[PairOutcome], ratio_min: float) -> dict[str, Any]:
     """Accepted registrations at one match ratio: counts, precision, recall and errors at the median."""
     registered = [o for o in outcomes if o.failure is None and o.correspondences >= CORRESPONDENCES_MIN]
     correct = sum(o.correct for o in registered)
@@ -315,7 +317,7 @@ def ratio_row(outcomes: Sequence[Outcome], ratio_min: float) -> dict[str, Any]:
     }
 
 
-def place_recognition(pairs: Sequence[Pair], best: Sequence[Outcome]) -> dict[str, Any]:
+def place_recognition(pairs: Sequence[ScoredPair], best: Sequence[PairOutcome]) -> dict[str, Any]:
     """How often best matches are right, and precision and recall of a similarity threshold over all pairs.
 
     A best match is judged by the true poses (`same_place`) and by whether it registers correctly.
@@ -341,7 +343,7 @@ def place_recognition(pairs: Sequence[Pair], best: Sequence[Outcome]) -> dict[st
 def judge_loop_pairs(folder: Path, skills: Perception) -> list[dict[str, Any]]:
     """Register the true revisits and the negatives of loop_pairs; the right camera is odometry's neighbour."""
     left, right = loop_pairs(folder)
-    scene = Scene(folder.name, left, 1.0, float(np.radians(60.0)), 0.3)
+    scene = RegistrationScene(folder.name, left, 1.0, float(np.radians(60.0)), 0.3)
     images = [view.image() for view in left]
     latents = [skills.encoder.encode(image) for image in images]
     descriptors = [skills.describer.describe(image) for image in images]
@@ -352,7 +354,7 @@ def judge_loop_pairs(folder: Path, skills: Perception) -> list[dict[str, Any]]:
         odometry = OdometryPair(neighbour, T_neighbour_query, f"{scene.name} right-{i}")
         for j in range(i + 1, len(left)):
             result = skills.registrar.register(latents[i], latents[j], odometry)
-            pair = Pair(i, j, float(descriptors[i] @ descriptors[j]), is_same_place(scene, i, j))
+            pair = ScoredPair(i, j, float(descriptors[i] @ descriptors[j]), is_same_place(scene, i, j))
             rows.append(asdict(outcome(scene, pair, result)))
     return rows
 
@@ -400,7 +402,9 @@ def main() -> None:
     sys.stdout.write(text(report) + "\n")
 
 
-def _by_view_and_robot(pairs: Sequence[Pair], scene: Scene) -> Iterator[tuple[tuple[int, str], Pair]]:
+def _by_view_and_robot(
+    pairs: Sequence[ScoredPair], scene: RegistrationScene
+) -> Iterator[tuple[tuple[int, str], ScoredPair]]:
     """Every pair twice: for its one view and the other's robot, and the other way round."""
     for pair in pairs:
         yield (pair.query, scene.views[pair.match].robot), pair

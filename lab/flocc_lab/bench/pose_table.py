@@ -29,7 +29,7 @@ MODES = ("calibrated", "uncalibrated", "true K on the raw pointmap")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class TableScene:
     """One synthetic decode and its matches.
 
     Attributes:
@@ -50,7 +50,7 @@ def true_K() -> Float:
     return np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HEIGHT / 2], [0.0, 0.0, 1.0]])
 
 
-def draw_scene(rng: np.random.Generator, outlier_ratio: float, focal_error: float) -> Scene:
+def draw_scene(rng: np.random.Generator, outlier_ratio: float, focal_error: float) -> TableScene:
     """Draw one pair: 5 % depth noise along the ray, 1 px at the match, |t| = 1 at depths of 3 to 15."""
     K = true_K()
     v, u = np.mgrid[SPACING_PX // 2 : HEIGHT : SPACING_PX, SPACING_PX // 2 : WIDTH : SPACING_PX]
@@ -67,10 +67,10 @@ def draw_scene(rng: np.random.Generator, outlier_ratio: float, focal_error: floa
     map_K = np.diag([1 + focal_error, 1 + focal_error, 1.0]) @ (K - [[0, 0, WIDTH / 2], [0, 0, HEIGHT / 2], [0, 0, 0]])
     map_K[:2, 2] = K[:2, 2]
     noisy_z = z * (1 + DEPTH_NOISE_RATIO * rng.standard_normal(len(z)))
-    return Scene(reray(noisy_z, uv_1, map_K).reshape(*u.shape, 3), uv_1, uv_2, T_1_2)
+    return TableScene(reray(noisy_z, uv_1, map_K).reshape(*u.shape, 3), uv_1, uv_2, T_1_2)
 
 
-def solve(scene: Scene, mode: str) -> RelativePose | PoseFailed:
+def solve(scene: TableScene, mode: str) -> RelativePose | PoseFailed:
     """Estimate the pose the way a calibrated robot does, an uncalibrated one, or the trap."""
     points = scene.pts3d.reshape(-1, 3)
     K = true_K()
@@ -102,7 +102,7 @@ def table(trials: int = 40, seed: int = 0, modes: tuple[str, ...] = MODES) -> li
     return rows
 
 
-def row(mode: str, outlier_ratio: float, focal_error: float, scenes: list[Scene]) -> dict[str, float | str | int]:
+def row(mode: str, outlier_ratio: float, focal_error: float, scenes: list[TableScene]) -> dict[str, float | str | int]:
     """One row of the table; failures are counted, not averaged."""
     errors = []
     for scene in scenes:

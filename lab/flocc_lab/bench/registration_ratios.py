@@ -20,8 +20,8 @@ from flocc_lab.bench.memory import measure
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from flocc_agent.perception.mast3r.network import Mast3r, View
     from flocc_agent.perception.mast3r.search import Search
+    from flocc_agent.perception.mast3r.two_view_network import DenseView, Mast3r
 
 Network = Literal["full", "small", "tiny"]
 Json = dict[str, Any]
@@ -122,12 +122,12 @@ def keyed_pair(network: Network) -> tuple["Mast3r", "Mast3r"]:
     """The float32 network with unfused attention, and the product's in bfloat16."""
     import torch
 
-    from flocc_agent.perception.mast3r.blocks import AttentionKind
     from flocc_agent.perception.mast3r.device import Compute
     from flocc_agent.perception.mast3r.engine import prepared
     from flocc_agent.perception.mast3r.keyed import MAST3R_SEED, keyed_state
-    from flocc_agent.perception.mast3r.network import Mast3r
     from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
+    from flocc_agent.perception.mast3r.transformer_blocks import AttentionKind
+    from flocc_agent.perception.mast3r.two_view_network import Mast3r
 
     with torch.device("meta"):
         plain = Mast3r(NAMED_SIZES[network], attention=AttentionKind.EAGER)
@@ -170,7 +170,7 @@ def network_ratios(network: Network, rounds: int, size: tuple[int, int]) -> tupl
     return ratios, errors
 
 
-def view_errors(found: tuple["View", "View"], expected: tuple["View", "View"]) -> Json:
+def view_errors(found: tuple["DenseView", "DenseView"], expected: tuple["DenseView", "DenseView"]) -> Json:
     """Frobenius-relative errors of both views' points and descriptors."""
     return {
         f"{part}_view_{k + 1}": relative(getattr(found[k], part), getattr(expected[k], part))
@@ -211,7 +211,7 @@ def matching_ratios(name: str, cells: int, rounds: int, size: tuple[int, int]) -
     """Ratio of reciprocal matching to its KD-tree version with as many threads, and whether the matches are equal."""
     import torch
 
-    from flocc_agent.perception.mast3r.matching import reciprocal_matches
+    from flocc_agent.perception.mast3r.reciprocal_matching import reciprocal_matches
 
     first, second = descriptor_fields(cells, size)
     workers = torch.get_num_threads()
@@ -240,7 +240,7 @@ def accelerator(network: Network, size: tuple[int, int]) -> Json:
 
     from flocc_agent.perception.mast3r.device import choose_compute
     from flocc_agent.perception.mast3r.engine import prepared
-    from flocc_agent.perception.mast3r.matching import reciprocal_matches
+    from flocc_agent.perception.mast3r.reciprocal_matching import reciprocal_matches
 
     plain, fast = keyed_pair(network)
     compute = choose_compute("cuda", "auto")

@@ -37,7 +37,7 @@ LOOP_PAIRS_BODY_POSES = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class SceneView:
     """One image, who took it and from where.
 
     Attributes:
@@ -71,7 +71,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class RegistrationScene:
     """Views in order of time, robot by robot.
 
     Attributes:
@@ -83,13 +83,13 @@ class Scene:
     """
 
     name: str
-    views: tuple[View, ...]
+    views: tuple[SceneView, ...]
     place_distance_m: float
     place_angle_rad: float
     position_error_max_m: float
 
 
-def sevenscenes(folder: Path, robots: int = 3) -> Scene:
+def sevenscenes(folder: Path, robots: int = 3) -> RegistrationScene:
     """The handheld room of sevenscenes: keyframes every 0.1 m or 10 degrees, cut by time into robots."""
     source = read_source(folder)
     if source.lens is None or source.truth is None:
@@ -103,11 +103,11 @@ def sevenscenes(folder: Path, robots: int = 3) -> Scene:
             kept.append((file, T))
     names = [f"r{1 + k * robots // len(kept)}" for k in range(len(kept))]
     camera = agents_camera(source.lens)
-    views = tuple(View(name, file, camera, T, T) for name, (file, T) in zip(names, kept, strict=True))
-    return Scene(folder.name, views, 0.4, float(np.radians(30.0)), 0.2)
+    views = tuple(SceneView(name, file, camera, T, T) for name, (file, T) in zip(names, kept, strict=True))
+    return RegistrationScene(folder.name, views, 0.4, float(np.radians(30.0)), 0.2)
 
 
-def fountain(folder: Path) -> Scene:
+def fountain(folder: Path) -> RegistrationScene:
     """Strecha's fountain-P11, surveyed by lidar; every image is a robot's, so that all pairs are registered."""
     files = sorted((folder / "images").glob("*.jpg"))
     views = []
@@ -116,17 +116,17 @@ def fountain(folder: Path) -> Scene:
         K, T = numbers[:9].reshape(3, 3), pose(numbers[12:21].reshape(3, 3), numbers[21:24])
         width, height = (round(size * FOUNTAIN_REDUCTION) for size in numbers[24:26])
         fx, fy, cx, cy = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) * FOUNTAIN_REDUCTION
-        views.append(View(f"r{k:02d}", file, Camera(width, height, fx, fy, cx, cy), T, T))
-    return Scene(folder.name, tuple(views), 4.0, float(np.radians(30.0)), 1.0)
+        views.append(SceneView(f"r{k:02d}", file, Camera(width, height, fx, fy, cx, cy), T, T))
+    return RegistrationScene(folder.name, tuple(views), 4.0, float(np.radians(30.0)), 1.0)
 
 
-def robots_beside(folder: Path, place_distance_m: float) -> Scene:
+def robots_beside(folder: Path, place_distance_m: float) -> RegistrationScene:
     """A folder with a plain data set per robot, such as street or herz_jesu."""
     views = [view for robot in sorted(folder.iterdir()) if robot.is_dir() for view in _plain_views(robot)]
-    return Scene(folder.name, tuple(views), place_distance_m, float(np.radians(40.0)), 1.0)
+    return RegistrationScene(folder.name, tuple(views), place_distance_m, float(np.radians(40.0)), 1.0)
 
 
-def _plain_views(folder: Path) -> Iterator[View]:
+def _plain_views(folder: Path) -> Iterator[SceneView]:
     """A robot's images that have a true pose."""
     source = read_source(folder)
     if source.lens is None or source.truth is None:
@@ -135,16 +135,16 @@ def _plain_views(folder: Path) -> Iterator[View]:
         T = source.truth.at(stamp_s)
         T_odom = T if source.odometry is None else source.odometry.at(stamp_s)
         if T is not None and T_odom is not None:
-            yield View(folder.name, file, agents_camera(source.lens), T, T_odom)
+            yield SceneView(folder.name, file, agents_camera(source.lens), T, T_odom)
 
 
-def kitti(folder: Path) -> Scene:
+def kitti(folder: Path) -> RegistrationScene:
     """A drive as two robots that took turns, four images (5 m) each."""
     views = [replace(view, robot=f"r{1 + k // 4 % 2}") for k, view in enumerate(_plain_views(folder))]
-    return Scene(folder.parent.name, tuple(views), 10.0, float(np.radians(40.0)), 1.0)
+    return RegistrationScene(folder.parent.name, tuple(views), 10.0, float(np.radians(40.0)), 1.0)
 
 
-def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:
+def loop_pairs(folder: Path) -> tuple[tuple[SceneView, ...], tuple[SceneView, ...]]:
     """Four stereo pairs of EuRoC: the left views, and the right ones, which stand in for odometry's neighbours."""
     sides = []
     for side in ("left", "right"):
@@ -154,16 +154,16 @@ def loop_pairs(folder: Path) -> tuple[tuple[View, ...], tuple[View, ...]]:
             q_and_t = np.array(numbers.split(), np.float64)
             T_world_body = pose_from_tq(np.concatenate([q_and_t[4:], q_and_t[:4]]))
             T = T_world_body @ lens.T_body_camera
-            views.append(View(f"r{k}", folder / f"{side}_img_{k}.png", agents_camera(lens), T, T))
+            views.append(SceneView(f"r{k}", folder / f"{side}_img_{k}.png", agents_camera(lens), T, T))
         sides.append(tuple(views))
     return sides[0], sides[1]
 
 
-def stereo_revisits(folder: Path) -> Scene:
+def stereo_revisits(folder: Path) -> RegistrationScene:
     """The views of loop_pairs as four robots, each with its right image before its left one."""
     left, right = loop_pairs(folder)
     views = tuple(view for pair in zip(right, left, strict=True) for view in pair)
-    return Scene(folder.name, views, 1.0, float(np.radians(60.0)), 0.3)
+    return RegistrationScene(folder.name, views, 1.0, float(np.radians(60.0)), 0.3)
 
 
 def corridor(folder: Path) -> tuple[list[Image], list[Image], list[set[int]]]:
@@ -173,14 +173,16 @@ def corridor(folder: Path) -> tuple[list[Image], list[Image], list[set[int]]]:
     return query, reference, right
 
 
-def from_recordings(folders: list[Path], keyframes: KeyframeConfig, position_error_max_m: float = 1.0) -> Scene:
+def from_recordings(
+    folders: list[Path], keyframes: KeyframeConfig, position_error_max_m: float = 1.0
+) -> RegistrationScene:
     """Keyframes of several robots' recordings with ground truth, such as the generated world's."""
     views = [view for k, folder in enumerate(folders) for view in _keyframes(f"r{k + 1}", folder, keyframes)]
     name = folders[0].parent.name if folders else "recordings"
-    return Scene(name, tuple(views), 3.0, float(np.radians(40.0)), position_error_max_m)
+    return RegistrationScene(name, tuple(views), 3.0, float(np.radians(40.0)), position_error_max_m)
 
 
-def _keyframes(robot: str, folder: Path, keyframes: KeyframeConfig) -> Iterator[View]:
+def _keyframes(robot: str, folder: Path, keyframes: KeyframeConfig) -> Iterator[SceneView]:
     """Views of a recording's keyframes."""
     recording = Recording.open(folder)
     selector = KeyframeSelector(keyframes)
@@ -191,7 +193,7 @@ def _keyframes(robot: str, folder: Path, keyframes: KeyframeConfig) -> Iterator[
         selector.took(frame.T_odom_body)
         T_world_camera = T_world_body @ recording.T_body_camera
         T_odom_camera = frame.T_odom_body @ recording.T_body_camera
-        yield View(robot, frame.image_path, recording.camera, T_world_camera, T_odom_camera)
+        yield SceneView(robot, frame.image_path, recording.camera, T_world_camera, T_odom_camera)
 
 
 def relative(T_world_a: Float, T_world_b: Float) -> Float:

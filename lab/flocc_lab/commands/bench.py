@@ -43,6 +43,27 @@ def perception(
     typer.echo(json.dumps(report, indent=1) if json_out else text(report))
 
 
+@bench.command()
+def acceptance(
+    shared: Annotated[Path, typer.Argument(help="Folder of the research sets, as ../shared/data.")],
+    front_end: Annotated[list[str], typer.Option(help="classical, or a model of the learned one; repeat for more.")],
+    recordings: Annotated[list[Path] | None, typer.Option(help="Recordings with ground truth: one more scene.")] = None,
+    scene: Annotated[list[str] | None, typer.Option(help="Only these scenes; all without.")] = None,
+    pairs: Annotated[int, typer.Option(min=8, help="Pairs of a scene; fewer are some of more.")] = 300,
+    out: Annotated[Path, typer.Option(help="Folder that keeps latents and rows; rows there are used again.")] = Path(
+        "runs/acceptance"
+    ),
+    json_out: JsonOption = False,
+) -> None:
+    """Which pairs each front end accepts, right and wrong, by scene and angle; its rule fitted leave-one-scene-out."""
+    from flocc_lab.bench.acceptance_fit import report, text
+    from flocc_lab.bench.acceptance_rows import collected
+
+    for name in front_end:
+        found = report(collected(name, shared, recordings or (), scene or (), pairs, out))
+        typer.echo(json.dumps({name: found}, indent=1) if json_out else text(name, found))
+
+
 def _print_bench(result: dict[str, Any], json_out: bool) -> None:
     if json_out:
         typer.echo(json.dumps(result, indent=1))

@@ -10,15 +10,15 @@ import numpy as np
 from flocc_agent.config import PerceptionConfig, SyntheticConfig
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_lab.bench.perception_quality import (
-    Outcome,
-    Pair,
+    PairOutcome,
+    ScoredPair,
     cross_pairs,
     is_same_place,
     odometry_pair,
     outcome,
     recalled,
 )
-from flocc_lab.bench.registration_scenes import Scene
+from flocc_lab.bench.registration_scenes import RegistrationScene
 from flocc_lab.experiments.experiment import Row
 from flocc_lab.experiments.keyed_engine import SIZES_PX, keyed_engine, keyed_pictures
 from flocc_lab.experiments.reductions import Basis, keypoint_forms, latent_forms, reduced_descriptors
@@ -79,7 +79,7 @@ class Meeting:
     learned: tuple[int, ...]
 
 
-def meetings(scene: Scene) -> list[Meeting]:
+def meetings(scene: RegistrationScene) -> list[Meeting]:
     """Every pair of robots of a scene with many views."""
     by_robot: dict[str, list[int]] = {}
     for k, view in enumerate(scene.views):
@@ -117,7 +117,7 @@ def keypoint_accuracy(data: RegistrationData, name: str, pairs: int, seed: int) 
     """Right registrations of drawn pairs at one place, with every form of the match's latent."""
     scene, encoded = data.scenes[name], data.encoded[name]
     near = near_pairs(scene, distance_m(RegistrationSettings(), scene))
-    outcomes: dict[str, list[Outcome]] = {}
+    outcomes: dict[str, list[PairOutcome]] = {}
     sizes: dict[str, list[int]] = {}
     for meeting in meetings(scene):
         forms = keypoint_forms(_descriptor_basis(encoded, meeting.learned))
@@ -142,9 +142,9 @@ def _descriptor_basis(encoded: Encoded, views: Sequence[int]) -> Basis:
 
 def _registered(
     data: RegistrationData,
-    scene: Scene,
+    scene: RegistrationScene,
     encoded: Encoded,
-    pair: Pair,
+    pair: ScoredPair,
     reduce: "Callable[[Features], tuple[int, Features]]",
 ) -> tuple[int, Registration | RegistrationFailed]:
     """Register a pair of which the match's latent travelled in another form; gives its bytes too."""
@@ -155,7 +155,7 @@ def _registered(
     return size, data.skills.register(encoded[pair.query], encode_features(features, {}), odometry)
 
 
-def accuracy(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
+def accuracy(outcomes: Sequence[PairOutcome]) -> dict[str, float | None]:
     """How many registrations come out right, and how right those are."""
     posed = [o for o in outcomes if o.failure is None]
     right = [o for o in posed if o.correct]
@@ -170,8 +170,8 @@ def accuracy(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
 
 def latent_accuracy(network: Literal["tiny", "small", "full"], pictures: int) -> list[Row]:
     """Errors of what the decoder makes of reduced latents, against unreduced ones; no pose can be judged."""
-    from flocc_agent.perception.mast3r.matching import MatchParameters
     from flocc_agent.perception.mast3r.pair import match_pair
+    from flocc_agent.perception.mast3r.reciprocal_matching import MatchParameters
     from flocc_agent.perception.mast3r.relative_pose import PoseFailed
 
     engine, size = keyed_engine(network, exact=True), SIZES_PX[network]
@@ -194,6 +194,6 @@ def latent_accuracy(network: Literal["tiny", "small", "full"], pictures: int) ->
     ]
 
 
-def usable(scene: Scene) -> bool:
+def usable(scene: RegistrationScene) -> bool:
     """Whether a scene has robots to compare and one to learn from."""
     return bool(meetings(scene))

@@ -21,7 +21,18 @@ from flocc_agent.core.parameters import (
     RoundParameters,
 )
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed, PoseGraph
-from flocc_lab.experiments.experiment import Cell, Experiment, Finding, Row, Settings, Summary, grid, judged
+from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected
+from flocc_agent.runtime.event_lines import of_kind
+from flocc_lab.experiments.experiment import (
+    Cell,
+    Experiment,
+    ExperimentFinding,
+    Row,
+    Settings,
+    Summary,
+    grid,
+    judged,
+)
 from flocc_lab.experiments.plots import COLOURS, from_zero
 from flocc_lab.experiments.statistics import grouped, middle, values
 from flocc_launch.runs.trajectory_errors import ate_m
@@ -29,6 +40,7 @@ from flocc_launch.scenarios.scenario import Scenario, SimulationScenario, Tracks
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.swarm import Swarm
 from flocc_launch.simulation.virtual_playback import Playback
+from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
 
 if TYPE_CHECKING:
@@ -88,12 +100,12 @@ def measure(settings: CandidateOrderSettings, cell: Cell, seed: int) -> Row:
     swarm.run_until(given.duration_s)
     graph, closures, times_s = registered(swarm)
     counts = sorted({*(n for n in settings.closures if n < len(closures)), len(closures)})
-    rejected = {(line["query"], line["match"]) for line in swarm.lines if line["event"] == "closure_rejected"}
+    rejected = {(told.fact.query, told.fact.match) for told in of_kind(swarm.told, ClosureRejected)}
     received = [swarm.network.traffic[name].received["latent"] for name in sorted(playbacks)]
     return {
         "closures": len(closures),
         "rejected": len(rejected),
-        "candidates": sum(line["event"] == "candidate" for line in swarm.lines),
+        "candidates": len(of_kind(swarm.told, CandidateFound)),
         "latent_bytes_received": sum(received),
         "curve": [[n, ate_of(PoseGraph(graph.trajectories, closures[:n]), playbacks)] for n in counts],
         "after_s": [[n, round(times_s[n - 1] - settings.apart_s, 1)] for n in counts if n],
@@ -136,12 +148,11 @@ def registered(swarm: Swarm) -> tuple[PoseGraph, list[LoopClosure], list[float]]
     cores = [station.core for station in swarm.running() if station.core is not None]
     knows = max(cores, key=lambda core: core.assembly.closures)
     graph = knows.assembly.graph()
-    first: dict[tuple[str, str], float] = {}
-    for line in swarm.lines:
-        if line["event"] == "closure_accepted":
-            first.setdefault((line["query"], line["match"]), line["t"])
+    first: dict[tuple[KeyframeId, KeyframeId], float] = {}
+    for told in of_kind(swarm.told, ClosureAccepted):
+        first.setdefault((told.fact.query, told.fact.match), round(told.t, 6))
     by_pair = {CandidatePair.of(c.query, c.match): c for c in graph.closures}
-    times = {pair: first[str(c.query), str(c.match)] for pair, c in by_pair.items()}
+    times = {pair: first[c.query, c.match] for pair, c in by_pair.items()}
     ordered = sorted(by_pair, key=lambda pair: (times[pair], pair))
     return graph, [by_pair[pair] for pair in ordered], [times[pair] for pair in ordered]
 
@@ -239,7 +250,7 @@ def _note(run: int, of_all: float | None, of_first: float | None) -> str:
     return f"Run {run}: {of_all:.2f} of the closures that were spent, {of_first:.2f} of the first that sufficed."
 
 
-def findings(rows: Sequence[Row]) -> list[Finding]:
+def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
     """The target, and the same against the first closures with which similarity order was as good as at its end."""
     shares = shares_of(rows)
     if not shares:

@@ -17,7 +17,7 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Settings,
@@ -135,7 +135,7 @@ def summarise(settings: DistributedSettings, rows: Sequence[Row]) -> Summary:
     return Summary([{name: row[name] for name in columns} for row in rows], findings(settings, rows))
 
 
-def findings(settings: DistributedSettings, rows: Sequence[Row]) -> list[Finding]:
+def findings(settings: DistributedSettings, rows: Sequence[Row]) -> list[ExperimentFinding]:
     """Whether RBCD reaches the centralised optimum."""
     reached = [row for row in rows if row["reached"]]
     missed = [

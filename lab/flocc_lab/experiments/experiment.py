@@ -65,7 +65,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ExperimentFinding:
     """A claim of the paper held against the rows.
 
     Attributes:
@@ -81,10 +81,10 @@ class Finding:
     numbers: str
 
 
-def judged(claim: str, source: str, holds: bool | None, numbers: str) -> Finding:
+def judged(claim: str, source: str, holds: bool | None, numbers: str) -> ExperimentFinding:
     """A finding; None where the rows cannot decide."""
     verdicts = {True: Verdict.CONFIRMED, False: Verdict.CONTRADICTED, None: Verdict.NOT_SHOWN}
-    return Finding(claim, source, verdicts[holds], numbers)
+    return ExperimentFinding(claim, source, verdicts[holds], numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class Summary:
     """
 
     table: Sequence[Row]
-    findings: Sequence[Finding] = ()
+    findings: Sequence[ExperimentFinding] = ()
     notes: Sequence[str] = ()
 
 

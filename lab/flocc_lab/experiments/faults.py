@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig
 from flocc_agent.core.parameters import CoreParameters, RoundParameters
-from flocc_lab.experiments.experiment import Cell, Experiment, Finding, Row, Settings, Summary, judged
+from flocc_lab.experiments.experiment import Cell, Experiment, ExperimentFinding, Row, Settings, Summary, judged
 from flocc_lab.experiments.plots import drawn_values, from_zero, spread_line
 from flocc_lab.experiments.simulated import simulated
 from flocc_lab.experiments.statistics import grouped, middle, with_spread
@@ -119,7 +119,7 @@ def _level(axis: str, level: float, rows: Sequence[Row]) -> Row:
     }
 
 
-def findings(rows: Sequence[Row]) -> list[Finding]:
+def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
     """What DESIGN.md promises: a lost message is never a hole."""
     losses = dict(levels_of(rows, "loss"))
     worst = max(losses, default=0.0)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from flocc_agent.config import Formulation, Solver
-from flocc_lab.experiments.experiment import Finding, judged
+from flocc_lab.experiments.experiment import ExperimentFinding, judged
 
 SAME_RATIO = 1.05
 """Errors nearer to each other than this are the same: one draw more would turn them around."""
@@ -15,7 +15,7 @@ COMPARED = (Formulation.BASE.value, *FREE)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredClaim:
     """One formulation with one solver.
 
     Attributes:
@@ -28,8 +28,8 @@ class Measured:
 
 
 def formulation_findings(
-    where: str, of: Mapping[tuple[str, str], Measured], odometry_m: float | None = None
-) -> list[Finding]:
+    where: str, of: Mapping[tuple[str, str], MeasuredClaim], odometry_m: float | None = None
+) -> list[ExperimentFinding]:
     """What the paper says of free scales and of GNC, as far as it was measured.
 
     Args:
@@ -48,7 +48,7 @@ def formulation_findings(
     return found
 
 
-def _free_beat_base(how: str, ate_m: Mapping[str, float], odometry_m: float | None) -> Finding:
+def _free_beat_base(how: str, ate_m: Mapping[str, float], odometry_m: float | None) -> ExperimentFinding:
     numbers = ", ".join(f"{name} {value:.3g} m" for name, value in ate_m.items())
     holds: bool | None = max(ate_m[name] for name in FREE) < ate_m[Formulation.BASE.value]
     if odometry_m is not None and min(ate_m.values()) > odometry_m:
@@ -58,14 +58,16 @@ def _free_beat_base(how: str, ate_m: Mapping[str, float], odometry_m: float | No
     return judged(f"Independent and smoothed scales beat base {how}", "Sec. IV-C", holds, f"{numbers}.")
 
 
-def _adds_little(where: str, plain: Measured, robust: Measured, odometry_m: float | None) -> Finding:
+def _adds_little(
+    where: str, plain: MeasuredClaim, robust: MeasuredClaim, odometry_m: float | None
+) -> ExperimentFinding:
     lost = odometry_m is not None and min(plain.ate_m, robust.ate_m) > odometry_m
     holds = None if lost else plain.ate_m <= LITTLE_RATIO * robust.ate_m
     numbers = f"LM {plain.ate_m:.3g} m, GNC {robust.ate_m:.3g} m."
     return judged(f"GNC adds little to smoothed scales ({where})", "Sec. IV-C", holds, numbers)
 
 
-def _costs_far_more(where: str, plain: Measured, robust: Measured) -> Finding:
+def _costs_far_more(where: str, plain: MeasuredClaim, robust: MeasuredClaim) -> ExperimentFinding:
     numbers = f"LM {plain.solve_cpu_s:.2g} s, GNC {robust.solve_cpu_s:.2g} s of CPU."
     holds = robust.solve_cpu_s > FAR_MORE_RATIO * plain.solve_cpu_s
     return judged(f"GNC costs far more than LM with smoothed scales ({where})", "Sec. IV-C", holds, numbers)

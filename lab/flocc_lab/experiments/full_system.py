@@ -19,23 +19,23 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Summary,
     judged,
 )
-from flocc_lab.experiments.formulation_claims import Measured, formulation_findings
+from flocc_lab.experiments.formulation_claims import MeasuredClaim, formulation_findings
 from flocc_lab.experiments.full_system_data import METHODS, FullSystemSettings, recordings_of, scenario_of
 from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_lab.experiments.rbcd_run import optimise_together
 from flocc_lab.experiments.statistics import grouped, middle, values, with_spread
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.scenarios.recordings import cache_folder
 from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.setup.cache import cache_folder
 from flocc_launch.simulation.simulate import playbacks_of, run, swarm_of, write
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def measure(settings: FullSystemSettings, cell: Cell, seed: int) -> Row:
     }
 
 
-def simulated_with_graph(scenario: Scenario, seed: int, recordings: dict[str, Path]) -> tuple[Report, PoseGraph]:
+def simulated_with_graph(scenario: Scenario, seed: int, recordings: dict[str, Path]) -> tuple[RunReport, PoseGraph]:
     """Run a scenario on virtual time; its report, and the pose graph of the first robot's logs at the end."""
     with TemporaryDirectory(prefix="flocc-experiment-") as folder:
         out = RunFolder.create(Path(folder) / "run")
@@ -147,12 +147,12 @@ def summarise(_settings: FullSystemSettings, rows: Sequence[Row]) -> Summary:
     return Summary(table, findings(rows), notes)
 
 
-def findings(rows: Sequence[Row]) -> list[Finding]:
+def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
     """The paper's claims on whole systems."""
     return [f for (source,), of_source in grouped(rows, "source").items() for f in _of_source(source, of_source)]
 
 
-def _of_source(source: str, rows: Sequence[Row]) -> list[Finding]:
+def _of_source(source: str, rows: Sequence[Row]) -> list[ExperimentFinding]:
     of = {method: group for (method,), group in grouped(rows, "method").items()}
     ate = {method: value for method, group in of.items() if (value := middle(group, "ate_m")) is not None}
     found = []
@@ -160,7 +160,9 @@ def _of_source(source: str, rows: Sequence[Row]) -> list[Finding]:
         claim = f"flocc's default ends at most {TARGET_ATE_M} m off on {source}"
         found.append(judged(claim, "issue 8", ate[DEFAULT] <= TARGET_ATE_M, f"{ate[DEFAULT]:.2f} m."))
     measured = {
-        (method.formulation.value, method.solver.value): Measured(ate[name], middle(of[name], "solve_cpu_s") or 0.0)
+        (method.formulation.value, method.solver.value): MeasuredClaim(
+            ate[name], middle(of[name], "solve_cpu_s") or 0.0
+        )
         for name, method in METHODS.items()
         if name in ate and not method.metric
     }

@@ -33,8 +33,9 @@ from flocc_launch.graph_files.graph_recording import (
     odometry_sigmas,
     write_recordings,
 )
-from flocc_launch.scenarios.recordings import cache_folder, recordings
+from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import DatasetScenario, RobotScenario, Scenario, TracksScenario, WorldScenario
+from flocc_launch.setup.cache import cache_folder
 
 SETTLE_S = 20.0
 """A run on cosmo_bench is quiet when nothing happened for a round's period and this."""

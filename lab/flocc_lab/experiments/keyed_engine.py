@@ -29,8 +29,8 @@ def keyed_engine(network: Literal["none", "tiny", "small", "full"], exact: bool 
     from flocc_agent.perception.mast3r.device import choose_compute
     from flocc_agent.perception.mast3r.engine import Engine
     from flocc_agent.perception.mast3r.keyed import MAST3R_SEED, keyed_state
-    from flocc_agent.perception.mast3r.network import Mast3r
     from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
+    from flocc_agent.perception.mast3r.two_view_network import Mast3r
 
     assert network != "none", "the settings say which"
     compute = choose_compute("auto", "fp32" if exact else "auto")

@@ -54,7 +54,7 @@ class WholeGraph:
 
 
 @dataclass(slots=True)
-class Traffic:
+class RbcdTraffic:
     """What was said: messages and bytes, by all robots."""
 
     messages: int = 0
@@ -78,7 +78,7 @@ class DistributedRun:
     T_map_keyframe: dict[LogId, Float] = field(default_factory=dict)
     anchors: dict[LogId, LogId] = field(default_factory=dict)
     iterations: dict[LogId, int] = field(default_factory=dict)
-    traffic: Traffic = field(default_factory=Traffic)
+    traffic: RbcdTraffic = field(default_factory=RbcdTraffic)
     end_s: float = 0.0
     is_settled: bool = False
     rejected: int = 0

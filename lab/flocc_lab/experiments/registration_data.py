@@ -9,11 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flocc_agent.composition import Perception, build_perception
 from flocc_agent.config import KeyframeConfig, PerceptionConfig
+from flocc_agent.core.interfaces import Perception
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.recording import Recording
-from flocc_lab.bench.perception_quality import Pair, is_same_place
-from flocc_lab.bench.registration_scenes import Scene, fountain, from_recordings, sevenscenes, stereo_revisits
+from flocc_lab.bench.perception_quality import ScoredPair, is_same_place
+from flocc_lab.bench.registration_scenes import (
+    RegistrationScene,
+    fountain,
+    from_recordings,
+    sevenscenes,
+    stereo_revisits,
+)
 from flocc_lab.experiments.experiment import ExperimentError, Progress, Settings
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario, TracksScenario, WorldScenario
@@ -22,7 +29,7 @@ ERROR_PER_DISTANCE = 0.2
 """The paper's outliers are off by more than 2 m among pairs within 10 m."""
 LATENTS_KEPT = 256
 WALKS_AREA_M, WALKS_LENGTH_M = 12.0, 24.0
-RESEARCH_SETS: dict[str, tuple[str, Callable[[Path], Scene]]] = {
+RESEARCH_SETS: dict[str, tuple[str, Callable[[Path], RegistrationScene]]] = {
     "sevenscenes": ("sevenscenes", sevenscenes),
     "fountain": ("strecha_fountain/fountain-P11", fountain),
     "loop_pairs": ("loop_pairs", stereo_revisits),
@@ -75,7 +82,7 @@ def town(settings: RegistrationSettings, seed: int) -> Scenario:
     return Scenario(world=WorldScenario(robots=settings.robots, seed=seed))
 
 
-def make_scenes(settings: RegistrationSettings) -> dict[str, Scene]:
+def make_scenes(settings: RegistrationSettings) -> dict[str, RegistrationScene]:
     """All scenes of the settings, by name; checks that each can be judged.
 
     Raises:
@@ -93,9 +100,9 @@ def make_scenes(settings: RegistrationSettings) -> dict[str, Scene]:
     return found
 
 
-def _all_scenes(settings: RegistrationSettings) -> dict[str, Scene]:
+def _all_scenes(settings: RegistrationSettings) -> dict[str, RegistrationScene]:
     keyframes = KeyframeConfig(distance_m=settings.keyframe_distance_m)
-    scenes: dict[str, Scene] = {}
+    scenes: dict[str, RegistrationScene] = {}
     if settings.data is not None:
         if not settings.data.is_dir():
             raise ExperimentError(f"{settings.data}: is not a folder")
@@ -114,7 +121,7 @@ def _all_scenes(settings: RegistrationSettings) -> dict[str, Scene]:
     return scenes
 
 
-def _of_recordings(folders: Sequence[Path], keyframes: KeyframeConfig) -> Scene:
+def _of_recordings(folders: Sequence[Path], keyframes: KeyframeConfig) -> RegistrationScene:
     """Keyframes of recordings; each must have ground truth.
 
     Raises:
@@ -126,17 +133,17 @@ def _of_recordings(folders: Sequence[Path], keyframes: KeyframeConfig) -> Scene:
     return from_recordings(list(folders), keyframes, position_error_max_m=2.0)
 
 
-def distance_m(settings: RegistrationSettings, scene: Scene) -> float:
+def distance_m(settings: RegistrationSettings, scene: RegistrationScene) -> float:
     """Largest distance of a pair in a scene."""
     return settings.distance_m or scene.position_error_max_m / ERROR_PER_DISTANCE
 
 
-def error_max_m(settings: RegistrationSettings, scene: Scene) -> float:
+def error_max_m(settings: RegistrationSettings, scene: RegistrationScene) -> float:
     """Largest translation error of a right registration in a scene."""
     return settings.error_max_m or ERROR_PER_DISTANCE * distance_m(settings, scene)
 
 
-def near_pairs(scene: Scene, limit_m: float) -> list[tuple[int, int]]:
+def near_pairs(scene: RegistrationScene, limit_m: float) -> list[tuple[int, int]]:
     """Views of different robots that are nearer than a limit, whatever they look at."""
     positions = np.array([view.T_world_camera[:3, 3] for view in scene.views]).reshape(-1, 3)
     robots = [view.robot for view in scene.views]
@@ -147,7 +154,7 @@ def near_pairs(scene: Scene, limit_m: float) -> list[tuple[int, int]]:
     return [(i, j) for i, j in found if robots[i] != robots[j]]
 
 
-def drawn_pairs(scene: Scene, limit_m: float, pairs_max: int, seed: int) -> list[tuple[int, int]]:
+def drawn_pairs(scene: RegistrationScene, limit_m: float, pairs_max: int, seed: int) -> list[tuple[int, int]]:
     """A seeded sample of a scene's near pairs, sorted, so that neighbouring pairs share views."""
     near = near_pairs(scene, limit_m)
     if len(near) <= pairs_max:
@@ -159,7 +166,7 @@ def drawn_pairs(scene: Scene, limit_m: float, pairs_max: int, seed: int) -> list
 class Encoded(Sequence[bytes]):
     """Latents of a scene's views, encoded when asked for; a bounded number is kept. Descriptors are all kept."""
 
-    def __init__(self, scene: Scene, skills: Perception) -> None:
+    def __init__(self, scene: RegistrationScene, skills: Perception) -> None:
         self._scene = scene
         self._skills = skills
         self._latents: OrderedDict[int, bytes] = OrderedDict()
@@ -176,10 +183,10 @@ class Encoded(Sequence[bytes]):
             self._latents.popitem(last=False)
         return self._latents[k]
 
-    def pair(self, i: int, j: int) -> Pair:
+    def pair(self, i: int, j: int) -> ScoredPair:
         """A pair of views with its similarity."""
         similarity = float(self.descriptor(i) @ self.descriptor(j))
-        return Pair(i, j, similarity, is_same_place(self._scene, i, j))
+        return ScoredPair(i, j, similarity, is_same_place(self._scene, i, j))
 
     def descriptor(self, k: int) -> NDArray[np.float32]:
         """Descriptor of a view, (D,) of unit length."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flocc_lab.experiments.experiment import Finding, Row, judged
+from flocc_lab.experiments.experiment import ExperimentFinding, Row, judged
 from flocc_lab.experiments.precision_recall import Curve, curve
 
 POOLED = "all"
@@ -13,7 +13,7 @@ RESAMPLES = 500
 SOURCE = "Sec. IV-B, precision and recall of five metrics"
 
 
-def findings(scenes: Mapping[str, Sequence[Row]], curves: Mapping[str, Mapping[str, Curve]]) -> list[Finding]:
+def findings(scenes: Mapping[str, Sequence[Row]], curves: Mapping[str, Mapping[str, Curve]]) -> list[ExperimentFinding]:
     """The paper's claims on the metrics."""
     name = POOLED if POOLED in curves else next(iter(curves))
     whole = curves[name]
@@ -25,7 +25,7 @@ def findings(scenes: Mapping[str, Sequence[Row]], curves: Mapping[str, Mapping[s
 
 def _ratio_beats_similarity(
     pairs: Sequence[Row], whole: Mapping[str, Curve], single: Mapping[str, Mapping[str, Curve]]
-) -> Finding:
+) -> ExperimentFinding:
     """Decided by the average precision over all pairs, where its difference is not a matter of which pairs came."""
     ratio, similarity = whole["ratio"], whole["similarity"]
     low, high = resampled_difference(pairs, "ratio", "similarity")
@@ -62,7 +62,7 @@ def halved(found: Curve) -> float:
     return 1.0 - 0.5 * (1.0 - found.right_share)
 
 
-def _similarity_alone(whole: Mapping[str, Curve]) -> Finding:
+def _similarity_alone(whole: Mapping[str, Curve]) -> ExperimentFinding:
     kept = {metric: _recall_when_halved(whole[metric]) for metric in ("similarity", "ratio")}
     numbers = (
         f"All accepted, {1.0 - whole['ratio'].right_share:.1%} are outliers; a threshold that halves this share keeps "
@@ -77,7 +77,7 @@ def _recall_when_halved(found: Curve) -> float:
     return 0.0 if k is None else float(found.recall[k])
 
 
-def _unitless(single: Mapping[str, Mapping[str, Curve]]) -> Finding:
+def _unitless(single: Mapping[str, Mapping[str, Curve]]) -> ExperimentFinding:
     """Whether the scenes want thresholds that differ less for the ratio than for the count."""
     wanted: dict[str, dict[str, float]] = {"ratio": {}, "correspondences": {}}
     for metric, values in wanted.items():

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from flocc_lab.bench.perception_quality import Outcome, registered
+from flocc_lab.bench.perception_quality import PairOutcome, registered
 from flocc_lab.experiments.experiment import Cell, Experiment, Row, Summary
 from flocc_lab.experiments.logistic import LogisticFit, fit_logistic
 from flocc_lab.experiments.plots import COLOURS
@@ -63,7 +63,7 @@ def measure(settings: RegistrationSettings, cell: Cell, seed: int) -> Row:
     }
 
 
-def outcome_row(outcome: Outcome, limit_m: float) -> Row:
+def outcome_row(outcome: PairOutcome, limit_m: float) -> Row:
     """What is kept of one pair."""
     error_m = outcome.position_error_m
     return {

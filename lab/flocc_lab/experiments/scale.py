@@ -16,13 +16,13 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Summary,
     grid,
 )
-from flocc_lab.experiments.formulation_claims import Measured, formulation_findings
+from flocc_lab.experiments.formulation_claims import MeasuredClaim, formulation_findings
 from flocc_lab.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_lab.experiments.scale_graphs import ScaleSettings, draw_graph
 from flocc_lab.experiments.statistics import grouped, middle, with_spread
@@ -126,17 +126,17 @@ def summarise(_settings: ScaleSettings, rows: Sequence[Row]) -> Summary:
     return Summary(table, findings(rows), ["The ATE is n/a where the robots end in several components."])
 
 
-def findings(rows: Sequence[Row]) -> list[Finding]:
+def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
     """The paper's claims, for every source and odometry."""
     return [
         f for (source, odometry), of in grouped(rows, "source", "odometry").items() for f in _of(source, odometry, of)
     ]
 
 
-def _of(source: str, odometry: str, rows: Sequence[Row]) -> list[Finding]:
+def _of(source: str, odometry: str, rows: Sequence[Row]) -> list[ExperimentFinding]:
     started = [row for row in rows if row["initial"] == ScaleInitial.ODOMETRY.value]
     measured = {
-        (key[0], key[1]): Measured(ate_m, middle(group, "solve_cpu_s") or 0.0)
+        (key[0], key[1]): MeasuredClaim(ate_m, middle(group, "solve_cpu_s") or 0.0)
         for key, group in grouped(started, "formulation", "solver").items()
         if (ate_m := middle(group, "ate_m")) is not None
     }

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import Event
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import playbacks_of, run, swarm_of, write
 
@@ -24,8 +25,8 @@ class Simulated:
         record_bytes: Records on all robots' disks at the end, every robot's copy counted.
     """
 
-    report: Report
-    events: list[Event]
+    report: RunReport
+    events: list[Reported[Fact]]
     latent_bytes: int
     record_bytes: int
 

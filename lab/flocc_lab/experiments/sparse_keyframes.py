@@ -14,7 +14,7 @@ from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Settings,
@@ -25,9 +25,10 @@ from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.plots import COLOURS, drawn_values, from_zero, spread_line
 from flocc_lab.experiments.simulated import simulated
 from flocc_lab.experiments.statistics import grouped, middle, values, with_spread
-from flocc_launch.scenarios.recordings import cache_folder, recordings
+from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario, TracksScenario
 from flocc_launch.scenarios.shipped import read_scenario
+from flocc_launch.setup.cache import cache_folder
 from flocc_launch.simulation.simulate import playbacks_of
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def prepare(settings: SparseKeyframesSettings, progress: Progress) -> None:
     Raises:
         FloccError: A back-end is unknown or its checkpoint is wrong, there is no ground truth, or no overlap.
     """
-    from flocc_agent.composition import build_perception
+    from flocc_agent.perception.backends import build_perception
 
     for backend in settings.backends:
         given = scenario(settings, backend, min(settings.distances_m), 1)
@@ -156,7 +157,7 @@ def summarise(_settings: SparseKeyframesSettings, rows: Sequence[Row]) -> Summar
     )
 
 
-def finding(backend: str, rows: Sequence[Row]) -> Finding:
+def finding(backend: str, rows: Sequence[Row]) -> ExperimentFinding:
     """Whether the error stays low, of the runs whose densest keyframes make one map that is better than odometry.
 
     It does where at every distance up to 4 m these runs still end in one map, with at most twice the densest ATE.

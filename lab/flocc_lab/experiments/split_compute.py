@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, Fact, KeyframeTaken
+from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
     ExperimentError,
-    Finding,
+    ExperimentFinding,
     Progress,
     Row,
     Settings,
@@ -29,10 +31,10 @@ from flocc_lab.experiments.plots import COLOURS
 from flocc_lab.experiments.simulated import simulated
 from flocc_lab.experiments.statistics import grouped, middle
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureAccepted, ClosureRejected, Event, KeyframeCaptured, of_kind
-from flocc_launch.scenarios.recordings import cache_folder, recordings
+from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_scenario
+from flocc_launch.setup.cache import cache_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,19 +110,19 @@ def _scenario(settings: SplitComputeSettings, similarity: float) -> Scenario:
     return read_scenario(settings.scenario, {"core.place_recognition.similarity_threshold": similarity})
 
 
-def counts(events: Sequence[Event]) -> Row:
+def counts(events: Sequence[Reported[Fact]]) -> Row:
     """Keyframes, and the pairs that were registered.
 
     Raises:
         ExperimentError: Nothing was registered, so nothing can be compared.
     """
-    pairs = [(event.robot, event.query, event.match) for event in of_kind(events, ClosureAccepted)]
-    rejected = [event for event in of_kind(events, ClosureRejected) if event.reason != LATENT_LOST]
-    pairs += [(event.robot, event.query, event.match) for event in rejected]
+    pairs = [(event.robot, event.fact.query, event.fact.match) for event in of_kind(events, ClosureAccepted)]
+    rejected = [event for event in of_kind(events, ClosureRejected) if event.fact.reason != LATENT_LOST]
+    pairs += [(event.robot, event.fact.query, event.fact.match) for event in rejected]
     if not pairs:
         raise ExperimentError("no pair was registered in this run: its robots do not overlap, or never met")
     return {
-        "keyframes": len(of_kind(events, KeyframeCaptured)),
+        "keyframes": len(of_kind(events, KeyframeTaken)),
         "registrations": len(pairs),
         "keyframes_registered": len({keyframe for _, *both in pairs for keyframe in both}),
         "odometry_pairs": len({(robot, query) for robot, query, _ in pairs}),
@@ -196,7 +198,7 @@ def _level(similarity: float | None, rows: Sequence[Row], devices: dict[str, tup
     return row
 
 
-def findings(table: Sequence[Row]) -> list[Finding]:
+def findings(table: Sequence[Row]) -> list[ExperimentFinding]:
     """Whether encoding once per keyframe computes less, judged at the most permissive threshold, as the paper's."""
     if not table:
         return []

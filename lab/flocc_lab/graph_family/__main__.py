@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from flocc_lab.graph_family.campaign import run, table
+from flocc_lab.graph_family.family_campaign import run, table
 from flocc_lab.graph_family.methods import Method, flocc, methods, settings
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import inverse, pose, se3_exp, so3_exp
-from flocc_lab.graph_family.spec import GROUP_CLOSURES, WEAK_CLOSURES, Lengths, Spec, drawn
+from flocc_lab.graph_family.family_spec import GROUP_CLOSURES, WEAK_CLOSURES, Lengths, Spec, drawn
 from flocc_lab.graph_family.ways import true_poses
 from flocc_protocol.ids import KeyframeId, LogId
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import umeyama
 from flocc_lab.graph_family.graphs import Member
-from flocc_lab.graph_family.methods import Answer
+from flocc_lab.graph_family.methods import MethodAnswer
 from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
@@ -19,7 +19,7 @@ WORSE_RATIO, WORSE_M = 1.1, 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class GraphVerdict:
     """One answer, judged.
 
     Attributes:
@@ -64,12 +64,12 @@ class Verdict:
         return far or self.worse_than_odometry or bool(self.lost)
 
 
-def judged(member: Member, method: str, answer: Answer, oracle: Answer) -> Verdict:
+def judged(member: Member, method: str, answer: MethodAnswer, oracle: MethodAnswer) -> GraphVerdict:
     """Compare an answer with the truth, and that with the oracle's."""
     own, own_oracle, own_odometry = (own_ate_m(member, T) for T in (answer.T_map_keyframe, oracle.T_map_keyframe, None))
     limit_m = max(WORSE_RATIO * own_odometry, own_odometry + WORSE_M)
     frame = {log: n for n, logs in enumerate(answer.groups) for log in logs}
-    return Verdict(
+    return GraphVerdict(
         seed=member.spec.seed,
         method=method,
         ate_m=joint_ate_m(member, answer, oracle.groups),
@@ -85,7 +85,7 @@ def judged(member: Member, method: str, answer: Answer, oracle: Answer) -> Verdi
     )
 
 
-def joint_ate_m(member: Member, answer: Answer, groups: Iterable[tuple[LogId, ...]]) -> float:
+def joint_ate_m(member: Member, answer: MethodAnswer, groups: Iterable[tuple[LogId, ...]]) -> float:
     """Root mean square of the positions' errors, each group of logs aligned as one."""
     return _rmse(np.concatenate([_errors_m(member, answer.T_map_keyframe, logs) for logs in groups]))
 

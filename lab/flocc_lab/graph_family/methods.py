@@ -49,7 +49,7 @@ class NoAnswer(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class MethodAnswer:
     """What a method makes of a graph.
 
     Attributes:
@@ -67,7 +67,7 @@ class Answer:
     cpu_s: float
 
 
-Method = Callable[[Member], Answer]
+Method = Callable[[Member], MethodAnswer]
 
 
 def settings(**changed: Any) -> BackendConfig:
@@ -78,7 +78,7 @@ def settings(**changed: Any) -> BackendConfig:
 def flocc(config: BackendConfig) -> Method:
     """The back end with a configuration."""
 
-    def method(member: Member) -> Answer:
+    def method(member: Member) -> MethodAnswer:
         began = time.process_time()
         solution = optimise(member.graph, config)
         return answer_of(solution, time.process_time() - began)
@@ -86,7 +86,7 @@ def flocc(config: BackendConfig) -> Method:
     return method
 
 
-def answer_of(solution: GraphSolution | OptimisationFailed, cpu_s: float) -> Answer:
+def answer_of(solution: GraphSolution | OptimisationFailed, cpu_s: float) -> MethodAnswer:
     """The back end's solution as an answer.
 
     Raises:
@@ -96,10 +96,10 @@ def answer_of(solution: GraphSolution | OptimisationFailed, cpu_s: float) -> Ans
         raise NoAnswer(solution.reason)
     poses = {log: T for c in solution.components for log, T in c.T_map_keyframe.items()}
     used = np.array([c.state is ClosureState.USED for c in solution.closures], dtype=bool)
-    return Answer(poses, tuple(c.logs for c in solution.components), used, tuple(solution.warnings), cpu_s)
+    return MethodAnswer(poses, tuple(c.logs for c in solution.components), used, tuple(solution.warnings), cpu_s)
 
 
-def oracle(member: Member) -> Answer:
+def oracle(member: Member) -> MethodAnswer:
     """LM with the right closures alone, from the true poses."""
     graph = member.right_closures()
     logs = tuple(sorted(member.T_world_keyframe))
@@ -108,10 +108,10 @@ def oracle(member: Member) -> Answer:
     answer = answer_of(optimise(graph, settings(solver=Solver.LM), truth), time.process_time() - began)
     used = member.is_right.copy()
     used[member.is_right] = answer.used
-    return Answer(answer.T_map_keyframe, answer.groups, used, answer.warnings, answer.cpu_s)
+    return MethodAnswer(answer.T_map_keyframe, answer.groups, used, answer.warnings, answer.cpu_s)
 
 
-def gtsam_gnc(member: Member) -> Answer:
+def gtsam_gnc(member: Member) -> MethodAnswer:
     """GTSAM's `GncLMOptimizer` from the same start, lengths that are free put into the covariances."""
     graph, began = member.graph, time.process_time()
     excluded = screen(graph).excluded
@@ -123,13 +123,13 @@ def gtsam_gnc(member: Member) -> Answer:
         of_group = {k: c for k, c in usable.items() if c.query.log in logs}
         part = PoseGraph({log: graph.trajectories[log] for log in logs}, ())
         poses |= _gtsam_group(part, of_group, used)
-    return Answer(poses, groups, used, (), time.process_time() - began)
+    return MethodAnswer(poses, groups, used, (), time.process_time() - began)
 
 
 def _gtsam_group(graph: PoseGraph, closures: Mapping[int, Any], used: NDArray[np.bool_]) -> dict[LogId, Float]:
     config = settings()
     T_start, _ = initial_poses(graph.trajectories, closures, config.steepness, None)
-    problem = build(graph.trajectories, closures, (), config, T_start, np.eye(4))
+    problem = build(graph.trajectories, closures, config)
     factors, values = between_factors(problem, T_start)
     odometry = [*range(problem.closure_rows.start), factors.size() - 1]
     try:
@@ -147,7 +147,7 @@ def earlier(source: Path) -> Method:
     """The default of another checkout, run by this interpreter in a process of its own."""
     paths = os.pathsep.join(str(source / name) for name in ("agent", "protocol", "launch"))
 
-    def method(member: Member) -> Answer:
+    def method(member: Member) -> MethodAnswer:
         done = subprocess.run(
             [sys.executable, "-c", EARLIER],
             input=pickle.dumps(member.graph),

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import pose, so3_exp
-from flocc_lab.graph_family.spec import Spec
+from flocc_lab.graph_family.family_spec import Spec
 
 Float = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from flocc_launch.report.model import Report
+    from flocc_launch.report.model import RunReport
 
 EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
@@ -51,7 +51,7 @@ class ProgressLines:
         typer.echo(f"{self._what}: {self._unit} {done} of {total}, about {left_s:.0f} s left", err=True)
 
 
-def show_report(report: "Report", out: Path) -> None:
+def show_report(report: "RunReport", out: Path) -> None:
     """Print what came of a run; leave with exit code 1 when an expectation is missed or unknown, or no robot lived."""
     from flocc_launch.report.text import sentences
 

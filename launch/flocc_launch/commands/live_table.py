@@ -1,7 +1,5 @@
 """The live table of a launch: one line per robot, the newest notes below."""
 
-from typing import Any
-
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -55,20 +53,20 @@ def table_of(watch: Watch) -> Table:
 
 def cells_of(agent: AgentProcess) -> list[str]:
     """One robot's line."""
-    status: dict[str, Any] = agent.status
-    if not status:
+    status = agent.status
+    if status is None:
         return [agent.name, state_of(agent), *[""] * (len(COLUMNS) - 2)]
     return [
         agent.name,
         state_of(agent),
-        status["leader"] or "-",
-        "-" if status["term"] is None else str(status["term"]),
-        str(len(status["neighbours"])),
-        str(status["keyframes"]),
-        str(status["closures"]),
-        str(status["candidates"]),
-        status["map_frame"] or "-",
-        f"{status['sent_bytes'] / 1000:.0f}",
+        status.leader or "-",
+        "-" if status.term is None else str(status.term),
+        str(len(status.neighbours)),
+        str(status.keyframes),
+        str(status.closures),
+        str(status.candidates),
+        status.map_frame or "-",
+        f"{status.sent_bytes / 1000:.0f}",
     ]
 
 
@@ -78,19 +76,18 @@ def state_of(agent: AgentProcess) -> str:
         return "not started"
     if agent.exit_code is not None:
         return "stopped" if agent.exit_code == 0 else "died"
-    if not agent.status:
+    if agent.status is None:
         return "starting"
-    if agent.status["playing"]:
+    if agent.status.playing:
         return "playing"
-    return "working" if agent.status["busy"] else "idle"
+    return "working" if agent.status.busy else "idle"
 
 
 def line_of(watch: Watch) -> str:
     """One line for logs."""
     parts = []
     for agent in watch.agents:
-        status = agent.status
-        frame = status.get("map_frame") or "-"
-        counts = f"{status.get('keyframes', 0)} keyframes, {status.get('closures', 0)} closures, {frame}"
+        said = agent.said
+        counts = f"{said.keyframes} keyframes, {said.closures} closures, {said.map_frame or '-'}"
         parts.append(f"{agent.name} {state_of(agent)}: {counts}")
     return f"{watch.elapsed_s:6.0f} s  " + "; ".join(parts)

@@ -12,7 +12,7 @@ from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
 from flocc_launch.commands.offline import add_offline, run_campaign
 from flocc_launch.commands.tools import add_tools
-from flocc_protocol.errors import FloccError
+from flocc_launch.setup.world_faults import sentence_of, speak_utf8
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -64,12 +64,16 @@ Set = Annotated[list[str] | None, typer.Option("--set", help="Another value for 
 
 def main() -> None:
     """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
+    speak_utf8()
     try:
         app()
-    except FloccError as error:
-        fail(str(error))
     except KeyboardInterrupt:
         sys.exit(130)
+    except Exception as error:
+        sentence = sentence_of(error)
+        if sentence is None:
+            raise
+        fail(sentence)
 
 
 def fail(sentence: str) -> NoReturn:
@@ -141,7 +145,8 @@ def simulate(
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
     from flocc_launch.scenarios.expectations import check_measurable
-    from flocc_launch.scenarios.recordings import cache_folder, recordings
+    from flocc_launch.scenarios.recordings import recordings
+    from flocc_launch.setup.cache import cache_folder
     from flocc_launch.simulation.simulate import simulate as run
     from flocc_launch.swarm.launching import fresh_folder
 

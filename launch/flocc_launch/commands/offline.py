@@ -43,7 +43,7 @@ def optimise(
 ) -> None:
     """Optimise the pose graph of a file, with any formulation and solver."""
     from flocc_agent.config import Formulation, ScaleInitial, Solver
-    from flocc_launch.graph_files.optimise import Noise, optimise_file
+    from flocc_launch.graph_files.optimise import NoiseModel, optimise_file
 
     result = optimise_file(
         file,
@@ -55,7 +55,7 @@ def optimise(
         unit_scale=unit_scale,
         drop_labelled_outliers=drop_outliers,
         from_file_initialisation=from_file,
-        noise=_chosen(Noise, noise, "--noise") or Noise.GAUSSIAN,
+        noise=_chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
         seed=seed,
     )
     for key in ("formulation", "solver", "cost_initial", "cost", "ate_m", "iterations", "solve_s"):
@@ -67,11 +67,11 @@ def optimise(
 
 def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
     """Simulate drawn scenarios under all checkers; leave with exit code 1 when an invariant was violated."""
-    from flocc_launch.simulation.campaign import Outcome, campaign, write_campaign
+    from flocc_launch.simulation.campaign import SeedOutcome, campaign, write_campaign
     from flocc_launch.simulation.campaign import shrink as smaller
     from flocc_launch.simulation.generator import drawn_scenario
 
-    def tell(outcome: Outcome) -> None:
+    def tell(outcome: SeedOutcome) -> None:
         for violation in outcome.violations:
             typer.echo(f"seed {outcome.seed}: {violation.invariant} at {violation.at_s:.2f} s")
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 
 if TYPE_CHECKING:
-    from flocc_launch.report.model import Expectation, Report
+    from flocc_launch.report.model import Expectation, RunReport
     from flocc_launch.scenarios.scenario import Scenario
 
 MARKER = "flocc(scenario, driver='simulate', seed=None, **changes): the scenario that flocc_run runs"
@@ -37,7 +37,7 @@ class ScenarioRun:
     """
 
     folder: Path
-    report: "Report"
+    report: "RunReport"
 
     @property
     def missed(self) -> "list[Expectation]":
@@ -87,7 +87,8 @@ class ScenarioRunner:
         Raises:
             FloccError: The scenario cannot be used.
         """
-        from flocc_launch.scenarios.recordings import cache_folder, recordings
+        from flocc_launch.scenarios.recordings import recordings
+        from flocc_launch.setup.cache import cache_folder
         from flocc_launch.simulation.simulate import simulate
 
         read, folder = self._read(scenario, seed, changes), self._fresh()

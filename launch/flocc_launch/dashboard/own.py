@@ -7,33 +7,27 @@ while somebody looks, so that a page nobody has open costs the agent nothing but
 import asyncio
 import json
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from flocc_agent.composition import Agent
+from flocc_agent.agent import Agent
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
+from flocc_agent.runtime.event_lines import Reported
+from flocc_launch.dashboard.snapshot import Snapshot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.runs.heard import Heard
-from flocc_launch.runs.run_folder import RunFolderError, event_from_line
-from flocc_launch.runs.run_records import (
-    ClosureAccepted,
-    ClosureRejected,
-    CorrectionApplied,
-    Event,
-    KeyframeCaptured,
-)
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import LogCorrection
 
 ANSWER_S_MAX = 5.0
 RECORDS_MAX = 2000
 """Records of one log that one look takes in, so that a long log does not keep the agent from its work."""
-FROM_LOGS = (KeyframeCaptured, ClosureAccepted, ClosureRejected, CorrectionApplied)
+FROM_LOGS = (KeyframeTaken, ClosureAccepted, ClosureRejected, CorrectionApplied)
 
 
 class AgentSource:
-    """One agent's view as a `SnapshotSource`: `line` takes the agent's events, `attach` the running agent."""
+    """One agent's view as a `SnapshotSource`: `take` takes the agent's facts, `attach` the running agent."""
 
     def __init__(self, swarm: str, robot: str, steepness: float, clock_s: Callable[[], float]) -> None:
         """Prepare, on the event loop of the agent to come.
@@ -57,13 +51,9 @@ class AgentSource:
         """Look at this agent, which runs, from now on."""
         self._agent = agent
 
-    def line(self, line: dict[str, Any]) -> None:
-        """Take one of the agent's events; what stands in its logs is read there, also after a restart."""
-        try:
-            event = event_from_line(json.dumps(line), self._name)
-        except RunFolderError:
-            return
-        if not isinstance(event, FROM_LOGS):
+    def take(self, event: Reported[Fact]) -> None:
+        """Take one of the agent's facts; what stands in its logs is read there, also after a restart."""
+        if not isinstance(event.fact, FROM_LOGS):
             self._state.apply(event)
 
     def snapshot_text(self) -> str:
@@ -73,12 +63,12 @@ class AgentSource:
             TimeoutError: The agent is too busy to answer.
         """
         asked = asyncio.run_coroutine_threadsafe(self._look(), self._loop)
-        return json.dumps(asked.result(ANSWER_S_MAX), allow_nan=False)
+        return json.dumps(asked.result(ANSWER_S_MAX).as_json(), allow_nan=False)
 
-    async def _look(self) -> dict[str, Any]:
+    async def _look(self) -> Snapshot:
         if self._agent is not None:
             self._read_robot(self._agent.robot)
-        return {"scenario": self._swarm, "seen_by": self._name} | self._state.snapshot(self._clock_s())
+        return self._state.snapshot(self._clock_s(), self._swarm, self._name)
 
     def _read_robot(self, robot: Robot) -> None:
         """Take in what is new in the core: records, corrections, and whom the neighbours follow."""
@@ -106,6 +96,6 @@ class AgentSource:
             positions_m = {correction.first + correction.step * k: position_m for k, position_m in listed}
             self._state.place(correction.log.robot, positions_m)
 
-    def _apply(self, event: Event | None) -> None:
+    def _apply(self, event: Reported[Fact] | None) -> None:
         if event is not None:
             self._state.apply(event)

@@ -5,10 +5,11 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import datetime
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
+from flocc_launch.dashboard.snapshot import Snapshot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.dashboard.tail import RunTail
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
@@ -41,8 +42,8 @@ class RunSource:
         self._over = False
         self._lock = threading.Lock()
 
-    def snapshot(self) -> dict[str, Any]:
-        """Read what is new; the state of the swarm as plain JSON values."""
+    def snapshot(self) -> Snapshot:
+        """Read what is new, and give the state of the swarm."""
         with self._lock:
             merged, events = self._tail.poll()
             if merged:
@@ -53,7 +54,7 @@ class RunSource:
                 self._state.apply(event)
             if merged:
                 self._place()
-            return {"scenario": self._run.scenario, "seen_by": None} | self._state.snapshot(self._now_s())
+            return self._state.snapshot(self._now_s(), self._run.scenario)
 
     def _place(self) -> None:
         """Take the corrected trajectories of a run that is over, of the robots that left one that can be read."""
@@ -67,7 +68,7 @@ class RunSource:
 
     def snapshot_text(self) -> str:
         """The snapshot as JSON."""
-        return json.dumps(self.snapshot(), allow_nan=False)
+        return json.dumps(self.snapshot().as_json(), allow_nan=False)
 
     def _now_s(self) -> float | None:
         if self._over:

@@ -3,30 +3,28 @@
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import pose_from_tq
-from flocc_launch.dashboard.words import sentence_of
-from flocc_launch.runs.run_records import (
-    AccountKept,
-    AgentDied,
-    AgentStopped,
-    BytesCounted,
+from flocc_agent.core.reports import (
     CandidateFound,
     ClosureAccepted,
     ClosureRejected,
     CorrectionApplied,
-    Event,
-    GraphOptimised,
-    KeyframeCaptured,
+    Fact,
+    KeyframeTaken,
     LeaderFollowed,
     LeaderLost,
     NeighbourDown,
     NeighbourUp,
+    RoundSolved,
 )
+from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.event_lines import Reported, is_of
+from flocc_agent.runtime.facts import AccountKept, AgentDied, AgentStopped, BytesCounted
+from flocc_launch.dashboard.snapshot import ClosureView, LinkView, MapGroup, RobotView, RoundView, Said, Snapshot
+from flocc_launch.dashboard.words import sentence_of
 from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
@@ -43,7 +41,7 @@ class RobotState:
     """One robot as its own events tell it."""
 
     leader: str | None = None
-    term: int | str | None = None
+    term: int | None = None
     neighbours: set[str] = field(default_factory=set)
     map_frame: str | None = None
     T_map_odom: Float = field(default_factory=lambda: np.eye(4))
@@ -53,12 +51,12 @@ class RobotState:
     candidates: int = 0
     accepted: int = 0
     rejected: int = 0
-    sent: dict[str, int] = field(default_factory=dict)
-    received: dict[str, int] = field(default_factory=dict)
+    sent: Mapping[str, int] = field(default_factory=dict)
+    received: Mapping[str, int] = field(default_factory=dict)
     sent_to: dict[str, int] = field(default_factory=dict)
     received_from: dict[str, int] = field(default_factory=dict)
-    loss: dict[str, float] = field(default_factory=dict)
-    queues: dict[str, int] = field(default_factory=dict)
+    loss: Mapping[str, float] = field(default_factory=dict)
+    queues: Mapping[str, int] = field(default_factory=dict)
     last_s: float = 0.0
     end: str | None = None
 
@@ -79,15 +77,15 @@ class RobotState:
         odom_m = self.positions_odom_m.get(index)
         return None if odom_m is None else np.asarray(self.T_map_odom[:3, :3] @ odom_m + self.T_map_odom[:3, 3])
 
-    def take(self, event: KeyframeCaptured) -> None:
+    def take(self, taken: KeyframeTaken) -> None:
         """One more keyframe; a robot that lost its disk begins anew."""
-        keyframe = KeyframeId.parse(event.keyframe)
+        keyframe = taken.keyframe
         if keyframe.log.incarnation != self.incarnation:
             self.positions_odom_m.clear()
             self.corrected_m.clear()
             self.incarnation = keyframe.log.incarnation
         if len(self.positions_odom_m) < KEYFRAMES_MAX:
-            self.positions_odom_m[keyframe.index] = pose_from_tq(np.array(event.T_odom_body))[:3, 3]
+            self.positions_odom_m[keyframe.index] = pose_from_tq(np.array(taken.T_odom_body))[:3, 3]
         self.end = None
 
 
@@ -103,23 +101,23 @@ class SwarmState:
         """
         self.robots = {robot: RobotState() for robot in sorted(robots)}
         self.servers = frozenset(servers)
-        self.closures: dict[tuple[str, str], float] = {}
-        self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT_MAX)
-        self.optimised: GraphOptimised | None = None
+        self.closures: dict[tuple[KeyframeId, KeyframeId], float | None] = {}
+        self.recent: deque[Said] = deque(maxlen=RECENT_MAX)
+        self.optimised: Reported[RoundSolved] | None = None
         self.t = 0.0
 
-    def apply(self, event: Event) -> None:
+    def apply(self, event: Reported[Fact]) -> None:
         """Take one event; those of one robot come in order."""
         robot = self.robots.setdefault(event.robot, RobotState())
         self.t, robot.last_s = max(self.t, event.t), event.t
-        apply_to(robot, event)
-        if isinstance(event, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
-            self.closures[event.query, event.match] = event.probability
-        if isinstance(event, GraphOptimised):
+        apply_to(robot, event.fact)
+        if isinstance(event.fact, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
+            self.closures[event.fact.query, event.fact.match] = event.fact.probability
+        if is_of(event, RoundSolved):
             self.optimised = event
         said = sentence_of(event)
         if said is not None:
-            self.recent.append({"t": event.t, "robot": event.robot, "text": said})
+            self.recent.append(Said(event.t, event.robot, said))
 
     def place(self, name: str, corrected_m: Mapping[int, Float]) -> None:
         """Corrected positions (3,) of single keyframes by their index, in the map frame of the last correction."""
@@ -129,44 +127,48 @@ class SwarmState:
         """A robot was heard of, without an event."""
         self.robots.setdefault(name, RobotState()).last_s = t
 
-    def snapshot(self, now_s: float | None = None) -> dict[str, Any]:
-        """Everything as plain JSON values.
+    def snapshot(self, now_s: float | None, scenario: str, seen_by: str | None = None) -> Snapshot:
+        """Everything that is to be shown.
 
         Args:
             now_s: Now on the run's clock; None for a run that is over.
+            scenario: Of the run, or the swarm's name.
+            seen_by: The robot whose view this is.
         """
         names = sorted(self.robots)
         here = ("running",) if now_s is not None else ("running", "stopped")
         living = {name: robot for name, robot in self.robots.items() if state_of(robot, now_s) in here}
-        return {
-            "t": self.t if now_s is None else now_s,
-            "running": now_s is not None,
-            "robots": [robot_json(name, self.robots[name], now_s) | {"server": name in self.servers} for name in names],
-            "maps": groups([(name, self.robots[name].map_frame) for name in names if name not in self.servers]),
-            "ranges": ranges(living),
-            "leaders": sorted({robot.leader for robot in living.values() if robot.leader is not None}),
-            "closures": [closure_json(self, query, match) for query, match in self.closures],
-            "optimised": optimised_json(self.optimised),
-            "recent": list(self.recent)[::-1],
-        }
+        return Snapshot(
+            scenario=scenario,
+            seen_by=seen_by,
+            t=self.t if now_s is None else now_s,
+            running=now_s is not None,
+            robots=[robot_view(name, self.robots[name], now_s, name in self.servers) for name in names],
+            maps=groups([(name, self.robots[name].map_frame) for name in names if name not in self.servers]),
+            ranges=ranges(living),
+            leaders=sorted({robot.leader for robot in living.values() if robot.leader is not None}),
+            closures=[closure_view(self, query, match) for query, match in self.closures],
+            optimised=None if self.optimised is None else round_view(self.optimised),
+            recent=list(self.recent)[::-1],
+        )
 
 
-def apply_to(robot: RobotState, event: Event) -> None:
-    """What an event changes of its robot."""
-    match event:
-        case KeyframeCaptured():
-            robot.take(event)
+def apply_to(robot: RobotState, fact: Fact) -> None:
+    """What a fact changes of its robot."""
+    match fact:
+        case KeyframeTaken():
+            robot.take(fact)
         case CorrectionApplied():
-            robot.map_frame, robot.T_map_odom = event.map_frame, pose_from_tq(np.array(event.T_map_odom))
+            robot.map_frame, robot.T_map_odom = fact.map_frame, pose_from_tq(np.array(fact.T_map_odom))
             robot.corrected_m = {}
         case LeaderFollowed():
-            robot.leader, robot.term = event.leader, event.term
+            robot.leader, robot.term = fact.leader, fact.term
         case LeaderLost():
             robot.leader = None
         case NeighbourUp():
-            robot.neighbours.add(event.peer)
+            robot.neighbours.add(fact.peer)
         case NeighbourDown():
-            robot.neighbours.discard(event.peer)
+            robot.neighbours.discard(fact.peer)
         case CandidateFound():
             robot.candidates += 1
         case ClosureAccepted():
@@ -174,14 +176,14 @@ def apply_to(robot: RobotState, event: Event) -> None:
         case ClosureRejected():
             robot.rejected += 1
         case BytesCounted():
-            robot.sent, robot.received = event.sent, event.received
-            robot.loss, robot.queues = event.loss, event.queues
+            robot.sent, robot.received = fact.sent, fact.received
+            robot.loss, robot.queues = fact.loss, fact.queues
         case AccountKept():
-            robot.sent_to, robot.received_from = totals(event.sent_to), totals(event.received_from)
-        case AgentDied() | AgentStopped():
-            robot.end = "died" if isinstance(event, AgentDied) else "stopped"
-            if robot.end == "died":
-                robot.leader, robot.neighbours = None, set()
+            robot.sent_to, robot.received_from = totals(fact.sent_to), totals(fact.received_from)
+        case AgentDied():
+            robot.end, robot.leader, robot.neighbours = "died", None, set()
+        case AgentStopped():
+            robot.end = "stopped"
 
 
 def totals(links: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
@@ -198,50 +200,51 @@ def state_of(robot: RobotState, now_s: float | None) -> str:
     return "silent"
 
 
-def robot_json(name: str, robot: RobotState, now_s: float | None) -> dict[str, Any]:
-    """One robot as JSON values; its path is thinned."""
+def robot_view(name: str, robot: RobotState, now_s: float | None, server: bool) -> RobotView:
+    """One robot; its path is thinned."""
     path = robot.path_m()
     step = max(1, -(-len(path) // PATH_POINTS_MAX))
     kept = path[::step] if step == 1 or not len(path) else np.vstack([path[::step], path[-1:]])
-    return {
-        "robot": name,
-        "state": state_of(robot, now_s),
-        "leader": robot.leader,
-        "term": robot.term,
-        "neighbours": sorted(robot.neighbours),
-        "links": links_json(robot),
-        "queues": robot.queues,
-        "map_frame": robot.map_frame,
-        "keyframes": len(robot.positions_odom_m),
-        "candidates": robot.candidates,
-        "accepted": robot.accepted,
-        "rejected": robot.rejected,
-        "sent": dict(sorted(robot.sent.items())),
-        "sent_bytes": sum(robot.sent.values()),
-        "received_bytes": sum(robot.received.values()),
-        "last_s": robot.last_s,
-        "path_m": np.round(kept, 3).tolist(),
-    }
+    return RobotView(
+        robot=name,
+        server=server,
+        state=state_of(robot, now_s),
+        leader=robot.leader,
+        term=robot.term,
+        neighbours=sorted(robot.neighbours),
+        links=link_views(robot),
+        queues=robot.queues,
+        map_frame=robot.map_frame,
+        keyframes=len(robot.positions_odom_m),
+        candidates=robot.candidates,
+        accepted=robot.accepted,
+        rejected=robot.rejected,
+        sent=dict(sorted(robot.sent.items())),
+        sent_bytes=sum(robot.sent.values()),
+        received_bytes=sum(robot.received.values()),
+        last_s=robot.last_s,
+        path_m=np.round(kept, 3).tolist(),
+    )
 
 
-def links_json(robot: RobotState) -> dict[str, dict[str, Any]]:
-    """What a robot knows of its links, by peer; null where it does not know."""
+def link_views(robot: RobotState) -> dict[str, LinkView]:
+    """What a robot knows of its links, by peer."""
     peers = sorted({*robot.neighbours, *robot.sent_to, *robot.received_from})
     return {
-        peer: {
-            "hears": peer in robot.neighbours,
-            "loss_ratio": robot.loss.get(peer) if peer in robot.neighbours else None,
-            "sent_bytes": robot.sent_to.get(peer),
-            "received_bytes": robot.received_from.get(peer),
-        }
+        peer: LinkView(
+            hears=peer in robot.neighbours,
+            loss_ratio=robot.loss.get(peer) if peer in robot.neighbours else None,
+            sent_bytes=robot.sent_to.get(peer),
+            received_bytes=robot.received_from.get(peer),
+        )
         for peer in peers
     }
 
 
-def closure_json(state: SwarmState, query: str, match: str) -> dict[str, Any]:
-    """A closure with the places of its ends, null where they are not known."""
-    ends = [place_of(state, KeyframeId.parse(keyframe)) for keyframe in (query, match)]
-    return {"query": query, "match": match, "probability": state.closures[query, match], "ends_m": ends}
+def closure_view(state: SwarmState, query: KeyframeId, match: KeyframeId) -> ClosureView:
+    """A closure with the places of its ends."""
+    ends = [place_of(state, keyframe) for keyframe in (query, match)]
+    return ClosureView(str(query), str(match), state.closures[query, match], ends)
 
 
 def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
@@ -251,11 +254,11 @@ def place_of(state: SwarmState, keyframe: KeyframeId) -> list[float] | None:
     return None if position_m is None else [round(float(v), 3) for v in position_m]
 
 
-def groups(members: list[tuple[str, str | None]]) -> list[dict[str, Any]]:
+def groups(members: list[tuple[str, str | None]]) -> list[MapGroup]:
     """Robots by map frame; those without one last."""
     frames = Counter(frame for _, frame in members)
     ordered = sorted(frames, key=lambda frame: (frame is None, frame or ""))
-    return [{"frame": f, "robots": [name for name, frame in members if frame == f]} for f in ordered]
+    return [MapGroup(f, [name for name, frame in members if frame == f]) for f in ordered]
 
 
 def ranges(robots: dict[str, RobotState]) -> list[list[str]]:
@@ -274,17 +277,16 @@ def ranges(robots: dict[str, RobotState]) -> list[list[str]]:
     return found
 
 
-def optimised_json(event: GraphOptimised | None) -> dict[str, Any] | None:
+def round_view(event: Reported[RoundSolved]) -> RoundView:
     """The last optimisation."""
-    if event is None:
-        return None
-    return {
-        "t": event.t,
-        "leader": event.robot,
-        "round": event.round,
-        "cost": event.cost,
-        "solve_s": event.solve_s,
-        "closures_used": event.closures_used,
-        "closures_rejected": event.closures_rejected,
-        "warnings": event.warnings,
-    }
+    solved = event.fact
+    return RoundView(
+        t=event.t,
+        leader=event.robot,
+        round=solved.round,
+        cost=solved.cost,
+        solve_s=solved.solve_s,
+        closures_used=solved.closures_used,
+        closures_rejected=solved.closures_rejected,
+        warnings=solved.warnings,
+    )

@@ -9,12 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import Field, ValidationError
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.status import MergeStatus
 from flocc_launch.dashboard.page_source import RunSource
+from flocc_launch.dashboard.snapshot import RobotView
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
 
@@ -26,55 +28,25 @@ class StatusError(FloccError):
     """Nobody answered; one sentence says who was asked."""
 
 
-class PairStatus(BaseModel):
-    """What came of pairs of keyframes of two robots, as one robot's logs tell."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    robots: tuple[str, str]
-    accepted: int = 0
-    rejected: int = 0
-    best_ratio: float | None = None
-    reason: str | None = None
-
-
-class SolverStatus(BaseModel):
-    """What the last solution that a robot made used and warned of."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    components: list[list[str]] = []
-    closures_used: int = 0
-    closures_rejected: int = 0
-    warnings: list[str] = []
-
-
-class RobotStatus(BaseModel):
-    """What one robot says of itself; what it does not say is null."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
+class RobotStatus(MergeStatus):
+    """What one robot says of itself, or its events tell; what is not known is null."""
 
     robot: str
     state: str = "running"
     leader: str | None = None
-    term: int | str | None = None
-    neighbours: list[str] = []
+    term: int | None = None
+    neighbours: tuple[str, ...] = ()
     map_frame: str | None = None
     keyframes: int | None = None
     closures: int | None = None
     candidates: int | None = None
     sent_bytes: int | None = None
     received_bytes: int | None = None
-    refused: dict[str, int] = {}
+    refused: dict[str, int] = Field(default_factory=dict)
     compute_class: int = 0
-    logs: dict[str, Any] = {}
-    loss: dict[str, float] = {}
-    queues: dict[str, int] = {}
-    best_similarities: dict[str, float] = {}
-    similarity_threshold: float | None = None
-    match_ratio_threshold: float | None = None
-    pairs: list[PairStatus] = []
-    solver: SolverStatus | None = None
+    logs: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    loss: dict[str, float] = Field(default_factory=dict)
+    queues: dict[str, int] = Field(default_factory=dict)
 
 
 def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0) -> list[RobotStatus]:
@@ -118,13 +90,26 @@ def status_of_run(path: Path) -> list[RobotStatus]:
         RunFolderError: It is not a run folder.
     """
     snapshot = RunSource(RunFolder.open(path)).snapshot()
-    return [status_of_robot(robot) for robot in snapshot["robots"]]
+    return [status_of_robot(robot) for robot in snapshot.robots]
 
 
-def status_of_robot(robot: dict[str, Any]) -> RobotStatus:
+def status_of_robot(robot: RobotView) -> RobotStatus:
     """One robot of a snapshot."""
-    known = {peer: link["loss_ratio"] for peer, link in robot["links"].items() if link["loss_ratio"] is not None}
-    return RobotStatus.model_validate({**robot, "closures": robot["accepted"], "loss": known})
+    return RobotStatus(
+        robot=robot.robot,
+        state=robot.state,
+        leader=robot.leader,
+        term=robot.term,
+        neighbours=tuple(robot.neighbours),
+        map_frame=robot.map_frame,
+        keyframes=robot.keyframes,
+        closures=robot.accepted,
+        candidates=robot.candidates,
+        sent_bytes=robot.sent_bytes,
+        received_bytes=robot.received_bytes,
+        loss={peer: link.loss_ratio for peer, link in robot.links.items() if link.loss_ratio is not None},
+        queues=dict(robot.queues),
+    )
 
 
 def status_json(rows: Sequence[RobotStatus]) -> str:

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported
 from flocc_launch.runs.run_folder import RunFolderError, event_from_line
-from flocc_launch.runs.run_records import Event
 
 CHUNK_BYTES_MAX = 8_000_000
 
@@ -17,7 +18,7 @@ class LineTail:
         self._torn = b""
         self._number = 0
 
-    def events(self) -> list[Event]:
+    def events(self) -> list[Reported[Fact]]:
         """What was written since the last call; lines that cannot be read are left out."""
         if not self.path.exists():
             return []
@@ -28,7 +29,7 @@ class LineTail:
         *lines, self._torn = (self._torn + data).split(b"\n")
         return [event for line in lines if (event := self._event(line)) is not None]
 
-    def _event(self, line: bytes) -> Event | None:
+    def _event(self, line: bytes) -> Reported[Fact] | None:
         self._number += 1
         try:
             return event_from_line(line.decode("utf-8"), f"{self.path}:{self._number}")
@@ -44,7 +45,7 @@ class RunTail:
         self._tails: dict[Path, LineTail] = {}
         self._merged: LineTail | None = None
 
-    def poll(self) -> tuple[bool, list[Event]]:
+    def poll(self) -> tuple[bool, list[Reported[Fact]]]:
         """What is new, in order of time.
 
         Returns:

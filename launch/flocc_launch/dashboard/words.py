@@ -1,53 +1,55 @@
 """Events as short sentences for people who watch."""
 
-from flocc_launch.runs.run_records import (
-    AgentDied,
-    AgentStopped,
+from flocc_agent.core.reports import (
     ClosureAccepted,
     ClosureRejected,
     CorrectionApplied,
     EncodingFailed,
-    Event,
-    GraphOptimised,
+    Fact,
     LatentFailed,
     LeaderFollowed,
     LeaderLost,
     NameTaken,
     NeighbourDown,
     NeighbourUp,
-    OptimisationFailed,
     PeerRefused,
+    RoundFailed,
+    RoundSolved,
 )
+from flocc_agent.runtime.event_lines import Reported, UnknownFact
+from flocc_agent.runtime.facts import AgentDied, AgentStopped
 
 
-def sentence_of(event: Event) -> str | None:
+def sentence_of(event: Reported[Fact]) -> str | None:
     """What happened, seen from the event's robot; None for what happens all the time."""
-    match event:
+    fact = event.fact
+    match fact:
         case LeaderFollowed():
-            who = "leads" if event.leader == event.robot else f"follows {event.leader}"
-            return f"{who}, term {event.term}" if event.leader is not None else "follows nobody"
+            return f"{'leads' if fact.leader == event.robot else f'follows {fact.leader}'}, term {fact.term}"
         case LeaderLost():
-            return f"lost its leader ({event.reason})" if event.reason else "lost its leader"
+            return f"lost its leader ({fact.reason})" if fact.reason else "lost its leader"
         case NeighbourUp():
-            return f"hears {event.peer}"
+            return f"hears {fact.peer}"
         case NeighbourDown():
-            return f"no longer hears {event.peer}"
+            return f"no longer hears {fact.peer}"
         case ClosureAccepted():
-            return f"closure {event.query} – {event.match}, match ratio {event.ratio:.2f}"
+            return f"closure {fact.query} – {fact.match}, match ratio {fact.ratio:.2f}"
         case ClosureRejected():
-            return f"rejected {event.query} – {event.match}: {event.reason}"
+            return f"rejected {fact.query} – {fact.match}: {fact.reason}"
         case CorrectionApplied():
-            return f"moved into {event.map_frame}" if event.frame_changed else None
-        case GraphOptimised():
-            return f"optimised round {event.round}: {event.keyframes} keyframes, {event.closures_used} closures"
-        case OptimisationFailed():
-            return f"optimisation of round {event.round} failed: {event.reason}"
+            return f"moved into {fact.map_frame}" if fact.frame_changed else None
+        case RoundSolved():
+            return f"optimised round {fact.round}: {fact.keyframes} keyframes, {fact.closures_used} closures"
+        case RoundFailed():
+            return f"optimisation of round {fact.round} failed: {fact.reason}"
         case AgentDied():
             return "died"
         case AgentStopped():
             return "stopped"
         case PeerRefused() | NameTaken():
-            return f"refused {event.peer}: {event.reason}"
+            return f"refused {fact.peer}: {fact.reason}"
         case LatentFailed() | EncodingFailed():
-            return f"{event.keyframe}: {event.reason}"
+            return f"{fact.keyframe}: {fact.reason}"
+        case UnknownFact():
+            return str(fact)
     return None

@@ -2,34 +2,41 @@
 
 import json
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flocc_agent.runtime.pictures import PictureError
+from flocc_agent.runtime.pictures import FULL, PictureError
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.datasets.bag_clock import ClockChoice, choose_clock
+from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, listed, only
 from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
     IMAGE_TYPES,
     POSE_TYPES,
     image_file,
     lens_of,
+    sampled_levels,
     stamp_ns,
 )
-from flocc_launch.datasets.bag_poses import PoseDecoder
-from flocc_launch.datasets.bag_reader import Bag, Topic
+from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.intrinsics import read_lens
-from flocc_launch.datasets.pixels import ImageWriter
+from flocc_launch.datasets.journeys import JourneyWatch
+from flocc_launch.datasets.names import robot_name
+from flocc_launch.datasets.pixels import ImageWriter, levels_note
 from flocc_launch.datasets.source import DatasetError, Lens
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_MESSAGES = 200
+CHECKPOINT_MESSAGES = 1000
+STRAY = "the stamp is zero, or more than a minute off that of the others"
+DAMAGED_RATIO_MAX = 0.2
+"""A topic of which more messages are damaged is refused."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +55,7 @@ class BagOptions:
         origin_m: Subtracted from ground truth's positions.
         form: Of `odometry` and `truth` (`trajectory_text.FORMS`); None finds out.
         published_form: Of files of a data set's own that do not name their columns.
+        robot: Which robot of a bag of several, by its name; None takes the only one there is.
     """
 
     image_topic: str | None = None
@@ -61,190 +69,366 @@ class BagOptions:
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     form: str | None = None
     published_form: str | None = None
+    robot: str | None = None
+    view_rad: float | None = None
 
 
 def convert_bag(path: Path, out: Path, options: BagOptions | None = None, progress: Progress | None = None) -> Path:
-    """Write one robot's part of a bag as a recording.
+    """Write a bag as a recording, or as one of each robot where it holds several.
+
+    Where odometry begins anew, the rest becomes another recording beside it, `OUT-2`.
 
     Args:
-        path: The bag: a file, or a ROS 2 folder.
-        out: The recording's folder.
+        path: The bag: a file, or a folder of its parts.
+        out: The recording's folder; that of the recordings where there are several robots.
         options: Topics, and what stands in files beside the bag.
         progress: Called with images done and images in all.
 
     Raises:
-        DatasetError: A topic is missing or unclear, a message cannot be used, or the bag is damaged; what was read
-            until then is kept, and the message says how much.
+        DatasetError: A topic is missing or unclear, too many messages cannot be used, or the bag is damaged; what was
+            read until then is kept, and the message says how much.
     """
     options = options or BagOptions()
     with Bag(path) as bag:
-        image_topic = chosen(bag, IMAGE_TYPES, options.image_topic, "image", "--image-topic")
-        odometry_topic = None
-        if options.odometry is None:
-            odometry_topic = chosen(bag, POSE_TYPES, options.odometry_topic, "odometry", "--odometry-topic")
-        lens = _lens(bag, image_topic, options.camera)
-        identity = (
-            f"bag {path.resolve()} {image_topic.name} {odometry_topic.name if odometry_topic else options.odometry}"
-        )
-        with (
-            RecordingWriter(out, identity) as writer,
-            PoseWriter(out / "odometry.tum", odometry_topic is not None) as log,
-        ):
-            run = _Conversion(bag, image_topic, odometry_topic, lens, options, writer, log)
-            run.convert(progress)
+        layout = Layout.of(bag)
+        robots = _wanted(layout, options)
+        if len(robots) == 1:
+            _convert_robot(layout, robots[0], out, options, progress)
+            return out
+        for robot in robots:
+            logger.warning("%s: %s", path, robot)
+            _convert_robot(layout, robot, out / robot_name(robot.name), options, progress)
     return out
 
 
-def chosen(bag: Bag, types: Sequence[str], name: str | None, what: str, option: str) -> Topic:
-    """The topic to take: the named one, or the only one of fitting type.
-
-    Raises:
-        DatasetError: It is not there, is of another type, or it is not clear which.
-    """
-    fitting = [topic for topic in bag.topics.values() if topic.type in types]
-    if name is not None:
-        topic = bag.topics.get(name)
-        if topic is None:
-            raise DatasetError(f"{bag.path}: has no topic {name}; it has {_listed(list(bag.topics.values()))}")
-        if topic.type not in types:
-            raise DatasetError(f"{bag.path}: topic {name} is of type {topic.type}, not one of {', '.join(types)}")
-        return topic
-    if len(fitting) == 1:
-        return fitting[0]
-    if fitting:
-        raise DatasetError(f"{bag.path}: has {len(fitting)} {what} topics, name one with {option}: {_listed(fitting)}")
-    raise DatasetError(f"{bag.path}: has no {what} topic; it has {_listed(list(bag.topics.values()))}")
+def robots_of_bag(path: Path) -> list[RobotTopics]:
+    """The robots whose topics a bag holds; one without a name where it is not clear, so that converting it says why."""
+    with Bag(path) as bag:
+        try:
+            return Layout.of(bag).robots()
+        except DatasetError:
+            return []
 
 
-def _listed(topics: list[Topic]) -> str:
-    return ", ".join(str(topic) for topic in topics[:12]) + (" and others" if len(topics) > 12 else "") or "no topic"
+def _wanted(layout: Layout, options: BagOptions) -> list[RobotTopics]:
+    """The robots to convert: by the topics that are named, else as the bag's namespaces say."""
+    bag = layout.bag
+    if options.image_topic is not None or options.odometry is not None or options.odometry_topic is not None:
+        images = [topic for topic in bag.topics.values() if topic.type in IMAGE_TYPES]
+        image = layout.chosen_image(images, options.image_topic)
+        poses = None if options.odometry is not None else layout.chosen_poses(image, options.odometry_topic)
+        robots = [RobotTopics("", image, None if options.camera else layout.info_of(image), poses)]
+    else:
+        robots = layout.robots()
+        for left in layout.left_out:
+            logger.warning("%s: %s", bag.path, left)
+    if options.robot is not None and len(robots) > 1:
+        robots = [robot for robot in robots if robot_name(robot.name) == options.robot]
+        if not robots:
+            raise DatasetError(f"{bag.path}: has no robot {options.robot}; its namespaces are those of other robots")
+    if options.odometry is None and any(robot.poses is None for robot in robots):
+        only(bag, [t for t in bag.topics.values() if t.type in POSE_TYPES], "odometry", "--odometry-topic")
+    return robots
 
 
-def _lens(bag: Bag, image_topic: Topic, camera: Path | Lens | None) -> Lens:
-    if isinstance(camera, Lens):
-        return camera
-    if camera is not None:
-        return read_lens(camera)
+def _convert_robot(
+    layout: Layout, robot: RobotTopics, out: Path, options: BagOptions, progress: Progress | None
+) -> None:
+    lens, notes = _lens(layout, robot, options)
+    lens = lens if options.view_rad is None else replace(lens, view_rad=options.view_rad)
+    clock = choose_clock(layout, robot)
+    identity = f"bag {layout.bag.path.resolve()} {robot.image.name} {robot.poses or options.odometry}"
+    others = layout.other_poses(robot)
+    if others:
+        notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
+    run = _Conversion(layout.bag, robot, lens, options, clock, out, identity)
+    run.convert(progress)
+    for note in (*notes, *([clock.note] if clock.note else []), *run.notes):
+        logger.warning("%s", note)
+
+
+def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens, list[str]]:
+    """Intrinsics and mounting: of the file that was named, else of the bag."""
+    if isinstance(options.camera, Lens):
+        return options.camera, []
+    if options.camera is not None:
+        lens = read_lens(options.camera)
+        return lens, list(lens.notes)
+    bag = layout.bag
     infos = [topic for topic in bag.topics.values() if topic.type == CAMERA_TYPE]
-    prefix = image_topic.name.rsplit("/", 1)[0]
-    near = [t for t in infos if prefix.startswith(t.name.rsplit("/", 1)[0]) or t.name.startswith(prefix)] or infos
-    if len(near) != 1:
-        found = _listed(infos) if infos else f"no {CAMERA_TYPE}"
+    if robot.info is None:
+        found = listed(infos) if infos else f"no {CAMERA_TYPE}"
         raise DatasetError(f"{bag.path}: intrinsics are missing or unclear ({found}); name a camera file with --camera")
-    for topic, _, message in bag.messages([near[0].name]):
-        return lens_of(message, topic)
-    raise DatasetError(f"{bag.path}: topic {near[0].name} has no message")
+    first = bag.first(robot.info.name)
+    if first is None:
+        raise DatasetError(f"{bag.path}: topic {robot.info.name} has no message that can be read")
+    T_body_camera, note = (None, None) if options.odometry else layout.mounting(robot)
+    lens = lens_of(first[1], robot.info)
+    lens = lens if T_body_camera is None else replace(lens, T_body_camera=T_body_camera)
+    return lens, [note] if note else []
+
+
+@dataclass(slots=True)
+class Tally:
+    """What became of a topic's messages.
+
+    Attributes:
+        seen: Messages.
+        damaged: Of them, those that cannot be used.
+        backwards: Of them, those that go back in time.
+        reason: Of the first damaged one.
+        step: Of the first that goes back.
+    """
+
+    seen: int = 0
+    damaged: int = 0
+    backwards: int = 0
+    reason: str = ""
+    step: str = ""
+
+    def damage(self, reason: str) -> None:
+        """Count one that cannot be used."""
+        self.damaged += 1
+        self.reason = self.reason or reason
+
+    def step_back(self, last_s: float, stamp_s: float) -> None:
+        """Count one that goes back in time."""
+        self.backwards += 1
+        self.step = self.step or f"time goes backwards, from {last_s:.6f} s to {stamp_s:.6f} s"
+
+    def sentences(self, topic: BagTopic) -> list[str]:
+        """What was left out."""
+        damaged = f"topic {topic.name}: {self.damaged} of {self.seen} messages were left out: {self.reason}"
+        back = f"topic {topic.name}: {self.step}; {self.backwards} of {self.seen} messages were left out"
+        return [*([damaged] if self.damaged else []), *([back] if self.backwards else [])]
+
+    def is_too_much(self) -> bool:
+        """Whether the topic cannot be trusted."""
+        return self.damaged > DAMAGED_RATIO_MAX * self.seen or self.backwards > DAMAGED_RATIO_MAX * self.seen
 
 
 @dataclass(slots=True, eq=False)
 class _Conversion:
-    """One pass over a bag."""
+    """One pass over one robot's topics of a bag."""
 
     bag: Bag
-    image_topic: Topic
-    odometry_topic: Topic | None
+    robot: RobotTopics
     lens: Lens
     options: BagOptions
-    writer: RecordingWriter
-    log: PoseWriter
-    images: ImageWriter = field(init=False)
+    clock: ClockChoice
+    out: Path
+    identity: str
     zero_ns: int = 0
-    images_seen: int = 0
+    images: Tally = field(default_factory=Tally)
+    poses: Tally = field(default_factory=Tally)
+    journey: int = 0
+    watch: JourneyWatch = field(default_factory=JourneyWatch)
+    notes: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+    kept: int = 0
+    _writer: RecordingWriter = field(init=False)
+    _log: PoseWriter = field(init=False)
+    _done_s: float | None = field(init=False, default=None)
+    _pictures: ImageWriter = field(init=False)
+    _image_span_s: tuple[float, float] | None = None
+    _pose_span_s: tuple[float, float] | None = None
 
     def convert(self, progress: Progress | None) -> None:
-        """Read to the end, or to the first message that cannot be used."""
-        self.images = ImageWriter(self.lens)
-        self.writer.write_lens(self.images.lens)
-        state_path = self.writer.path / "bag_state.json"
-        start_ns = self._restored(state_path)
-        done_s = self.writer.last_stamp_s
-        names = [topic.name for topic in (self.image_topic, self.odometry_topic) if topic is not None]
-        total = self.image_topic.count or 0
-        pose_topic = self.odometry_topic
-        decoders = {} if pose_topic is None else {pose_topic.name: PoseDecoder(self.bag, pose_topic)}
+        """Read to the end; a message that cannot be used costs itself."""
+        start_ns = self._restored()
+        source = self.robot.poses
+        decoder = None if source is None else _decoder(self.bag, source)
+        names = [self.robot.image.name, *([] if source is None else [source.topic.name])]
+        image_topic, total = self.robot.image, self.robot.image.count or 0
+        levels = sampled_levels(self.bag, image_topic)
+        if levels != FULL:
+            self.notes.append(f"{self.bag.path}: topic {image_topic.name}: {levels_note(levels)}")
+        self._pictures = ImageWriter(self.lens, levels)
+        self._open()
         try:
-            for number, (topic, bag_ns, message) in enumerate(self.bag.messages(names, start_ns, decoders)):
+            for number, (topic, bag_ns, raw) in enumerate(self.bag.raw(names, start_ns)):
                 if number % CHECKPOINT_MESSAGES == 0:
-                    self._save(state_path, bag_ns)
-                if topic is self.image_topic:
-                    self._add_image(message, bag_ns, done_s)
+                    self._save(bag_ns)
+                if topic is image_topic:
+                    self._add_image(raw, bag_ns)
                     if progress is not None:
-                        progress(self.images_seen, max(total, self.images_seen))
-                else:
-                    for posed in message:
-                        self.log.add(*posed)
-        except DatasetError as error:
-            prefix = "" if str(error).startswith(str(self.bag.path)) else f"{self.bag.path}: "
-            self.faults.insert(0, f"{prefix}{error}")
-        self._finish()
-        state_path.unlink(missing_ok=True)
-        self.log.forget()
+                        progress(self.images.seen, max(total, self.images.seen))
+                elif decoder is not None:
+                    self._add_poses(decoder, raw, bag_ns)
+        except BaseException:
+            self._leave()
+            raise
+        self._close()
+        self._judge()
 
-    def _add_image(self, message: Any, bag_ns: int, done_s: float | None) -> None:
-        self.images_seen += 1
-        taken_ns = stamp_ns(message.header) or bag_ns
-        if self.options.from_zero and self.zero_ns == 0:
-            self.zero_ns = taken_ns
-        stamp_s = (taken_ns - self.zero_ns) * 1e-9
-        if (self.images_seen - 1) % self.options.every or (done_s is not None and stamp_s <= done_s + 1e-9):
-            return
-        last_s = self.writer.last_stamp_s
-        if last_s is not None and stamp_s <= last_s:
-            self._once(f"time goes backwards, from {last_s:.6f} s to {stamp_s:.6f} s; such images were left out")
-            return
-        encoded, suffix = image_file(message, self.image_topic, self.options.jpeg)
+    def _open(self) -> None:
+        """Open the recording of the journey that runs."""
+        out = self.out if self.journey == 0 else self.out.with_name(f"{self.out.name}-{self.journey + 1}")
+        self._writer = RecordingWriter(out, f"{self.identity}{f' journey {self.journey + 1}' if self.journey else ''}")
+        self._log = PoseWriter(out / "odometry.tum", self.robot.poses is not None)
+        self._log.__enter__()
+        self._writer.write_lens(self._pictures.lens)
+        self._done_s = self._writer.last_stamp_s
+
+    def _leave(self) -> None:
+        """Close the files, for a later attempt to go on."""
+        self._writer.__exit__(None, None, None)
+        self._log.__exit__(None, None, None)
+
+    def _close(self) -> None:
+        """Finish the recording of the journey that runs."""
+        writer, log = self._writer, self._log
         try:
-            written = self.images.written(encoded, suffix)
+            writer.flush()
+            log.finish(self.zero_ns)
+            self._write_beside(writer)
+        finally:
+            self._leave()
+        log.forget()
+        (self.out / "bag_state.json").unlink(missing_ok=True)
+        self.kept += writer.count
+
+    def _add_poses(self, decoder: "PoseDecoder | TransformDecoder", raw: bytes, bag_ns: int) -> None:
+        self.poses.seen += 1
+        try:
+            posed = decoder(raw)
+        except DatasetError as error:
+            self.poses.damage(_bare(error, self.robot.poses.topic if self.robot.poses else self.robot.image))
+            return
+        if len(posed) == 1 and not self.clock.is_bag and self.clock.is_off(posed[0][0], bag_ns):
+            self.poses.damage(STRAY)
+            return
+        for header_ns, numbers in posed:
+            taken_ns = bag_ns if self.clock.is_bag else header_ns
+            for is_new, good_ns, good in self.watch.take(taken_ns, numbers):
+                if is_new:
+                    self._begin_journey(good_ns, bag_ns)
+                self._pose_span_s = _wider(self._pose_span_s, (good_ns - self.zero_ns) * 1e-9)
+                if not self._log.add(good_ns, good) and len(posed) == 1:
+                    self.poses.step_back(self._log.last_ns * 1e-9, good_ns * 1e-9)
+
+    def _begin_journey(self, stamp_ns: int, bag_ns: int) -> None:
+        """Go on in another recording, since odometry is of another frame from here."""
+        self._close()
+        self.journey += 1
+        self._open()
+        self._save(bag_ns)
+        self.notes.append(
+            f"{self.bag.path}: topic {self.robot.poses}: odometry begins anew at {stamp_ns * 1e-9:.3f} s; what follows "
+            f"is in {self._writer.path}"
+        )
+
+    def _add_image(self, raw: bytes, bag_ns: int) -> None:
+        tally, topic = self.images, self.robot.image
+        tally.seen += 1
+        if (tally.seen - 1) % self.options.every:
+            return
+        try:
+            message = self.bag.decoded(raw, topic)
+            taken_ns = bag_ns if self.clock.is_bag else stamp_ns(message.header)
+            if taken_ns == 0 or (not self.clock.is_bag and self.clock.is_off(taken_ns, bag_ns)):
+                raise DatasetError(STRAY)
+            if self.options.from_zero and self.zero_ns == 0:
+                self.zero_ns = taken_ns
+            stamp_s = (taken_ns - self.zero_ns) * 1e-9
+            if self._done_s is not None and stamp_s <= self._done_s + 1e-9:
+                return
+            last_s = self._writer.last_stamp_s
+            if last_s is not None and stamp_s <= last_s:
+                tally.step_back(last_s, stamp_s)
+                return
+            self._writer.add(stamp_s, *self._encoded(message))
+            self._image_span_s = _wider(self._image_span_s, stamp_s)
+        except DatasetError as error:
+            tally.damage(_bare(error, topic))
+
+    def _encoded(self, message: Any) -> tuple[bytes, str]:
+        encoded, suffix = image_file(message, self.robot.image, self.options.jpeg)
+        try:
+            return self._pictures.written(encoded, suffix)
         except PictureError as error:
-            raise DatasetError(f"topic {self.image_topic.name}: {error}") from error
-        self.writer.add(stamp_s, *written)
+            raise DatasetError(f"topic {self.robot.image.name}: {error}") from error
 
-    def _once(self, fault: str) -> None:
-        sentence = f"{self.bag.path}: topic {self.image_topic.name}: {fault}"
-        if not any("time goes backwards" in known for known in self.faults):
-            self.faults.append(sentence)
-
-    def _restored(self, path: Path) -> int | None:
+    def _restored(self) -> int | None:
         """Bag time to go on from, or None at the start."""
-        if not path.exists() or self.writer.count == 0:
+        path = self.out / "bag_state.json"
+        if not path.exists() or not (self.out / "images.txt").exists():
             return None
         state = json.loads(path.read_text(encoding="utf-8"))
-        self.zero_ns, self.images_seen = state["zero_ns"], state["images_seen"]
+        self.zero_ns, self.journey = state["zero_ns"], state["journey"]
+        self.images, self.poses = Tally(**state["images"]), Tally(**state["poses"])
         return int(state["bag_ns"])
 
-    def _save(self, path: Path, bag_ns: int) -> None:
+    def _save(self, bag_ns: int) -> None:
         """Note where to go on, once all that came before is written; a file is there whole or not at all."""
-        self.writer.flush()
-        self.log.flush()
-        state = {"bag_ns": bag_ns, "zero_ns": self.zero_ns, "images_seen": self.images_seen}
+        self._writer.flush()
+        self._log.flush()
+        tallies = {"images": asdict(self.images), "poses": asdict(self.poses)}
+        state = {"bag_ns": bag_ns, "zero_ns": self.zero_ns, "journey": self.journey, **tallies}
+        path = self.out / "bag_state.json"
         partial = path.with_suffix(".part")
         partial.write_text(json.dumps(state), encoding="utf-8")
         partial.replace(path)
 
-    def _finish(self) -> None:
-        """Write what stands in files beside the bag, and raise the first fault."""
-        self.log.finish(self.zero_ns)
-        odometry = self._beside(self.options.odometry)
-        truth = self._beside(self.options.truth)
+    def _write_beside(self, writer: RecordingWriter) -> None:
+        """Write what stands in files beside the bag."""
+        odometry, truth = self._beside(self.options.odometry), self._beside(self.options.truth)
         if truth is not None:
             truth.T_fixed_body[:, :3, 3] -= self.options.origin_m
-        self.writer.write_trajectories(odometry, truth)
-        if self.bag.damage is not None:
-            self.faults.append(self.bag.damage)
-        if self.writer.count == 0 and not self.faults:
-            self.faults.append(f"{self.bag.path}: topic {self.image_topic.name} has no message")
-        if self.faults:
-            raise DatasetError(f"{self.faults[0]}; {self.writer.count} images were kept in {self.writer.path}")
+        writer.write_trajectories(odometry, truth)
 
     def _beside(self, path: Path | None) -> Trajectory | None:
         """A trajectory in a file beside the bag."""
         if path is None:
             return None
         trajectory, notes = read_trajectory(path, self.options.form, otherwise=self.options.published_form)
-        for note in notes:
-            logger.warning("%s", note)
+        self.notes.extend(notes)
         return _shifted(trajectory, self.zero_ns)
+
+    def _judge(self) -> None:
+        """Tell what was left out, and raise where it was too much."""
+        if self.watch.outliers:
+            jumps = f"{self.watch.outliers} single poses jump, and were left out"
+            self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {jumps}")
+        tallies = [(self.images, self.robot.image)]
+        if self.robot.poses is not None:
+            tallies.append((self.poses, self.robot.poses.topic))
+        for tally, topic in tallies:
+            sentences = [f"{self.bag.path}: {sentence}" for sentence in tally.sentences(topic)]
+            (self.faults if tally.is_too_much() else self.notes).extend(sentences)
+            if tally.seen == 0:
+                self.faults.append(f"{self.bag.path}: topic {topic.name} has no message")
+        apart = self._apart()
+        if apart is not None:
+            self.faults.append(apart)
+        if self.bag.damage is not None:
+            self.faults.append(self.bag.damage)
+        if self.faults:
+            raise DatasetError(f"{self.faults[0]}; {self.kept} images were kept in {self.out}")
+
+    def _apart(self) -> str | None:
+        """A sentence where no image lies within odometry's time."""
+        images, poses = self._image_span_s, self._pose_span_s
+        if images is None or poses is None or (images[0] <= poses[1] and poses[0] <= images[1]):
+            return None
+        return (
+            f"{self.bag.path}: images of {self.robot.image.name} are from {images[0]:.3f} s to {images[1]:.3f} s, "
+            f"but odometry of {self.robot.poses} is from {poses[0]:.3f} s to {poses[1]:.3f} s, "
+            f"{images[0] - poses[0]:+.3f} s apart: their clocks differ"
+        )
+
+
+def _wider(span_s: tuple[float, float] | None, stamp_s: float) -> tuple[float, float]:
+    return (stamp_s, stamp_s) if span_s is None else (min(span_s[0], stamp_s), max(span_s[1], stamp_s))
+
+
+def _decoder(bag: Bag, source: PoseSource) -> PoseDecoder | TransformDecoder:
+    return PoseDecoder(bag, source.topic) if source.edge is None else TransformDecoder(bag, source.topic, source.edge)
+
+
+def _bare(error: Exception, topic: BagTopic) -> str:
+    """What went wrong, without the topic's name, which the sentence around it says."""
+    return str(error).rpartition(f"topic {topic.name}: ")[2]
 
 
 def _shifted(trajectory: Trajectory, zero_ns: int) -> Trajectory:

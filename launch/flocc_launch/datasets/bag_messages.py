@@ -2,15 +2,17 @@
 
 import math
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from flocc_agent.runtime.picture_heads import SUFFIXES, PictureError, head_of
-from flocc_agent.runtime.ros2.pixels import camera_of, raw_pixels, refuse_depth
+from flocc_agent.runtime.pictures import FULL, SAMPLE_MAX, Levels, levels_of
+from flocc_agent.runtime.ros2.raw_images import camera_of, compressed_pixels, raw_pixels, refuse_depth
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
-from flocc_launch.datasets.bag_reader import Topic
-from flocc_launch.datasets.pixels import encoded_image
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
+from flocc_launch.datasets.pixels import encoded_image, pnm
 from flocc_launch.datasets.source import DatasetError, Lens
 
 RAW_IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -19,8 +21,11 @@ POSE_TYPES = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Path",
 )
+TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
+TRANSFORMS_TYPES = (TRANSFORMS_TYPE, "tf/msg/tfMessage")
 CAMERA_TYPE = "sensor_msgs/msg/CameraInfo"
 
 
@@ -30,7 +35,7 @@ def stamp_ns(header: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
+def image_file(message: Any, topic: BagTopic, jpeg: bool) -> tuple[bytes, str]:
     """Bytes and suffix of an image message.
 
     A compressed image is passed on as it is; a raw one becomes PNM (fast, lossless) or JPEG (small), of 16 bits PNG.
@@ -53,13 +58,42 @@ def image_file(message: Any, topic: Topic, jpeg: bool) -> tuple[bytes, str]:
         raise DatasetError(f"topic {topic.name}: {error}") from error
     if jpeg:
         return encoded_image(pixels, lossless=pixels.dtype != np.uint8)
-    height, width = pixels.shape[:2]
-    kind, suffix = (b"P6", ".ppm") if pixels.ndim == 3 else (b"P5", ".pgm")
-    largest, values = (255, pixels) if pixels.dtype == np.uint8 else (65535, pixels.astype(">u2"))
-    return b"%s\n%d %d\n%d\n%s" % (kind, width, height, largest, values.tobytes()), suffix
+    return pnm(pixels)
 
 
-def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]:
+def sampled_levels(bag: Bag, topic: BagTopic) -> Levels:
+    """How a topic's images of 16 bits are brought to 8, by a sample over the whole bag."""
+    first = bag.first(topic.name)
+    if first is None or _deep_pixels(first[1]) is None:
+        return FULL
+    return levels_of(pixels for message in _spread(bag, topic) if (pixels := _deep_pixels(message)) is not None)
+
+
+def _spread(bag: Bag, topic: BagTopic) -> Iterator[Any]:
+    """Messages at even distances of bag time, or the first ones of a bag that cannot be searched."""
+    if bag.start_ns is None or bag.end_ns is None:
+        sample: Iterator[tuple[BagTopic, int, bytes]] = islice(bag.raw([topic.name]), SAMPLE_MAX)
+    else:
+        times_ns = np.linspace(bag.start_ns, bag.end_ns, SAMPLE_MAX, endpoint=False)
+        sample = (found for t in times_ns if (found := next(bag.raw([topic.name], int(t)), None)) is not None)
+    for _, _, raw in sample:
+        try:
+            yield bag.decoded(raw, topic)
+        except DatasetError:
+            continue
+
+
+def _deep_pixels(message: Any) -> Any:
+    """Pixels of an image of 16 bits; None of others, and of what cannot be read."""
+    try:
+        compressed = hasattr(message, "format")
+        pixels = compressed_pixels(message) if compressed else raw_pixels(message)
+    except ValueError:
+        return None
+    return pixels if pixels.dtype == np.uint16 else None
+
+
+def poses(message: Any, topic: BagTopic) -> Iterator[tuple[int, tuple[float, ...]]]:
     """Yield stamps in nanoseconds and `tx ty tz qx qy qz qw` of a pose message; a path has many.
 
     Raises:
@@ -69,16 +103,29 @@ def poses(message: Any, topic: Topic) -> Iterator[tuple[int, tuple[float, ...]]]
         for posed in message.poses:
             yield stamp_ns(posed.header), _numbers(posed.pose, topic)
         return
+    if topic.type == "geometry_msgs/msg/TransformStamped":
+        yield stamp_ns(message.header), transform_numbers(message.transform, topic)
+        return
     pose = message.pose if topic.type == "geometry_msgs/msg/PoseStamped" else message.pose.pose
     yield stamp_ns(message.header), _numbers(pose, topic)
 
 
-def _numbers(pose: Any, topic: Topic) -> tuple[float, ...]:
+def transform_numbers(transform: Any, topic: BagTopic) -> tuple[float, ...]:
+    """`tx ty tz qx qy qz qw` of a transform.
+
+    Raises:
+        DatasetError: As `checked_numbers`.
+    """
+    t, q = transform.translation, transform.rotation
+    return checked_numbers((t.x, t.y, t.z, q.x, q.y, q.z, q.w), topic)
+
+
+def _numbers(pose: Any, topic: BagTopic) -> tuple[float, ...]:
     p, q = pose.position, pose.orientation
     return checked_numbers((p.x, p.y, p.z, q.x, q.y, q.z, q.w), topic)
 
 
-def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ...]:
+def checked_numbers(numbers: tuple[float, ...], topic: BagTopic) -> tuple[float, ...]:
     """`tx ty tz qx qy qz qw` with a quaternion of unit length.
 
     Raises:
@@ -88,12 +135,14 @@ def checked_numbers(numbers: tuple[float, ...], topic: Topic) -> tuple[float, ..
     norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     if not math.isfinite(x + y + z + norm):
         raise DatasetError(f"topic {topic.name}: a pose has a number that is not finite")
+    if norm < QUATERNION_NORM_TOLERANCE:
+        raise DatasetError(f"topic {topic.name}: odometry gives no pose (its quaternion is zero), as where it is lost")
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
         raise DatasetError(f"topic {topic.name}: a pose is not rigid (its quaternion has length {norm:.4g}, not 1)")
     return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm
 
 
-def lens_of(message: Any, topic: Topic) -> Lens:
+def lens_of(message: Any, topic: BagTopic) -> Lens:
     """Intrinsics of a CameraInfo message; the camera is taken as the body.
 
     Raises:

@@ -11,6 +11,7 @@ import sqlite3
 import struct
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -137,14 +138,34 @@ def _ros1_message(
             yield (*connection, seconds * 10**9 + nanoseconds, data)
 
 
-def _mcap_records(path: Path) -> Iterator[Record]:
-    schemas: dict[int, tuple[str, str]] = {}
-    channels: dict[int, tuple[int, str]] = {}
+@dataclass(frozen=True, slots=True)
+class McapMessage:
+    """A message of an MCAP file with what its channel and schema say."""
+
+    topic: str
+    schema: str
+    schema_encoding: str
+    schema_data: bytes
+    encoding: str
+    log_ns: int
+    data: bytes
+
+
+def mcap_messages(path: Path) -> Iterator[McapMessage]:
+    """Yield the messages of an MCAP file from its front, as far as they are whole."""
+    schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
+    channels: dict[int, tuple[int, str, str]] = {}
     with path.open("rb") as file:
         if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             return
         while (record := _mcap_record(file.read)) is not None:
-            yield from _mcap_messages(*record, schemas, channels)
+            yield from _messages_of(*record, schemas, channels)
+
+
+def _mcap_records(path: Path) -> Iterator[Record]:
+    for message in mcap_messages(path):
+        described = message.schema_data.decode(errors="replace") if message.schema_encoding == "ros2msg" else ""
+        yield message.topic, message.schema, described, message.log_ns, message.data
 
 
 def _mcap_record(read: Any) -> tuple[int, bytes] | None:
@@ -156,30 +177,41 @@ def _mcap_record(read: Any) -> tuple[int, bytes] | None:
     return (operation, body) if len(body) == length or (operation == MCAP_CHUNK and len(body) > 64) else None
 
 
-def _mcap_messages(
-    operation: int, body: bytes, schemas: dict[int, tuple[str, str]], channels: dict[int, tuple[int, str]]
-) -> Iterator[Record]:
+def _messages_of(
+    operation: int,
+    body: bytes,
+    schemas: dict[int, tuple[str, str, bytes]],
+    channels: dict[int, tuple[int, str, str]],
+) -> Iterator[McapMessage]:
     if operation == 0x03:
-        at, texts = 2, []
-        for _ in range(3):
-            length = struct.unpack_from("<I", body, at)[0]
-            texts.append(body[at + 4 : at + 4 + length].decode(errors="replace"))
-            at += 4 + length
-        schemas[struct.unpack_from("<H", body)[0]] = (texts[0], texts[2] if texts[1] == "ros2msg" else "")
+        name, at = _mcap_bytes(body, 2)
+        encoding, at = _mcap_bytes(body, at)
+        data, _ = _mcap_bytes(body, at)
+        schemas[struct.unpack_from("<H", body)[0]] = (name.decode(errors="replace"), encoding.decode(), data)
     elif operation == 0x04:
-        channel, schema, length = struct.unpack_from("<HHI", body)
-        channels[channel] = (schema, body[8 : 8 + length].decode())
+        channel, schema = struct.unpack_from("<HH", body)
+        topic, at = _mcap_bytes(body, 4)
+        encoding, _ = _mcap_bytes(body, at)
+        channels[channel] = (schema, topic.decode(errors="replace"), encoding.decode())
     elif operation == 0x05:
         channel, _, stamp_ns = struct.unpack_from("<HIQ", body)
-        schema, topic = channels[channel]
-        yield (topic, *schemas[schema], stamp_ns, body[22:])
+        if channel in channels:
+            schema, topic_name, coding = channels[channel]
+            if schema in schemas:
+                yield McapMessage(topic_name, *schemas[schema], coding, stamp_ns, body[22:])
     elif operation == MCAP_CHUNK:
         length = struct.unpack_from("<I", body, 28)[0]
         compression = body[32 : 32 + length].decode()
         size = struct.unpack_from("<Q", body, 32 + length)[0]
         inner = BytesIO(_decompressed(compression or "none", body[40 + length : 40 + length + size]))
         while (record := _mcap_record(inner.read)) is not None:
-            yield from _mcap_messages(*record, schemas, channels)
+            yield from _messages_of(*record, schemas, channels)
+
+
+def _mcap_bytes(body: bytes, at: int) -> tuple[bytes, int]:
+    """A part with its length before it, and where the next one begins."""
+    length = struct.unpack_from("<I", body, at)[0]
+    return body[at + 4 : at + 4 + length], at + 4 + length
 
 
 def _sqlite_records(path: Path) -> Iterator[Record]:

@@ -1,6 +1,8 @@
 """What `flocc dataset info | convert | split` do: look at a data set, turn it into recordings, cut it into robots."""
 
 import logging
+import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,20 +10,41 @@ from pathlib import Path
 import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
+from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
+from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
+from flocc_launch.datasets.clocks import ClockFit, measured
 from flocc_launch.datasets.cut import cut
-from flocc_launch.datasets.detect import check_times, read_source
-from flocc_launch.datasets.drift import HANDHELD_DRIFT, DriftSpec, drifted
+from flocc_launch.datasets.detect import check_times, read_source, team_folder
+from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import expected_files
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.video import (
+    WHAT_ODOMETRY,
+    convert_video,
+    is_video,
+    lens_beside,
+    odometry_beside,
+    read_head,
+)
 from flocc_launch.datasets.writer import Progress, write_source
+from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)
+
+USED_NAMES = re.compile(
+    r"(odometry|trajectory|poses|vio|groundtruth|gt|ground_truth|traj|images|rgb|times|source|odometry_made)"
+    r"\.(tum|txt|csv)$|state_groundtruth|mocap0|camera|calib|intrinsics|sensor|transforms\.json$|sparse$|frame-",
+    re.IGNORECASE,
+)
+"""Names of what readers use beside images."""
+ODOMETRY_MADE = "odometry_made.txt"
+"""In a recording: how its odometry was made of ground truth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +65,7 @@ class Info:
         faults: What is wrong with it, one sentence each.
         topics: Of a bag, with types and numbers of messages.
         notes: What was left out, or concluded where nothing said it.
+        robots: Of a bag, which topics belong together.
     """
 
     path: Path
@@ -57,6 +81,7 @@ class Info:
     faults: tuple[str, ...]
     topics: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
 
 
 def info(path: Path, format_name: str | None = None, form: str | None = None) -> Info:
@@ -72,6 +97,8 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
     """
     if is_bag(path):
         return _bag_info(path)
+    if is_video(path):
+        return _video_info(path)
     source = read_source(path, format_name, form=form)
     travelled = source.truth or source.odometry
     return Info(
@@ -86,8 +113,21 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source)),
-        notes=source.notes,
+        notes=(*source.notes, *_unused(source)),
     )
+
+
+def _unused(source: Source) -> list[str]:
+    """What lies in a data set's folder and is not used, in one sentence."""
+    root = source.path / "mav0" if (source.path / "mav0").is_dir() else source.path
+    used = {file.relative_to(root).parts[0] for _, file in source.images if file.is_relative_to(root)}
+    others = [
+        entry.name
+        for entry in sorted(root.iterdir())
+        if entry.name[0] != "." and entry.name not in used and not USED_NAMES.match(entry.name)
+    ]
+    more = f" and {len(others) - 8} more" if len(others) > 8 else ""
+    return [f"{root}: not used: {', '.join(others[:8])}{more}"] if others else []
 
 
 def _posed(source: Source, trajectory: Trajectory | None) -> int | None:
@@ -113,6 +153,7 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
     yield "images", f"{found.images}, from {found.from_s:.3f} s to {found.to_s:.3f} s{covered}"
     if found.format == "bag":
         yield from (("topic", topic) for topic in found.topics)
+        yield from (("robot", robot) for robot in found.robots)
     else:
         yield "camera", "none" if camera is None else _told(camera)
         yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
@@ -129,6 +170,7 @@ def _told(camera: CameraModel) -> str:
 def _bag_info(path: Path) -> Info:
     with Bag(path) as bag:
         images = [topic.count for topic in bag.topics.values() if topic.type in IMAGE_TYPES and topic.count is not None]
+        robots, faults = _robots_of(Layout.of(bag))
         return Info(
             path=path,
             format="bag",
@@ -140,9 +182,81 @@ def _bag_info(path: Path) -> Info:
             odometry_poses=None,
             truth_poses=None,
             length_m=None,
-            faults=(bag.damage,) if bag.damage else (),
+            faults=((bag.damage,) if bag.damage else ()) + tuple(faults),
             topics=tuple(str(topic) for topic in bag.topics.values()),
+            robots=tuple(robots),
         )
+
+
+def _robots_of(layout: Layout) -> tuple[list[str], list[str]]:
+    """Which topics belong together, one sentence for each robot, and why a bag cannot be converted as it is."""
+    try:
+        robots = layout.robots()
+    except DatasetError as error:
+        return [], [str(error)]
+    sentences, faults = [], []
+    for robot in robots:
+        sentences.append(str(robot))
+        try:
+            layout.mounting(robot)
+        except DatasetError as error:
+            faults.append(str(error))
+    return sentences, faults
+
+
+def _video_info(path: Path) -> Info:
+    head, odometry, lens = read_head(path), odometry_beside(path), lens_beside(path)
+    trajectory = None if odometry is None else read_trajectory(odometry)[0]
+    lacks = [
+        *([f"{path}: {WHAT_ODOMETRY}"] if odometry is None else []),
+        *([f"{path}: intrinsics are missing; name a camera file with --camera"] if lens is None else []),
+    ]
+    return Info(
+        path=path,
+        format="video",
+        images=head.frames,
+        posed=None,
+        from_s=0.0,
+        to_s=head.frames / head.rate_hz if head.rate_hz > 0 else 0.0,
+        camera=lens.camera if lens else None,
+        odometry_poses=None if trajectory is None else len(trajectory),
+        truth_poses=None,
+        length_m=None if trajectory is None else trajectory.length_m(),
+        faults=tuple(lacks),
+    )
+
+
+def infos(path: Path, format_name: str | None = None, form: str | None = None) -> Iterator[Info]:
+    """Look at what a path holds: one data set, bag or video, or those of a team in a folder.
+
+    Raises:
+        DatasetError: Nothing that is known is there.
+    """
+    team = team_folder(path) if format_name is None else {}
+    if not team:
+        yield info(path, format_name, form)
+        return
+    for entry in team.values():
+        try:
+            yield info(entry, None, form)
+        except FloccError as error:
+            logger.warning("%s", error)
+    others = [entry.name for entry in sorted(path.iterdir()) if entry not in team.values() and entry.name[0] != "."]
+    if others:
+        logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
+
+
+def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, form: str | None = None) -> ClockFit:
+    """Measure how far a data set's pictures and its trajectory (or another one) are apart in time.
+
+    Raises:
+        DatasetError: There is no trajectory or calibration, or the pictures do not tell.
+    """
+    source = read_source(path, None, camera, form if odometry is None else None, time_offset_s=None)
+    trajectory = source.odometry or source.truth if odometry is None else read_trajectory(odometry, form)[0]
+    if trajectory is None:
+        raise DatasetError(f"{path}: has neither odometry nor ground truth ({expected_files(path)})")
+    return measured(source.images, source.lens.camera if source.lens else None, trajectory)
 
 
 def convert(
@@ -160,6 +274,9 @@ def convert(
     every: int = 1,
     jpeg: bool = False,
     form: str | None = None,
+    robot: str | None = None,
+    view_deg: float | None = None,
+    time_offset_s: float = 0.0,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -178,6 +295,9 @@ def convert(
         every: Of a bag, keeps one image of so many.
         jpeg: Of a bag, writes raw images as JPEG instead of lossless PNM.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
+        time_offset_s: Added to the stamps of a folder's odometry and ground truth.
         progress: Called with images done and images in all.
 
     Returns:
@@ -187,14 +307,33 @@ def convert(
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
     if is_bag(path):
-        options = BagOptions(image_topic, odometry_topic, camera, odometry, truth, every, jpeg, form=form)
+        options = BagOptions(
+            image_topic,
+            odometry_topic,
+            camera,
+            odometry,
+            truth,
+            every,
+            jpeg,
+            form=form,
+            robot=robot,
+            view_rad=None if view_deg is None else math.radians(view_deg),
+        )
         return convert_bag(path, out, options, progress)
-    source = read_source(path, format_name, camera, form if odometry is None else None)
+    if is_video(path):
+        for note in convert_video(path, out, camera, odometry, form, every, progress):
+            logger.warning("%s", note)
+        return out
+    own_form = form if odometry is None else None
+    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
     _tell(source)
-    identity = _identity("convert", path, source, drift, seed)
-    given = None if odometry is None else _given_odometry(source, odometry, form)
+    identity = _identity(
+        f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
+    )
+    given = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
+    _note_drift(out, drift if given is None else None)
     _complain(source, out, len(source.images))
     return out
 
@@ -210,6 +349,8 @@ def split(
     format_name: str | None = None,
     camera: Path | None = None,
     form: str | None = None,
+    kind: DriftKind | None = None,
+    view_deg: float | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Cut one data set by time into recordings of several robots, which then run at the same time.
@@ -222,11 +363,13 @@ def split(
         out: Gets one folder per robot: alpha, bravo, charlie.
         robots: How many parts.
         seed: Of the drift; each robot has its own.
-        drift: Makes odometry from the ground truth; None takes the data set's own, else `HANDHELD_DRIFT`.
+        drift: Makes odometry from the ground truth; None takes the data set's own, else `needed_drift`.
+        kind: What carried the camera, where odometry is made; None tells it by the data set and the motion.
         overlap_s: How much longer each part is than its share, at its end.
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics in place of the folder's.
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
+        view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
         progress: Called with images done and images in all.
 
     Returns:
@@ -235,25 +378,47 @@ def split(
     Raises:
         DatasetError: Nothing can be used, there are fewer images than robots, or a part was bad; the good one is kept.
     """
-    source = read_source(path, format_name, camera, form)
+    source = _viewed(read_source(path, format_name, camera, form), view_deg)
     _tell(source)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
-    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift, seed)
+    identity = _identity(f"split overlap_s={overlap_s}", path, source, drift or needed_drift(source, kind), seed)
     folders = []
     for index, name in enumerate(robot_names(robots)):
         part = cut(source, index, robots, overlap_s)
         rng = np.random.default_rng([seed, index])
-        moved = _odometry(part, drift or needed_drift(part), rng)
+        spec = drift or needed_drift(part, kind)
+        moved = _odometry(part, spec, rng)
         write_source(part, out / name, moved, f"{identity} part {index + 1} of {robots}", progress)
+        _note_drift(out / name, spec)
         folders.append(out / name)
     _complain(source, out, len(source.images))
     return folders
 
 
-def needed_drift(source: Source) -> DriftSpec | None:
-    """How odometry is made of ground truth where a data set has none of its own."""
-    return HANDHELD_DRIFT if source.odometry is None and source.truth is not None else None
+def needed_drift(source: Source, kind: DriftKind | None = None) -> DriftSpec | None:
+    """How odometry is made of ground truth where a data set has none of its own; None where it has.
+
+    Args:
+        source: The data set, or a robot's part of it.
+        kind: What carried the camera; None tells it by the data set and the motion.
+    """
+    if source.odometry is not None or source.truth is None:
+        return None
+    return fitted(kind or kind_of(source.format, source.truth), source.truth.length_m())
+
+
+def _note_drift(recording: Path, spec: DriftSpec | None) -> None:
+    """Say in a recording how its odometry was made, for the report of a run."""
+    if spec is not None:
+        (recording / ODOMETRY_MADE).write_text(summary(spec) + "\n", encoding="utf-8")
+
+
+def _viewed(source: Source, view_deg: float | None) -> Source:
+    """The source with the field of view that is wanted of its lens."""
+    if view_deg is None or source.lens is None:
+        return source
+    return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
 
 
 def _tell(source: Source) -> None:
@@ -262,8 +427,9 @@ def _tell(source: Source) -> None:
         logger.warning("%s", note)
 
 
-def _given_odometry(source: Source, path: Path, form: str | None) -> Trajectory:
-    given, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+def _given_odometry(source: Source, path: Path, form: str | None, time_offset_s: float) -> Trajectory:
+    read, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+    given = read.later(time_offset_s)
     _tell(replace(source, notes=notes))
     check_times(source, given, path)
     return given.relative_to_first()
@@ -290,4 +456,7 @@ def _complain(source: Source, out: Path, count: int) -> None:
 
 def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None, seed: int) -> str:
     errors = drift.model_dump_json() if drift is not None else "default"
-    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}"
+    lens, changed = source.lens, ""
+    if lens is not None and (lens.camera.agent_camera() is None or source.levels != FULL):
+        changed = f" of {lens.camera} view={lens.view_rad} {source.levels}"
+    return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}{changed}"

@@ -17,6 +17,7 @@ from flocc_launch.datasets.folders import (
 )
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
+from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder
 from flocc_launch.datasets.pixels import size_of, usable_images
 from flocc_launch.datasets.plain import is_plain, read_plain
@@ -30,6 +31,9 @@ from flocc_launch.datasets.reconstructions import (
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import is_video
 
+CLOCKS_DIFFER = (
+    "both must be of one clock: flocc dataset clock measures how far they are apart, and --time-offset mends it"
+)
 READERS: dict[str, Callable[[Path], Source]] = {
     "euroc": read_euroc,
     "kitti": read_kitti,
@@ -61,7 +65,9 @@ def detect_format(path: Path) -> str:
     other = kind_of_folder(path) if path.is_dir() else kind_of_file(path)
     if other is not None:
         raise DatasetError(f"{path}: {other}")
-    inside = [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry)] if path.is_dir() else []
+    inside = (
+        [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry) or is_bag(entry)] if path.is_dir() else []
+    )
     raise DatasetError(
         f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
         f"(odometry.tum or groundtruth.tum) and camera.yaml; {_what_is_there(path)}"
@@ -81,6 +87,24 @@ def _what_is_there(path: Path) -> str:
 def is_dataset(path: Path) -> bool:
     """Whether a reader knows what a folder is."""
     return path.is_dir() and _known_format(path) is not None
+
+
+def team_folder(path: Path) -> dict[str, Path]:
+    """Data sets, bags and videos in a folder that is none itself, by the robot's name; empty where it is one.
+
+    Raises:
+        DatasetError: Two would have one name.
+    """
+    if not path.is_dir() or is_bag(path) or is_dataset(path):
+        return {}
+    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+    found: dict[str, Path] = {}
+    for folder in (entry for entry in entries if is_bag(entry) or is_dataset(entry) or is_video(entry)):
+        name = robot_name(folder.stem if folder.is_file() else folder.name)
+        if name in found:
+            raise DatasetError(f"{folder}: its robot would be called {name}, as that of {found[name]}")
+        found[name] = folder
+    return found
 
 
 def _known_format(path: Path) -> str | None:
@@ -104,7 +128,11 @@ def _known_format(path: Path) -> str | None:
 
 
 def read_source(
-    path: Path, format_name: str | None = None, camera: Path | None = None, form: str | None = None
+    path: Path,
+    format_name: str | None = None,
+    camera: Path | None = None,
+    form: str | None = None,
+    time_offset_s: float | None = 0.0,
 ) -> Source:
     """Read one robot's data set.
 
@@ -113,6 +141,7 @@ def read_source(
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics, where the folder has none or others are wanted.
         form: Of the trajectories of a plain folder (`trajectory_text.FORMS`); None finds out.
+        time_offset_s: Added to the stamps of trajectories; None leaves them as they are and unchecked.
 
     Raises:
         DatasetError: Unknown, or nothing in it can be used.
@@ -121,8 +150,11 @@ def read_source(
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
     source = _read(path, name, form)
+    if time_offset_s:
+        odometry, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
+        source = replace(source, odometry=odometry, truth=truth)
     for trajectory in (source.odometry, source.truth):
-        if trajectory is not None:
+        if trajectory is not None and time_offset_s is not None:
             check_times(source, trajectory)
     lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
     return _usable(replace(source, lens=lens))
@@ -169,7 +201,7 @@ def _what_stamps_look_like(source: Source, trajectory: Trajectory) -> str:
         return "the trajectory's stamps look like numbers of images, not seconds"
     unit = _time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
     known = unit not in (None, "seconds")
-    return f"the trajectory's stamps look like {unit}, not seconds" if known else "both must be of one clock"
+    return f"the trajectory's stamps look like {unit}, not seconds" if known else CLOCKS_DIFFER
 
 
 def _time_unit(duration_s: float, reference_s: float) -> str | None:

@@ -1,7 +1,9 @@
 """What the readers of folders share: lists of images, the files in a folder, a camera beside them."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,8 +16,12 @@ from flocc_launch.datasets.source import DatasetError, Lens
 
 T = TypeVar("T")
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")
-CAMERA_FILES = ("camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "intrinsics.yaml", "sensor.yaml")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
+CAMERA_FILES = (
+    "camera.toml", "camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "intrinsics.yaml",
+    "intrinsics.yml", "sensor.yaml", "camera_info.yaml", "camchain.yaml", "ost.yaml", "camera.json", "calibration.json",
+    "intrinsics.json", "cameras.txt", "camera.txt", "intrinsics.txt", "calibration.txt", "ost.txt", "camera_matrix.csv",
+)  # fmt: skip
 
 
 def unequal(folder: Path, images: int, stamps_file: Path, stamps: int, poses: int) -> tuple[str, ...]:
@@ -78,7 +84,9 @@ def image_files(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder")
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(
+        file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+    )
 
 
 def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
@@ -88,13 +96,30 @@ def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
         DatasetError: There is none.
     """
     if not images:
-        raise DatasetError(f"{where}: no image was found")
+        raise DatasetError(f"{where}: no image was found{_what_is_there(where)}")
     return images
+
+
+def _what_is_there(where: Path) -> str:
+    """What a folder without images holds, and what an image would be."""
+    if not where.is_dir():
+        return ""
+    entries = [entry for entry in sorted(where.iterdir()) if not entry.name.startswith(".")]
+    kinds = Counter(entry.suffix or "nameless" for entry in entries if entry.is_file())
+    told = [f"{count} {kind} file{'s' * (count > 1)}" for kind, count in kinds.most_common(4)]
+    told += [f"{entry.name}/" for entry in entries if entry.is_dir()][:4]
+    read = ", ".join(IMAGE_SUFFIXES)
+    return f"; there is {', '.join(told) or 'nothing'}, but images are {read}: convert them to JPEG or PNG"
 
 
 def camera_file(
     path: Path, images: Sequence[tuple[float, Path]] = (), size: tuple[int, int] | None = None
 ) -> Lens | None:
     """The camera that a file in a folder describes, or None; a file without a size takes that of the images."""
-    file = next((path / name for name in CAMERA_FILES if (path / name).exists()), None)
-    return None if file is None else read_lens(file, size_of(images) if images else size)
+    files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+    files += sorted(path.glob("*-camchain.yaml")) if path.is_dir() else []
+    if not files:
+        return None
+    lens = read_lens(files[0], size_of(images) if images else size)
+    others = ", ".join(file.name for file in files[1:])
+    return replace(lens, notes=(*lens.notes, f"{files[0]}: was taken as the camera, not {others}")) if others else lens

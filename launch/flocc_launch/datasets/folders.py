@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.text_tables import RecordingError, number_lines
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
-from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_agent.runtime.trajectory_text import DAMAGED_RATIO_MAX, read_trajectory
 from flocc_launch.datasets.files import (
     camera_file,
     image_files,
@@ -119,13 +119,15 @@ def read_sevenscenes(path: Path) -> Source:
     if not images and damaged:
         raise DatasetError(damaged[0])
     some(tuple(images), path)
-    faults = (f"{damaged[0]} ({len(damaged)} images have no usable pose)",) if damaged else ()
+    said = (f"{damaged[0]} ({len(damaged)} images have no usable pose, and were left out)",) if damaged else ()
+    few = len(damaged) <= DAMAGED_RATIO_MAX * (len(images) + len(damaged))
+    notes, faults = (said, ()) if few else ((), said)
     orphans = len(list(path.glob("frame-*.pose.txt"))) - len(images) - len(damaged)
     if orphans > 0:
         faults = (*faults, f"{path}: has {orphans} poses more than images")
     truth = Trajectory(np.array([stamp_s for stamp_s, _ in images]), np.array(poses))
     lens = camera_file(path, images) or _sevenscenes_lens(path, images[0][1])
-    return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
+    return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes)
 
 
 def _sevenscenes_pose(path: Path) -> Float:

@@ -9,8 +9,8 @@ from flocc_agent.runtime.recording import read_camera
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_launch.datasets.calibrations.document import parsed_json, parsed_xml, parsed_yaml, read_text
 from flocc_launch.datasets.calibrations.fields import lens_of_keys
-from flocc_launch.datasets.calibrations.keys import Keys, plain
 from flocc_launch.datasets.calibrations.maps import FORMS, REFUSED_MAPS, Cameras, form_of
+from flocc_launch.datasets.calibrations.taken_keys import Keys, plain
 from flocc_launch.datasets.calibrations.texts import REFUSED_TEXTS, TEXT_FORMS, text_form
 from flocc_launch.datasets.source import DatasetError, Lens
 
@@ -47,6 +47,8 @@ def read_lens(path: Path, size: Size | None = None) -> Lens:
         sentence = (
             str(error) if isinstance(error, ValueError | RecordingError) else f"is not of the form it seems ({error!r})"
         )
+        if "intrinsics are missing" in sentence or "is no YAML" in sentence:
+            sentence += f"; flocc reads {'; '.join(forms_read())}"
         raise DatasetError(f"{path}: {sentence}") from error
 
 
@@ -69,10 +71,17 @@ def _lens(path: Path, text: str, chosen: str | None, size: Size | None) -> Lens:
         document = _document(text)
         if (followed := _followed(path, document, size)) is not None:
             return followed
-        cameras = form_of(document).cameras(document)
-    name, notes = _choice(cameras, chosen)
+        cameras = _cameras(document, size)
+    name, notes = _choice(cameras, chosen, size)
     lens = lens_of_keys(Keys(cameras[name]), size)
     return replace(lens, notes=tuple(f"{path}: {note}" for note in (*notes, *lens.notes)))
+
+
+def _cameras(document: dict[str, Any], size: Size | None) -> Cameras:
+    """Cameras of a document; one that has only a field of view takes the size of the images."""
+    if size is not None and isinstance(document.get("frames"), list) and "camera_angle_x" in document:
+        document = {"w": size[0], "h": size[1]} | document
+    return form_of(document).cameras(document)
 
 
 def _document(text: str) -> dict[str, Any]:
@@ -102,7 +111,7 @@ def _followed(path: Path, document: dict[str, Any], size: Size | None) -> Lens |
     return None
 
 
-def _choice(cameras: Cameras, chosen: str | None) -> tuple[str, tuple[str, ...]]:
+def _choice(cameras: Cameras, chosen: str | None, size: Size | None) -> tuple[str, tuple[str, ...]]:
     """The camera to take, and a note on the others.
 
     Raises:
@@ -118,6 +127,10 @@ def _choice(cameras: Cameras, chosen: str | None) -> tuple[str, tuple[str, ...]]
         raise ValueError("holds no camera")
     if len(names) == 1:
         return names[0], ()
+    fitting = [name for name in names if size is not None and cameras[name].get("resolution") == list(size)]
+    lefts = [name for name in fitting if name.startswith("LEFT")]
+    if len(lefts) == 1:
+        return lefts[0], (f"{lefts[0]} was taken, which is of the images' size; FILE#NAME takes another camera",)
     numbered = sorted(name for name in names if plain(name) in ("cam0", "camera0", "camera1", "left"))
     if not numbered or "LEFT" in names:
         raise ValueError(f"holds {len(names)} cameras, name one as FILE#NAME: {', '.join(names[:16])}")

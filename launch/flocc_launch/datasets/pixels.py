@@ -68,8 +68,13 @@ def usable_images(images: Stamped, size: tuple[int, int] | None) -> tuple[Stampe
         raise DatasetError(str(error)) from error
     notes = [] if looked.fault is None else [looked.fault]
     if looked.levels != FULL:
-        notes.append(f"images of 16 bits use {looked.levels.black} to {looked.levels.white}, which become 0 to 255")
+        notes.append(levels_note(looked.levels))
     return tuple(images[k] for k in looked.good), tuple(notes), looked.levels
+
+
+def levels_note(levels: Levels) -> str:
+    """What was made of images of 16 bits."""
+    return f"images of 16 bits use {levels.black} to {levels.white}, which become 0 to 255"
 
 
 def agents_camera(lens: Lens) -> Camera:
@@ -118,12 +123,20 @@ class ImageWriter:
         head = head_of(encoded)
         if (fault := pictures.size_fault(head, self._size)) is not None:
             raise PictureError(fault)
-        if not self._straightener.is_needed and (head.bits == 8 or self._levels == FULL):
+        if not self._straightener.is_needed and head.bits == 8:
             return encoded, suffix or SUFFIXES[head.format]
-        pixels = pictures.decoded(encoded, self._size)
-        if pixels.dtype == np.uint16 and self._levels != FULL:
+        pixels = self._straightener.apply(pictures.decoded(encoded, self._size))
+        if pixels.dtype == np.uint16:
             pixels = self._levels.eight_bits(pixels)
-        return encoded_image(self._straightener.apply(pixels), lossless=head.bits > 8)
+        return pnm(pixels) if head.bits > 8 and head.format == "PNM" else encoded_image(pixels, head.bits > 8)
+
+
+def pnm(pixels: NDArray[Any]) -> tuple[bytes, str]:
+    """Bytes and suffix of RGB or grey pixels as PNM: lossless, and as fast as copying."""
+    height, width = pixels.shape[:2]
+    kind, suffix = (b"P6", ".ppm") if pixels.ndim == 3 else (b"P5", ".pgm")
+    largest, values = (255, pixels) if pixels.dtype == np.uint8 else (65535, pixels.astype(">u2"))
+    return b"%s\n%d %d\n%d\n%s" % (kind, width, height, largest, values.tobytes()), suffix
 
 
 def encoded_image(pixels: NDArray[Any], lossless: bool) -> tuple[bytes, str]:

@@ -72,8 +72,10 @@ def _has_trajectory(path: Path) -> bool:
 
 
 def _trajectory_file(path: Path, stems: tuple[str, ...]) -> Path | None:
+    """The first file of one of the names, whatever their capitals; nothing in what is no folder."""
+    there = {entry.name.lower(): entry for entry in sorted(path.iterdir())} if path.is_dir() else {}
     names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
-    return next((path / name for name in names if (path / name).exists()), None)
+    return next((there[name] for name in names if name in there and there[name].is_file()), None)
 
 
 def _first_trajectory(
@@ -84,7 +86,12 @@ def _first_trajectory(
 
 
 def _image_folder(path: Path) -> Path:
-    return next((path / name for name in IMAGE_FOLDERS if (path / name).is_dir()), path)
+    """Where the images are: in a folder of a usual name, or in the only folder inside of it (images/cam0)."""
+    folder = next((path / name for name in IMAGE_FOLDERS if (path / name).is_dir()), path)
+    if folder == path or image_files(folder):
+        return folder
+    inside = [entry for entry in folder.iterdir() if entry.is_dir()]
+    return inside[0] if len(inside) == 1 else folder
 
 
 def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:

@@ -133,13 +133,16 @@ class PoseWriter:
     """Appends poses to a TUM file as they come, and takes up one that was cut short.
 
     `finish` makes the trajectory, and counts stamps from another zero where it is asked to.
+
+    Attributes:
+        last_ns: Stamp of the last pose, or -1.
     """
 
     def __init__(self, path: Path, wanted: bool) -> None:
         self._path = path
         self._partial = path.with_suffix(".part")
         self._wanted = wanted
-        self._last_ns = -1
+        self.last_ns = -1
         if wanted and path.exists() and not self._partial.exists():
             path.unlink()
         if wanted and self._partial.exists():
@@ -156,12 +159,13 @@ class PoseWriter:
         if self._wanted:
             self._file.close()
 
-    def add(self, stamp_ns: int, numbers: tuple[float, ...]) -> None:
-        """Append `tx ty tz qx qy qz qw`; a stamp that is not after the last one is left out."""
-        if stamp_ns > self._last_ns:
+    def add(self, stamp_ns: int, numbers: tuple[float, ...]) -> bool:
+        """Append `tx ty tz qx qy qz qw`; one that is before the last one is left out, and the return value False."""
+        if stamp_ns > self.last_ns:
             line = "%d.%09d %.9f %.9f %.9f %.12f %.12f %.12f %.12f\n"
             self._file.write(line % (*divmod(stamp_ns, 10**9), *numbers))
-            self._last_ns = stamp_ns
+            self.last_ns = stamp_ns
+        return stamp_ns >= self.last_ns
 
     def flush(self) -> None:
         """Hand every pose that was added to the system."""
@@ -192,7 +196,7 @@ class PoseWriter:
             for line in lines:
                 if line.endswith(b"\n"):
                     kept += len(line)
-                    self._last_ns = int(line.split(b" ", 1)[0].replace(b".", b""))
+                    self.last_ns = int(line.split(b" ", 1)[0].replace(b".", b""))
         os.truncate(self._partial, kept)
 
 

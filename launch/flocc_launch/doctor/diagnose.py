@@ -8,12 +8,12 @@ did not merge, the pair that came furthest is looked at, and the first step that
 from collections.abc import Iterable
 from dataclasses import replace
 
+from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.steps import STEPS
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import AgentDied
 from flocc_launch.runs.timeline import ends
 
 
@@ -46,7 +46,7 @@ def merging(loaded: LoadedRun) -> list[Finding]:
 
 def groups_of(loaded: LoadedRun) -> list[tuple[str, ...]]:
     """Living robots with a camera by their map frame at the end; a robot without a frame is a group of its own."""
-    died = {robot for robot, end in ends(loaded.events).items() if isinstance(end, AgentDied)}
+    died = {robot for robot, end in ends(loaded.events).items() if isinstance(end.fact, AgentDied)}
     groups: dict[str, list[str]] = {}
     for robot in loaded.robots:
         if robot not in died and robot not in loaded.run.servers:

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
+from flocc_agent.core.reports import EncodingFailed, NameTaken, RoundSolved
+from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import seconds
-from flocc_launch.runs.run_records import AgentDied, EncodingFailed, GraphOptimised, NameTaken, of_kind
 from flocc_launch.runs.timeline import how_it_died
 
 LEADER_CHANGES_MANY = 6
@@ -29,22 +31,22 @@ def deaths(loaded: LoadedRun) -> list[Finding]:
 
 def solver_warnings(loaded: LoadedRun) -> list[Finding]:
     """What the solver warned of last."""
-    rounds = of_kind(loaded.events, GraphOptimised)
+    rounds = of_kind(loaded.events, RoundSolved)
     advice = "See docs/report.md on the pose graph; more closures from other view points make scales observable."
-    warnings = rounds[-1].warnings if rounds else []
+    warnings = rounds[-1].fact.warnings if rounds else ()
     return [Finding("solver-warning", Severity.HINDERS, f"The solver warns: {text}.", advice) for text in warnings]
 
 
 def encoding_failures(loaded: LoadedRun) -> list[Finding]:
     """Keyframes without descriptor or latent."""
-    found: dict[str, list[EncodingFailed]] = {}
+    found: dict[str, list[Reported[EncodingFailed]]] = {}
     for event in of_kind(loaded.events, EncodingFailed):
         found.setdefault(event.robot, []).append(event)
     return [
         Finding(
             "encoding-failed",
             Severity.HINDERS,
-            f"{len(events)} keyframes of {robot} could not be encoded (last: {events[-1].reason}).",
+            f"{len(events)} keyframes of {robot} could not be encoded (last: {events[-1].fact.reason}).",
             "Check the images, and the checkpoints of the perception back-end.",
             (robot,),
         )
@@ -66,7 +68,7 @@ def unsteady_leaders(loaded: LoadedRun) -> list[Finding]:
 
 def shared_names(loaded: LoadedRun) -> list[Finding]:
     """Names that two agents run with."""
-    names = sorted({event.peer for event in of_kind(loaded.events, NameTaken)})
+    names = sorted({event.fact.peer for event in of_kind(loaded.events, NameTaken)})
     return [
         Finding(
             "duplicate-name",
@@ -93,9 +95,7 @@ def weak_links(loaded: LoadedRun) -> list[Finding]:
             f"{robot} hangs on {track.map_frame} by {len(ties)} of {accepted} accepted closures; the solver did not "
             "use the rest. One false closure misplaces it."
         )
-        advice = (
-            "Let it meet the others again, or raise core.loop_closing.match_ratio_threshold so that fewer are false."
-        )
+        advice = "Let it meet the others again, or use a front end that sees further (perception.method = 'learned')."
         findings.append(Finding("weak-link", Severity.HINDERS, sentence, advice, (robot,)))
     return findings
 

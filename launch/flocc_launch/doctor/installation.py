@@ -2,6 +2,8 @@
 
 import importlib
 import importlib.util
+import locale
+import os
 import shutil
 import sys
 import time
@@ -9,8 +11,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from flocc_agent.config import Mast3rConfig, PerceptionConfig, TransportConfig
+from flocc_agent.perception.backends import OWN, PerceptionError, check_perception, methods
 from flocc_launch.doctor.finding import Finding, Severity, good
-from flocc_launch.doctor.network_check import discovery, ports
+from flocc_launch.doctor.network_check import configured_network, discovery, ports
+from flocc_launch.setup.cache import CacheError, cache_folder, can_be_written
 from flocc_protocol.errors import FloccError
 
 DISK_FREE_BYTES_MIN = 2_000_000_000
@@ -38,8 +42,10 @@ def check_installation(
         *packages(),
         *networks(perception or PerceptionConfig()),
         *disk(folder or Path.cwd()),
+        *surroundings(folder or Path.cwd()),
         *clock(time.time()),
         *ports(transport),
+        *configured_network(transport),
         *discovery(transport),
     ]
 
@@ -68,6 +74,12 @@ def packages() -> list[Finding]:
 
 def networks(config: PerceptionConfig) -> list[Finding]:
     """Torch and the checkpoints, where perception needs them."""
+    try:
+        check_perception(config)
+    except PerceptionError as error:
+        return [Finding("perception", Severity.BLOCKS, f"{error}.", "Install the package that brings it.")]
+    if config.method not in OWN:
+        return [good("perception", f"Perception '{config.method}' comes from {methods()[config.method]}.")]
     if config.method != "mast3r":
         return [good("checkpoint", f"Perception '{config.method}' needs neither torch nor checkpoints.")]
     problem = import_problem("torch")
@@ -137,6 +149,29 @@ def disk(folder: Path) -> list[Finding]:
     if free >= DISK_FREE_BYTES_MIN:
         return [good("disk", sentence)]
     return [Finding("disk", Severity.HINDERS, sentence, "Free some, or lower the store's limits; latents take most.")]
+
+
+def surroundings(folder: Path) -> list[Finding]:
+    """Whether this user may write where flocc writes, and whether names are UTF-8."""
+    found = []
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not os.access(existing, os.W_OK):
+        advice = "Run flocc in a folder of your own, or name one with --out."
+        found.append(Finding("folder", Severity.HINDERS, f"{existing} cannot be written by this user.", advice))
+    try:
+        cache = cache_folder()
+    except CacheError as error:
+        found.append(Finding("cache", Severity.BLOCKS, f"{str(error).rstrip('.')}.", "Set FLOCC_CACHE to a folder."))
+    else:
+        if not can_be_written(cache):
+            advice = "Set FLOCC_CACHE to a folder that can be written."
+            found.append(Finding("cache", Severity.BLOCKS, f"The cache {cache} cannot be written.", advice))
+        else:
+            found.append(good("cache", f"Generated data is kept in {cache}."))
+    if locale.getpreferredencoding(False).lower().replace("-", "") != "utf8":
+        sentence = f"The locale's encoding is {locale.getpreferredencoding(False)}; flocc reads and writes UTF-8."
+        found.append(Finding("locale", Severity.NOTE, sentence, "Set LC_ALL=C.UTF-8 for names with umlauts."))
+    return found
 
 
 def clock(now_s: float) -> list[Finding]:

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from flocc_launch.dashboard.status_table import PairStatus, RobotStatus
+from flocc_agent.runtime.status import PairStatus
+from flocc_launch.dashboard.status_table import RobotStatus
 from flocc_launch.doctor.finding import Finding, Severity, blocked
 from flocc_launch.doctor.merge_evidence import held_records
 from flocc_launch.runs.plain_numbers import number
@@ -90,7 +91,7 @@ def rejected_all(rows: Rows, a: RobotStatus, b: RobotStatus) -> Finding | None:
         "registrations-rejected",
         f"All {pair.rejected} registrations between {a.robot} and {b.robot} were rejected so far; the best match ratio "
         f"is {number(pair.best_ratio)} ({pair.reason}){limit}.",
-        "If these pairs do show one place, lower core.loop_closing.match_ratio_threshold or use the mast3r back-end; "
+        "If these pairs do show one place, use the learned or the mast3r front end, which see further; "
         "else raise core.place_recognition.similarity_threshold to save the work.",
         a.robot,
         b.robot,
@@ -114,9 +115,8 @@ def solver_dropped_closures(rows: Rows, a: RobotStatus, b: RobotStatus) -> Findi
         Severity.BLOCKS,
         f"{accepted} closures between {a.robot} and {b.robot} were accepted, but the last solution of {a.leader} keeps "
         f"them in separate parts ({solver.closures_used} closures used, {solver.closures_rejected} rejected).{warned}",
-        "The closures contradict each other or odometry, or are too few: raise "
-        "core.loop_closing.match_ratio_threshold, check the camera's intrinsics and T_body_camera, and that odometry "
-        "is metric.",
+        "The closures contradict each other or odometry, or are too few: check the camera's "
+        "intrinsics and T_body_camera, and that odometry is metric.",
         (a.robot, b.robot),
     )
 

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable, Mapping
 
+from flocc_agent.core.reports import CorrectionApplied
+from flocc_agent.runtime.event_lines import of_kind
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.run_records import CorrectionApplied, of_kind
 from flocc_protocol.ids import LogId
 
 
@@ -42,12 +43,10 @@ def best_similarity(loaded: LoadedRun, a: str, b: str) -> float | None:
     return max(known, default=None)
 
 
-def components_join(components: object, a: str, b: str) -> bool | None:
+def components_join(components: Iterable[Iterable[LogId]], a: str, b: str) -> bool | None:
     """Whether one part of a solved graph holds both robots; None where the parts are not listed."""
-    if not isinstance(components, list) or not all(isinstance(part, list) for part in components):
-        return None
-    robots = [{str(log).partition("~")[0] for log in part} for part in components]
-    return any({a, b} <= part for part in robots)
+    robots = [{log.robot for log in part} for part in components]
+    return any({a, b} <= part for part in robots) if robots else None
 
 
 def last_correction_s(loaded: LoadedRun, robot: str) -> float:

@@ -26,6 +26,17 @@ def ports(config: TransportConfig) -> list[Finding]:
     return found or [good("port", "The ports to listen on are free.")]
 
 
+def configured_network(config: TransportConfig) -> list[Finding]:
+    """Whether the interfaces and hosts that the configuration names are there."""
+    from flocc_agent.runtime.network_faults import network_faults
+
+    advice = "Bring it up, or change it in [transport] of the agent's configuration; an agent goes on trying meanwhile."
+    return [
+        Finding("network", Severity.HINDERS, f"{fault[0].upper()}{fault[1:]}.", advice)
+        for fault in network_faults(config, "")
+    ]
+
+
 def port_problem(host: str, port: int) -> str | None:
     """Why a TCP port cannot be bound; None where it can."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -6,6 +6,9 @@ A step looks at two robots and gives None where it holds. Later steps may rely o
 from collections.abc import Callable
 
 from flocc_agent.core.election import ANSWER_TIMEOUT_S
+from flocc_agent.core.reports import LatentFailed, NameTaken, PeerRefused, RoundFailed, RoundSolved
+from flocc_agent.runtime.event_lines import of_kind
+from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.finding import Finding, blocked
 from flocc_launch.doctor.merge_evidence import (
     best_similarity,
@@ -19,17 +22,7 @@ from flocc_launch.doctor.merge_evidence import (
 )
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import count_of, number, seconds
-from flocc_launch.runs.run_records import (
-    AgentDied,
-    GraphOptimised,
-    LatentFailed,
-    NameTaken,
-    OptimisationFailed,
-    PeerRefused,
-    of_kind,
-    setting_number,
-)
-from flocc_protocol.ids import KeyframeId
+from flocc_launch.runs.run_records import setting_number
 
 HEARD_S_MIN = 5.0
 EXAMPLES_MAX = 3
@@ -53,7 +46,7 @@ def took_no_keyframes(loaded: LoadedRun, a: str, b: str) -> Finding | None:
 
 def share_a_name(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     """Two agents under one name are ignored by everybody."""
-    taken = [e for e in of_kind(loaded.events, NameTaken) if e.peer in (a, b)]
+    taken = [e.fact for e in of_kind(loaded.events, NameTaken) if e.fact.peer in (a, b)]
     if not taken or holds(loaded, a, b):
         return None
     name = taken[0].peer
@@ -64,13 +57,13 @@ def share_a_name(loaded: LoadedRun, a: str, b: str) -> Finding | None:
 
 def refused(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     """A peer that is refused is not heard."""
-    found = [e for e in of_kind(loaded.events, PeerRefused) if {e.robot, e.peer} == {a, b}]
+    found = [e for e in of_kind(loaded.events, PeerRefused) if {e.robot, e.fact.peer} == {a, b}]
     if not found or holds(loaded, a, b):
         return None
     event = found[-1]
     return blocked(
         "refused",
-        f"{event.robot} refuses {event.peer}: {event.reason}.",
+        f"{event.robot} refuses {event.fact.peer}: {event.fact.reason}.",
         "Run the same flocc version, swarm name and keys on all robots.",
         a,
         b,
@@ -151,7 +144,7 @@ def lacked_latents(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     pairs = pairs_between(loaded, a, b)
     if any(pair.accepted or pair.rejected for pair in pairs):
         return None
-    failed = [e for e in of_kind(loaded.events, LatentFailed) if KeyframeId.parse(e.keyframe).log.robot in (a, b)]
+    failed = [e.fact for e in of_kind(loaded.events, LatentFailed) if e.fact.keyframe.log.robot in (a, b)]
     if not failed:
         return None
     return blocked(
@@ -193,7 +186,7 @@ def rejected_all(loaded: LoadedRun, a: str, b: str) -> Finding | None:
         "registrations-rejected",
         f"All {len(rejected)} registrations between {a} and {b} were rejected ({'; '.join(reasons)}); "
         f"the best match ratios{limit} are {examples}.",
-        "If these pairs do show one place, lower core.loop_closing.match_ratio_threshold or use the mast3r back-end; "
+        "If these pairs do show one place, use the learned or the mast3r front end, which see further; "
         "else raise core.place_recognition.similarity_threshold to save the work.",
         a,
         b,
@@ -218,13 +211,13 @@ def optimised_nothing(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     since_s = min(
         (pair.at_s for pair in pairs_between(loaded, a, b) if pair.accepted and pair.at_s is not None), default=0.0
     )
-    if any(event.t >= since_s for event in of_kind(loaded.events, GraphOptimised)):
+    if any(event.t >= since_s for event in of_kind(loaded.events, RoundSolved)):
         return None
-    failed = of_kind(loaded.events, OptimisationFailed)
+    failed = of_kind(loaded.events, RoundFailed)
     if failed:
         return blocked(
             "solver-failed",
-            f"Every optimisation since the first closure between {a} and {b} failed ({failed[-1].reason}).",
+            f"Every optimisation since the first closure between {a} and {b} failed ({failed[-1].fact.reason}).",
             "Try backend.solver = 'gnc-tls' and look at the warnings of the solver.",
             a,
             b,
@@ -245,7 +238,7 @@ def optimised_nothing(loaded: LoadedRun, a: str, b: str) -> Finding | None:
 
 def solver_dropped_closures(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     """The solver had the closures and used none of them."""
-    last = of_kind(loaded.events, GraphOptimised)[-1]
+    last = of_kind(loaded.events, RoundSolved)[-1].fact
     count = sum(pair.accepted for pair in pairs_between(loaded, a, b))
     joined = components_join(last.components, a, b)
     if joined or (joined is None and last.closures_used != 0):
@@ -254,8 +247,8 @@ def solver_dropped_closures(loaded: LoadedRun, a: str, b: str) -> Finding | None
         "closures-not-connecting",
         f"{count} closures between {a} and {b} were accepted, but the optimisation of round {last.round} kept them in "
         f"separate parts ({count_of(last.closures_used)} closures used, {count_of(last.closures_rejected)} rejected).",
-        "The closures contradict each other or odometry: raise core.loop_closing.match_ratio_threshold, check the "
-        "camera's intrinsics and T_body_camera, and that odometry is metric.",
+        "The closures contradict each other or odometry: check the camera's intrinsics and T_body_camera, and that "
+        "odometry is metric.",
         a,
         b,
     )
@@ -263,7 +256,7 @@ def solver_dropped_closures(loaded: LoadedRun, a: str, b: str) -> Finding | None
 
 def lost_corrections(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     """The leader joined them, but a robot never heard of it."""
-    last = of_kind(loaded.events, GraphOptimised)[-1]
+    last = of_kind(loaded.events, RoundSolved)[-1]
     late = [robot for robot in (a, b) if last_correction_s(loaded, robot) < last.t]
     if not late:
         return None

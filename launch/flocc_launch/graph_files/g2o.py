@@ -8,8 +8,8 @@ all keyframes, robot after robot.
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,29 +204,36 @@ def write_g2o(path: Path, T_keyframe: Mapping[LogId, Float], closures: Iterable[
     def key(keyframe: KeyframeId) -> int:
         return (numbers[keyframe.log] << INDEX_BITS) | keyframe.index
 
+    posed = [(KeyframeId(log, k), T) for log in sorted(T_keyframe) for k, T in enumerate(T_keyframe[log])]
+    lines = [vertex_line(key(keyframe), T) for keyframe, T in posed]
+    for log in sorted(T_keyframe):
+        for k, (T_first, T_second) in enumerate(pairwise(T_keyframe[log])):
+            ends = key(KeyframeId(log, k)), key(KeyframeId(log, k + 1))
+            lines.append(edge_line(*ends, np.linalg.solve(T_first, T_second), np.eye(6)))
+    for c in closures:
+        covariance = np.eye(6) if c.covariance is None else c.covariance
+        information: Float = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        lines.append(edge_line(key(c.query), key(c.match), c.T_query_match_unscaled, information))
     try:
-        with path.open("w", encoding="utf-8") as out:
-            for log in sorted(T_keyframe):
-                for k, T in enumerate(T_keyframe[log]):
-                    out.write(f"VERTEX_SE3:QUAT {key(KeyframeId(log, k))} {_seven(T)}\n")
-            for log in sorted(T_keyframe):
-                T_all = T_keyframe[log]
-                for k in range(len(T_all) - 1):
-                    T = np.linalg.solve(T_all[k], T_all[k + 1])
-                    _write_edge(out, key(KeyframeId(log, k)), key(KeyframeId(log, k + 1)), T, np.eye(6))
-            for c in closures:
-                information = np.linalg.inv(np.eye(6) if c.covariance is None else c.covariance)
-                _write_edge(out, key(c.query), key(c.match), c.T_query_match_unscaled, information)
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
         raise GraphFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def vertex_line(vertex: int, T: Float) -> str:
+    """One vertex: its pose (4, 4) as `x y z qx qy qz qw`."""
+    return f"VERTEX_SE3:QUAT {vertex} {_seven(T)}"
+
+
+def edge_line(first: int, second: int, T: Float, information: Float) -> str:
+    """One edge: the pose (4, 4) of the second in the first, information (6, 6) with rotation first.
+
+    g2o has translation first, of the information its upper triangle.
+    """
+    upper = information[np.ix_(ROTATION_FIRST, ROTATION_FIRST)][np.triu_indices(6)]
+    return f"EDGE_SE3:QUAT {first} {second} {_seven(T)} {' '.join(repr(float(v)) for v in upper)}"
 
 
 def _seven(T: Float) -> str:
     q = q_wxyz_from_R(T[:3, :3])
     return " ".join(repr(float(v)) for v in [*T[:3, 3], *q[1:], q[0]])
-
-
-def _write_edge(out: TextIO, first: int, second: int, T: Float, information: NDArray[np.floating[Any]]) -> None:
-    """One edge; information (6, 6) with rotation first is written with translation first."""
-    upper = information[np.ix_(ROTATION_FIRST, ROTATION_FIRST)][np.triu_indices(6)]
-    out.write(f"EDGE_SE3:QUAT {first} {second} {_seven(T)} {' '.join(repr(float(v)) for v in upper)}\n")

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flocc_agent.core.corrections import upper_triangle
 from flocc_agent.core.pose_graph import LoopClosure
-from flocc_agent.geometry import tq_from_pose
+from flocc_agent.geometry import tq_from_pose, upper_triangle
 from flocc_agent.perception.recorded import FORMAT, name_image
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_launch.datasets.writer import RecordingWriter

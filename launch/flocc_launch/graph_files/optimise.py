@@ -35,7 +35,7 @@ Float = NDArray[np.float64]
 CONVERGED_RATIO = 1e-9
 
 
-class Noise(StrEnum):
+class NoiseModel(StrEnum):
     """What is made of a file's information matrices."""
 
     GAUSSIAN = "gaussian"
@@ -57,7 +57,7 @@ def optimise_file(
     unit_scale: bool = False,
     drop_labelled_outliers: bool = False,
     from_file_initialisation: bool = False,
-    noise: Noise = Noise.GAUSSIAN,
+    noise: NoiseModel = NoiseModel.GAUSSIAN,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Optimise the pose graph of a file and write `result.json`, `optimised.g2o` and corrected trajectories.
@@ -82,8 +82,8 @@ def optimise_file(
         GraphFileError: The file cannot be read, or lacks what was asked for.
         OptimiseError: There is no solution, or the folder cannot be written.
     """
-    file = read_graph_file(path, isotropic=noise is Noise.ISOTROPIC)
-    file = file.with_isotropic_noise() if noise is Noise.ISOTROPIC else file
+    file = read_graph_file(path, isotropic=noise is NoiseModel.ISOTROPIC)
+    file = file.with_isotropic_noise() if noise is NoiseModel.ISOTROPIC else file
     file = prepared(file, path, unit_scale, drop_labelled_outliers, scale_initial)
     config = file_config(formulation, solver, scale_initial, pairwise_consistency)
     initial = initialisation(file, path) if from_file_initialisation else None

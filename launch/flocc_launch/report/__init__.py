@@ -2,7 +2,7 @@
 
 from flocc_launch.report.evaluate import evaluate
 from flocc_launch.report.finish import finish, read_report
-from flocc_launch.report.model import SCHEMA_VERSION, Report
+from flocc_launch.report.model import SCHEMA_VERSION, RunReport
 from flocc_launch.report.text import sentences
 
-__all__ = ["finish", "evaluate", "sentences", "read_report", "Report", "SCHEMA_VERSION"]
+__all__ = ["finish", "evaluate", "sentences", "read_report", "RunReport", "SCHEMA_VERSION"]

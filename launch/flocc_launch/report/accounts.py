@@ -7,23 +7,25 @@ the last line of each start counts, and starts add up.
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from flocc_agent.stages import BOUNDS_S, Histogram
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_agent.runtime.facts import AccountKept
+from flocc_agent.stages import BOUNDS_S, Histogram, StageCounts
 from flocc_launch.report.model import KindBytes, LinkBytes, StageTime
-from flocc_launch.runs.run_records import AccountKept, Event, StageCounts, of_kind
 
 Cell = tuple[str, str, str]
 """Sender, receiver, kind."""
 
 
-def last_accounts(events: Iterable[Event]) -> list[AccountKept]:
+def last_accounts(events: Iterable[Reported[Fact]]) -> list[Reported[AccountKept]]:
     """The last account of each start of each robot."""
-    last: dict[tuple[str, float], AccountKept] = {}
+    last: dict[tuple[str, float], Reported[AccountKept]] = {}
     for event in of_kind(events, AccountKept):
-        last[event.robot, event.since_s] = event
+        last[event.robot, event.fact.since_s] = event
     return [last[key] for key in sorted(last)]
 
 
-def links_of(events: Iterable[Event]) -> list[LinkBytes]:
+def links_of(events: Iterable[Reported[Fact]]) -> list[LinkBytes]:
     """Every link that anybody used, by sender and receiver."""
     accounts = last_accounts(events)
     kept = {account.robot for account in accounts}
@@ -32,10 +34,10 @@ def links_of(events: Iterable[Event]) -> list[LinkBytes]:
     lost: Counter[Cell] = Counter()
     repeated: Counter[Cell] = Counter()
     for account in accounts:
-        me = account.robot
-        for peer, kinds in account.sent_to.items():
+        me, kept_of = account.robot, account.fact
+        for peer, kinds in kept_of.sent_to.items():
             sent.update({(me, peer, kind): count for kind, count in kinds.items()})
-        tables = ((account.received_from, received), (account.lost_from, lost), (account.repeated_from, repeated))
+        tables = ((kept_of.received_from, received), (kept_of.lost_from, lost), (kept_of.repeated_from, repeated))
         for table, counted in tables:
             for peer, kinds in table.items():
                 counted.update({(peer, me, kind): count for kind, count in kinds.items()})
@@ -70,19 +72,19 @@ def _link(ends: tuple[str, str], kinds: list[str], kept: set[str], counted: tupl
     )
 
 
-def stages_by_robot(events: Iterable[Event]) -> dict[str, dict[str, StageTime]]:
+def stages_by_robot(events: Iterable[Reported[Fact]]) -> dict[str, dict[str, StageTime]]:
     """Time by stage of each robot, over all its starts."""
     merged: dict[str, dict[str, Histogram]] = {}
     for account in last_accounts(events):
-        _merge(merged.setdefault(account.robot, {}), account.stages)
+        _merge(merged.setdefault(account.robot, {}), account.fact.stages)
     return {robot: {stage: stage_time(h) for stage, h in sorted(stages.items())} for robot, stages in merged.items()}
 
 
-def stages_of(events: Iterable[Event]) -> dict[str, StageTime]:
+def stages_of(events: Iterable[Reported[Fact]]) -> dict[str, StageTime]:
     """Time by stage of all robots together."""
     merged: dict[str, Histogram] = {}
     for account in last_accounts(events):
-        _merge(merged, account.stages)
+        _merge(merged, account.fact.stages)
     return {stage: stage_time(h) for stage, h in sorted(merged.items())}
 
 

@@ -2,39 +2,57 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.reports import ClosureAccepted, PeerRefused, RoundSolved
+from flocc_agent.runtime.event_lines import UnknownFact, of_kind
+from flocc_agent.runtime.facts import AgentDied, BytesCounted
 from flocc_agent.stages import BOUNDS_S
+from flocc_launch.datasets.commands import ODOMETRY_MADE
 from flocc_launch.report.accounts import links_of, stages_by_robot, stages_of
 from flocc_launch.report.model import (
     Closures,
     Expectation,
     LeaderSpan,
     Optimisations,
-    Report,
-    Robot,
     RobotBytes,
+    RobotReport,
+    RunReport,
     TrackError,
 )
 from flocc_launch.runs.loaded_run import LoadedRun
-from flocc_launch.runs.run_records import AgentDied, BytesCounted, ClosureAccepted, GraphOptimised, PeerRefused, of_kind
-from flocc_launch.runs.timeline import corrections_of, ends, how_it_died, leader_changes, merged_after_s, terms_led
-from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.timeline import (
+    corrections_of,
+    deaths_unasked,
+    ends,
+    how_it_died,
+    leader_changes,
+    merged_after_s,
+    terms_led,
+)
+from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import ate_m, relative_pose_error, unaligned_ate_m
 from flocc_launch.runs.version import flocc_version
 
 Float = NDArray[np.float64]
 
 
-def build(loaded: LoadedRun) -> Report:
+def _odometry_made(recordings: Mapping[str, str]) -> dict[str, str]:
+    """What recordings say of odometry that was made; one that is no longer there says nothing."""
+    files = {robot: Path(folder) / ODOMETRY_MADE for robot, folder in recordings.items()}
+    return {robot: file.read_text(encoding="utf-8").strip() for robot, file in files.items() if file.is_file()}
+
+
+def build(loaded: LoadedRun) -> RunReport:
     """Compute the report of a run."""
     run, tracks = loaded.run, loaded.tracks
     frames = sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
     by_robot = bytes_by_robot(loaded)
-    report = Report(
+    report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
         driver=run.driver,
@@ -43,6 +61,7 @@ def build(loaded: LoadedRun) -> Report:
         duration_s=loaded.end_s,
         wall_s=run.wall_s,
         robots=list(loaded.robots),
+        odometry_made=_odometry_made(run.recordings),
         map_frames=frames,
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
@@ -66,17 +85,18 @@ def build(loaded: LoadedRun) -> Report:
         optimisations=optimisations_part(loaded),
         expectations=[],
         robot_details=robots,
+        deaths_unasked=deaths_unasked(loaded.events),
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
 
 
-def with_keyframes(tracks: Iterable[Track]) -> list[Track]:
+def with_keyframes(tracks: Iterable[RobotTrack]) -> list[RobotTrack]:
     """The tracks that have keyframes at all."""
     return [track for track in tracks if len(track)]
 
 
-def ate_joint_m(tracks: Mapping[str, Track]) -> float | None:
+def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:
     """Joint ATE, or None unless every robot with keyframes is in one map frame and has ground truth."""
     moved = with_keyframes(tracks.values())
     frames = {track.map_frame for track in moved}
@@ -85,13 +105,13 @@ def ate_joint_m(tracks: Mapping[str, Track]) -> float | None:
     return ate_in_frame_m(moved, frames.pop() or "")
 
 
-def ate_in_frame_m(tracks: Iterable[Track], frame: str) -> float | None:
+def ate_in_frame_m(tracks: Iterable[RobotTrack], frame: str) -> float | None:
     """Joint ATE of the robots in one map frame."""
     pairs = [track.corrected_and_true() for track in tracks if track.map_frame == frame]
     return ate_m([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
 
 
-def ate_joint_odometry_m(tracks: Mapping[str, Track], aligned: bool) -> float | None:
+def ate_joint_odometry_m(tracks: Mapping[str, RobotTrack], aligned: bool) -> float | None:
     """Joint ATE of odometry placed at its true starts, or None unless every robot has ground truth."""
     moved = with_keyframes(tracks.values())
     pairs = [track.odometry_and_true() for track in moved]
@@ -111,15 +131,15 @@ def track_error(estimate: Float, truth: Float) -> TrackError:
     )
 
 
-def robot_part(loaded: LoadedRun, robot: str) -> Robot:
+def robot_part(loaded: LoadedRun, robot: str) -> RobotReport:
     """One robot's part of the report."""
     track, result = loaded.tracks[robot], loaded.results.get(robot)
     corrections = corrections_of(loaded.events, robot)
     end = ends(loaded.events).get(robot)
-    return Robot(
+    return RobotReport(
         robot=robot,
         incarnation=None if result is None else result.incarnation,
-        end=None if end is None else "died" if isinstance(end, AgentDied) else "stopped",
+        end=None if end is None else "died" if isinstance(end.fact, AgentDied) else "stopped",
         ended_s=None if end is None else end.t,
         keyframes=len(track),
         keyframes_with_ground_truth=int(track.true.sum()),
@@ -127,7 +147,7 @@ def robot_part(loaded: LoadedRun, robot: str) -> Robot:
         map_frame=track.map_frame,
         server=robot in loaded.run.servers,
         corrections=len(corrections),
-        frame_changes=sum(correction.frame_changed for correction in corrections),
+        frame_changes=sum(correction.fact.frame_changed for correction in corrections),
         logs={} if result is None else dict(sorted(result.logs.items())),
         corrected=track_error(*track.corrected_and_true()),
         odometry=track_error(*track.odometry_and_true()),
@@ -138,7 +158,7 @@ def closures_part(loaded: LoadedRun) -> Closures:
     """Count pairs by what became of them."""
     pairs = loaded.pairs
     rejected = Counter(pair.reason for pair in pairs if pair.rejected and pair.reason is not None)
-    rounds = of_kind(loaded.events, GraphOptimised)
+    rounds = [event.fact for event in of_kind(loaded.events, RoundSolved)]
     return Closures(
         accepted=sum(pair.accepted for pair in pairs),
         rejected=sum(pair.rejected for pair in pairs),
@@ -152,8 +172,8 @@ def closures_part(loaded: LoadedRun) -> Closures:
 
 def optimisations_part(loaded: LoadedRun) -> Optimisations:
     """What the leaders' solvers did."""
-    rounds = of_kind(loaded.events, GraphOptimised)
-    times_s = [event.solve_s for event in rounds if event.solve_s is not None]
+    rounds = [event.fact for event in of_kind(loaded.events, RoundSolved)]
+    times_s = [solved.solve_s for solved in rounds if solved.solve_s is not None]
     return Optimisations(
         rounds=len(rounds), cost=rounds[-1].cost if rounds else None, solve_s_max=max(times_s, default=None)
     )
@@ -166,13 +186,13 @@ def bytes_by_robot(loaded: LoadedRun) -> dict[str, RobotBytes]:
     last: dict[str, BytesCounted] = {}
     for event in of_kind(loaded.events, BytesCounted):
         before = last.get(event.robot)
-        if before is not None and sum(event.sent.values()) < sum(before.sent.values()):
+        if before is not None and sum(event.fact.sent.values()) < sum(before.sent.values()):
             sent.setdefault(event.robot, Counter()).update(before.sent)
             received.setdefault(event.robot, Counter()).update(before.received)
-        last[event.robot] = event
-    for robot, event in last.items():
-        sent.setdefault(robot, Counter()).update(event.sent)
-        received.setdefault(robot, Counter()).update(event.received)
+        last[event.robot] = event.fact
+    for robot, counted in last.items():
+        sent.setdefault(robot, Counter()).update(counted.sent)
+        received.setdefault(robot, Counter()).update(counted.received)
     return {
         robot: RobotBytes(sent=dict(sorted(sent[robot].items())), received=dict(sorted(received[robot].items())))
         for robot in sorted(sent)
@@ -188,24 +208,27 @@ def total_bytes(by_robot: Mapping[str, RobotBytes]) -> dict[str, int]:
 
 
 def warnings_of(loaded: LoadedRun) -> list[str]:
-    """Sentences that a reader should see: deaths, refusals, missing results, what the solver said last."""
+    """Sentences that a reader should see: deaths, refusals, missing results, unknown events, the solver's last."""
     events = loaded.events
     found = [f"{e.robot} died after {e.t:.1f} s ({how_it_died(e)})." for e in of_kind(events, AgentDied)]
-    found += sorted({f"{e.robot} refused {e.peer}: {e.reason}." for e in of_kind(events, PeerRefused)})
+    found += sorted({f"{e.robot} refused {e.fact.peer}: {e.fact.reason}." for e in of_kind(events, PeerRefused)})
     for robot in loaded.robots:
         if robot not in loaded.results:
             found.append(f"{robot} left no result; its trajectory is odometry only.")
-    rounds = of_kind(events, GraphOptimised)
-    return found + ([f"Last optimisation: {text}" for text in rounds[-1].warnings] if rounds else [])
+    unknown = Counter(event.fact.name for event in of_kind(events, UnknownFact))
+    for name, count in sorted(unknown.items()):
+        found.append(f"This version does not know events of the kind {name} ({count} in this run).")
+    rounds = of_kind(events, RoundSolved)
+    return found + ([f"Last optimisation: {text}" for text in rounds[-1].fact.warnings] if rounds else [])
 
 
 def registered_by(loaded: LoadedRun) -> Counter[str]:
     """Accepted closures by the robot that registered them."""
-    return Counter(event.by or event.robot for event in of_kind(loaded.events, ClosureAccepted))
+    return Counter(event.fact.by or event.robot for event in of_kind(loaded.events, ClosureAccepted))
 
 
 def judged(
-    limits: Mapping[str, float | str], report: Report, registered: Mapping[str, int] | None = None
+    limits: Mapping[str, float | str], report: RunReport, registered: Mapping[str, int] | None = None
 ) -> list[Expectation]:
     """Hold a scenario's expectations against a report.
 
@@ -229,7 +252,7 @@ def met(name: str, limit: float | str, value: float | str | None) -> bool | None
     return value >= limit if name.endswith("_min") else value <= limit
 
 
-def measured(report: Report, registered: Mapping[str, int]) -> dict[str, float | str | None]:
+def measured(report: RunReport, registered: Mapping[str, int]) -> dict[str, float | str | None]:
     """The values that expectations can name."""
     before, after = report.ate_joint_odometry_m, report.ate_joint_m
     leader = max(report.leaders, key=lambda span: span.to_s).leader if report.leaders else None
@@ -245,5 +268,6 @@ def measured(report: Report, registered: Mapping[str, int]) -> dict[str, float |
         "bytes_max": sum(report.bytes.values()),
         "wall_max_s": report.wall_s,
         "leader": leader,
+        "deaths_max": len(report.deaths_unasked),
         "leader_registered_ratio_min": None if leader is None or not closures else registered.get(leader, 0) / closures,
     }

@@ -7,7 +7,7 @@ from flocc_launch.report.figure_map import colour
 from flocc_launch.report.svg import Axis, element, path, svg, text_of, title
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.run_records import setting_number
-from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import alignment
 
 Float = NDArray[np.float64]
@@ -85,7 +85,7 @@ def error_figure(loaded: LoadedRun) -> str | None:
     return svg(WIDTH_PX, HEIGHT_PX, frame(x, y, "stamp, s", "error, m"), *lines, label="Error of each keyframe")
 
 
-def errors_before(track: Track) -> Float:
+def errors_before(track: RobotTrack) -> Float:
     """Position error (N,) of odometry put at its true first pose, NaN without truth."""
     errors = np.full(len(track), np.nan)
     estimate, truth = track.odometry_and_true()

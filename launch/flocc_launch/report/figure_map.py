@@ -11,7 +11,7 @@ from flocc_launch.report.svg import PALETTE_SIZE, Axis, element, nice_step, path
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import number
-from flocc_launch.runs.tracks import Track
+from flocc_launch.runs.tracks import RobotTrack
 from flocc_launch.runs.trajectory_errors import alignment
 from flocc_protocol.ids import KeyframeId
 
@@ -25,7 +25,7 @@ AXIS_NAMES = "xyz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class MapScene:
     """Positions to draw, all in one frame: per robot (N, 3), NaN where unknown."""
 
     name: str
@@ -36,7 +36,7 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class MapView:
     """Which two axes are drawn, and how metres become pixels."""
 
     across: int
@@ -50,7 +50,7 @@ class View:
         return self.x(float(position_m[self.across])), self.y(float(position_m[self.up]))
 
 
-def scenes(loaded: LoadedRun) -> list[Scene]:
+def scenes(loaded: LoadedRun) -> list[MapScene]:
     """Before and after: in the world where ground truth is known, else in each map frame."""
     if any(track.true.any() for track in loaded.tracks.values()):
         return [before_in_world(loaded), after_in_world(loaded)]
@@ -58,7 +58,7 @@ def scenes(loaded: LoadedRun) -> list[Scene]:
     return [scene for frame in frames for scene in in_map(loaded, frame)]
 
 
-def before_in_world(loaded: LoadedRun) -> Scene:
+def before_in_world(loaded: LoadedRun) -> MapScene:
     """Odometry, each robot put at its true first pose."""
     lines = {}
     for robot, track in loaded.tracks.items():
@@ -66,10 +66,10 @@ def before_in_world(loaded: LoadedRun) -> Scene:
             first = int(np.argmax(track.true))
             T_world_odom = track.T_world_body[first] @ inverse(track.T_odom_body[first])
             lines[robot] = (T_world_odom @ track.T_odom_body)[:, :3, 3]
-    return Scene("Before", "Odometry alone, each robot put at its true start.", lines, truths(loaded), False)
+    return MapScene("Before", "Odometry alone, each robot put at its true start.", lines, truths(loaded), False)
 
 
-def after_in_world(loaded: LoadedRun) -> Scene:
+def after_in_world(loaded: LoadedRun) -> MapScene:
     """Corrected trajectories, the robots of one map frame aligned to ground truth together."""
     lines: dict[str, Float] = {}
     frames = sorted({track.map_frame for track in loaded.tracks.values() if track.map_frame is not None})
@@ -80,21 +80,21 @@ def after_in_world(loaded: LoadedRun) -> Scene:
             T_world_map = alignment([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
             lines |= {robot: (T_world_map @ track.T_map_body)[:, :3, 3] for robot, track in members.items()}
     together = "all robots moved together onto the truth" if len(frames) == 1 else "each map moved onto the truth"
-    return Scene("After", f"Corrected by the swarm, {together}.", lines, truths(loaded), True)
+    return MapScene("After", f"Corrected by the swarm, {together}.", lines, truths(loaded), True)
 
 
-def in_map(loaded: LoadedRun, frame: str) -> list[Scene]:
+def in_map(loaded: LoadedRun, frame: str) -> list[MapScene]:
     """Odometry from its corrected start, and corrected trajectories, of the robots in one map frame."""
     members = {robot: track for robot, track in loaded.tracks.items() if track.map_frame == frame}
     before = {robot: from_corrected_start(track) for robot, track in members.items()}
     after = {robot: track.T_map_body[:, :3, 3] for robot, track in members.items()}
     return [
-        Scene(f"Before, in {frame}", "Odometry alone, from each robot's corrected start.", before, {}, False),
-        Scene(f"After, in {frame}", "Corrected by the swarm.", after, {}, True),
+        MapScene(f"Before, in {frame}", "Odometry alone, from each robot's corrected start.", before, {}, False),
+        MapScene(f"After, in {frame}", "Corrected by the swarm.", after, {}, True),
     ]
 
 
-def from_corrected_start(track: Track) -> Float:
+def from_corrected_start(track: RobotTrack) -> Float:
     """Odometry positions (N, 3) in the map frame, put at the first corrected pose."""
     if not track.corrected.any():
         return np.full((len(track), 3), np.nan)
@@ -108,7 +108,7 @@ def truths(loaded: LoadedRun) -> dict[str, Float]:
     return {robot: track.T_world_body[:, :3, 3] for robot, track in loaded.tracks.items() if track.true.any()}
 
 
-def view_of(shown: Iterable[Scene]) -> View:
+def view_of(shown: Iterable[MapScene]) -> MapView:
     """One view for all scenes: the plane with the largest extent, equal axes."""
     clouds = [line for scene in shown for line in (*scene.lines_m.values(), *scene.truth_m.values())]
     points = np.concatenate(clouds) if clouds else np.zeros((1, 3))
@@ -123,10 +123,10 @@ def view_of(shown: Iterable[Scene]) -> View:
     half_x, half_y = drawn_px / 2 / scale, (height_px / 2 - MARGIN_PX) / scale
     x = Axis(middle[across] - half_x, middle[across] + half_x, MARGIN_PX, WIDTH_PX - MARGIN_PX)
     y = Axis(middle[up] - half_y, middle[up] + half_y, height_px - MARGIN_PX, MARGIN_PX)
-    return View(across, up, x, y, height_px)
+    return MapView(across, up, x, y, height_px)
 
 
-def map_figure(scene: Scene, view: View, loaded: LoadedRun) -> str:
+def map_figure(scene: MapScene, view: MapView, loaded: LoadedRun) -> str:
     """Draw one scene."""
     robots = list(loaded.robots)
     layers = [element("rect", x=0.5, y=0.5, width=WIDTH_PX - 1, height=view.height_px - 1, rx=8, class_="frame")]
@@ -147,7 +147,7 @@ def colour(robots: Sequence[str], robot: str) -> str:
     return f"c{robots.index(robot) % PALETTE_SIZE}" if robot in robots else f"c{PALETTE_SIZE - 1}"
 
 
-def line_of(points_m: Float, view: View, class_: str) -> str:
+def line_of(points_m: Float, view: MapView, class_: str) -> str:
     """A line through the known points; it breaks where one is unknown."""
     known = np.asarray(np.isfinite(points_m).all(axis=1))
     pieces = np.split(np.arange(len(points_m)), np.flatnonzero(~known))
@@ -155,7 +155,7 @@ def line_of(points_m: Float, view: View, class_: str) -> str:
     return "".join(path((view(points_m[i]) for i in run), class_) for run in runs if len(run))
 
 
-def start_of(robot: str, points_m: Float, view: View, class_: str) -> str:
+def start_of(robot: str, points_m: Float, view: MapView, class_: str) -> str:
     """A dot and the robot's name where its line starts."""
     known = points_m[np.isfinite(points_m).all(axis=1)]
     if not len(known):
@@ -169,7 +169,7 @@ def start_of(robot: str, points_m: Float, view: View, class_: str) -> str:
     return element("g", element("circle", cx=x, cy=y, r=5, class_="dot"), name, class_=class_)
 
 
-def pairs_layer(scene: Scene, view: View, loaded: LoadedRun) -> str:
+def pairs_layer(scene: MapScene, view: MapView, loaded: LoadedRun) -> str:
     """Accepted closures coloured by probability, rejected candidates as crosses."""
     accepted, rejected = [], []
     for pair in loaded.pairs:
@@ -183,7 +183,7 @@ def pairs_layer(scene: Scene, view: View, loaded: LoadedRun) -> str:
     return element("g", *rejected, class_="rejected") + element("g", *accepted, class_="accepted")
 
 
-def position_of(scene: Scene, loaded: LoadedRun, keyframe: KeyframeId) -> Float | None:
+def position_of(scene: MapScene, loaded: LoadedRun, keyframe: KeyframeId) -> Float | None:
     """Where a keyframe is drawn, None where it is not."""
     points, track = scene.lines_m.get(keyframe.log.robot), loaded.tracks.get(keyframe.log.robot)
     if points is None or track is None or keyframe.log.incarnation != track.incarnation:
@@ -219,7 +219,7 @@ def cross(pair: Pair, at_px: tuple[float, float]) -> str:
     return element("path", title(f"{pair.query} – {pair.match}: {pair.reason}"), d=d, class_="cross")
 
 
-def scale_bar(view: View) -> str:
+def scale_bar(view: MapView) -> str:
     """A bar of a round length, at the bottom left."""
     metres_per_px = (view.x.high - view.x.low) / (view.x.to_px - view.x.from_px)
     length_m = nice_step(60 * metres_per_px)
@@ -228,7 +228,7 @@ def scale_bar(view: View) -> str:
     return bar + element("text", f"{length_m:g} m", x=end + 6, y=y + 1, class_="soft", font_size=12)
 
 
-def compass(view: View) -> str:
+def compass(view: MapView) -> str:
     """Which axes are drawn, at the bottom right."""
     text = f"{AXIS_NAMES[view.across]} →  {AXIS_NAMES[view.up]} ↑"
     return element("text", text, x=WIDTH_PX - 12, y=view.height_px - 11, class_="soft", text_anchor="end", font_size=12)

@@ -4,12 +4,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from flocc_agent.core.reports import CorrectionApplied
+from flocc_agent.runtime.event_lines import of_kind
+from flocc_agent.runtime.facts import AgentDied, AgentStopped
 from flocc_launch.report.figure_map import colour
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.report.svg import Axis, element, path, svg, text_of, title
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import count_of, seconds
-from flocc_launch.runs.run_records import AgentDied, AgentStopped, CorrectionApplied, of_kind
 from flocc_launch.runs.timeline import Link
 from flocc_protocol.ids import LogId
 
@@ -45,7 +47,7 @@ class Row:
     below: Sequence[Span] | None = None
 
 
-def time_figure(loaded: LoadedRun, report: Report) -> str:
+def time_figure(loaded: LoadedRun, report: RunReport) -> str:
     """Draw everything that happened over time."""
     axis = Axis(0.0, max(loaded.end_s, 1e-3), LEFT_PX, WIDTH_PX - RIGHT_PX)
     groups = [
@@ -105,8 +107,8 @@ def frame_spans(loaded: LoadedRun, robot: str) -> list[Span]:
     """Stretches of one robot in one map frame; a robot that died is in none."""
     changes: list[tuple[float, str | None]] = []
     for event in loaded.events:
-        if event.robot == robot and isinstance(event, CorrectionApplied | AgentDied | AgentStopped):
-            frame = event.map_frame if isinstance(event, CorrectionApplied) else None
+        if event.robot == robot and isinstance(event.fact, CorrectionApplied | AgentDied | AgentStopped):
+            frame = event.fact.map_frame if isinstance(event.fact, CorrectionApplied) else None
             if not changes or changes[-1][1] != frame:
                 changes.append((event.t, frame))
     spans = []
@@ -219,7 +221,7 @@ def time_grid(axis: Axis, top: float, bottom: float) -> str:
     return "".join(lines)
 
 
-def moments(loaded: LoadedRun, report: Report) -> list[tuple[float, str, str]]:
+def moments(loaded: LoadedRun, report: RunReport) -> list[tuple[float, str, str]]:
     """Time, name and class of the moments that are marked: the merge and deaths; in order of time."""
     found = [(event.t, f"{event.robot} died", "mark bad") for event in of_kind(loaded.events, AgentDied)]
     if report.merged_after_s is not None:

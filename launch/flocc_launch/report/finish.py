@@ -4,15 +4,15 @@ from pathlib import Path
 
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.report.build import build
-from flocc_launch.report.g2o import write_pose_graph
 from flocc_launch.report.html import write_html
-from flocc_launch.report.model import SCHEMA_VERSION, Report
+from flocc_launch.report.model import SCHEMA_VERSION, RunReport
+from flocc_launch.report.run_graph import write_pose_graph
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, read_record, write_json
 from flocc_launch.runs.tracks import Float, Mask
 
 
-def finish(folder: RunFolder) -> Report:
+def finish(folder: RunFolder) -> RunReport:
     """Write trajectories, pose graph, report.json and report.html; doing it again gives the same files.
 
     Raises:
@@ -27,13 +27,13 @@ def finish(folder: RunFolder) -> Report:
     return report
 
 
-def read_report(path: Path) -> Report:
+def read_report(path: Path) -> RunReport:
     """Read a `report.json`.
 
     Raises:
         RunFolderError: It is missing, cut off, or of another schema version.
     """
-    report = read_record(path, Report)
+    report = read_record(path, RunReport)
     if report.schema_version != SCHEMA_VERSION:
         raise RunFolderError(f"{path}: has schema version {report.schema_version}, this flocc reads {SCHEMA_VERSION}")
     return report

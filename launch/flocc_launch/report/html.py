@@ -4,18 +4,18 @@ from importlib.resources import files
 from pathlib import Path
 
 from flocc_launch.report import section_accounts, sections
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.report.svg import element, text_of
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.loaded_run import LoadedRun
 
 
-def write_html(path: Path, report: Report, loaded: LoadedRun) -> None:
+def write_html(path: Path, report: RunReport, loaded: LoadedRun) -> None:
     """Write report.html."""
     path.write_text(page(report, loaded), encoding="utf-8")
 
 
-def page(report: Report, loaded: LoadedRun) -> str:
+def page(report: RunReport, loaded: LoadedRun) -> str:
     """The whole page: the verdict first, then what it rests on."""
     body = element(
         "main",

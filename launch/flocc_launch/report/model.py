@@ -5,7 +5,7 @@ The keys that other programs rely on stand in DESIGN.md section 8, all of them i
 
 from pydantic import Field
 
-from flocc_launch.runs.run_records import Record
+from flocc_agent.runtime.robot_result import Record
 
 SCHEMA_VERSION = 1
 
@@ -59,7 +59,7 @@ class TrackError(Record):
     """RMSE of the turn from one keyframe to the next."""
 
 
-class Robot(Record):
+class RobotReport(Record):
     """One robot at the end of the run."""
 
     robot: str
@@ -139,7 +139,7 @@ class Optimisations(Record):
     """Longest one."""
 
 
-class Report(Record):
+class RunReport(Record):
     """`report.json`."""
 
     schema_version: int = SCHEMA_VERSION
@@ -152,6 +152,8 @@ class Report(Record):
     """Length of the run on its own clock."""
     wall_s: float | None
     robots: list[str]
+    odometry_made: dict[str, str] = Field(default_factory=dict)
+    """Robot -> how its odometry was made of ground truth, where its data set had none."""
     map_frames: list[str]
     """Frames at the end, each named once; a robot that was never corrected adds none."""
     merged_after_s: float | None
@@ -184,5 +186,7 @@ class Report(Record):
     """How often the robots went from one leader to another, the upper median over the robots."""
     optimisations: Optimisations
     expectations: list[Expectation]
-    robot_details: list[Robot]
+    robot_details: list[RobotReport]
+    deaths_unasked: list[str] = Field(default_factory=list)
+    """Robots whose agents died without a fault of the scenario or an operator's order, once for each death."""
     warnings: list[str]

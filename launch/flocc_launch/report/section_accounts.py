@@ -1,6 +1,6 @@
 """The parts of report.html about cost: bytes on every link, and time by stage."""
 
-from flocc_launch.report.model import LinkBytes, Report, StageTime
+from flocc_launch.report.model import LinkBytes, RunReport, StageTime
 from flocc_launch.report.sections import bar, noted, swatch, table
 from flocc_launch.report.svg import element, svg, text_of, title
 from flocc_launch.runs.plain_numbers import count_of, number, size_of
@@ -10,7 +10,7 @@ LINKS_SHOWN_MAX = 20
 BARS_WIDTH_PX, BARS_HEIGHT_PX = 200.0, 26.0
 
 
-def links(report: Report) -> str:
+def links(report: RunReport) -> str:
     """Bytes on every link: a matrix for few robots, the heaviest links for many."""
     if not report.links:
         return ""
@@ -28,7 +28,7 @@ def links(report: Report) -> str:
     return element("h3", "From whom to whom") + shown + noted(note) + below
 
 
-def matrix(report: Report, robots: list[str]) -> str:
+def matrix(report: RunReport, robots: list[str]) -> str:
     """Received bytes, senders down and receivers across; darker is more."""
     by_ends = {(link.sender, link.receiver): link for link in report.links}
     most = max((received_of(link) for link in report.links), default=0) or 1
@@ -56,7 +56,7 @@ def cell(link: LinkBytes | None, most: int) -> str:
     return element("td", text_of(size_of(received_of(link)) + lost), class_="n", style=shade, title=said)
 
 
-def link_table(report: Report, shown: list[LinkBytes]) -> str:
+def link_table(report: RunReport, shown: list[LinkBytes]) -> str:
     """Both ends' counts of each link."""
     rows = [
         [
@@ -79,7 +79,7 @@ def unaccounted(link: LinkBytes) -> str:
     return f"{100 * link.unaccounted / link.sent:.2f} %"
 
 
-def stages(report: Report) -> str:
+def stages(report: RunReport) -> str:
     """How long each stage of the work took."""
     if not report.stages:
         return ""

@@ -10,13 +10,13 @@ from flocc_launch.doctor import Severity, diagnose_loaded
 from flocc_launch.report.figure_charts import error_figure, ratio_figure
 from flocc_launch.report.figure_map import colour, map_figure, scenes, view_of
 from flocc_launch.report.figure_time import time_figure
-from flocc_launch.report.model import Report, Robot
+from flocc_launch.report.model import RobotReport, RunReport
 from flocc_launch.report.svg import element, text_of
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
 
 
-def kicker(report: Report) -> str:
+def kicker(report: RunReport) -> str:
     """What ran, in one line above the verdict."""
     parts = [f"flocc {report.driver or 'run'}", report.scenario, f"{len(report.robots)} robots"]
     parts += [when(report.start)] if report.start is not None else []
@@ -32,7 +32,7 @@ def when(start: str | float) -> str:
     return f"{moment:%Y-%m-%d %H:%M} {moment.tzname() or ''}".rstrip()
 
 
-def tiles(report: Report) -> str:
+def tiles(report: RunReport) -> str:
     """The figures that matter most."""
     shown = [
         (seconds(report.merged_after_s), "until one map" if report.merged_after_s else "not merged into one map"),
@@ -46,14 +46,14 @@ def tiles(report: Report) -> str:
     return element("div", *made, class_="tiles")
 
 
-def duration_text(report: Report) -> str:
+def duration_text(report: RunReport) -> str:
     """On which clock the run was that long."""
     if report.wall_s is None:
         return "run, virtual time" if report.driver == "simulate" else "run"
     return f"run; {seconds(report.wall_s)} of wall time"
 
 
-def ate_tile(report: Report) -> tuple[str, str]:
+def ate_tile(report: RunReport) -> tuple[str, str]:
     """The joint error beside odometry's; of the one map there is, where some robots are not in it."""
     before, after = report.ate_joint_odometry_m, report.ate_joint_m
     alone = report.ate_by_frame_m.get(report.map_frames[0]) if len(report.map_frames) == 1 else None
@@ -65,7 +65,7 @@ def ate_tile(report: Report) -> tuple[str, str]:
     return number(after, "m"), f"joint ATE; odometry alone: {number(before, 'm')}{gain}"
 
 
-def expectations(report: Report) -> str:
+def expectations(report: RunReport) -> str:
     """What the scenario asked for, and whether it holds."""
     if not report.expectations:
         return ""
@@ -78,7 +78,7 @@ def expectations(report: Report) -> str:
     return element("h2", "Expectations") + table(["name", "limit#", "value#", ""], rows, class_="narrow")
 
 
-def warnings(report: Report) -> str:
+def warnings(report: RunReport) -> str:
     """What a reader should know before trusting the rest."""
     if not report.warnings:
         return ""
@@ -98,7 +98,7 @@ def findings(loaded: LoadedRun) -> str:
     return element("div", element("h3", heading), element("ul", *items), class_="callout")
 
 
-def trajectories(report: Report, loaded: LoadedRun) -> str:
+def trajectories(report: RunReport, loaded: LoadedRun) -> str:
     """Before and after, seen from above, with what is needed to read it."""
     shown = scenes(loaded)
     heading = element("h2", "Where the robots went")
@@ -124,7 +124,7 @@ def trajectories(report: Report, loaded: LoadedRun) -> str:
     )
 
 
-def map_legend(report: Report, with_truth: bool, unused: bool) -> str:
+def map_legend(report: RunReport, with_truth: bool, unused: bool) -> str:
     """Colours and marks, with switches for the layers."""
     robots = [
         element("li", key(f'<line x1="0" x2="26" y1="6" y2="6" class="track {colour(report.robots, robot)}"/>'), robot)
@@ -154,7 +154,7 @@ def switch(layer: str, drawing: str, name: str, on: bool) -> str:
     return element("li", element("label", box, drawing, name))
 
 
-def errors_part(report: Report, errors: str) -> str:
+def errors_part(report: RunReport, errors: str) -> str:
     """Error of each keyframe, beside the errors of each robot."""
     rows = []
     for robot in report.robot_details:
@@ -185,7 +185,7 @@ def errors_part(report: Report, errors: str) -> str:
     return element("div", left, right, class_="pair")
 
 
-def over_time(report: Report, loaded: LoadedRun) -> str:
+def over_time(report: RunReport, loaded: LoadedRun) -> str:
     """What happened when."""
     text = (
         "Bars take the colour of the map's anchor or of the leader. "
@@ -195,7 +195,7 @@ def over_time(report: Report, loaded: LoadedRun) -> str:
     return element("h2", "What happened when") + noted(text) + figure
 
 
-def closures(report: Report, loaded: LoadedRun) -> str:
+def closures(report: RunReport, loaded: LoadedRun) -> str:
     """Where closures came from and why candidates were rejected."""
     counts, heading = report.closures, element("h2", "Loop closures")
     solver = "" if counts.used is None else f" The last optimisation used {counts.used}"
@@ -217,7 +217,7 @@ def closures(report: Report, loaded: LoadedRun) -> str:
     return heading + element("p", text_of(text)) + element("div", *parts, class_="pair")
 
 
-def by_robots(report: Report, loaded: LoadedRun) -> str:
+def by_robots(report: RunReport, loaded: LoadedRun) -> str:
     """Accepted and rejected pairs of each two robots."""
     accepted: Counter[tuple[str, str]] = Counter()
     rejected: Counter[tuple[str, str]] = Counter()
@@ -248,7 +248,7 @@ def by_reason(reasons: dict[str, int]) -> str:
     return element("h3", "Why candidates were rejected") + table(["reason", "pairs#", "!"], rows)
 
 
-def network(report: Report) -> str:
+def network(report: RunReport) -> str:
     """Bytes by kind and by robot."""
     heading = element("h2", "What travelled")
     if not report.bytes:
@@ -278,7 +278,7 @@ def bar(ratio: float, kind: str) -> str:
     return f'<span class="in" style="width:{100 * ratio:.1f}%;background:var(--p{0 if kind == "good" else 1})"></span>'
 
 
-def robots(report: Report) -> str:
+def robots(report: RunReport) -> str:
     """Every robot at the end."""
     rows = [robot_row(report, robot) for robot in report.robot_details]
     heads = ["", "keyframes#", "path, m#", "map frame", "corrections#", "frame changes#", "records held#", "end"]
@@ -293,7 +293,7 @@ def robots(report: Report) -> str:
     return element("h2", "Robots") + wide + (leaders if led else "")
 
 
-def robot_row(report: Report, robot: Robot) -> list[str]:
+def robot_row(report: RunReport, robot: RobotReport) -> list[str]:
     """One robot's row."""
     end = "–" if robot.end is None else f"{robot.end} at {seconds(robot.ended_s)}"
     return [
@@ -308,7 +308,7 @@ def robot_row(report: Report, robot: Robot) -> list[str]:
     ]
 
 
-def settings(report: Report, loaded: LoadedRun) -> str:
+def settings(report: RunReport, loaded: LoadedRun) -> str:
     """With what it ran: enough to run it again."""
     run = loaded.run
     pairs: list[tuple[str, Any]] = [("scenario", report.scenario), ("driver", report.driver), ("seed", report.seed)]
@@ -333,7 +333,7 @@ def setting(value: Any) -> str:
     return "–" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
-def footer(report: Report) -> str:
+def footer(report: RunReport) -> str:
     """What the figures mean and where the rest lies."""
     text = (
         "ATE is the translation RMSE over keyframes. Beside this page: report.json (the same figures), trajectories/, "
@@ -347,7 +347,7 @@ def noted(text: str) -> str:
     return element("p", text_of(text), class_="note")
 
 
-def swatch(report: Report, robot: str) -> str:
+def swatch(report: RunReport, robot: str) -> str:
     """A robot's name beside its colour."""
     square = element("span", class_=f"swatch {colour(report.robots, robot)}")
     return element("span", square, text_of(robot), style="white-space:nowrap")

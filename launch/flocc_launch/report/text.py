@@ -1,11 +1,11 @@
 """A report for the terminal: the verdict, the figures, expectations, warnings."""
 
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
 
 
-def sentences(report: Report) -> list[str]:
+def sentences(report: RunReport) -> list[str]:
     """Lines that a person reads after a run: the verdict, the figures, the robots, what was expected."""
     closures, bytes_sent = report.closures, sum(report.bytes.values())
     lines = [
@@ -35,7 +35,7 @@ def judged(met: bool | None) -> str:
     return "not measured" if met is None else "met" if met else "MISSED"
 
 
-def stage_lines(report: Report) -> list[str]:
+def stage_lines(report: RunReport) -> list[str]:
     """A table of stages, where the run kept account of them."""
     if not report.stages:
         return []
@@ -48,7 +48,7 @@ def stage_lines(report: Report) -> list[str]:
     return [head, *rows, ""]
 
 
-def robot_lines(report: Report) -> list[str]:
+def robot_lines(report: RunReport) -> list[str]:
     """A table of robots."""
     head = f"{'robot':<14}{'keyframes':>10}{'ATE, m':>10}{'odometry':>10}{'RPE, m':>10}{'odometry':>10}  map frame"
     rows = [

@@ -1,19 +1,19 @@
 """The run in one or two sentences."""
 
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.plain_numbers import number, seconds
 
 COUNT_WORDS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine"}
 
 
-def verdict(report: Report) -> str:
+def verdict(report: RunReport) -> str:
     """Whether the maps merged, when, and what it did to the error."""
     if len(report.robots) == 1:
         return alone(report)
     return " ".join(sentence for sentence in (map_sentence(report), error_sentence(report)) if sentence)
 
 
-def alone(report: Report) -> str:
+def alone(report: RunReport) -> str:
     """What there is to say of a single robot, which closes loops with itself where it was asked to."""
     loops = report.closures.accepted
     if loops:
@@ -24,7 +24,7 @@ def alone(report: Report) -> str:
     return f"One robot ran, alone: nothing corrects its odometry.{error}"
 
 
-def map_sentence(report: Report) -> str:
+def map_sentence(report: RunReport) -> str:
     """Whether the robots that lived to the end share one map."""
     died = [robot.robot for robot in report.robot_details if robot.end == "died"]
     living = [robot for robot in report.robot_details if robot.end != "died" and not robot.server]
@@ -44,7 +44,7 @@ def map_sentence(report: Report) -> str:
     )
 
 
-def error_sentence(report: Report) -> str:
+def error_sentence(report: RunReport) -> str:
     """What the joint error came to, against odometry alone."""
     before, after = report.ate_joint_odometry_m, report.ate_joint_m
     if before is None and not any(value is not None for value in report.ate_odometry_m.values()):

@@ -3,7 +3,9 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from flocc_launch.runs.run_records import CandidateFound, ClosureAccepted, ClosureRejected, Event, RobotResult
+from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected, Fact
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_protocol.ids import KeyframeId
 
 
@@ -44,14 +46,14 @@ class Pair:
         return self.query.log.robot != self.match.log.robot
 
 
-def pairs_of(events: Iterable[Event], results: Iterable[RobotResult]) -> list[Pair]:
+def pairs_of(events: Iterable[Reported[Fact]], results: Iterable[RobotResult]) -> list[Pair]:
     """Every pair that any robot found, registered or holds in its logs at the end; sorted."""
     pairs: dict[tuple[KeyframeId, KeyframeId], Pair] = {}
     for event in events:
-        if isinstance(event, CandidateFound | ClosureAccepted | ClosureRejected):
-            query, match = KeyframeId.parse(event.query), KeyframeId.parse(event.match)
+        if isinstance(event.fact, CandidateFound | ClosureAccepted | ClosureRejected):
+            query, match = event.fact.query, event.fact.match
             key = (min(query, match), max(query, match))
-            pairs[key] = updated(pairs.get(key, Pair(query, match)), event)
+            pairs[key] = updated(pairs.get(key, Pair(query, match)), event.fact, event.t)
     closures = [closure for result in results for closure in result.closures]
     scales_known = any(closure.scale is not None for closure in closures)
     for closure in closures:
@@ -63,16 +65,20 @@ def pairs_of(events: Iterable[Event], results: Iterable[RobotResult]) -> list[Pa
     return [pairs[key] for key in sorted(pairs)]
 
 
-def updated(pair: Pair, event: CandidateFound | ClosureAccepted | ClosureRejected) -> Pair:
-    """The pair after one more event; an acceptance stands whatever comes later."""
-    if isinstance(event, CandidateFound):
-        return replace(pair, similarity=max(event.similarity, pair.similarity or -1.0))
+def updated(pair: Pair, fact: CandidateFound | ClosureAccepted | ClosureRejected, t: float) -> Pair:
+    """The pair after one more fact; an acceptance stands whatever comes later."""
+    if isinstance(fact, CandidateFound):
+        return replace(pair, similarity=max(fact.similarity, pair.similarity or -1.0))
     if pair.accepted:
         return pair
-    at_s = event.t if pair.at_s is None else pair.at_s
-    if isinstance(event, ClosureRejected):
-        return replace(pair, ratio=event.ratio, reason=event.reason, at_s=at_s)
-    query, match = KeyframeId.parse(event.query), KeyframeId.parse(event.match)
+    if isinstance(fact, ClosureRejected):
+        return replace(pair, ratio=fact.ratio, reason=fact.reason, at_s=t if pair.at_s is None else pair.at_s)
     return replace(
-        pair, query=query, match=match, ratio=event.ratio, probability=event.probability, accepted=True, at_s=event.t
+        pair,
+        query=fact.query,
+        match=fact.match,
+        ratio=fact.ratio,
+        probability=fact.probability,
+        accepted=True,
+        at_s=t,
     )

@@ -3,11 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.robot_result import RobotResult
 from flocc_launch.runs.closure_table import Pair, pairs_of
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import Event, RobotResult, Run
+from flocc_launch.runs.run_records import Run
 from flocc_launch.runs.timeline import Following, Link, end_s, followings, links
-from flocc_launch.runs.tracks import Track, tracks_of
+from flocc_launch.runs.tracks import RobotTrack, tracks_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,9 +19,9 @@ class LoadedRun:
 
     run: Run
     robots: tuple[str, ...]
-    events: tuple[Event, ...]
+    events: tuple[Reported[Fact], ...]
     results: Mapping[str, RobotResult]
-    tracks: Mapping[str, Track]
+    tracks: Mapping[str, RobotTrack]
     pairs: tuple[Pair, ...]
     followings: tuple[Following, ...]
     links: tuple[Link, ...]

@@ -16,7 +16,10 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from flocc_launch.runs.run_records import EVENT_TYPES, RUN_VERSION, Event, Record, RobotResult, Run
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import BadLine, Reported, reported_of
+from flocc_agent.runtime.robot_result import Record, RobotResult
+from flocc_launch.runs.run_records import RUN_VERSION, Run
 from flocc_protocol.errors import FloccError
 
 __all__ = ["Run", "RobotResult", "RunFolder", "RunFolderError"]
@@ -90,15 +93,15 @@ class RunFolder:
         """
         return read_record(self.path / "run.json", Run)
 
-    def events(self) -> list[Event]:
-        """Read `events.jsonl`; a kind that this version does not know comes back as a plain `Event`.
+    def events(self) -> list[Reported[Fact]]:
+        """Read `events.jsonl`; a kind that this version does not know comes back as an `UnknownFact`.
 
         Raises:
             RunFolderError: The file is missing, or a line is cut off, not JSON or lacks a key.
         """
         return list(self.iterate_events())
 
-    def iterate_events(self) -> Iterator[Event]:
+    def iterate_events(self) -> Iterator[Reported[Fact]]:
         """Read `events.jsonl` line by line; as `events`."""
         path = self.path / "events.jsonl"
         for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -124,18 +127,16 @@ class RunFolder:
         return None if name is None else (self.path / name)
 
 
-def event_from_line(line: str, where: str) -> Event:
+def event_from_line(line: str, where: str) -> Reported[Fact]:
     """Read one line of `events.jsonl`.
 
     Raises:
         RunFolderError: It is cut off, not JSON or lacks a key; the message starts with `where`.
     """
     try:
-        fields = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise RunFolderError(f"{where}: is cut off or not JSON: {error.msg}") from error
-    kind = fields.get("event") if isinstance(fields, dict) else None
-    return validated(fields, EVENT_TYPES.get(kind, Event) if isinstance(kind, str) else Event, where)
+        return reported_of(line)
+    except BadLine as error:
+        raise RunFolderError(f"{where}: {error}") from error
 
 
 def validated(fields: Any, record: type[R], where: str) -> R:

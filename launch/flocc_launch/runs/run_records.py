@@ -1,48 +1,13 @@
-"""What stands in a run folder, as types: `run.json`, the lines of `events.jsonl`, `result.json`.
+"""`run.json` of a run folder, as a type."""
 
-Unknown keys are ignored, so that a driver may write more than this version reads; numbers are finite, quaternions of
-unit length and keyframe identifiers well formed.
-"""
+from collections.abc import Mapping
+from typing import Any, Literal
 
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from pydantic import Field
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
-
-from flocc_agent.geometry import pose_from_tq
-from flocc_protocol.ids import KeyframeId
-
-Float = NDArray[np.float64]
-
-
-def with_direction(pose7: list[float]) -> list[float]:
-    """Return seven numbers of a pose, or say that their quaternion is none."""
-    if abs(sum(q * q for q in pose7[3:]) - 1.0) > QUATERNION_TOLERANCE:
-        raise ValueError(f"quaternion {pose7[3:]} is not of unit length")
-    return pose7
-
-
-def checked_keyframe(text: str) -> str:
-    """Return the text of a keyframe identifier, or say that it is none."""
-    KeyframeId.parse(text)
-    return text
-
-
-QUATERNION_TOLERANCE = 1e-3
-Keyframe = Annotated[str, AfterValidator(checked_keyframe)]
-"""A keyframe as text, such as `r1/12`."""
-Pose7 = Annotated[list[float], Field(min_length=7, max_length=7), AfterValidator(with_direction)]
-"""Seven finite numbers: translation x y z in metres, quaternion w x y z."""
+from flocc_agent.runtime.robot_result import Record
 
 RUN_VERSION = 1
-
-
-class Record(BaseModel):
-    """Base of what stands in a run folder: frozen; unknown keys are ignored; numbers are finite."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class Run(Record):
@@ -56,19 +21,19 @@ class Run(Record):
     """Seed of everything that is drawn; null where nothing was seeded."""
     robots: list[str]
     """Robot names."""
-    servers: list[str] = []
+    servers: list[str] = Field(default_factory=list)
     """Those of them without a camera: they take no keyframes, so they are in no map."""
     start: str | float | None = None
     """Wall clock at t = 0: ISO 8601 or Unix seconds; null on virtual time."""
     driver: Literal["launch", "simulate", "agent"] | None = None
     """What ran the agents."""
-    recordings: dict[str, str] = {}
+    recordings: dict[str, str] = Field(default_factory=dict)
     """Robot -> folder of its recording; relative paths start at the run folder."""
-    radio: dict[str, Any] = {}
+    radio: dict[str, Any] = Field(default_factory=dict)
     """Settings of the link model: loss, latency, bandwidth, range, as the scenario gave them."""
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings worth reading beside the result, nested as in the configuration."""
-    expectations: dict[str, float | str] = {}
+    expectations: dict[str, float | str] = Field(default_factory=dict)
     """Expectation -> limit, of the scenario; of `leader` the robot's name."""
     duration_s: float | None = None
     """End of the run on the clock of `events.jsonl`; null where the last event is the end."""
@@ -85,272 +50,3 @@ def setting_number(settings: Mapping[str, Any], *names: str) -> float | None:
         if found is not None:
             return found
     return None
-
-
-class Event(Record):
-    """One line of `events.jsonl`; the subclasses are the kinds of event."""
-
-    t: float
-    """Seconds since the run started, on the run's clock (virtual or real)."""
-    robot: str
-    """The robot that it happened on."""
-    event: str
-    """Kind of event."""
-
-
-class KeyframeCaptured(Event):
-    """`keyframe`: a robot took a keyframe."""
-
-    keyframe: Keyframe
-    stamp_s: float
-    T_odom_body: Pose7
-
-
-class CandidateFound(Event):
-    """`candidate`: two keyframes look alike."""
-
-    query: Keyframe
-    match: Keyframe
-    similarity: float
-
-
-class ClosureAccepted(Event):
-    """`closure_accepted`: a candidate was registered and passed R_thr."""
-
-    query: Keyframe
-    match: Keyframe
-    ratio: float
-    probability: float
-    correspondences: int
-    odometry_correspondences: int
-    scale_initial: float | None = None
-    by: str | None = None
-
-
-class ClosureRejected(Event):
-    """`closure_rejected`: a candidate was not made a closure."""
-
-    query: Keyframe
-    match: Keyframe
-    ratio: float | None = None
-    reason: str
-
-
-class LeaderFollowed(Event):
-    """`leader`: this robot now follows (or is) the leader of a term; null when it follows none."""
-
-    term: int | str | None
-    leader: str | None
-
-
-class LeaderLost(Event):
-    """`leader_lost`: this robot's leader fell silent or left; it follows nobody until the next `leader`."""
-
-    term: int | str | None = None
-    reason: str | None = None
-
-
-class NeighbourUp(Event):
-    """`neighbour_up`: heartbeats of a peer arrive."""
-
-    peer: str
-
-
-class NeighbourDown(Event):
-    """`neighbour_down`: heartbeats of a peer stopped."""
-
-    peer: str
-
-
-class GraphOptimised(Event):
-    """`optimised`: this robot, as leader, solved the pose graph."""
-
-    term: int | str
-    round: int
-    components: Any = None
-    keyframes: int | None = None
-    closures_used: int | None = None
-    closures_rejected: int | None = None
-    cost: float | None = None
-    solve_s: float | None = None
-    warnings: list[str] = []
-
-
-class CorrectionApplied(Event):
-    """`correction`: this robot applied a correction."""
-
-    term: int | str
-    round: int
-    map_frame: str
-    T_map_odom: Pose7
-    frame_changed: bool = False
-
-
-class BytesCounted(Event):
-    """`bytes`: bytes by kind since the robot started; cumulative, the last one counts."""
-
-    sent: dict[str, int]
-    received: dict[str, int]
-    loss: dict[str, float] = {}
-    """Peer in range -> share of its last heartbeats that did not arrive."""
-    queues: dict[str, int] = {}
-    """What waits: events for the core, images for the encoder, candidates for their registration."""
-
-
-class StageCounts(Record):
-    """Histogram of how long a stage took; the buckets are those of `flocc_agent.stages`."""
-
-    counts: list[int]
-    total_s: float
-    max_s: float
-
-
-class AccountKept(Event):
-    """`account`: payload bytes by peer and kind, and time by stage, since this start; the last one counts."""
-
-    since_s: float
-    """When the robot was started, on the run's clock: names the start."""
-    sent_to: dict[str, dict[str, int]]
-    received_from: dict[str, dict[str, int]]
-    lost_from: dict[str, dict[str, int]]
-    """Arrived from a peer, but the emulated radio or a limit kept it away."""
-    repeated_from: dict[str, dict[str, int]]
-    """Of what was received, copies that the emulated radio made."""
-    stages: dict[str, StageCounts]
-
-
-class PeerRefused(Event):
-    """`peer_refused`: a peer that this robot does not talk to."""
-
-    peer: str
-    reason: str
-
-
-class NameTaken(Event):
-    """`duplicate_name`: two robots run with one name."""
-
-    peer: str
-    reason: str
-
-
-class LatentFetched(Event):
-    """`latent_fetched`: a latent that a candidate needs has arrived."""
-
-    keyframe: Keyframe
-    holder: str | None = None
-
-
-class LatentFailed(Event):
-    """`latent_failed`: a latent that a candidate needs could not be fetched this time."""
-
-    keyframe: Keyframe
-    holder: str | None = None
-    reason: str
-
-
-class EncodingFailed(Event):
-    """`encoding_failed`: a keyframe has no descriptor or latent."""
-
-    keyframe: Keyframe
-    reason: str
-
-
-class OptimisationFailed(Event):
-    """`optimisation_failed`: the solver gave nothing; the last good solution stands."""
-
-    term: int | str
-    round: int
-    reason: str
-
-
-class AgentDied(Event):
-    """`agent_died`: an agent ended without being asked to."""
-
-    signal: int | str | None = None
-    exit_code: int | None = None
-
-
-class AgentStopped(Event):
-    """`agent_stopped`: an agent ended in order."""
-
-
-EVENT_TYPES: Mapping[str, type[Event]] = {
-    "keyframe": KeyframeCaptured,
-    "candidate": CandidateFound,
-    "closure_accepted": ClosureAccepted,
-    "closure_rejected": ClosureRejected,
-    "leader": LeaderFollowed,
-    "leader_lost": LeaderLost,
-    "neighbour_up": NeighbourUp,
-    "neighbour_down": NeighbourDown,
-    "optimised": GraphOptimised,
-    "correction": CorrectionApplied,
-    "bytes": BytesCounted,
-    "account": AccountKept,
-    "peer_refused": PeerRefused,
-    "duplicate_name": NameTaken,
-    "latent_fetched": LatentFetched,
-    "latent_failed": LatentFailed,
-    "encoding_failed": EncodingFailed,
-    "optimisation_failed": OptimisationFailed,
-    "agent_died": AgentDied,
-    "agent_stopped": AgentStopped,
-}
-
-
-class KeyframeResult(Record):
-    """One keyframe of a robot at the end of the run."""
-
-    index: int
-    stamp_s: float
-    T_odom_body: Pose7
-    T_map_body: Pose7 | None = None
-
-
-class ClosureKnown(Record):
-    """One closure in a robot's logs at the end of the run."""
-
-    query: Keyframe
-    match: Keyframe
-    T_query_match_unscaled: Pose7 | None = None
-    """Pose of the match camera in the query camera; the translation in network units."""
-    match_ratio: float | None = None
-    scale_initial: float | None = None
-    metric: bool = False
-    """The translation is in metres already."""
-    scale: float | None = None
-    """Metres per network unit after optimisation; null where the back end estimated none."""
-
-
-class RobotResult(Record):
-    """`robots/ROBOT/result.json`: what a robot knew at its end, or what its store held."""
-
-    robot: str
-    incarnation: int = 0
-    map_frame: str | None = None
-    T_map_odom: Pose7 | None = None
-    T_body_camera: Pose7 | None = None
-    keyframes: list[KeyframeResult] = []
-    closures: list[ClosureKnown] = []
-    logs: dict[str, int] = {}
-    """Log -> number of its records that this robot holds."""
-    best_similarities: dict[str, float] = {}
-    """Robot -> best cosine similarity of any of its keyframes with one of this robot, below the threshold as well."""
-
-    def T_odom_body(self) -> Float:
-        """Odometry of all keyframes, (N, 4, 4)."""
-        return stacked_poses([keyframe.T_odom_body for keyframe in self.keyframes])
-
-
-def stacked_poses(rows: Iterable[list[float]]) -> Float:
-    """Poses (N, 4, 4) of rows of seven numbers."""
-    poses = [pose_from_tq(np.array(row)) for row in rows]
-    return np.array(poses) if poses else np.zeros((0, 4, 4))
-
-
-E = TypeVar("E", bound=Event)
-
-
-def of_kind(events: Iterable[Event], kind: type[E]) -> list[E]:
-    """The events of one kind, in their order."""
-    return [event for event in events if isinstance(event, kind)]

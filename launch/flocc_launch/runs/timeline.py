@@ -4,18 +4,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median_high
 
-from flocc_launch.runs.run_records import (
-    AgentDied,
-    AgentStopped,
+from flocc_agent.core.reports import (
     CorrectionApplied,
-    Event,
-    KeyframeCaptured,
+    Fact,
+    KeyframeTaken,
     LeaderFollowed,
     LeaderLost,
     NeighbourDown,
     NeighbourUp,
-    of_kind,
 )
+from flocc_agent.runtime.event_lines import Reported, is_of, of_kind
+from flocc_agent.runtime.facts import AgentDied, AgentStopped, KilledByOrder
+
+Events = Iterable[Reported[Fact]]
+End = Reported[AgentDied] | Reported[AgentStopped]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +25,7 @@ class Following:
     """One robot follows one leader from one time to another."""
 
     robot: str
-    term: int | str | None
+    term: int
     leader: str
     from_s: float
     to_s: float
@@ -39,26 +41,26 @@ class Link:
     to_s: float
 
 
-def end_s(events: Sequence[Event], duration_s: float | None) -> float:
+def end_s(events: Sequence[Reported[Fact]], duration_s: float | None) -> float:
     """When the run ended: as measured, or at its last event."""
     return max([event.t for event in events] + [duration_s or 0.0])
 
 
-def followings(events: Iterable[Event], until_s: float) -> list[Following]:
+def followings(events: Events, until_s: float) -> list[Following]:
     """Who followed whom, per robot in order of time; an agent's end ends it."""
-    open_spans: dict[str, LeaderFollowed] = {}
+    open_spans: dict[str, Reported[LeaderFollowed]] = {}
     spans: list[Following] = []
 
     def close(robot: str, t: float) -> None:
         opened = open_spans.pop(robot, None)
-        if opened is not None and opened.leader is not None:
-            spans.append(Following(robot, opened.term, opened.leader, opened.t, t))
+        if opened is not None:
+            spans.append(Following(robot, opened.fact.term, opened.fact.leader, opened.t, t))
 
     for event in events:
-        if isinstance(event, LeaderFollowed):
+        if is_of(event, LeaderFollowed):
             close(event.robot, event.t)
             open_spans[event.robot] = event
-        elif isinstance(event, AgentDied | AgentStopped | LeaderLost):
+        elif isinstance(event.fact, AgentDied | AgentStopped | LeaderLost):
             close(event.robot, event.t)
     for robot in sorted(open_spans):
         close(robot, until_s)
@@ -67,9 +69,9 @@ def followings(events: Iterable[Event], until_s: float) -> list[Following]:
 
 def terms_led(spans: Iterable[Following]) -> list[Following]:
     """One span per term and leader, over all robots that followed; in order of time."""
-    led: dict[tuple[str, str], Following] = {}
+    led: dict[tuple[int, str], Following] = {}
     for span in spans:
-        key = (str(span.term), span.leader)
+        key = (span.term, span.leader)
         seen = led.get(key, span)
         from_s, to_s = min(seen.from_s, span.from_s), max(seen.to_s, span.to_s)
         led[key] = Following(span.leader, span.term, span.leader, from_s, to_s)
@@ -87,7 +89,7 @@ def leader_changes(spans: Iterable[Following]) -> int:
     return median_high(changes.values()) if changes else 0
 
 
-def links(events: Iterable[Event], until_s: float) -> list[Link]:
+def links(events: Events, until_s: float) -> list[Link]:
     """Who heard whom, in order of robot, peer and time; an agent's end ends its own side."""
     up: dict[tuple[str, str], float] = {}
     found: list[Link] = []
@@ -98,11 +100,11 @@ def links(events: Iterable[Event], until_s: float) -> list[Link]:
             found.append(Link(robot, peer, from_s, t))
 
     for event in events:
-        if isinstance(event, NeighbourUp):
-            up.setdefault((event.robot, event.peer), event.t)
-        elif isinstance(event, NeighbourDown):
-            close(event.robot, event.peer, event.t)
-        elif isinstance(event, AgentDied | AgentStopped):
+        if isinstance(event.fact, NeighbourUp):
+            up.setdefault((event.robot, event.fact.peer), event.t)
+        elif isinstance(event.fact, NeighbourDown):
+            close(event.robot, event.fact.peer, event.t)
+        elif isinstance(event.fact, AgentDied | AgentStopped):
             for robot, peer in sorted(up):
                 if robot == event.robot:
                     close(robot, peer, event.t)
@@ -111,7 +113,7 @@ def links(events: Iterable[Event], until_s: float) -> list[Link]:
     return sorted(found, key=lambda link: (link.robot, link.peer, link.from_s))
 
 
-def merged_after_s(events: Iterable[Event], robots: Iterable[str]) -> float | None:
+def merged_after_s(events: Events, robots: Iterable[str]) -> float | None:
     """When all living robots first were in one map frame, two robots at least; None if never.
 
     A robot counts from the start of the run, also before its first keyframe, until it dies; it comes back with
@@ -120,37 +122,43 @@ def merged_after_s(events: Iterable[Event], robots: Iterable[str]) -> float | No
     alive = set(robots)
     frames: dict[str, str] = {}
     for event in events:
-        if isinstance(event, CorrectionApplied):
-            frames[event.robot] = event.map_frame
-        elif isinstance(event, AgentDied):
+        if isinstance(event.fact, CorrectionApplied):
+            frames[event.robot] = event.fact.map_frame
+        elif isinstance(event.fact, AgentDied):
             alive.discard(event.robot)
-        elif isinstance(event, KeyframeCaptured):
+        elif isinstance(event.fact, KeyframeTaken):
             alive.add(event.robot)
         if len(alive) > 1 and len({frames.get(robot) for robot in alive}) == 1 and alive <= frames.keys():
             return event.t
     return None
 
 
-def ends(events: Iterable[Event]) -> Mapping[str, AgentDied | AgentStopped]:
+def ends(events: Events) -> Mapping[str, End]:
     """The last end of each agent that was seen to end and took no keyframe afterwards."""
-    last: dict[str, AgentDied | AgentStopped] = {}
+    last: dict[str, End] = {}
     for event in events:
-        if isinstance(event, AgentDied | AgentStopped):
+        if is_of(event, AgentDied) or is_of(event, AgentStopped):
             last[event.robot] = event
-        elif isinstance(event, KeyframeCaptured):
+        elif isinstance(event.fact, KeyframeTaken):
             last.pop(event.robot, None)
     return last
 
 
-def corrections_of(events: Iterable[Event], robot: str) -> list[CorrectionApplied]:
+def corrections_of(events: Events, robot: str) -> list[Reported[CorrectionApplied]]:
     """The corrections that one robot applied, in order."""
     return [event for event in of_kind(events, CorrectionApplied) if event.robot == robot]
 
 
-def how_it_died(event: AgentDied) -> str:
+def how_it_died(event: Reported[AgentDied]) -> str:
     """The signal or exit code of an agent's death, and where it says more."""
-    if event.signal is not None:
-        return f"signal {event.signal}"
-    if event.exit_code is None:
+    if event.fact.signal is not None:
+        return f"signal {event.fact.signal}"
+    if event.fact.exit_code is None:
         return "no reason known"
-    return f"exit code {event.exit_code}; robots/{event.robot}/agent.log says why"
+    return f"exit code {event.fact.exit_code}; robots/{event.robot}/agent.log says why"
+
+
+def deaths_unasked(events: Events) -> list[str]:
+    """Robots that died without a fault of the scenario or an operator's order, once for each death, in order."""
+    ordered = {event.robot for event in of_kind(events, KilledByOrder)}
+    return [e.robot for e in of_kind(events, AgentDied) if not e.fact.scripted and e.robot not in ordered]

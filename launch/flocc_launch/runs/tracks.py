@@ -7,20 +7,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.reports import Fact, KeyframeTaken
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_agent.runtime.robot_result import RobotResult, stacked_poses
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import Event, KeyframeCaptured, RobotResult, of_kind, stacked_poses
 from flocc_launch.runs.trajectory_errors import associate, placed_at_true_start
-from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class RobotTrack:
     """Keyframes of one robot.
 
     Attributes:
@@ -63,20 +64,22 @@ class Track:
         return float(np.linalg.norm(np.diff(self.T_odom_body[:, :3, 3], axis=0), axis=1).sum())
 
 
-def tracks_of(folder: RunFolder, results: Mapping[str, RobotResult], events: Sequence[Event]) -> dict[str, Track]:
+def tracks_of(
+    folder: RunFolder, results: Mapping[str, RobotResult], events: Sequence[Reported[Fact]]
+) -> dict[str, RobotTrack]:
     """Put together every robot's track; one that left no result has the odometry of its `keyframe` events."""
-    captured = of_kind(events, KeyframeCaptured)
+    taken = of_kind(events, KeyframeTaken)
     tracks = {}
     for robot in sorted(folder.run().robots):
         truth = ground_truth(folder, robot)
         if robot in results:
             tracks[robot] = track_of_result(results[robot], truth)
         else:
-            tracks[robot] = track_of_events([event for event in captured if event.robot == robot], robot, truth)
+            tracks[robot] = track_of_events([event.fact for event in taken if event.robot == robot], robot, truth)
     return tracks
 
 
-def track_of_result(result: RobotResult, truth: Trajectory | None) -> Track:
+def track_of_result(result: RobotResult, truth: Trajectory | None) -> RobotTrack:
     """Track of a robot that left a result; a keyframe after the last correction moves with `T_map_odom`."""
     stamps_s = np.array([keyframe.stamp_s for keyframe in result.keyframes])
     T_odom_body = result.T_odom_body()
@@ -89,11 +92,11 @@ def track_of_result(result: RobotResult, truth: Trajectory | None) -> Track:
     return completed(result.robot, result.incarnation, result.map_frame, stamps_s, T_odom_body, T_map_body, truth)
 
 
-def track_of_events(events: list[KeyframeCaptured], robot: str, truth: Trajectory | None) -> Track:
+def track_of_events(keyframes: list[KeyframeTaken], robot: str, truth: Trajectory | None) -> RobotTrack:
     """Track of a robot that left no result: odometry only."""
-    stamps_s = np.array([event.stamp_s for event in events])
-    T_odom_body = stacked_poses([event.T_odom_body for event in events])
-    incarnation = KeyframeId.parse(events[-1].keyframe).log.incarnation if events else 0
+    stamps_s = np.array([taken.stamp_s for taken in keyframes])
+    T_odom_body = stacked_poses([taken.T_odom_body for taken in keyframes])
+    incarnation = keyframes[-1].keyframe.log.incarnation if keyframes else 0
     return completed(robot, incarnation, None, stamps_s, T_odom_body, np.full_like(T_odom_body, np.nan), truth)
 
 
@@ -105,7 +108,7 @@ def completed(
     T_odom_body: Float,
     T_map_body: Float,
     truth: Trajectory | None,
-) -> Track:
+) -> RobotTrack:
     """Put a track together with the ground truth at its stamps."""
     T_world_body = np.full_like(T_odom_body, np.nan)
     true: Mask = np.zeros(len(stamps_s), dtype=bool)
@@ -113,7 +116,7 @@ def completed(
         true, poses = associate(stamps_s, truth)
         T_world_body[true] = poses
     corrected: Mask = np.asarray(np.isfinite(T_map_body).all(axis=(1, 2)))
-    return Track(robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
+    return RobotTrack(robot, incarnation, map_frame, stamps_s, T_odom_body, corrected, T_map_body, true, T_world_body)
 
 
 def ground_truth(folder: RunFolder, robot: str) -> Trajectory | None:

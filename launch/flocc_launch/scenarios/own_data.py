@@ -3,27 +3,29 @@
 One data set is cut by time into robots; a folder of several is a robot each. What was chosen is said in a sentence.
 """
 
-import re
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
 
+from flocc_launch.datasets.bag_convert import robots_of_bag
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.commands import needed_drift
-from flocc_launch.datasets.detect import detect_format, is_dataset, read_source
+from flocc_launch.datasets.detect import detect_format, is_dataset, read_source, team_folder
+from flocc_launch.datasets.drift import kind_of
+from flocc_launch.datasets.names import robot_name as name_of
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.video import is_video
 
 ROBOTS = 3
 ROBOTS_MAX = 16
 KEYFRAMES_WANTED = 25
 DISTANCE_MIN_M, DISTANCE_MAX_M = 0.05, 0.5
 ROTATION_NEAR_RAD = 0.17
-NAME_LENGTH_MAX = 32
 
 
 def is_own_data(path: Path) -> bool:
     """Whether a path is data rather than a scenario file."""
-    return path.is_dir() or is_bag(path)
+    return path.is_dir() or is_bag(path) or is_video(path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +55,18 @@ class OwnData:
         Raises:
             DatasetError: There is no data set, one of them cannot be used, or there are not `agents` of them.
         """
-        single = not _holds_bags(path) and (is_bag(path) or is_dataset(path))
-        folders = {robot_name(path): path} if single else _robots(path)
+        single = is_bag(path) or is_dataset(path) or is_video(path)
+        folders = _single(path) if single else _team(path)
+        single = single and len(folders) == 1
         if not single and agents not in (None, len(folders)):
             raise DatasetError(f"{path}: holds {len(folders)} robots ({', '.join(folders)}), not {agents}")
-        sources = {name: read_source(folder) for name, folder in folders.items() if not is_bag(folder)}
+        sources = {name: read_source(folder) for name, folder in folders.items() if is_dataset(folder)}
         return cls(path, folders, sources, (agents or ROBOTS) if single else 1)
 
     @property
     def single(self) -> bool:
         """Whether it is one data set, to be cut."""
-        return self.path in self.folders.values()
+        return list(self.folders.values()) == [self.path]
 
     def fields(self) -> dict[str, object]:
         """Fields of a scenario that runs it."""
@@ -86,8 +89,16 @@ class OwnData:
         near_m = self._near_m()
         spacing = "" if near_m is None else f"; a keyframe every {near_m:g} m, because robots move little"
         made = [name for name, source in self.sources.items() if needed_drift(source) is not None]
-        drift = "; odometry is made of ground truth, with seeded drift" if made else ""
-        return f"data: {self.path}, {taken}{spacing}{drift}"
+        kinds = sorted(
+            {kind_of(self.sources[name].format, truth) for name in made if (truth := self.sources[name].truth)}
+        )
+        drift = f"; odometry is made of ground truth, with seeded drift as of {' and '.join(kinds)}" if made else ""
+        return f"data: {self.path}, {taken}{spacing}{drift}{self._pairs()}"
+
+    def _pairs(self) -> str:
+        """How topics of a bag of several robots belong together."""
+        shared = is_bag(self.path) and not self.single
+        return "".join(f"\n  {robot}" for robot in robots_of_bag(self.path)) if shared else ""
 
     def _near_m(self) -> float | None:
         """Distance of keyframes where robots move so little that the usual one gives too few; by the median path."""
@@ -106,31 +117,21 @@ class OwnData:
 
 
 def robot_name(path: Path) -> str:
-    """A name that keys can hold, made of a folder's."""
-    stem = path.resolve().stem if path.is_file() else path.resolve().name
-    return re.sub(r"[^a-z0-9_-]+", "-", stem.lower()).strip("-_")[:NAME_LENGTH_MAX] or "robots"
+    """A name that keys can hold, made of a folder's or a file's."""
+    return name_of(path.resolve().stem if path.is_file() else path.resolve().name)
 
 
-def _holds_bags(path: Path) -> bool:
-    """Whether a folder holds bags of several robots; `run_0.db3` and `run_1.db3` are parts of one, as rosbag2 does."""
-    if not path.is_dir() or (path / "metadata.yaml").exists():
-        return False
-    stems = [re.sub(r"_\d+$", "", entry.stem) for entry in path.iterdir() if entry.is_file() and is_bag(entry)]
-    return len(set(stems)) > 1
+def _single(path: Path) -> dict[str, Path]:
+    """One data set, or the robots of a bag, each of which is found in it by its name."""
+    robots = robots_of_bag(path) if is_bag(path) else []
+    return {name_of(robot.name): path for robot in robots} if len(robots) > 1 else {robot_name(path): path}
 
 
-def _robots(path: Path) -> dict[str, Path]:
-    """Data sets and bags in a folder, by the robot's name."""
-    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
-    folders = [entry for entry in entries if is_bag(entry) or is_dataset(entry)]
-    if not folders:
+def _team(path: Path) -> dict[str, Path]:
+    """Data sets, bags and videos in a folder, by the robot's name."""
+    found = team_folder(path)
+    if not found:
         detect_format(path)  # says what a data set is
-    if len(folders) > ROBOTS_MAX:
-        raise DatasetError(f"{path}: holds {len(folders)} data sets; at most {ROBOTS_MAX} robots run on one machine")
-    found: dict[str, Path] = {}
-    for folder in folders:
-        name = robot_name(folder)
-        if name in found:
-            raise DatasetError(f"{folder}: its robot would be called {name}, as that of {found[name]}")
-        found[name] = folder
+    if len(found) > ROBOTS_MAX:
+        raise DatasetError(f"{path}: holds {len(found)} data sets; at most {ROBOTS_MAX} robots run on one machine")
     return found

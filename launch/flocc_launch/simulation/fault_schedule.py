@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import assert_never
 
 from flocc_agent.radio import Blackout, LinkParameters, Partition, RadioParameters
-from flocc_launch.scenarios.scenario import Fault, FaultKind
+from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault
 from flocc_launch.simulation.swarm import Swarm
 
 
@@ -38,7 +39,7 @@ def inject(swarm: Swarm, fault: Fault) -> None:
             for name in fault.robots:
                 swarm.stations[name].workers.slowness = fault.value or 1.0
         case _:
-            swarm.radio.parameters = changed(swarm.radio.parameters, fault, swarm.agenda.now_s)
+            swarm.radio.parameters = changed(swarm.radio.parameters, fault.kind, fault, swarm.agenda.now_s)
 
 
 def kill(swarm: Swarm, name: str, effects: float | None) -> None:
@@ -65,9 +66,9 @@ def calm(swarm: Swarm) -> None:
         station.workers.slowness = 1.0
 
 
-def changed(radio: RadioParameters, fault: Fault, now_s: float) -> RadioParameters:
+def changed(radio: RadioParameters, kind: LinkFault, fault: Fault, now_s: float) -> RadioParameters:
     """The links after a fault."""
-    match fault.kind:
+    match kind:
         case FaultKind.PARTITION:
             return replace(radio, partitions=(Partition(fault.groups, now_s),))
         case FaultKind.BLACKOUT:
@@ -81,7 +82,7 @@ def changed(radio: RadioParameters, fault: Fault, now_s: float) -> RadioParamete
         case FaultKind.RANGE:
             return replace(radio, range_m=fault.value or None)
         case _:
-            return radio
+            assert_never(kind)
 
 
 def _every_link(radio: RadioParameters, **values: float) -> RadioParameters:

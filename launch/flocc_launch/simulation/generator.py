@@ -4,7 +4,14 @@ import numpy as np
 
 from flocc_agent.config import KeyframeConfig, LinkOverrideConfig, PerceptionConfig, RadioConfig, SyntheticConfig
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
-from flocc_launch.scenarios.scenario import Fault, FaultKind, RobotScenario, Scenario, TracksScenario
+from flocc_launch.scenarios.scenario import (
+    Fault,
+    FaultKind,
+    RobotScenario,
+    Scenario,
+    SensorsScenario,
+    TracksScenario,
+)
 
 FAULTS_END_S = 30.0
 ROBOTS_MAX = 5
@@ -12,6 +19,16 @@ FAULTS_MAX = 6
 WALKS = 8
 LENGTHS_M = (8.0, 14.0, 20.0)
 """Few walks, so that a process draws each once; faults differ from seed to seed."""
+SENSING_RATIO = 0.25
+SENSORS = SensorsScenario(
+    tags={"7": (6.0, 6.0, 1.5)},
+    tag_range_m=6.0,
+    fix_robots=("r1",),
+    start_robots=("r2",),
+    closure_every_s=6.0,
+    odometry_every_s=6.0,
+)
+"""What a quarter of the swarms measures besides: at every keyframe, now and then, and before the first one."""
 
 
 def drawn_scenario(seed: int) -> Scenario:
@@ -37,6 +54,7 @@ def drawn_scenario(seed: int) -> Scenario:
             method="synthetic", synthetic=SyntheticConfig(dimension=16, outlier_probability=0.0, alias_probability=0.0)
         ),
         faults=_faults(rng, names),
+        sensors=SENSORS if np.random.default_rng([seed, 1]).uniform() < SENSING_RATIO else None,
     )
 
 

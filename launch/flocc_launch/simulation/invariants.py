@@ -61,7 +61,7 @@ class Violation:
     detail: str
 
 
-class Watch:
+class InvariantWatch:
     """Holds invariants against a swarm.
 
     Attributes:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 from flocc_agent.core.effects import (
     Broadcast,
-    Correction,
     Deliver,
     Optimise,
     PersistRecord,
@@ -16,11 +15,13 @@ from flocc_agent.core.effects import (
 )
 from flocc_agent.core.gossip import decoded
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
+from flocc_agent.core.pose_graph import map_frame
+from flocc_agent.core.reports import NeighbourDown, NeighbourUp
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.invariants import Invariant, Step, core
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, Records
+from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, LogCorrection, Records
 from flocc_protocol.records import ClosureRecord, Record, RejectionRecord
 
 SIZES_EVERY = 25
@@ -51,26 +52,26 @@ def all_invariants(separated: bool) -> list[Invariant]:
 class Fencing:
     """No robot applies a correction older than one it applied, and a consumer is told when the frame changes."""
 
-    _last: dict[LogId, tuple[Correction, int]] = field(default_factory=dict)
+    _last: dict[LogId, tuple[LogCorrection, int]] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
         """Deliveries whose (term, round) does not grow, or whose jump is not told."""
         for effect in step.effects:
             if isinstance(effect, Deliver):
-                yield from self._delivered(step.station, effect.correction)
+                yield from self._delivered(step.station, effect.correction, effect.frame_changed)
 
-    def _delivered(self, station: Station, correction: Correction) -> Iterator[str]:
+    def _delivered(self, station: Station, correction: LogCorrection, told: bool) -> Iterator[str]:
         """A robot that died in the middle of a jump may tell of it once more when it is back."""
         last, life = self._last.get(station.log, (None, 0))
         self._last[station.log] = (correction, station.life)
         if last is None:
             return
-        name, told = station.log, correction.frame_changed
+        name = station.log
         if (correction.term, correction.round) <= (last.term, last.round):
             yield f"{name} applied {correction.term}/{correction.round} after {last.term}/{last.round}"
-        jumps = correction.map_frame != last.map_frame
+        jumps = correction.anchor != last.anchor
         if told != jumps and not (told and station.life != life):
-            yield f"{name} went from {last.map_frame} to {correction.map_frame}, told {told}"
+            yield f"{name} went from {map_frame(last.anchor)} to {map_frame(correction.anchor)}, told {told}"
 
 
 @dataclass(slots=True)
@@ -130,8 +131,8 @@ class Once:
             match effect:
                 case PersistRecord(log, number, data):
                     self._note_record(log, number, decoded(data)[0])
-                case Report("neighbour_up" | "neighbour_down", fields):
-                    self._changed_s[step.station.name, str(fields["peer"])] = step.at_s
+                case Report(NeighbourUp() | NeighbourDown() as changed):
+                    self._changed_s[step.station.name, changed.peer] = step.at_s
                 case Register(pair):
                     yield from self._registers(step, pair)
 

@@ -3,16 +3,29 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from flocc_agent.composition import build_optimiser, build_perception
+from flocc_agent.backend import build_optimiser
+from flocc_agent.core.reports import (
+    CandidateFound,
+    ClosureAccepted,
+    ClosureRejected,
+    CorrectionApplied,
+    KeyframeTaken,
+    RoundSolved,
+)
+from flocc_agent.perception.backends import build_perception
+from flocc_agent.runtime.event_lines import line_of
+from flocc_agent.runtime.facts import AccountKept, AgentStopped, BytesCounted
+from flocc_agent.runtime.measurement_file import rows_of
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.runtime.trajectory import write_tum
-from flocc_agent.stages import fields_of
+from flocc_agent.stages import counts_of
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
-from flocc_launch.runs.run_folder import RobotResult, Run, RunFolder
+from flocc_launch.report.model import RunReport
+from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.scenario import Scenario
+from flocc_launch.scenarios.sensors import sense
 from flocc_launch.scenarios.walks import walks
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
@@ -23,7 +36,7 @@ from flocc_launch.simulation.virtual_workers import WorkTimes
 
 LOOK_S = 1.0
 LONGEST_AFTER_LAST_S = 300.0
-QUIET_KINDS = frozenset({"optimised", "correction", "keyframe", "candidate", "closure_accepted", "closure_rejected"})
+QUIET_KINDS = (RoundSolved, CorrectionApplied, KeyframeTaken, CandidateFound, ClosureAccepted, ClosureRejected)
 
 
 def simulate(
@@ -32,7 +45,7 @@ def simulate(
     seed: int | None = None,
     recordings: Mapping[str, Path] | None = None,
     cache: Path | None = None,
-) -> Report:
+) -> RunReport:
     """Run a scenario on virtual time.
 
     Args:
@@ -73,13 +86,16 @@ def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str
     """What each robot of a scenario sees."""
     drawn = walks(scenario.tracks) if scenario.tracks else []
     walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
+    measured = sense(scenario.sensors, {name: walk.truth for name, walk in walked.items()}) if scenario.sensors else {}
     playbacks = {}
     for name in scenario.names():
         path = recordings.get(name) or scenario.robot(name).recording
         if path is not None:
             playbacks[name] = of_recording(Recording.open(path), scenario.keyframes)
         elif name in walked:
-            playbacks[name] = of_walk(walked[name], name, scenario.keyframes)
+            walk = walked[name]
+            seen = rows_of(measured.get(name, ()), walk.truth.stamps_s.tolist(), f"[sensors] of {name}")
+            playbacks[name] = of_walk(walk, name, scenario.keyframes, seen)
         else:
             playbacks[name] = nothing()
     return playbacks
@@ -110,7 +126,7 @@ def write(
             truth = folder.path / "groundtruth" / f"{name}.tum"
             truth.parent.mkdir(exist_ok=True)
             write_tum(truth, station.playback.truth)
-    folder.write_events(swarm.lines)
+    folder.write_events(line_of(told) for told in swarm.told)
     folder.write_run(
         Run(
             scenario=scenario.name,
@@ -130,14 +146,13 @@ def write(
 def _write_robot(folder: RunFolder, swarm: Swarm, name: str) -> None:
     station, traffic = swarm.stations[name], swarm.network.traffic.get(name)
     if traffic is not None:
-        fields = {"sent": dict(sorted(traffic.sent.items())), "received": dict(sorted(traffic.received.items()))}
-        swarm.report(name, "bytes", fields)
-    links, stages = swarm.network.links.tables(name), fields_of(station.workers.stages.snapshot())
-    swarm.report(name, "account", {"since_s": 0.0, **links, "stages": stages})
+        sent, received = dict(sorted(traffic.sent.items())), dict(sorted(traffic.received.items()))
+        swarm.report(name, BytesCounted(sent=sent, received=received))
+    links, stages = swarm.network.links.tables(name), counts_of(station.workers.stages.snapshot())
+    swarm.report(name, AccountKept(since_s=0.0, **links, stages=stages))
     if station.core is not None:
-        fields = result_of(station.core, station.playback.T_body_camera, station.solution)
-        folder.write_result(RobotResult.model_validate(fields))
-        swarm.report(name, "agent_stopped", {})
+        folder.write_result(result_of(station.core, station.playback.T_body_camera, station.solution))
+        swarm.report(name, AgentStopped())
 
 
 def _last_capture_s(swarm: Swarm, name: str) -> float:
@@ -151,5 +166,5 @@ def _is_quiet(swarm: Swarm, last_s: float) -> bool:
     """Whether nothing of interest happened for the scenario's settling time."""
     if any(s.core.closing.load for s in swarm.running() if s.core):
         return False
-    latest_s = next((line["t"] for line in reversed(swarm.lines) if line["event"] in QUIET_KINDS), 0.0)
+    latest_s = next((told.t for told in reversed(swarm.told) if isinstance(told.fact, QUIET_KINDS)), 0.0)
     return swarm.agenda.now_s >= max(latest_s, last_s) + swarm.scenario.settle_s

@@ -3,15 +3,17 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from flocc_agent.composition import build_iterator
+from flocc_agent.backend import build_iterator
 from flocc_agent.config import BackendMode
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
+from flocc_agent.core.reports import Fact
 from flocc_agent.radio import Radio
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.facts import AgentDied, AgentStopped
 from flocc_agent.runtime.reporting import Reporter
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.agenda import Agenda
@@ -20,7 +22,7 @@ from flocc_launch.simulation.virtual_fetches import LatentFetcher
 from flocc_launch.simulation.virtual_network import Network
 from flocc_launch.simulation.virtual_playback import Playback
 from flocc_launch.simulation.virtual_robot import Clock, Station, Surroundings
-from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, Workers, WorkTimes
+from flocc_launch.simulation.virtual_workers import Eyes, Optimiser, VirtualWorkers, WorkTimes
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Envelope, Message
 
@@ -47,7 +49,7 @@ class Swarm:
         agenda: The clock.
         radio: The links.
         stations: By name.
-        lines: What was reported, as lines of `events.jsonl`.
+        told: What was reported, in the order in which it happened.
         observers: Told of every step of every station.
     """
 
@@ -58,7 +60,7 @@ class Swarm:
         self.network = Network(self.agenda, self.radio, self._receive, np.random.default_rng([seed, AIR]))
         self.stations: dict[str, Station] = {}
         self._named: dict[str, list[Station]] = {}
-        self.lines: list[dict[str, Any]] = []
+        self.told: list[Reported[Fact]] = []
         self.observers: list[Observer] = []
         self._equipment = equipment
         self._seed = seed
@@ -89,7 +91,7 @@ class Swarm:
         if station.running:
             station.kill()
             self._fetcher.forget(name)
-            self.report(name, "agent_died", {"signal": 9})
+            self.report(name, AgentDied(signal=9, scripted=True))
 
     def leave(self, name: str) -> None:
         """A robot stops in order."""
@@ -98,7 +100,7 @@ class Swarm:
             station.handle(Leaving())
             station.kill()
             self._fetcher.forget(name)
-            self.report(name, "agent_stopped", {})
+            self.report(name, AgentStopped())
 
     def add_twin(self, name: str) -> None:
         """Somebody switches on a second robot under a name that is taken, with a disk of its own."""
@@ -115,9 +117,9 @@ class Swarm:
         station.disk = Disk(self.scenario.store.latent_bytes_max)
         station.log = LogId(station.log.robot, station.log.incarnation + 1)
 
-    def report(self, name: str, event: str, fields: Mapping[str, Any]) -> None:
-        """Add a line that is not the core's."""
-        self.lines.append({"t": round(self.agenda.now_s, 6), "robot": name, "event": event, **fields})
+    def report(self, name: str, fact: Fact) -> None:
+        """Add a fact that is not the core's."""
+        self.told.append(Reported(self.agenda.now_s, name, fact))
 
     def running(self) -> list[Station]:
         """Stations that are switched on, by name."""
@@ -131,7 +133,7 @@ class Swarm:
             LogId(name),
             robot.compute_class,
             playback,
-            Workers(
+            VirtualWorkers(
                 self._equipment.eyes,
                 self._equipment.optimiser,
                 build_iterator(self.scenario.backend),
@@ -202,7 +204,7 @@ class Swarm:
     def _observe(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, Report):
-                self.lines.append(self._reporters[station.name].line(effect, self.agenda.now_s))
+                self.told.append(self._reporters[station.name].reported(effect.fact, self.agenda.now_s))
         for observer in self.observers:
             observer(station, event, effects)
 

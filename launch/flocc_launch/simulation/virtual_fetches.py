@@ -45,7 +45,7 @@ class LatentFetcher:
 
     def fetch(self, asker: Station, job: FetchLatent) -> None:
         """Start a fetch; it ends in one LatentFetched or LatentFetchFailed, at the latest when its time is over."""
-        fetch = _Fetch(self, asker, job)
+        fetch = _FetchUnderWay(self, asker, job)
         self._agenda.after(job.deadline_s, lambda: fetch.fail("deadline"))
         fetch.ask()
 
@@ -69,7 +69,7 @@ class LatentFetcher:
         self._arrived = {key: size for key, size in self._arrived.items() if key[0] != station}
 
 
-class _Fetch:
+class _FetchUnderWay:
     """One fetch under way."""
 
     def __init__(self, fetcher: LatentFetcher, asker: Station, job: FetchLatent) -> None:

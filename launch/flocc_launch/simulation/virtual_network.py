@@ -18,7 +18,7 @@ Link = tuple[str, str, str]
 
 
 @dataclass(slots=True)
-class Traffic:
+class RobotTraffic:
     """Bytes of one robot by kind, since the run began; a broadcast counts once."""
 
     sent: Counter[str] = field(default_factory=Counter)
@@ -69,7 +69,7 @@ class Network:
     """
 
     def __init__(self, agenda: Agenda, radio: Radio, receive: Receive, rng: np.random.Generator) -> None:
-        self.traffic: dict[str, Traffic] = {}
+        self.traffic: dict[str, RobotTraffic] = {}
         self.links = LinkTraffic()
         self.muted: dict[str, float] = {}
         self._rng = rng
@@ -150,10 +150,10 @@ class Network:
         else:
             self.links.lost[link] += payload_bytes
 
-    def _traffic(self, station: str) -> Traffic:
+    def _traffic(self, station: str) -> RobotTraffic:
         traffic = self.traffic.get(station)
         if traffic is None:
-            traffic = self.traffic[station] = Traffic()
+            traffic = self.traffic[station] = RobotTraffic()
         return traffic
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import KeyframeConfig
 from flocc_agent.core.interfaces import Image
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, Stamped
 from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory
@@ -28,6 +29,7 @@ class Capture:
         load: Gives the image.
         source: Image file, or None where there is none.
         camera_key: What the image means beyond its pixels: the intrinsics.
+        measured: What else was measured there.
     """
 
     stamp_s: float
@@ -35,6 +37,7 @@ class Capture:
     load: Callable[[], Image]
     source: Path | None = None
     camera_key: bytes = b""
+    measured: tuple[Stamped, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,17 +74,18 @@ def nothing() -> Playback:
     return Playback((), np.eye(4), None)
 
 
-def of_walk(walk: Walk, robot: str, config: KeyframeConfig) -> Playback:
+def of_walk(walk: Walk, robot: str, config: KeyframeConfig, measurements: RecordedMeasurements = NOTHING) -> Playback:
     """Keyframes of a walk; their images hold the true pose for synthetic perception."""
-    chosen = select(walk.odometry.T_fixed_body, config)
-    captures = tuple(_walked(walk, robot, k) for k in chosen)
+    chosen = select(walk.odometry.T_fixed_body, config, walk.odometry.stamps_s, measurements)
+    captures = tuple(_walked(walk, robot, k, measurements) for k in chosen)
     return Playback(captures, T_BODY_CAMERA, walk.truth)
 
 
 def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
     """Keyframes of a recording; pixels are read when they are asked for."""
     frames = recording.frames
-    chosen = select([frame.T_odom_body for frame in frames], config)
+    measurements = recording.measurements
+    chosen = select([f.T_odom_body for f in frames], config, [f.stamp_s for f in frames], measurements)
     captures = tuple(
         Capture(
             frames[k].stamp_s,
@@ -89,26 +93,34 @@ def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
             lambda frame=frames[k]: recording.load_image(frame),  # type: ignore[misc]
             frames[k].image_path,
             repr(recording.camera if recording.levels == FULL else (recording.camera, recording.levels)).encode(),
+            measurements.at(frames[k].stamp_s),
         )
         for k in chosen
     )
     return Playback(captures, recording.T_body_camera, recording.truth, frames[0].stamp_s)
 
 
-def select(poses: Iterable[Float], config: KeyframeConfig) -> list[int]:
-    """Choose keyframes: the first pose, then each that moved or turned enough since the last one chosen."""
+def select(
+    poses: Iterable[Float], config: KeyframeConfig, stamps_s: Iterable[float], measurements: RecordedMeasurements
+) -> list[int]:
+    """Choose keyframes: the first pose, each that moved or turned enough, and those at which something was seen."""
     selector = KeyframeSelector(config)
     chosen = []
-    for k, T_odom_body in enumerate(poses):
-        if selector.wants(T_odom_body):
+    for k, (T_odom_body, stamp_s) in enumerate(zip(poses, stamps_s, strict=True)):
+        if selector.wants(T_odom_body) or measurements.keeps(float(stamp_s)):
             selector.took(T_odom_body)
             chosen.append(k)
     return chosen
 
 
-def _walked(walk: Walk, robot: str, k: int) -> Capture:
+def _walked(walk: Walk, robot: str, k: int, measurements: RecordedMeasurements) -> Capture:
     from flocc_agent.perception.synthetic import pose_image
 
     T_world_camera = walk.truth.T_fixed_body[k] @ T_BODY_CAMERA
     stamp_s = float(walk.truth.stamps_s[k])
-    return Capture(stamp_s, walk.odometry.T_fixed_body[k], lambda: pose_image(T_world_camera, f"{robot}/{k}"))
+    return Capture(
+        stamp_s,
+        walk.odometry.T_fixed_body[k],
+        lambda: pose_image(T_world_camera, f"{robot}/{k}"),
+        measured=measurements.at(stamp_s),
+    )

@@ -6,8 +6,8 @@ memory is gone: answers of workers and links that belong to an earlier life are 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import assert_never
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -23,15 +23,19 @@ from flocc_agent.core.effects import (
     Report,
     Unicast,
 )
-from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, MessageReceived
+from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Measured, MessageReceived
+from flocc_agent.core.measurements import BadMeasurement
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import pose7
+from flocc_agent.runtime.given_keyframes import GivenKeyframes
+from flocc_agent.runtime.measurement_file import Stamped
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture, Playback
-from flocc_launch.simulation.virtual_workers import Workers
-from flocc_protocol.ids import LogId
+from flocc_launch.simulation.virtual_workers import VirtualWorkers
+from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Message
 
 
@@ -87,7 +91,7 @@ class Station:
         log: LogId,
         compute_class: int,
         playback: Playback,
-        workers: Workers,
+        workers: VirtualWorkers,
         disk: Disk,
         clock: Clock,
         agenda: Agenda,
@@ -107,6 +111,7 @@ class Station:
         self._agenda = agenda
         self._around = around
         self._images: dict[int, Capture] = {}
+        self._given = GivenKeyframes()
         self._tick_s = float("inf")
         self._due_s = float("inf")
 
@@ -128,6 +133,7 @@ class Station:
         self.core = Robot(
             self.log, self._compute_class, boot, parameters, self.now_s(), restored, distributed=distributed
         )
+        self._given = GivenKeyframes.of(self.core)
         self._tick_s = self._due_s = float("inf")
         self._arm()
 
@@ -145,7 +151,20 @@ class Station:
         capture = self.playback.captures[number]
         self._images[number] = capture
         T_odom_camera = capture.T_odom_body @ self.playback.T_body_camera
+        self._given.add(capture.stamp_s)
         self.handle(KeyframeCaptured(capture.stamp_s, pose7(T_odom_camera), number))
+        for stamped in capture.measured:
+            self._measure(stamped, capture.stamp_s)
+
+    def _measure(self, stamped: Stamped, stamp_s: float) -> None:
+        """Hand the core what was measured at a keyframe; what belongs to one that a crash lost is lost as well."""
+        try:
+            measurement = stamped.made(lambda match_s: KeyframeId(self.log, self._given.at("closure", match_s)))
+            index = self._given.index_of(measurement, stamp_s)
+        except BadMeasurement:
+            return
+        if self.running:
+            self.handle(Measured(measurement.in_camera(self.playback.T_body_camera), index))
 
     def receive(self, envelope: Envelope) -> bool:
         """A message arrived; whether the robot was switched on."""
@@ -244,3 +263,5 @@ class Station:
                 self.disk.correction, self.disk.frame_changed = correction, frame_changed
             case Deliver() | Report():
                 pass
+            case _:
+                assert_never(effect)

@@ -65,7 +65,7 @@ class WorkTimes:
     iterate_s: float = 0.05
 
 
-class Workers:
+class VirtualWorkers:
     """The workers of one robot.
 
     Attributes:

@@ -12,12 +12,17 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from flocc_agent.config import AgentConfig, RadioConfig, validated
-from flocc_protocol.errors import FloccError
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported, line_of
+from flocc_agent.runtime.facts import AgentStopped
+from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.status import AgentStatus
+from flocc_launch.setup.world_faults import sentence_of
 
 if TYPE_CHECKING:
     from flocc_launch.dashboard.own import AgentSource
@@ -29,7 +34,10 @@ EXIT_BAD_INPUT = 2
 
 
 class Lines:
-    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported."""
+    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported.
+
+    A disk that fails ends the file, not the robot: it goes on, as it does without its store.
+    """
 
     def __init__(self, path: Path | None) -> None:
         self._file: TextIO | None = None
@@ -37,22 +45,29 @@ class Lines:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a", encoding="utf-8")
 
-    def write(self, line: dict[str, Any]) -> None:
+    def write(self, event: Reported[Fact]) -> None:
         """Append one event."""
-        if self._file is not None:
-            self._file.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")
+        if self._file is None:
+            return
+        try:
+            self._file.write(json.dumps(line_of(event), separators=(",", ":"), allow_nan=False) + "\n")
             self._file.flush()
+        except OSError as error:
+            logger.error("%s: %s; events are no longer written", self._file.name, error.strerror or error)
+            self.close()
 
     def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
+        """Close the file; what a full disk did not take is lost."""
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError):
+                file.close()
 
 
 async def run_agent(
     config: AgentConfig,
     epoch_s: float,
-    on_status: Callable[[dict[str, Any]], None],
+    on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
 ) -> None:
@@ -76,19 +91,19 @@ async def run_agent(
 async def _run(
     config: AgentConfig,
     epoch_s: float,
-    on_status: Callable[[dict[str, Any]], None],
+    on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None,
     lines: Lines,
     source: "AgentSource | None",
 ) -> None:
-    from flocc_agent.composition import Agent
+    from flocc_agent.agent import Agent
 
-    def on_line(line: dict[str, Any]) -> None:
-        lines.write(line)
+    def on_report(event: Reported[Fact]) -> None:
+        lines.write(event)
         if source is not None:
-            source.line(line)
+            source.take(event)
 
-    agent = Agent(config, on_line=on_line, clock_s=lambda: time.monotonic() - epoch_s)
+    agent = Agent(config, on_report=on_report, clock_s=lambda: time.monotonic() - epoch_s)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, agent.stop)
@@ -105,7 +120,7 @@ async def _run(
         for task in background:
             task.cancel()
         _write_result(config.folder, agent.result())
-        lines.write({"t": round(time.monotonic() - epoch_s, 6), "robot": config.name, "event": "agent_stopped"})
+        lines.write(Reported(time.monotonic() - epoch_s, config.name, AgentStopped()))
         lines.close()
 
 
@@ -131,20 +146,20 @@ def _page(config: AgentConfig, where: str | None, clock_s: Callable[[], float]) 
 
 def recover_result(config: AgentConfig) -> None:
     """Write the result of an agent that was killed, from what its store holds."""
-    from flocc_agent.composition import stored_result
+    from flocc_agent.agent import stored_result
 
     if config.folder is not None and (config.folder / "store").exists():
         _write_result(config.folder, stored_result(config))
 
 
-def _write_result(folder: Path | None, result: dict[str, Any] | None) -> None:
+def _write_result(folder: Path | None, result: RobotResult | None) -> None:
     if folder is not None and result is not None:
         path = folder / "result.json"
-        path.with_suffix(".tmp").write_text(json.dumps(result, allow_nan=False), encoding="utf-8")
+        path.with_suffix(".tmp").write_text(result.model_dump_json(), encoding="utf-8")
         path.with_suffix(".tmp").replace(path)
 
 
-async def _tell(agent: Any, on_status: Callable[[dict[str, Any]], None]) -> None:
+async def _tell(agent: Any, on_status: Callable[[AgentStatus], None]) -> None:
     while True:
         on_status(agent.status())
         await asyncio.sleep(STATUS_PERIOD_S)
@@ -171,8 +186,8 @@ async def _standard_input() -> asyncio.StreamReader:
     return reader
 
 
-def _print_status(status: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(status, separators=(",", ":")) + "\n")
+def _print_status(status: AgentStatus) -> None:
+    sys.stdout.write(status.model_dump_json() + "\n")
     sys.stdout.flush()
 
 
@@ -190,8 +205,11 @@ def main() -> None:
     try:
         config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
         asyncio.run(_run_launched(config, arguments.epoch_s))
-    except FloccError as error:
-        sys.stderr.write(f"error: {error}\n")
+    except Exception as error:
+        sentence = sentence_of(error)
+        if sentence is None:
+            raise
+        sys.stderr.write(f"error: {sentence}\n")
         sys.exit(EXIT_BAD_INPUT)
 
 

@@ -13,20 +13,25 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never
 
 from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
+from flocc_agent.perception.backends import check_perception
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.report.finish import finish
-from flocc_launch.report.model import Report
+from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
-from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario, agent_config
+from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault, Scenario, agent_config
 from flocc_launch.setup.credentials import make_keys
 from flocc_launch.swarm.agent_process import Lines, recover_result
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
 
+Seen = tuple[dict[str, tuple[int, int]], str | None, int | None, str | None, bool]
+"""Logs, map frame, round, leader, and whether it plays: a run goes on while they change."""
 LAUNCHER_EVENTS = "launcher.events.jsonl"
 PERIOD_S = 0.25
 UNSETTLED_MAX_S = 120.0
@@ -65,7 +70,7 @@ def launch(
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
     metrics: str | None = None,
-) -> Report:
+) -> RunReport:
     """Run a scenario and write its run folder.
 
     Args:
@@ -80,6 +85,7 @@ def launch(
         FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
     """
     check_faults(scenario)
+    check_perception(scenario.perception)
     names = scenario.names()
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
     paths = recordings(scenario, progress)
@@ -135,11 +141,12 @@ class _Launch:
         self._radio = scenario.links()
         self._faults = sorted(scenario.faults, key=lambda fault: fault.at_s)
         self._interrupted = False
+        self._killed: set[str] = set()
         self._changed_s = 0.0
-        self._seen: dict[str, Any] = {}
+        self._seen: dict[str, Seen] = {}
         self._watch = Watch(scenario, self._agents())
 
-    async def run(self) -> Report:
+    async def run(self) -> RunReport:
         """Start, watch, stop, write."""
         self._folder.write_run(self._run_record())
         loop = asyncio.get_running_loop()
@@ -201,16 +208,16 @@ class _Launch:
             return True
         self._note_changes(alive)
         quiet_s = self._now_s() - self._changed_s
-        if any(not agent.status or agent.status["playing"] for agent in alive):
+        if any(agent.status is None or agent.status.playing for agent in alive):
             return False
-        settled = _agree(alive) and not any(agent.status["busy"] for agent in alive)
+        settled = _agree(alive) and not any(agent.said.busy for agent in alive)
         return quiet_s >= (self._scenario.settle_s if settled else UNSETTLED_MAX_S)
 
     def _note_changes(self, alive: Iterable[AgentProcess]) -> None:
         """Remember when any robot's logs, frame or leader changed last."""
         for agent in alive:
-            keys = ("logs", "map_frame", "round", "leader", "playing")
-            seen = {key: agent.status.get(key) for key in keys}
+            said = agent.said
+            seen = (said.logs, said.map_frame, said.round, said.leader, said.playing)
             if seen != self._seen.get(agent.name):
                 self._seen[agent.name] = seen
                 self._changed_s = self._now_s()
@@ -228,6 +235,7 @@ class _Launch:
         match fault.kind:
             case FaultKind.KILL:
                 for agent in concerned:
+                    self._killed.add(agent.name)
                     agent.kill()
                     await agent.wait(STOP_NOW_S)
             case FaultKind.RESTART:
@@ -242,8 +250,10 @@ class _Launch:
             case FaultKind.SLOW:
                 for agent in concerned:
                     await agent.order({"slow": fault.value})
+            case FaultKind.MUTE | FaultKind.CALM:
+                raise AssertionError(f"{fault.kind.value} exists on virtual time only: check_faults refuses it")
             case _:
-                self._radio = changed_radio(self._radio, fault, self._now_s())
+                self._radio = changed_radio(self._radio, fault.kind, fault, self._now_s())
                 order = {"radio": json.loads(self._radio.model_dump_json())}
                 await asyncio.gather(*(agent.order(order) for agent in self._watch.agents))
 
@@ -263,11 +273,14 @@ class _Launch:
                 continue
             agent.asked = True
             code = agent.exit_code
-            event = {"signal": -code, "exit_code": None} if code < 0 else {"signal": None, "exit_code": code}
-            self._lines.write(self._event(agent.name, "agent_died", event))
+            scripted = agent.name in self._killed
+            self._killed.discard(agent.name)
+            signal_number, exit_code = (-code, None) if code < 0 else (None, code)
+            death = AgentDied(signal=signal_number, exit_code=exit_code, scripted=scripted)
+            self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
-        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and not agent.status]
+        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and agent.status is None]
         if died and self._now_s() < START_S:
             raise LaunchError(f"robot {died[0].name} could not start: {_sentence(died[0].last_words())}")
 
@@ -302,9 +315,6 @@ class _Launch:
             wall_s=wall_s,
         )
 
-    def _event(self, robot: str, kind: str, fields: dict[str, Any]) -> dict[str, Any]:
-        return {"t": round(self._now_s(), 6), "robot": robot, "event": kind, **fields}
-
     def _note(self, sentence: str) -> None:
         self._watch.notes.append(f"{self._now_s():7.1f} s  {sentence}")
 
@@ -315,9 +325,9 @@ class _Launch:
         return time.monotonic() - self._epoch_s
 
 
-def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig:
+def changed_radio(radio: RadioConfig, kind: LinkFault, fault: Fault, now_s: float) -> RadioConfig:
     """The radio after a fault that concerns links."""
-    match fault.kind:
+    match kind:
         case FaultKind.PARTITION:
             partition = {"groups": fault.groups, "from_s": now_s}
             return radio.model_validate({**radio.model_dump(), "partitions": [*radio.partitions, partition]})
@@ -333,12 +343,12 @@ def changed_radio(radio: RadioConfig, fault: Fault, now_s: float) -> RadioConfig
         case FaultKind.RANGE:
             return radio.model_validate({**radio.model_dump(), "range_m": fault.value})
         case _:
-            raise ValueError(f"{fault.kind.value} does not concern links")
+            assert_never(kind)
 
 
 def _agree(alive: list[AgentProcess]) -> bool:
     """Whether all running robots hold the same logs."""
-    logs = [agent.status.get("logs") for agent in alive]
+    logs = [agent.said.logs for agent in alive]
     return all(log == logs[0] for log in logs)
 
 

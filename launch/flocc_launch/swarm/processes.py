@@ -9,11 +9,14 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from flocc_agent.config import AgentConfig, PeerEndpoints, TlsConfig, TransportConfig
+from flocc_agent.runtime.status import AgentStatus
 
 STOP_TIMEOUT_S = 20.0
 LOG_TAIL_LINES = 5
@@ -27,7 +30,7 @@ class AgentProcess:
         config: Its configuration.
         folder: Where its files are.
         process: The process, None before it was started.
-        status: Its last state.
+        status: Its last state, None before the first.
         heard_s: When that came, on the monotonic clock.
         asked: Whether it was told to stop or killed on purpose.
         exit_code: How it ended; negative for a signal.
@@ -36,7 +39,7 @@ class AgentProcess:
     config: AgentConfig
     folder: Path
     process: asyncio.subprocess.Process | None = None
-    status: dict[str, Any] = field(default_factory=dict)
+    status: AgentStatus | None = None
     heard_s: float = 0.0
     asked: bool = False
     exit_code: int | None = None
@@ -46,6 +49,11 @@ class AgentProcess:
     def name(self) -> str:
         """The robot's name."""
         return self.config.name
+
+    @property
+    def said(self) -> AgentStatus:
+        """Its last state; before the first one, that it holds nothing."""
+        return self.status or AgentStatus(robot=self.name)
 
     @property
     def running(self) -> bool:
@@ -68,7 +76,7 @@ class AgentProcess:
                 start_new_session=True,
                 limit=4 * 1024 * 1024,
             )
-        self.exit_code, self.asked, self.status = None, False, {}
+        self.exit_code, self.asked, self.status = None, False, None
         self.reader = asyncio.create_task(self._read())
 
     async def order(self, order: dict[str, Any]) -> None:
@@ -112,8 +120,8 @@ class AgentProcess:
         assert self.process is not None
         assert self.process.stdout is not None
         async for line in self.process.stdout:
-            with contextlib.suppress(json.JSONDecodeError):
-                self.status = json.loads(line)
+            with contextlib.suppress(ValidationError):
+                self.status = AgentStatus.model_validate_json(line)
                 self.heard_s = time.monotonic()
         self.exit_code = await self.process.wait()
         with contextlib.suppress(ProcessLookupError):

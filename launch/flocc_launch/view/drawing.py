@@ -14,23 +14,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.recording import Frame, Recording
-from flocc_launch.dashboard.state import RobotState, SwarmState, place_of
-from flocc_launch.dashboard.words import sentence_of
-from flocc_launch.runs.run_records import (
-    AgentDied,
-    AgentStopped,
+from flocc_agent.core.reports import (
     ClosureAccepted,
     CorrectionApplied,
-    Event,
-    GraphOptimised,
-    KeyframeCaptured,
+    Fact,
+    KeyframeTaken,
     LeaderFollowed,
     LeaderLost,
     NeighbourDown,
     NeighbourUp,
+    RoundSolved,
 )
+from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.facts import AgentDied, AgentStopped
+from flocc_agent.runtime.recording import Frame, Recording
+from flocc_launch.dashboard.state import RobotState, SwarmState, place_of
+from flocc_launch.dashboard.words import sentence_of
 from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
@@ -67,34 +67,36 @@ class Drawing:
         self._images = images
         self._state = SwarmState(self._robots)
         self._chunks: dict[str, list[Float]] = {}
-        self._stamps_s: dict[str, float] = {}
+        self._stamps_s: dict[KeyframeId, float] = {}
         self._images_drawn = 0
         self._closures_due_s = 0.0
         self._closures_changed = False
 
-    def take(self, event: Event) -> None:
+    def take(self, event: Reported[Fact]) -> None:
         """Draw what one event changes."""
         self._state.apply(event)
         self._recording.set_time(TIMELINE, duration=event.t)
-        match event:
-            case KeyframeCaptured():
-                self._odometry(event)
+        fact = event.fact
+        match fact:
+            case KeyframeTaken():
+                self._odometry(event.robot, fact)
             case CorrectionApplied():
-                T = pose_from_tq(np.array(event.T_map_odom))
+                T = pose_from_tq(np.array(fact.T_map_odom))
                 transform = self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])
                 self._recording.log(f"live/{event.robot}", transform)
                 self._closures_changed = True
                 self._links()
             case ClosureAccepted():
                 self._closures_changed = True
-                self._recording.log("closure/probability", self._rr.Scalars(event.probability))
-                self._closure_images(event)
+                if fact.probability is not None:
+                    self._recording.log("closure/probability", self._rr.Scalars(fact.probability))
+                self._closure_images(fact)
             case NeighbourUp() | NeighbourDown() | AgentDied() | AgentStopped():
                 self._links()
             case LeaderFollowed() | LeaderLost():
                 self._here(event.robot)
-            case GraphOptimised():
-                self._solver(event)
+            case RoundSolved():
+                self._solver(fact)
         self._closures(event.t)
         said = sentence_of(event)
         if said is not None:
@@ -107,13 +109,12 @@ class Drawing:
             self._robots.append(robot)
         return COLOURS[self._robots.index(robot) % len(COLOURS)] if robot in self._robots else GREY
 
-    def _odometry(self, event: KeyframeCaptured) -> None:
+    def _odometry(self, robot: str, taken: KeyframeTaken) -> None:
         """One more keyframe: the open piece of the line is logged anew, so that a long walk is not."""
-        robot = event.robot
-        self._stamps_s[event.keyframe] = event.stamp_s
+        self._stamps_s[taken.keyframe] = taken.stamp_s
         piece = self._chunks.setdefault(robot, [])
-        piece.append(np.array(event.T_odom_body[:3]))
-        number = KeyframeId.parse(event.keyframe).index // CHUNK_POINTS
+        piece.append(np.array(taken.T_odom_body[:3]))
+        number = taken.keyframe.index // CHUNK_POINTS
         strip = self._rr.LineStrips3D([np.array(piece)], colors=[self.colour(robot)])
         self._recording.log(f"live/{robot}/odometry/{number}", strip)
         if len(piece) > CHUNK_POINTS:
@@ -160,37 +161,36 @@ class Drawing:
         self._recording.log("closures", strips)
 
     def _joined(self) -> Iterator[tuple[Float, Colour]]:
-        for (query, match), probability in self._state.closures.items():
-            keyframes = [KeyframeId.parse(query), KeyframeId.parse(match)]
+        for keyframes, probability in self._state.closures.items():
             frames = {self._state.robots[k.log.robot].map_frame for k in keyframes if k.log.robot in self._state.robots}
             ends = [place_of(self._state, keyframe) for keyframe in keyframes]
             if len(frames) == 1 and None not in frames and None not in ends:
                 yield np.array(ends), confidence_colour(probability)
 
-    def _closure_images(self, event: ClosureAccepted) -> None:
+    def _closure_images(self, closure: ClosureAccepted) -> None:
         """Both images of a closure, where they are at hand; at most `IMAGES_MAX` closures."""
         if self._images_drawn >= IMAGES_MAX:
             return
-        found = {side: self._frame(keyframe) for side, keyframe in (("query", event.query), ("match", event.match))}
+        found = {side: self._frame(keyframe) for side, keyframe in (("query", closure.query), ("match", closure.match))}
         self._images_drawn += any(frame is not None for frame in found.values())
         for side, frame in found.items():
             if frame is not None:
                 pixels = frame[0].load_image(frame[1]).pixels
                 self._recording.log(f"closure/{side}", self._rr.Image(pixels).compress(jpeg_quality=80))
 
-    def _frame(self, keyframe: str) -> tuple[Recording, Frame] | None:
+    def _frame(self, keyframe: KeyframeId) -> tuple[Recording, Frame] | None:
         """The recording's frame that a keyframe was, None where it is not known."""
-        source, stamp_s = self._images.get(KeyframeId.parse(keyframe).log.robot), self._stamps_s.get(keyframe)
+        source, stamp_s = self._images.get(keyframe.log.robot), self._stamps_s.get(keyframe)
         if source is None or stamp_s is None:
             return None
         return source, min(source.frames, key=lambda frame: abs(frame.stamp_s - stamp_s))
 
-    def _solver(self, event: GraphOptimised) -> None:
+    def _solver(self, solved: RoundSolved) -> None:
         """How well each round's graph fits together: what is left of all residuals, and what was thrown out."""
         for name, value in (
-            ("cost", event.cost),
-            ("closures_used", event.closures_used),
-            ("closures_rejected", event.closures_rejected),
+            ("cost", solved.cost),
+            ("closures_used", solved.closures_used),
+            ("closures_rejected", solved.closures_rejected),
         ):
             if value is not None:
                 self._recording.log(f"solver/{name}", self._rr.Scalars(float(value)))

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.zenoh_observer import Observer
 from flocc_launch.dashboard.tail import RunTail
 from flocc_launch.runs.heard import Heard
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import Event
 from flocc_launch.view.drawing import Colour, Drawing
 from flocc_launch.view.run_view import images_of, opened, rerun_module
 from flocc_protocol.errors import DecodeError, FloccError
@@ -97,7 +98,7 @@ def view_swarm(observer: Observer, save: Path | None, steepness: float, is_over:
 
 
 class Overheard:
-    """Envelopes as events, each record once. Signatures are taken off, not checked: this is for eyes only.
+    """Envelopes as facts, each record once. Signatures are taken off, not checked: this is for eyes only.
 
     Attributes:
         anybody: Whether any robot was heard.
@@ -109,7 +110,7 @@ class Overheard:
         self._signature_bytes = SIGNATURE_BYTES if signed else 0
         self._seen: set[tuple[LogId, int]] = set()
 
-    def events(self, envelope: Envelope, t: float) -> Iterator[Event]:
+    def events(self, envelope: Envelope, t: float) -> Iterator[Reported[Fact]]:
         """What one message tells."""
         self.anybody = True
         match envelope.message:
@@ -120,13 +121,13 @@ class Overheard:
             case Records(batches):
                 for batch in batches:
                     yield from self._records(batch, t)
-            case _:
-                for correction in corrections_of(envelope):
+            case CorrectionBatch(corrections):
+                for correction in corrections:
                     applied = self._heard.correction(correction, t)
                     if applied is not None:
                         yield applied
 
-    def _records(self, batch: RecordBatch, t: float) -> Iterator[Event]:
+    def _records(self, batch: RecordBatch, t: float) -> Iterator[Reported[Fact]]:
         for number, data in enumerate(batch.records, start=batch.first):
             if (batch.log, number) in self._seen or len(self._seen) >= RECORDS_MAX:
                 continue

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_launch.report.figure_charts import errors_after
-from flocc_launch.report.figure_map import Scene, scenes
+from flocc_launch.report.figure_map import MapScene, scenes
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
-from flocc_launch.runs.run_records import ClosureKnown
 from flocc_launch.view.drawing import COLOURS, GREY, TIMELINE, Colour, Drawing, confidence_colour
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
@@ -109,7 +109,7 @@ def images_of(folder: RunFolder) -> dict[str, Recording]:
     return found
 
 
-def log_scene(rr: Any, recording: Any, loaded: LoadedRun, scene: Scene) -> None:
+def log_scene(rr: Any, recording: Any, loaded: LoadedRun, scene: MapScene) -> None:
     """Trajectories of one scene of the report, with ground truth and closures; they hold at any time."""
     place = scene.name.lower().replace(", in ", "/").replace(" ", "_")
     for robot, points in scene.lines_m.items():
@@ -123,7 +123,7 @@ def log_scene(rr: Any, recording: Any, loaded: LoadedRun, scene: Scene) -> None:
         recording.log(f"{place}/closures", rr.LineStrips3D(strips, colors=colours), static=True)
 
 
-def closure_lines(loaded: LoadedRun, scene: Scene) -> Iterator[tuple[Float, Colour]]:
+def closure_lines(loaded: LoadedRun, scene: MapScene) -> Iterator[tuple[Float, Colour]]:
     """Lines between the ends of accepted closures, coloured by their probability."""
     for pair in loaded.pairs:
         ends = [scene.lines_m.get(keyframe.log.robot) for keyframe in (pair.query, pair.match)]

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend import rotations
 from flocc_agent.backend.edges import GAMMA_MIN, Edges, Residuals, State, jacobians, residuals, scales_at, state_of
-from flocc_agent.geometry import pose, so3_exp, so3_log
+from flocc_agent.geometry import pose, quaternions, so3_exp, so3_log
 
 Float = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def edge(rng: np.random.Generator, case: str, sigma: float, cluster: int, scale:
     L = np.linalg.inv(np.linalg.cholesky(covariance))
     wide = np.linalg.inv(np.linalg.cholesky(covariance + sigma**2 * np.outer(d, d)))
     edges = Edges(
-        np.array([0]), np.array([1]), rotations.quaternions(R_hat[None]), d[None], L[None], wide[None],
+        np.array([0]), np.array([1]), quaternions(R_hat[None]), d[None], L[None], wide[None],
         np.array([sigma]), np.array([cluster]),
     )  # fmt: skip
     state = state_of(np.array([T_i, T_i @ T_ij]))
@@ -75,7 +75,7 @@ def test_a_held_scale_pulls_at_its_cluster_and_not_at_its_poses_scale() -> None:
 def test_batched_quaternions_agree_with_the_logarithm(angle_rad: float) -> None:
     axis = np.array([0.6, -0.64, 0.48])
     R = so3_exp(angle_rad * axis)
-    q = rotations.quaternions(R[None])
+    q = quaternions(R[None])
     np.testing.assert_allclose(rotations.matrices(q)[0], R, atol=1e-12)
     assert rotations.angles_rad(q)[0] == pytest.approx(float(np.linalg.norm(so3_log(R))), abs=1e-7)
     np.testing.assert_allclose(rotations.matrices(rotations.exponential(angle_rad * axis[None]))[0], R, atol=1e-12)

@@ -1,5 +1,6 @@
 """Claims on measured factors: they correct, join maps where they fix all that is open, and wrong ones are named."""
 
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -263,6 +264,14 @@ def test_a_metric_closure_joins_and_is_weighed() -> None:
     assert joint_error_m(solution) < 0.01
 
 
+def test_a_graph_with_landmarks_is_sent_to_a_worker_and_back() -> None:
+    given = graph([R1, R2], [sighting(R1, 15, TAG), sighting(R2, 3, TAG)])
+    sent = pickle.loads(pickle.dumps(given))  # our own bytes
+    solution = pickle.loads(pickle.dumps(solved(sent)))
+    assert groups(solution) == [["r1", "r2"]]
+    assert solution.measured[0].factor.match == given.measured[0].match
+
+
 def test_points_on_a_line_do_not_fix_a_rotation() -> None:
     line = np.outer(np.arange(6.0), [1.0, 2.0, 0.5])
     plane = line + np.array([[0, 0, 0], [0, 1, 0], [0, 2, 1.0], [0, 0, 2], [1, 0, 0], [0, 0, 0]])
@@ -270,3 +279,28 @@ def test_points_on_a_line_do_not_fix_a_rotation() -> None:
     assert not aligned_points(line, line, sigmas)[1]
     assert aligned_points(plane, plane, sigmas)[1]
     assert not aligned_points(plane[:2], plane[:2], sigmas[:2])[1]
+
+
+def test_right_fixes_of_a_long_way_that_drifted_far_are_kept_and_wrong_ones_rejected() -> None:
+    """Laid as a rigid whole, most right fixes would look wrong, and GNC would throw them out."""
+    rng, count, sigma_m = np.random.default_rng(2), 1500, 2.0
+    way, T_odom = [np.eye(4)], [np.eye(4)]
+    for k in range(count - 1):
+        step = se3_exp(np.array([0.0, 0.0, 0.05 * np.sin(k / 40), 1.0, 0.0, 0.0]))
+        way.append(way[-1] @ step)
+        T_odom.append(T_odom[-1] @ step @ se3_exp(np.repeat([0.02, 0.03], 3) * rng.normal(size=6)))
+    wrong = set(range(50, count, 150))
+    measured = []
+    for k in range(0, count, 5):
+        off_m = 30.0 if k in wrong else sigma_m
+        at, position = KeyframeId(R1, k), way[k][:3, 3] + off_m * rng.normal(size=3)
+        world = landmark(WORLD)
+        measured.append(MeasuredFactor("fix", at, world, at, pose(np.eye(3), position), sigma_m**2 * np.eye(3)))
+    solution = solved(PoseGraph({R1: Trajectory(np.array(T_odom))}, measured=tuple(measured)))
+    rejected = {r.factor.at.index for r in solution.measured if r.state is not ClosureState.USED}
+    assert rejected <= wrong
+    assert len(rejected) >= len(wrong) - 2
+    (component,) = solution.components
+    assert component.T_map_world is not None
+    off = (inverse(component.T_map_world) @ component.T_map_keyframe[R1] - np.array(way))[:, :3, 3]
+    assert np.linalg.norm(off, axis=1).mean() < sigma_m

@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import LISTED_MAX, Corrections, pose7
+from flocc_agent.core.corrections import LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
+from flocc_agent.core.reports import CorrectionApplied, PeerRefused
 from flocc_agent.core.robot import Restored
-from flocc_agent.geometry import pose
+from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
@@ -32,8 +33,8 @@ def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> 
 
 
 def delivered(effects: list[Effect]) -> list[tuple[int, int, bool]]:
-    found = [e.correction for e in effects if isinstance(e, Deliver)]
-    return [(c.term.counter, c.round, c.frame_changed) for c in found]
+    found = [e for e in effects if isinstance(e, Deliver)]
+    return [(e.correction.term.counter, e.correction.round, e.frame_changed) for e in found]
 
 
 def solution(shift_m: float = 0.0, keyframes: int = 3) -> GraphSolution:
@@ -154,9 +155,7 @@ def test_a_relay_cannot_forge_a_correction() -> None:
     genuine = replace(correction(Term(1, R2), 1), signature=Seals("r2").sign_correction(b""))
     for forged in (replace(genuine, signature=b""), replace(genuine, term=Term(9, R3))):
         effects = machine.on_message("r3", forged)
-        assert effects == [
-            Report("peer_refused", {"peer": "r3", "reason": "correction without its leader's signature"})
-        ]
+        assert effects == [Report(PeerRefused(peer="r3", reason="correction without its leader's signature"))]
     assert delivered(machine.on_message("r3", genuine)) == [(1, 1, False)]
 
 
@@ -173,7 +172,7 @@ def test_a_correction_of_an_absurd_term_is_refused() -> None:
     hostile = correction(Term(TERM_COUNTER_MAX, R2), 1)
     robots.put("r1", MessageReceived(Envelope(R2, CorrectionBatch((hostile,)))))
     assert robots.effects("r1", Deliver) == []
-    assert len(robots.reports("r1", "peer_refused")) == 1
+    assert len(robots.facts("r1", PeerRefused)) == 1
 
 
 def test_a_lost_correction_is_repaired_by_heartbeats() -> None:
@@ -224,7 +223,5 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
     robots.separate()
     robots.run(15.0)
     assert set(robots.frames().values()) == {"map/r1"}
-    changes = [
-        report.fields["map_frame"] for report in robots.reports("r4", "correction") if report.fields["frame_changed"]
-    ]
+    changes = [fact.map_frame for fact in robots.facts("r4", CorrectionApplied) if fact.frame_changed]
     assert changes == ["map/r1"]

@@ -10,6 +10,7 @@ from flocc_agent.core.distributed_optimisation import DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.reports import RoundFailed
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair, Separators
@@ -169,7 +170,7 @@ def test_an_overdue_or_failed_iteration_is_tried_again_after_a_growing_pause() -
     b = machine()
     (job,) = jobs(b.tick(0.0))
     effects = b.tick(10.0)
-    assert [effect.event for effect in effects if isinstance(effect, Report)] == ["optimisation_failed"]
+    assert [type(effect.fact) for effect in effects if isinstance(effect, Report)] == [RoundFailed]
     assert b.on_step(job.number, step(), 10.1) == []
     (second,) = jobs(b.tick(10.4))
     b.on_failed(second.number, "singular", 11.0)

@@ -1,14 +1,17 @@
 """Bully election with terms, over several hops."""
 
+import random
+
+import pytest
 from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
-from flocc_agent.core.election import ANSWER_TIMEOUT_S, COUNTER_JUMP_MAX, LeaderElection, Role
+from flocc_agent.core.election import ANSWER_TIMEOUT_S, COUNTER_JUMP_MAX, TRANSITIONS, LeaderElection, Role, Turn
 from flocc_agent.core.events import Leaving
 from flocc_agent.core.parameters import CoreParameters, ElectionParameters
 from flocc_agent.core.robot import Restored
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import Answer, Coordinator, Election, Heartbeat, LeaderAdvert
+from flocc_protocol.messages import Answer, Coordinator, Election, Handover, Heartbeat, LeaderAdvert
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
@@ -235,3 +238,46 @@ def test_robots_beyond_the_greatest_number_of_hops_follow_nobody_and_are_correct
     robots.run(30.0)
     assert robots.leaders() == {"r1": "1:r1", "r2": "1:r1", "r3": "1:r1", "r4": "None", "r5": "None"}
     assert set(robots.frames()) == set(names)
+
+
+def test_the_table_says_every_transition_that_happens_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: set[tuple[Role, Turn, Role]] = set()
+    turn = LeaderElection._turn
+
+    def noted(self: LeaderElection, what: Turn, due_s: float) -> None:
+        before = self.role
+        turn(self, what, due_s)
+        taken.add((before, what, self.role))
+
+    monkeypatch.setattr(LeaderElection, "_turn", noted)
+    for seed in range(200):
+        _live(random.Random(seed))
+    stated = {(role, what, after) for role, turns in TRANSITIONS.items() for what, after in turns.items()}
+    assert taken == stated
+
+
+def _live(draw: random.Random) -> None:
+    """Push anything at one robot, in any order."""
+    robot, now = election(draw.choice((R1, R2, R3))), 0.0
+    for beat in range(60):
+        now += draw.choice((0.0, 0.3, 2.0))
+        sender = draw.choice([log for log in (R1, R2, R3) if log != robot._own])
+        counter = draw.randrange(8)
+        advert = LeaderAdvert(Term(counter, sender), 0, beat, 0)
+        match draw.randrange(8):
+            case 0:
+                robot.on_heartbeat(sender, heartbeat(draw.choice((None, advert)), counter), now)
+            case 1:
+                robot.on_coordinator(sender, Coordinator(advert), now)
+            case 2:
+                robot.on_election(sender, now)
+            case 3:
+                robot.on_answer(sender, now)
+            case 4:
+                robot.on_handover(sender, Handover(robot.term or advert.term), now)
+            case 5:
+                robot.on_lost(sender.robot)
+            case 6 if draw.random() < 0.2:
+                robot.leave()
+            case _:
+                robot.tick(now)

@@ -9,6 +9,7 @@ from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pulls import BACKOFF_MAX_S, REQUEST_PERIOD_S
+from flocc_agent.core.reports import Fact, LogForked, PeerRefused
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import LogDigest, LogPosition, RecordBatch, RecordRequest, Records
 from flocc_protocol.records import KeyframeRecord, RejectionRecord, encode_record
@@ -40,8 +41,8 @@ def requests(effects: list[Effect]) -> list[tuple[str, int]]:
     return [(to, position.first) for to, message in asked for position in message.positions]
 
 
-def reports(effects: list[Effect]) -> list[str]:
-    return [effect.event for effect in effects if isinstance(effect, Report)]
+def facts(effects: list[Effect]) -> list[type[Fact]]:
+    return [type(effect.fact) for effect in effects if isinstance(effect, Report)]
 
 
 def test_a_longer_copy_elsewhere_is_asked_for_from_where_this_one_ends() -> None:
@@ -107,7 +108,7 @@ def test_a_fork_is_reported_once_and_neither_side_is_damaged() -> None:
     reader.on_records(R1, batch(writer(R1, 3), R1, 0), 0.0)
     before = reader.digests()
     other = writer(R1, 5, x_m=1.0)
-    assert reports(reader.on_records(R2, batch(other, R1, 3), 1.0)[1]) == ["log_forked"]
+    assert facts(reader.on_records(R2, batch(other, R1, 3), 1.0)[1]) == [LogForked]
     assert reader.on_records(R2, batch(other, R1, 3), 2.0) == ([], [])
     assert reader.on_digests(R2, other.digests(), 3.0) == []
     assert reader.digests() == before
@@ -117,7 +118,7 @@ def test_a_batch_that_contradicts_the_copy_within_it_is_refused_whole() -> None:
     reader = Gossip(R3, PARAMETERS)
     reader.on_records(R1, batch(writer(R1, 3), R1, 0), 0.0)
     new, effects = reader.on_records(R2, batch(writer(R1, 5, x_m=1.0), R1, 0), 1.0)
-    assert (new, reports(effects)) == ([], ["log_forked"])
+    assert (new, facts(effects)) == ([], [LogForked])
     assert len(reader.logs[R1]) == 3
 
 
@@ -133,7 +134,7 @@ def test_the_own_log_is_never_written_by_others() -> None:
     for first in (0, 1, 2):
         robot = writer(R1, 2)
         new, effects = robot.on_records(R2, batch(writer(R1, 4, x_m=float(first < 2)), R1, first), 0.0)
-        assert (new, reports(effects)) == ([], ["log_forked"])
+        assert (new, facts(effects)) == ([], [LogForked])
         assert len(robot.logs[R1]) == 2
 
 
@@ -142,7 +143,7 @@ def test_what_is_no_record_says_nothing_of_the_own_log() -> None:
     (good,) = batch(writer(R1, 4), R1, 2).batches
     for data in (b"", b"\x00", good.records[0][:-1], bytes(60)):
         effects = robot.on_records(R2, Records((replace(good, records=(data,)),)), 0.0)[1]
-        assert "log_forked" not in reports(effects)
+        assert LogForked not in facts(effects)
 
 
 def test_an_old_contradiction_in_the_own_log_is_followed_to_where_it_began() -> None:
@@ -161,7 +162,7 @@ def test_a_damaged_record_is_refused_and_what_came_before_it_kept() -> None:
     damaged = replace(good, records=(good.records[0], b"\x00", good.records[2]))
     new, effects = reader.on_records(R1, Records((damaged,)), 0.0)
     assert [entry.number for entry in new] == [0]
-    assert reports(effects) == ["peer_refused"]
+    assert facts(effects) == [PeerRefused]
 
 
 def test_keyframes_are_numbered_without_gaps() -> None:
@@ -174,7 +175,7 @@ def test_logs_beyond_the_maximum_are_refused_without_asking() -> None:
     reader = Gossip(R1, GossipParameters(logs_max=2))
     reader.on_records(R2, batch(writer(R2, 1), R2, 0), 0.0)
     digests = writer(R3, 4).digests()
-    assert reports(reader.on_digests(R3, digests, 0.0)) == ["peer_refused"]
+    assert facts(reader.on_digests(R3, digests, 0.0)) == [PeerRefused]
     assert reader.on_digests(R3, digests, 1.0) == []
 
 

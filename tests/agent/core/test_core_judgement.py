@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from tests.agent.core.virtual_time import keyframe
 
-from flocc_agent.core.judgement import judged, judgement_report
+from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected
 from flocc_protocol.ids import LogId
 from flocc_protocol.records import ClosureRecord, RejectionRecord
 
@@ -37,6 +38,15 @@ def test_few_correspondences_are_refused_whatever_their_ratio() -> None:
     assert reason(replace(GOOD, correspondences=19, odometry_correspondences=20)) == "fewer than 20 correspondences"
 
 
+def test_what_its_front_end_judged_needs_no_ratio() -> None:
+    few = replace(GOOD, correspondences=18, judged_ratio=1.2)
+
+    record = judged(QUERY, MATCH, few, LIMITS)
+
+    assert isinstance(record, ClosureRecord)
+    assert (record.match_ratio, record.correspondences) == (1.2, 18)
+
+
 def test_a_failed_registration_is_refused_with_its_reason() -> None:
     failed = RegistrationFailed(RegistrationFailure.DEGENERATE, correspondences=7)
     assert reason(failed) == RegistrationFailure.DEGENERATE.value
@@ -54,7 +64,9 @@ def test_a_scale_that_no_record_can_hold_counts_as_none() -> None:
 
 
 def test_people_are_told_of_both() -> None:
-    accepted = judgement_report(judged(QUERY, MATCH, GOOD, LIMITS), LogId("r1"))
-    refused = judgement_report(judged(QUERY, MATCH, replace(GOOD, correspondences=5), LIMITS), LogId("r1"))
-    assert (accepted.event, accepted.fields["ratio"], accepted.fields["by"]) == ("closure_accepted", 0.6, "r1")
-    assert (refused.event, refused.fields["reason"]) == ("closure_rejected", "fewer than 20 correspondences")
+    accepted = told(judged(QUERY, MATCH, GOOD, LIMITS), LogId("r1"))
+    refused = told(judged(QUERY, MATCH, replace(GOOD, correspondences=5), LIMITS), LogId("r1"))
+    assert isinstance(accepted, ClosureAccepted)
+    assert (accepted.ratio, accepted.by) == (0.6, "r1")
+    assert isinstance(refused, ClosureRejected)
+    assert refused.reason == "fewer than 20 correspondences"

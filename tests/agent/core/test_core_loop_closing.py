@@ -17,6 +17,7 @@ from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, r
 from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.reports import ClosureRejected
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
 from flocc_protocol.records import RejectionRecord
@@ -378,7 +379,7 @@ def test_a_lost_latent_is_known_to_robots_that_only_hear_the_owner_through_other
     meet(robots, "r1", "r4")
     robots.run(60.0)
     assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
-    assert {r.fields["reason"] for r in robots.reports("r4", "closure_rejected")} == {"a latent was lost"}
+    assert {fact.reason for fact in robots.facts("r4", ClosureRejected)} == {"a latent was lost"}
     robots.run(60.0)
     assert all(core.closing.lost(robots.now_s) == () for core in robots.cores.values())
 

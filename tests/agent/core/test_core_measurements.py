@@ -1,5 +1,7 @@
 """Claims on measurements: each belongs to its keyframe, waits for it, and is refused with a reason where it cannot."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from tests.agent.core.virtual_time import Robots, answer
@@ -19,6 +21,7 @@ from flocc_agent.core.measurements import (
     StartPose,
     TagSighting,
 )
+from flocc_agent.core.reports import MeasurementRefused
 from flocc_agent.geometry import Float, inverse, pose, se3_exp, se3_log, so3_exp
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
@@ -99,7 +102,7 @@ def test_what_belongs_to_no_keyframe_is_refused_with_a_reason() -> None:
     robots.capture("r1", 0.0, look=0)
     robots.run(1.0)
     robots.put("r1", Measured(OdometryCovariance(np.eye(6)), 0))
-    reasons = [report.fields["reason"] for report in robots.reports("r1", "measurement_refused")]
+    reasons = [refused.reason for refused in robots.facts("r1", MeasurementRefused)]
     assert reasons == ["there is no such keyframe", "odometry: the first keyframe has no edge before it"]
 
 
@@ -118,8 +121,8 @@ def test_as_many_measurements_wait_for_a_keyframe_as_the_limit_says() -> None:
     robots.capture("r1", 0.0, look=0)
     for _ in range(WAITING_MAX + 1):
         robots.put("r1", Measured(fix(0.0), 0))
-    (report,) = robots.reports("r1", "measurement_refused")
-    assert report.fields["reason"] == f"{WAITING_MAX} others wait for this keyframe"
+    (refused,) = robots.facts("r1", MeasurementRefused)
+    assert refused.reason == f"{WAITING_MAX} others wait for this keyframe"
     held, most = robots.cores["r1"].sizes()["measurements"]
     assert held == most == WAITING_MAX
 
@@ -211,3 +214,13 @@ def test_a_bearing_and_range_becomes_a_position_with_its_spread_along_and_across
     assert isinstance(record, RobotBearingRecord)
     np.testing.assert_allclose(record.position_m.numpy(), [10.0, 0.0, 0.0])
     np.testing.assert_allclose(record.covariance_m2.numpy(), np.diag([0.25, 0.01, 0.01]).ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["TagSighting", "RobotSighting", "RobotBearing", "GeodeticFix"])
+def test_a_kind_of_measurement_touches_at_most_four_source_files(kind: str) -> None:
+    """Simulated sensors and the positions' file format aside, which name some kinds for reasons of their own."""
+    roots = [
+        Path(__file__).parents[3] / root for root in ("protocol", "agent/flocc_agent/core", "agent/flocc_agent/backend")
+    ]
+    touched = [path for root in roots for path in root.rglob("*.py") if kind in path.read_text(encoding="utf-8")]
+    assert 3 <= len(touched) <= 4, touched

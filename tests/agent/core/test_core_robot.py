@@ -10,6 +10,7 @@ from flocc_agent.core.events import Event, KeyframeEncoded, MessageReceived
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters, NeighbourParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.reports import LogForked, NameTaken, NeighbourDown, NeighbourRestarted, NeighbourUp, PeerRefused
 from flocc_agent.core.robot import Restored
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
@@ -82,7 +83,7 @@ def test_a_silent_robot_is_out_of_range_after_the_timeout() -> None:
     robots.kill("r2")
     robots.run(3.1)
     assert robots.cores["r1"].neighbours.names() == []
-    assert len(robots.reports("r1", "neighbour_down")) == 1
+    assert len(robots.facts("r1", NeighbourDown)) == 1
 
 
 def test_a_restarted_robot_continues_its_numbering() -> None:
@@ -99,7 +100,7 @@ def test_a_restarted_robot_continues_its_numbering() -> None:
     robots.run(5.0)
     assert [e.keyframe.index for e in robots.effects("r1", Encode) if isinstance(e, Encode)] == [0, 1, 2, 3]
     assert robots.cores["r2"].gossip.logs[R1].encoded == robots.cores["r1"].gossip.logs[R1].encoded
-    assert robots.reports("r2", "log_forked") == []
+    assert robots.facts("r2", LogForked) == []
 
 
 def test_a_restarted_robot_registers_nothing_twice() -> None:
@@ -157,7 +158,7 @@ def test_a_robot_that_lost_its_disk_is_a_new_incarnation_and_its_old_log_stays()
     robots.run(10.0)
     logs = {str(log): copy.keyframes for log, copy in robots.cores["r2"].gossip.logs.items()}
     assert logs == {"r1": 3, "r1~1": 1, "r2": 0}
-    assert robots.reports("r1", "log_forked") == []
+    assert robots.facts("r1", LogForked) == []
 
 
 def test_keyframes_are_recorded_in_the_order_of_capture() -> None:
@@ -186,15 +187,15 @@ def test_another_robot_with_this_robots_name_is_reported_once() -> None:
     robots.add("r1")
     for k in range(3):
         robots.put("r1", MessageReceived(Envelope(R1, heartbeat(boot=5, sequence=k))))
-    assert len(robots.reports("r1", "duplicate_name")) == 1
+    assert len(robots.facts("r1", NameTaken)) == 1
 
 
 def test_two_robots_with_one_name_are_told_from_a_restart() -> None:
     neighbours = Neighbours(R1, 1, NeighbourParameters())
     found = []
     for t, boot in enumerate((5, 6, 6, 5, 6)):
-        found += [e.event for e in neighbours.on_heartbeat(R2, heartbeat(boot), float(t)) if isinstance(e, Report)]
-    assert found == ["neighbour_up", "neighbour_restarted", "duplicate_name"]
+        found += [type(e.fact) for e in neighbours.on_heartbeat(R2, heartbeat(boot), float(t)) if isinstance(e, Report)]
+    assert found == [NeighbourUp, NeighbourRestarted, NameTaken]
 
 
 def test_two_robots_with_one_name_corrupt_neither_log() -> None:
@@ -215,7 +216,7 @@ def test_two_robots_with_one_name_corrupt_neither_log() -> None:
         robots.put("r2", MessageReceived(Envelope(R1, message)))
     robots.run(3.0)
     assert robots.cores["r2"].gossip.logs[R1].encoded == kept
-    assert len(robots.reports("r2", "log_forked")) == 1
+    assert len(robots.facts("r2", LogForked)) == 1
 
 
 def test_no_pair_is_handed_to_a_name_under_which_two_robots_run() -> None:
@@ -238,7 +239,7 @@ def test_neighbours_beyond_the_maximum_are_refused() -> None:
     for k in range(5):
         robots.put("r1", MessageReceived(Envelope(LogId(f"x{k}"), heartbeat(boot=k))))
     assert len(robots.cores["r1"].neighbours.names()) == 2
-    assert len(robots.reports("r1", "peer_refused")) == 3
+    assert len(robots.facts("r1", PeerRefused)) == 3
 
 
 def test_every_table_has_a_maximum() -> None:

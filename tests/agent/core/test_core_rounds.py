@@ -8,6 +8,7 @@ from flocc_agent.core.effects import Effect, Optimise, Report
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.reports import RoundTimedOut
 from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PERIOD_PER_KEYFRAME_S, TIMEOUT_S, Rounds
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
@@ -125,7 +126,7 @@ def test_a_round_that_gives_no_answer_is_given_up_and_tried_again() -> None:
     rounds, _ = leading()
     rounds.tick(0.0)
     effects = rounds.tick(TIMEOUT_S)
-    assert [e.event for e in effects if isinstance(e, Report)] == ["round_timeout"]
+    assert [type(e.fact) for e in effects if isinstance(e, Report)] == [RoundTimedOut]
     assert rounds.deadline() > TIMEOUT_S
     assert started(rounds.tick(rounds.deadline())) == [2]
 

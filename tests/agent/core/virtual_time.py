@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
-from flocc_agent.core.corrections import pose7
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -27,13 +27,16 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
 from flocc_agent.core.robot import Restored, Robot
-from flocc_agent.geometry import pose
+from flocc_agent.geometry import pose, pose7
 from flocc_launch.simulation.rigid_alignment import align
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Message
+
+F = TypeVar("F")
 
 LATENCY_S = 0.01
 WORK_S = 0.1
@@ -138,16 +141,17 @@ class Robots:
         """What a robot wanted, of one kind."""
         return [effect for _, who, effect in self.done if who == name and isinstance(effect, kind)]
 
-    def reports(self, name: str, event: str) -> list[Report]:
+    def facts(self, name: str, kind: type[F]) -> list[F]:
         """What a robot reported, of one kind."""
-        return [e for _, who, e in self.done if who == name and isinstance(e, Report) and e.event == event]
+        told = [effect.fact for _, who, effect in self.done if who == name and isinstance(effect, Report)]
+        return [fact for fact in told if isinstance(fact, kind)]
 
     def frames(self) -> dict[str, str]:
         """Robot -> map frame of its last correction."""
         found: dict[str, str] = {}
         for _, name, effect in self.done:
             if isinstance(effect, Deliver):
-                found[name] = effect.correction.map_frame
+                found[name] = map_frame(effect.correction.anchor)
         return {name: found[name] for name in sorted(found) if name in self.cores}
 
     def _send(self, sender: str, receiver: str, message: Message) -> None:

@@ -19,8 +19,8 @@ from flocc_agent.perception.mast3r.keyed import (  # noqa: E402
     keyed_image,
     keyed_state,
 )
-from flocc_agent.perception.mast3r.network import Mast3r  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import Mast3rSizes  # noqa: E402
+from flocc_agent.perception.mast3r.two_view_network import Mast3r  # noqa: E402
 
 SHARED = Path(os.environ.get("FLOCC_SHARED", Path(__file__).resolve().parents[4] / "shared"))
 

@@ -6,14 +6,14 @@ from tests.agent.perception.classical_scenes import FOCAL_PX, box, camera_at, se
 from flocc_agent.geometry import angle_rad, inverse, pose, se3_log, so3_exp
 from flocc_agent.perception.classical.matching import mutual_matches
 from flocc_agent.perception.multiview.bundle import (
-    View,
+    BundleView,
     _linearise,
     covariance_of_view,
     inverse_depths_from,
     refine,
 )
-from flocc_agent.perception.multiview.parameters import Geometry
 from flocc_agent.perception.multiview.two_view import TwoView, decompose_essential, two_view
+from flocc_agent.perception.multiview.view_parameters import Geometry
 
 Float = NDArray[np.float64]
 GEOMETRY = Geometry()
@@ -65,7 +65,7 @@ def test_an_essential_matrix_has_four_poses_one_of_them_true() -> None:
     assert all(np.isclose(np.linalg.det(candidate[:3, :3]), 1.0) for candidate in poses)
 
 
-def _two_views(rng: np.random.Generator, sigma_px: float) -> tuple[Float, Float, tuple[View, ...], Float]:
+def _two_views(rng: np.random.Generator, sigma_px: float) -> tuple[Float, Float, tuple[BundleView, ...], Float]:
     """Points in the query, their inverse depths, two views with true poses, and the true match pose."""
     world = rng.uniform([-3, -2, 4], [3, 2, 9], (120, 3))
     points = world[:, :2] / world[:, 2:]
@@ -74,7 +74,7 @@ def _two_views(rng: np.random.Generator, sigma_px: float) -> tuple[Float, Float,
         T = inverse(T_query_view)
         p = world @ T[:3, :3].T + T[:3, 3]
         observed = p[:, :2] / p[:, 2:] + rng.normal(0, sigma_px / FOCAL_PX, (len(p), 2))
-        views.append(View(T, observed, np.arange(len(p)) % 5 != k, FOCAL_PX, unit_translation=k == 0))
+        views.append(BundleView(T, observed, np.arange(len(p)) % 5 != k, FOCAL_PX, unit_translation=k == 0))
     return points, 1.0 / world[:, 2], tuple(views), inverse(views[1].T_view_query)
 
 
@@ -92,7 +92,7 @@ def test_gradient_agrees_with_numerical_differentiation() -> None:
             delta = np.zeros(6)
             delta[k] = sign * step
             T = pose(so3_exp(delta[:3]) @ view.T_view_query[:3, :3], view.T_view_query[:3, 3] + delta[3:])
-            moved = View(T, view.observed, view.seen, FOCAL_PX, unit_translation=False)
+            moved = BundleView(T, view.observed, view.seen, FOCAL_PX, unit_translation=False)
             costs.append(_linearise(rays, depths, (views[0], moved), 1.0).cost)
         numerical[k] = (costs[0] - costs[1]) / (2 * step)
 
@@ -103,7 +103,7 @@ def test_refinement_recovers_poses_and_length_from_a_disturbed_start() -> None:
     rng = np.random.default_rng(4)
     points, depths, views, T_true = _two_views(rng, 0.0)
     disturbed = pose(so3_exp(np.array([0.05, -0.04, 0.03])), np.array([0.1, -0.1, 0.2])) @ views[1].T_view_query
-    start = (views[0], View(disturbed, views[1].observed, views[1].seen, FOCAL_PX, unit_translation=False))
+    start = (views[0], BundleView(disturbed, views[1].observed, views[1].seen, FOCAL_PX, unit_translation=False))
 
     refined = refine(points, depths * 1.1, start, 0.7, iterations_max=50)
 
@@ -117,7 +117,9 @@ def test_covariance_is_that_of_repeated_measurements() -> None:
     for _ in range(120):
         points, depths, views, T_true = _two_views(np.random.default_rng(6), 0.0)
         noisy = tuple(
-            View(v.T_view_query, v.observed + rng.normal(0, 0.7 / FOCAL_PX, v.observed.shape), v.seen, FOCAL_PX, u)
+            BundleView(
+                v.T_view_query, v.observed + rng.normal(0, 0.7 / FOCAL_PX, v.observed.shape), v.seen, FOCAL_PX, u
+            )
             for v, u in zip(views, (True, False), strict=True)
         )
         refined = refine(points, depths, noisy, 0.7)

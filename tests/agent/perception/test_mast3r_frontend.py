@@ -25,11 +25,11 @@ from flocc_agent.perception.mast3r.device import (  # noqa: E402
     require_memory,
 )
 from flocc_agent.perception.mast3r.engine import Engine, LatentOnDevice, batches  # noqa: E402
-from flocc_agent.perception.mast3r.frontend import Mast3rEncoder, Mast3rRegistrar  # noqa: E402
-from flocc_agent.perception.mast3r.network import Mast3r, View  # noqa: E402
+from flocc_agent.perception.mast3r.mast3r_frontend import Mast3rEncoder, Mast3rRegistrar  # noqa: E402
 from flocc_agent.perception.mast3r.pair import mean_confidence  # noqa: E402
 from flocc_agent.perception.mast3r.preprocess import BadImage  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import TINY  # noqa: E402
+from flocc_agent.perception.mast3r.two_view_network import DenseView, Mast3r  # noqa: E402
 from flocc_launch.setup.weight_files import synthesize  # noqa: E402
 
 CPU = Compute(torch.device("cpu"), torch.float32, torch.float32)
@@ -108,14 +108,14 @@ class Scripted(Engine):
         self.spoil = spoil
         self.decoded = 0
 
-    def decode(self, pairs: Any) -> list[tuple[View, View]]:
+    def decode(self, pairs: Any) -> list[tuple[DenseView, DenseView]]:
         self.decoded += len(pairs)
         if self.spoil == "memory":
             raise NotEnoughMemory("memory ran out on cpu while running MASt3R")
         reversed_order = [k > 0 and second is pairs[0][0] for k, (_, second) in enumerate(pairs)]
         return [self._views(inverse(self.T_1_2) if back else self.T_1_2) for back in reversed_order]
 
-    def _views(self, T_1_2: Any) -> tuple[View, View]:
+    def _views(self, T_1_2: Any) -> tuple[DenseView, DenseView]:
         size, f, c = 224, 179.2, 112.0
         generator = torch.Generator().manual_seed(1)
         texture = torch.nn.functional.normalize(torch.randn(size, size, 24, generator=generator), dim=-1)
@@ -131,7 +131,7 @@ class Scripted(Engine):
         if self.spoil == "not finite":
             points = points * float("nan")
         ones = torch.ones(1, size, size)
-        return View(points, ones, texture[None], ones), View(points, ones, desc_2[None], ones)
+        return DenseView(points, ones, texture[None], ones), DenseView(points, ones, desc_2[None], ones)
 
 
 def scripted(config: Mast3rConfig, T_1_2: Any, spoil: str = "") -> tuple[Mast3rEncoder, Mast3rRegistrar, Scripted]:
@@ -164,7 +164,7 @@ def test_a_true_pose_is_found_with_its_counts_scale_and_covariance(config: Mast3
 
 def test_the_mean_confidence_is_that_of_both_views_points() -> None:
     nothing = torch.zeros(1, 2, 2)
-    views = (View(nothing, 2.0 + nothing, nothing, nothing), View(nothing, 4.0 + nothing, nothing, nothing))
+    views = (DenseView(nothing, 2.0 + nothing, nothing, nothing), DenseView(nothing, 4.0 + nothing, nothing, nothing))
     assert mean_confidence(views) == 3.0
 
 

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="torch, an optional extra, is not in
 
 from tests.agent.perception.mast3r_examples import golden  # noqa: E402
 
-from flocc_agent.perception.mast3r.matching import (  # noqa: E402
+from flocc_agent.perception.mast3r.reciprocal_matching import (  # noqa: E402
     MatchParameters,
     match_confidences,
     match_views,

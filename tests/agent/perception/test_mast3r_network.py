@@ -11,15 +11,15 @@ from tests.agent.perception.mast3r_examples import (  # noqa: E402
     keyed_mast3r,
 )
 
-from flocc_agent.perception.mast3r.blocks import AttentionKind, set_attention  # noqa: E402
 from flocc_agent.perception.mast3r.keyed import (  # noqa: E402
     MAST3R_SEED,
     keyed_image,
     keyed_weight,
 )
-from flocc_agent.perception.mast3r.network import Mast3r, patch_grid, postprocess  # noqa: E402
 from flocc_agent.perception.mast3r.rope import grid_rotation, patch_positions, rotate  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import FULL, SMALL, TINY, Mast3rSizes  # noqa: E402
+from flocc_agent.perception.mast3r.transformer_blocks import AttentionKind, set_attention  # noqa: E402
+from flocc_agent.perception.mast3r.two_view_network import Mast3r, patch_grid, postprocess  # noqa: E402
 
 pytestmark = pytest.mark.golden
 

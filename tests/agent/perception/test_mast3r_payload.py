@@ -12,8 +12,8 @@ pytest.importorskip("torch", reason="torch, an optional extra, is not installed"
 from flocc_agent.perception.latent import BadLatent, pack, unpack
 from flocc_agent.perception.mast3r.payload import (
     KIND,
-    Geometry,
     LatentDtype,
+    PixelGeometry,
     jpeg_of,
     jpeg_size,
     read_payload,
@@ -26,9 +26,9 @@ MODEL = "mast3r-0123456789abcdef"
 CHANNELS = 64
 
 
-def geometry() -> Geometry:
+def geometry() -> PixelGeometry:
     crop = plan_crop(640, 480)
-    return Geometry(crop, crop.K(np.array([[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]])))
+    return PixelGeometry(crop, crop.K(np.array([[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]])))
 
 
 def latent(seed: int = 0) -> Any:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flocc_agent import Agent, AgentConfig
-from flocc_agent.composition import BadKeyframe
+from flocc_agent.agent import BadKeyframe
 from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.interfaces import Camera

@@ -70,7 +70,7 @@ async def test_an_agent_starts_on_the_older_store_and_keeps_its_map_frame(tmp_pa
     config = CONFIG.model_copy(update={"name": "r2", "folder": tmp_path, "incarnation": 0, "transport": ALONE})
     async with Agent(config, camera()) as agent:
         status = agent.status()
-    assert (status["log"], status["map_frame"], status["keyframes"]) == ("r2", "map/r1", 12)
+    assert (status.log, status.map_frame, status.keyframes) == ("r2", "map/r1", 12)
 
 
 async def test_records_of_a_later_version_in_the_own_store_keep_no_agent_from_starting(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ async def test_records_of_a_later_version_in_the_own_store_keep_no_agent_from_st
         assert agent.log == OWN
         assert log.encoded[27:] == later
         assert [type(record) for record in log.records[27:]] == [UnknownRecord, UnknownRecord]
-        assert agent.status()["keyframes"] == 13
+        assert agent.status().keyframes == 13
         await agent.add_keyframe(pose_image(np.eye(4), "r2/12").pixels, np.eye(4), 30.0)
         async with asyncio.timeout(20.0):
             while len(log) < 30:

@@ -84,6 +84,24 @@ READ: dict[str, bytes] = {
         "sec,nanosec,x,y,z,qw,qx,qy,qz\n"
         + "".join(row(ZERO_S, k * 10**8, *t, q[3], *q[:3]) for k, (_, t, q) in enumerate(rows()))
     ).encode(),
+    "pose_in_a_group.csv": (
+        "timestamp,pose.x,pose.y,pose.z,pose.qx,pose.qy,pose.qz,pose.qw\n" + GOOD.replace(" ", ",")
+    ).encode(),
+    "millimetres.csv": (
+        "timestamp,x [mm],y [mm],z [mm],qx,qy,qz,qw\n"
+        + "".join(row(s, *(1000 * value for value in t), *q) for s, t, q in rows())
+    ).encode(),
+    "printed_lists.txt": "".join(
+        f"{s:.6f} [{t[0]:.9f}, {t[1]:.9f}, {t[2]:.9f}] ({q[0]:.9f}, {q[1]:.9f}, {q[2]:.9f}, {q[3]:.9f})\n"
+        for s, t, q in rows()
+    ).encode(),
+    "quoted.csv": (
+        '"timestamp","tx","ty","tz","qx","qy","qz","qw"\n'
+        + "".join('"' + '","'.join(line.split()) + '"\n' for line in GOOD.splitlines())
+    ).encode(),
+    "utf32.csv": GOOD.encode("utf-32"),
+    "words_before.csv": ("exported by a tool\nversion two\ntime,x,y,z,qx,qy,qz,qw\n" + GOOD.replace(" ", ",")).encode(),
+    "power_failed.tum": GOOD.encode() + bytes(300),
     "reversed.tum": tum(rows()[::-1]).encode(),
     "repeated.tum": "".join(line + "\n" + line + "\n" for line in GOOD.splitlines()).encode(),
 }
@@ -119,6 +137,22 @@ REFUSED = {
     "angles.csv": ("t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,0\n", "angles.csv:1: the header names no qx, .* angles"),
     "half.csv": ("timestamp,x,y,z,qx,qy,qz\n0,1,2,3,0,0,0\n", "half.csv:1: the header names no qw"),
     "twice.csv": ("t,x,y,z,x,qx,qy,qz,qw\n0,1,2,3,0,0,0,0,1\n", "twice.csv:1: the header names 'x' twice"),
+    "places.csv": (
+        "timestamp,latitude,longitude,altitude,qx,qy,qz,qw\n" + GOOD.replace(" ", ","),
+        "places.csv:1: the header names no x, y, z",
+    ),
+    "ned.csv": (
+        "# timestamp,north,east,down,qx,qy,qz,qw\n" + GOOD.replace(" ", ","),
+        "ned.csv:1: the header names no x, y, z",
+    ),
+    "feet.csv": (
+        "timestamp,x [ft],y [ft],z [ft],qx,qy,qz,qw\n" + GOOD.replace(" ", ","),
+        "feet.csv:1: the header gives positions in 'ft', not in metres",
+    ),
+    "estimates.csv": (
+        "time,est_x,est_y,est_z,est_a,est_b,est_c,est_d\n" + GOOD.replace(" ", ","),
+        "estimates.csv:1: the header is not understood",
+    ),
     "units.txt": (
         "".join(f"{2 * k} {k} 0 0 0 0 0 1\n" for k in range(5)),
         r"units.txt: stamps can be in seconds \(8 s in all\) or milliseconds \(0.008 s in all\)",
@@ -185,6 +219,20 @@ def test_a_form_that_is_named_settles_it(tmp_path: Path, form: str) -> None:
     np.testing.assert_allclose(found.T_fixed_body, expected.T_fixed_body, atol=2e-6)
 
 
+def test_matrices_may_have_stamps(tmp_path: Path) -> None:
+    text = "".join(row(s, 1, 0, 0, t[0], 0, 1, 0, t[1], 0, 0, 1, t[2]) for s, t, _ in rows())
+    found, _ = read_trajectory(write(tmp_path, "m.csv", text.encode()))
+    assert found.stamps_s.tolist() == pytest.approx([s for s, _, _ in rows()])
+    assert found.T_fixed_body[:, 0, 3].tolist() == pytest.approx([t[0] for _, t, _ in rows()])
+
+
+def test_a_declared_unit_that_cannot_be_is_not_taken(tmp_path: Path) -> None:
+    text = "".join(row(k * 10**8, *t, *q, separator=" ") for k, (_, t, q) in enumerate(rows()))
+    found, notes = read_trajectory(write(tmp_path, "n.tum", text.encode()))
+    assert found.stamps_s.tolist() == pytest.approx([0.1 * k for k in range(10)])
+    assert "said to be in seconds, but can only be in nanoseconds" in notes[0]
+
+
 def test_an_unknown_form_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"--trajectory-format 'tmu' is not known; there are tum, tum-wxyz, euroc"):
         read_trajectory(write(tmp_path, "x.txt", GOOD.encode()), "tmu")
@@ -197,3 +245,11 @@ def test_matrices_take_the_stamps_that_they_are_given(tmp_path: Path) -> None:
     assert found.T_fixed_body[:, 0, 3].tolist() == [0.0, 1.0, 2.0]
     with pytest.raises(RecordingError, match="has 3 poses without stamps, but there are 2 images"):
         read_trajectory(path, stamps_s=[5.0, 6.0])
+
+
+def test_a_stamp_in_the_future_costs_its_row(tmp_path: Path) -> None:
+    poses = rows(40)
+    poses[20] = (4e9, *poses[20][1:])
+    found, notes = read_trajectory(write(tmp_path, "f.tum", tum(poses).encode()))
+    assert len(found) == 39
+    assert "f.tum:21: 1 rows with a stamp far ahead of those around them were left out" in notes[0]

@@ -11,7 +11,7 @@ from flocc_agent.config import ConfigError
 from flocc_agent.core.registration import closure_probability
 from flocc_lab.experiments.experiment import ExperimentError, Verdict
 from flocc_lab.experiments.folder import ExperimentFolder, configuration_of
-from flocc_lab.experiments.formulation_claims import Measured, formulation_findings
+from flocc_lab.experiments.formulation_claims import MeasuredClaim, formulation_findings
 from flocc_lab.experiments.logistic import fit_logistic
 from flocc_lab.experiments.overlap import joined
 from flocc_lab.experiments.precision_recall import curve
@@ -196,7 +196,7 @@ def test_nothing_is_claimed_of_errors_that_are_the_same_or_worse_than_odometry(
     plain_m: tuple[float, ...], robust_m: tuple[float, ...], verdicts: list[Verdict]
 ) -> None:
     of = {
-        (name, solver): Measured(ate_m, seconds)
+        (name, solver): MeasuredClaim(ate_m, seconds)
         for solver, errors_m, seconds in (("lm", plain_m, 1.0), ("gnc-tls", robust_m, 3.0))
         for name, ate_m in zip(("base", "independent", "smoothed"), errors_m, strict=True)
     }

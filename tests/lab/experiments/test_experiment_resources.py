@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
+from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, Fact, KeyframeTaken
+from flocc_agent.runtime.event_lines import Reported
 from flocc_lab.experiments.experiment import ExperimentError, Verdict
 from flocc_lab.experiments.reductions import Basis, keypoint_forms, latent_forms, reduced_descriptors, unit
 from flocc_lab.experiments.split_compute import SplitComputeSettings, counts, summarise
-from flocc_launch.runs.run_records import ClosureAccepted, ClosureRejected, Event, KeyframeCaptured
+from flocc_protocol.ids import KeyframeId, LogId
 
-POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 def flat_data(count: int = 60, dimension: int = 40, rank: int = 5) -> np.ndarray:
@@ -80,20 +82,23 @@ def test_fewer_keypoints_are_the_strongest_ones() -> None:
     assert forms["pca-64"](features)[1].descriptors.shape == (8, 128)
 
 
-def registered(robot: str, query: str, match: str, reason: str | None = None) -> Event:
+def registered(robot: str, query: str, match: str, reason: str | None = None) -> Reported[Fact]:
+    first, second = KeyframeId.parse(query), KeyframeId.parse(match)
     if reason is not None:
-        return ClosureRejected(t=1.0, robot=robot, event="closure_rejected", query=query, match=match, reason=reason)
-    return ClosureAccepted(
-        t=1.0, robot=robot, event="closure_accepted", query=query, match=match,
-        ratio=0.5, probability=0.5, correspondences=50, odometry_correspondences=100,
-    )  # fmt: skip
+        return Reported(1.0, robot, ClosureRejected(query=first, match=second, reason=reason))
+    return Reported(
+        1.0,
+        robot,
+        ClosureAccepted(query=first, match=second, ratio=0.5, correspondences=50, odometry_correspondences=100),
+    )
 
 
 def test_every_registration_counts_once_and_a_lost_latent_none() -> None:
     keyframes = [
-        KeyframeCaptured(t=0.0, robot=f"r{r}", event="keyframe", keyframe=f"r{r}/{k}", stamp_s=0.0, T_odom_body=POSE)
-        for r in (1, 2) for k in range(3)
-    ]  # fmt: skip
+        Reported(0.0, log.robot, KeyframeTaken(keyframe=KeyframeId(log, k), stamp_s=0.0, T_odom_body=POSE))
+        for log in (LogId("r1"), LogId("r2"))
+        for k in range(3)
+    ]
     pairs = [
         registered("r1", "r1/0", "r2/0"),
         registered("r1", "r1/0", "r2/1", "few correspondences"),

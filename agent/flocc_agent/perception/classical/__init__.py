@@ -2,6 +2,6 @@
 
 from flocc_agent.perception.classical.describer import ClassicalDescriber
 from flocc_agent.perception.classical.encoder import ClassicalEncoder
-from flocc_agent.perception.classical.registrar import classical_registrar
+from flocc_agent.perception.classical.sift_registrar import classical_registrar
 
 __all__ = ["ClassicalDescriber", "ClassicalEncoder", "classical_registrar"]

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.perception.multiview.parameters import Indices, Matched
+from flocc_agent.perception.multiview.view_parameters import Indices, Matched
 
 
 def mutual_matches(first: NDArray[np.uint8], second: NDArray[np.uint8], distance_ratio_max: float) -> Matched:

@@ -22,7 +22,7 @@ def build(config: LearnedConfig) -> tuple[Describer, Encoder, Registrar]:
         FloccError: A file or a device does not allow it; the message says which.
     """
     try:
-        from flocc_agent.perception.learned import frontend
+        from flocc_agent.perception.learned import learned_frontend as frontend
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] not in ("torch", "kornia"):
             raise

@@ -18,8 +18,8 @@ from kornia.feature.xfeat import XFeat
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from flocc_agent.perception.learned.features import FEATURES_MAX, LearnedFeatures
-from flocc_agent.perception.learned.files import (
+from flocc_agent.perception.learned.keypoints import FEATURES_MAX, LearnedFeatures
+from flocc_agent.perception.learned.weight_sources import (
     ALIKED_LIGHTGLUE,
     ALIKED_N16ROT,
     XFEAT_FEATURES,
@@ -28,7 +28,7 @@ from flocc_agent.perception.learned.files import (
     WeightFile,
     checked,
 )
-from flocc_agent.perception.multiview.parameters import Matched
+from flocc_agent.perception.multiview.view_parameters import Matched
 
 Float32 = NDArray[np.float32]
 

@@ -22,7 +22,7 @@ def build(config: Mast3rConfig) -> tuple[Describer, Encoder, Registrar]:
         FloccError: A path, a file, a device or the memory does not allow it; the message says which.
     """
     try:
-        from flocc_agent.perception.mast3r import frontend
+        from flocc_agent.perception.mast3r import mast3r_frontend as frontend
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "PIL"):
             raise

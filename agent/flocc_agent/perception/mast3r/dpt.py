@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from flocc_agent.perception.mast3r.blocks import Mlp
 from flocc_agent.perception.mast3r.sizes import LOCAL_DIMENSION, PATCH_PX, Mast3rSizes
+from flocc_agent.perception.mast3r.transformer_blocks import Mlp
 
 POINT_AND_CONFIDENCE_DIM = 4
 
@@ -122,7 +122,7 @@ class Dpt(nn.Module):
         return functional.conv2d(x.float(), last.weight.float(), last.bias.float())
 
 
-class Head(nn.Module):
+class DptHead(nn.Module):
     """One branch's head: raw dense outputs from its token list."""
 
     def __init__(self, sizes: Mast3rSizes) -> None:

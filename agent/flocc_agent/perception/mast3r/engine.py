@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flocc_agent.perception.mast3r.device import Compute, NotEnoughMemory, is_out_of_memory
-from flocc_agent.perception.mast3r.network import Mast3r, View
+from flocc_agent.perception.mast3r.two_view_network import DenseView, Mast3r
 
 Float32 = NDArray[np.float32]
 Size = tuple[int, int]
@@ -78,13 +78,13 @@ class Engine:
             self._note_encode_s((time.perf_counter() - start) / max(len(inputs), 1))
         return [latent for latent in out if latent is not None]
 
-    def decode(self, pairs: Sequence[tuple[LatentOnDevice, LatentOnDevice]]) -> list[tuple[View, View]]:
+    def decode(self, pairs: Sequence[tuple[LatentOnDevice, LatentOnDevice]]) -> list[tuple[DenseView, DenseView]]:
         """Decode pairs of latents; gives both views of each, batch dimension 1, in their order.
 
         Raises:
             NotEnoughMemory: Memory ran out.
         """
-        out: dict[int, tuple[View, View]] = {}
+        out: dict[int, tuple[DenseView, DenseView]] = {}
         with self._lock, torch.inference_mode():
             for batch in batches([(a.size, b.size) for a, b in pairs], self._batch_max):
                 a, b = (torch.cat([pairs[k][side].latent for k in batch]) for side in (0, 1))
@@ -140,7 +140,7 @@ def batches(sizes: Sequence[object], batch_max: int) -> list[list[int]]:
     return [group[k : k + batch_max] for group in groups.values() for k in range(0, len(group), batch_max)]
 
 
-def one(view: View, index: int) -> View:
+def one(view: DenseView, index: int) -> DenseView:
     """One element of a batch, batch dimension kept."""
     kept = slice(index, index + 1)
-    return View(view.pts3d[kept], view.conf[kept], view.desc[kept], view.desc_conf[kept])
+    return DenseView(view.pts3d[kept], view.conf[kept], view.desc[kept], view.desc_conf[kept])

@@ -7,9 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import angle_rad
-from flocc_agent.perception.mast3r.matching import Matches, MatchParameters, match_views
-from flocc_agent.perception.mast3r.network import View
-from flocc_agent.perception.mast3r.payload import Geometry
+from flocc_agent.perception.mast3r.payload import PixelGeometry
+from flocc_agent.perception.mast3r.reciprocal_matching import Matches, MatchParameters, match_views
 from flocc_agent.perception.mast3r.relative_pose import (
     PnpParameters,
     PoseFailed,
@@ -18,6 +17,7 @@ from flocc_agent.perception.mast3r.relative_pose import (
     reray,
     weiszfeld_focal,
 )
+from flocc_agent.perception.mast3r.two_view_network import DenseView
 from flocc_agent.stages import stage
 
 Float = NDArray[np.float64]
@@ -38,7 +38,7 @@ class PairResult:
     confidence: float | None = None
 
 
-def estimated_K(view: View, geometry: Geometry) -> Float | None:
+def estimated_K(view: DenseView, geometry: PixelGeometry) -> Float | None:
     """Calibration that a view's own pointmap implies, with the principal point in the middle; None if it fixes none."""
     centre = (geometry.crop.width / 2, geometry.crop.height / 2)
     focal = weiszfeld_focal(view.pts3d[0].float().cpu().numpy(), centre, clip=True)
@@ -47,7 +47,7 @@ def estimated_K(view: View, geometry: Geometry) -> Float | None:
     return np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
 
 
-def match_pair(views: tuple[View, View], parameters: MatchParameters) -> Matches | PoseFailed:
+def match_pair(views: tuple[DenseView, DenseView], parameters: MatchParameters) -> Matches | PoseFailed:
     """Match the two views of a decode, unless the network gave values that are not finite."""
     for view in views:
         if not all(bool(torch.isfinite(part).all()) for part in (view.pts3d, view.desc, view.desc_conf)):
@@ -57,7 +57,7 @@ def match_pair(views: tuple[View, View], parameters: MatchParameters) -> Matches
 
 
 def register_pair(
-    views: tuple[View, View],
+    views: tuple[DenseView, DenseView],
     calibrations: tuple[Float, Float] | None,
     K_estimated: Float | None,
     matching: MatchParameters,
@@ -89,7 +89,7 @@ def register_pair(
         return PairResult(len(matches), relative_pose(points, matches.xy2.astype(np.float64), K_2, pnp), confidence)
 
 
-def mean_confidence(views: tuple[View, View]) -> float:
+def mean_confidence(views: tuple[DenseView, DenseView]) -> float:
     """Mean confidence of both views' points, >= 1: what the paper compares the match ratio with (Sec. IV-B)."""
     return float(torch.stack([view.conf.float().mean() for view in views]).mean())
 

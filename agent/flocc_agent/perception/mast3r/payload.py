@@ -29,7 +29,7 @@ LatentDtype = Literal["fp16", "int8"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Geometry:
+class PixelGeometry:
     """Where the network's pixels lie in the camera.
 
     Attributes:
@@ -55,7 +55,7 @@ class Payload:
         pixels: (H, W, 3) uint8 RGB of the network's input, or None where the latent was sent.
     """
 
-    geometry: Geometry
+    geometry: PixelGeometry
     latent: Float32 | None
     pixels: Pixels | None
 
@@ -126,7 +126,7 @@ def jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 def write_payload(
     model: str,
-    geometry: Geometry,
+    geometry: PixelGeometry,
     latent: Float32 | None,
     dtype: LatentDtype = "fp16",
     jpeg: NDArray[np.uint8] | None = None,
@@ -168,7 +168,7 @@ def read_payload(data: bytes, model: str, channels: int) -> Payload:
         raise BadLatent(f"the latent has format version {str(content.header.get('version'))[:16]}, not {VERSION}")
     if content.header.get("model") != model:
         raise BadLatent(f"the latent is of model {str(content.header.get('model'))[:64]!r}, this robot runs {model!r}")
-    geometry = Geometry(_crop(content.header.get("crop")), _calibration(content.header.get("K")))
+    geometry = PixelGeometry(_crop(content.header.get("crop")), _calibration(content.header.get("K")))
     jpeg = content.arrays.get("jpeg")
     if "latent" in content.arrays:
         latent = dequantised(content)

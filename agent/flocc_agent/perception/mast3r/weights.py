@@ -7,7 +7,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from flocc_agent.perception.mast3r.blocks import AttentionKind
 from flocc_agent.perception.mast3r.checkpoint import (
     ENCODER_PREFIXES,
     BadCheckpoint,
@@ -17,8 +16,9 @@ from flocc_agent.perception.mast3r.checkpoint import (
     read_checkpoint,
 )
 from flocc_agent.perception.mast3r.cosplace import CosPlace
-from flocc_agent.perception.mast3r.network import Mast3r
 from flocc_agent.perception.mast3r.sizes import FULL, Mast3rSizes
+from flocc_agent.perception.mast3r.transformer_blocks import AttentionKind
+from flocc_agent.perception.mast3r.two_view_network import Mast3r
 
 CPU = torch.device("cpu")
 STAGE_2_BLOCKS = {2: "ResNet18", 4: "ResNet50", 8: "ResNet152"}

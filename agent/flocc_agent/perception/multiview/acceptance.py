@@ -1,9 +1,10 @@
 """When a registered pair is a loop closure: by what its front end's wrong pairs never have.
 
-A count alone is no evidence: repeated facades give wrong pairs with many correspondences. What separates them is
-whether a third image agrees: the neighbour in the three-view refinement that gives the scale, or, where the count is
-in doubt, the neighbour registered with the match by itself. The numbers are fitted on all scenes together
-(docs/learned.md).
+A good match ratio, Eq. (1), suffices, but where keyframes are dense or views differ right pairs have a poor one, too. A
+count alone is no evidence: repeated facades give wrong pairs with many correspondences. What separates those is how
+certain the rotation is, and whether a third image agrees: the neighbour in the three-view refinement that gives the
+scale, or, where the count is in doubt, the neighbour registered with the match by itself. The numbers are fitted on all
+scenes together (docs/learned.md).
 """
 
 from dataclasses import dataclass, replace
@@ -12,21 +13,22 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure, match_ratio
 from flocc_agent.geometry import angle_rad, inverse
-from flocc_agent.perception.multiview.parameters import Rays
 from flocc_agent.perception.multiview.two_view import TwoView
 
 Float = NDArray[np.float64]
 
-CELL = 0.15
-"""Side of a cell of the picture, as x/z: 9 degrees, a ninth of a 70 degree wide picture."""
+RATIO_CORRESPONDENCES_MIN = 20
+"""A ratio of fewer is chance, as in the core (`LoopClosingParameters.correspondences_min`)."""
 ROTATION_AGREES_RAD = float(np.radians(5.0))
 """Both pairs' rotations are right within 1 to 3 degrees where they are right at all."""
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
+NEVER = 100_000
+"""More correspondences than any picture has features."""
 
 
-class Neighbour(Enum):
+class OdometryNeighbour(Enum):
     """What the query's neighbour says of the pair."""
 
     NOT_ASKED = "not asked"
@@ -41,16 +43,18 @@ class Evidence:
 
     Attributes:
         correspondences: Verified ones of the loop pair.
+        match_ratio: Eq. (1).
         has_scale: Whether three views agree on the length.
-        cells: Cells of the picture that hold verified correspondences, in the image where they are fewer.
+        rotation_sigma_rad: How uncertain the rotation is about its worst axis; what few, badly spread points leave.
         neighbour: What the neighbour says.
         neighbour_correspondences: Verified ones of the neighbour with the match.
     """
 
     correspondences: int
+    match_ratio: float
     has_scale: bool
-    cells: int
-    neighbour: Neighbour = Neighbour.NOT_ASKED
+    rotation_sigma_rad: float
+    neighbour: OdometryNeighbour = OdometryNeighbour.NOT_ASKED
     neighbour_correspondences: int = 0
 
 
@@ -61,12 +65,12 @@ class Needed:
     Attributes:
         alone: Correspondences that suffice.
         agreeing: Correspondences that suffice where the neighbour agrees.
-        cells: Cells of the picture that they must spread over.
+        rotation_sigma_max_rad: A less certain rotation is none.
     """
 
     alone: int
     agreeing: int
-    cells: int
+    rotation_sigma_max_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +80,17 @@ class Acceptance:
     Attributes:
         with_scale: What a pair needs whose length three views agree on.
         without_scale: What another one needs.
+        match_ratio_min: Eq. (1) that suffices for either, from `RATIO_CORRESPONDENCES_MIN` correspondences on.
     """
 
     with_scale: Needed
     without_scale: Needed
+    match_ratio_min: float
+
+    def has_ratio(self, evidence: Evidence) -> bool:
+        """Whether the paper's rule accepts the pair."""
+        enough = evidence.correspondences >= RATIO_CORRESPONDENCES_MIN
+        return enough and evidence.match_ratio >= self.match_ratio_min
 
     def needed(self, evidence: Evidence) -> Needed:
         """What a pair of this kind needs."""
@@ -88,36 +99,45 @@ class Acceptance:
     def needs_neighbour(self, evidence: Evidence) -> bool:
         """Whether the neighbour's word decides."""
         needed = self.needed(evidence)
-        return needed.agreeing <= evidence.correspondences < needed.alone and evidence.cells >= needed.cells
+        in_doubt = needed.agreeing <= evidence.correspondences < needed.alone
+        return (
+            in_doubt and not self.has_ratio(evidence) and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
+        )
 
     def accepts(self, evidence: Evidence) -> bool:
         """Whether the evidence suffices."""
+        return self.ratio(evidence) >= 1.0
+
+    def ratio(self, evidence: Evidence) -> float:
+        """Evidence over what suffices: Eq. (1) over its threshold, or correspondences over those needed."""
         needed = self.needed(evidence)
-        agrees = evidence.neighbour is Neighbour.AGREES
-        enough = needed.agreeing if agrees else needed.alone
-        return evidence.correspondences >= enough and evidence.cells >= needed.cells
+        enough = needed.agreeing if evidence.neighbour is OdometryNeighbour.AGREES else needed.alone
+        is_certain = evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
+        by_count = evidence.correspondences / enough if is_certain else 0.0
+        by_ratio = evidence.match_ratio / self.match_ratio_min if self.has_ratio(evidence) else 0.0
+        return max(by_count, by_ratio)
 
     def judged(self, result: Registration, evidence: Evidence) -> Registration | RegistrationFailed:
-        """The registration, marked as judged, or why it is not trusted."""
+        """The registration with its ratio, or why it is not trusted."""
         if self.accepts(evidence):
-            return replace(result, is_judged=True)
+            return replace(result, judged_ratio=self.ratio(evidence))
         needed = self.needed(evidence)
         kind = "with" if evidence.has_scale else "without"
+        found_deg, most_deg = np.degrees([evidence.rotation_sigma_rad, needed.rotation_sigma_max_rad])
         detail = (
-            f"{evidence.correspondences} correspondences in {evidence.cells} cells {kind} scale, "
-            f"{needed.alone} in {needed.cells} needed; neighbour {evidence.neighbour.value}"
+            f"{evidence.correspondences} correspondences {kind} scale, rotation known to {found_deg:.1f} degrees; "
+            f"{needed.alone} and {most_deg:.1f} needed; neighbour {evidence.neighbour.value}"
         )
         counts = result.correspondences, result.odometry_correspondences
         return RegistrationFailed(RegistrationFailure.UNCONVINCING, detail, *counts)
 
 
-def cells(query: Rays, pair: TwoView) -> int:
-    """Cells that hold a pair's correspondences, in the image where they are fewer."""
-    return min(_cells(query.points[pair.query_indices]), _cells(pair.view.observed))
-
-
-def _cells(points: NDArray[np.floating]) -> int:
-    return len(np.unique(np.floor(points / CELL).astype(np.int64), axis=0))
+def evidence_of(result: Registration) -> Evidence:
+    """What a registration says for itself."""
+    assert result.covariance is not None
+    variance = float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1])
+    ratio = match_ratio(result.correspondences, result.odometry_correspondences)
+    return Evidence(result.correspondences, ratio, result.scale_initial is not None, float(np.sqrt(max(variance, 0.0))))
 
 
 def evidence_of_neighbour(
@@ -132,9 +152,9 @@ def evidence_of_neighbour(
         T_neighbour_query: (4, 4) from odometry, metres.
     """
     if isinstance(neighbour_pair, int):
-        return replace(evidence, neighbour=Neighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
+        return replace(evidence, neighbour=OdometryNeighbour.SEES_NOTHING, neighbour_correspondences=neighbour_pair)
     agrees = agree(inverse(neighbour_pair.view.T_view_query), result, T_neighbour_query)
-    word = Neighbour.AGREES if agrees else Neighbour.CONTRADICTS
+    word = OdometryNeighbour.AGREES if agrees else OdometryNeighbour.CONTRADICTS
     return replace(evidence, neighbour=word, neighbour_correspondences=neighbour_pair.correspondences)
 
 

@@ -35,7 +35,7 @@ class DirectionPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class BundleView:
     """One image beside the query.
 
     Attributes:
@@ -66,7 +66,7 @@ class Refined:
         information: (6V, 6V) of the poses (rotation, translation; left perturbation), points marginalised.
     """
 
-    views: tuple[View, ...]
+    views: tuple[BundleView, ...]
     inverse_depths: Float
     cost: float
     information: Float
@@ -83,7 +83,7 @@ class _Linearised:
 
 
 def refine(
-    points: Float, inverse_depths: Float, views: tuple[View, ...], sigma_px: float, iterations_max: int = 15
+    points: Float, inverse_depths: Float, views: tuple[BundleView, ...], sigma_px: float, iterations_max: int = 15
 ) -> Refined:
     """Minimise the reprojection errors over the views' poses and the inverse depths.
 
@@ -114,7 +114,7 @@ def refine(
     return Refined(views, inverse_depths, state.cost, reduced)
 
 
-def reprojection_errors_px(points: Float, inverse_depths: Float, view: View) -> Float:
+def reprojection_errors_px(points: Float, inverse_depths: Float, view: BundleView) -> Float:
     """Distances (N,) between where the view sees the points and where they project; infinite behind the view."""
     rays = np.column_stack([points, np.ones(len(points))])
     P = rays @ view.T_view_query[:3, :3].T + inverse_depths[:, None] * view.T_view_query[:3, 3]
@@ -142,7 +142,7 @@ def tangent_basis(direction: Float) -> Float:
     return np.column_stack([first, second / np.linalg.norm(second)])
 
 
-def _linearise(rays: Float, inverse_depths: Float, views: tuple[View, ...], sigma_px: float) -> _Linearised:
+def _linearise(rays: Float, inverse_depths: Float, views: tuple[BundleView, ...], sigma_px: float) -> _Linearised:
     """Cost, gradient and Gauss-Newton blocks of all views; translations with six columns even where length is fixed."""
     size, count = 6 * len(views), len(rays)
     H, b, H_mixed = np.zeros((size, size)), np.zeros(size), np.zeros((count, size))
@@ -171,7 +171,7 @@ CAUCHY_SCALE = 3.0
 """Errors of this many sigma have half their weight."""
 
 
-def _residuals(rays: Float, inverse_depths: Float, view: View, sigma_px: float) -> tuple[Float, Float, Float]:
+def _residuals(rays: Float, inverse_depths: Float, view: BundleView, sigma_px: float) -> tuple[Float, Float, Float]:
     """Errors (N, 2) in sigmas, and their derivatives by the pose (N, 2, 6) and by the inverse depth (N, 2)."""
     R, t = view.T_view_query[:3, :3], view.T_view_query[:3, 3]
     rotated = rays @ R.T
@@ -188,7 +188,7 @@ def _residuals(rays: Float, inverse_depths: Float, view: View, sigma_px: float) 
     return errors, J_pose, J_P @ t
 
 
-def _add_prior(view: View, H: Float, b: Float) -> float:
+def _add_prior(view: BundleView, H: Float, b: Float) -> float:
     """Add the view's prior to its blocks and return its cost."""
     if view.prior is None:
         return 0.0
@@ -211,8 +211,8 @@ def _reduce(state: _Linearised, damping: float) -> tuple[Float, Float]:
 
 
 def _step(
-    state: _Linearised, views: tuple[View, ...], inverse_depths: Float, damping: float
-) -> tuple[tuple[View, ...], Float]:
+    state: _Linearised, views: tuple[BundleView, ...], inverse_depths: Float, damping: float
+) -> tuple[tuple[BundleView, ...], Float]:
     """Solve the damped normal equations and move poses and inverse depths."""
     H, b = _reduce(state, damping)
     basis = free_directions(views)
@@ -224,7 +224,7 @@ def _step(
     return moved, inverse_depths + step_depth
 
 
-def free_directions(views: tuple[View, ...]) -> Float:
+def free_directions(views: tuple[BundleView, ...]) -> Float:
     """Orthonormal columns (6V, F) that span the poses' degrees of freedom."""
     columns = []
     for k, view in enumerate(views):
@@ -236,7 +236,7 @@ def free_directions(views: tuple[View, ...]) -> Float:
     return np.concatenate(columns, axis=1)
 
 
-def _moved(view: View, delta: Float) -> View:
+def _moved(view: BundleView, delta: Float) -> BundleView:
     """Rotate the view's pose from the left and shift its translation."""
     t = view.T_view_query[:3, 3] + delta[3:]
     if view.unit_translation:

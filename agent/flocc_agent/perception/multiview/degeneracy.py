@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import angle_rad, nearest_rotation, pose
 from flocc_agent.perception.multiview.bundle import (
-    View,
+    BundleView,
     covariance_of_view,
     inverse_depths_from,
     refine,
 )
-from flocc_agent.perception.multiview.parameters import Geometry
 from flocc_agent.perception.multiview.two_view import TwoView, usac_parameters
+from flocc_agent.perception.multiview.view_parameters import Geometry
 
 Float = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ def direction_sigma_rad(pair: TwoView) -> float:
     return float(np.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0)))
 
 
-def rotation_share(points: Float, view: View, geometry: Geometry) -> float:
+def rotation_share(points: Float, view: BundleView, geometry: Geometry) -> float:
     """Share of the correspondences that a rotation alone explains."""
     bearings, seen = _bearings(points), _bearings(view.observed)
     weights = np.ones(len(points))

@@ -24,12 +24,12 @@ from flocc_agent.core.registration import (
 )
 from flocc_agent.geometry import inverse
 from flocc_agent.perception.latent import BadLatent
-from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, cells, evidence_of_neighbour
+from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, evidence_of, evidence_of_neighbour
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
-from flocc_agent.perception.multiview.parameters import Geometry, Matched, Rays
 from flocc_agent.perception.multiview.three_view import three_view
 from flocc_agent.perception.multiview.two_view import TwoView, two_view
+from flocc_agent.perception.multiview.view_parameters import Geometry, LocalFeatures, Matched
 from flocc_agent.stages import stage
 
 BASELINE_MIN_M = 1e-3
@@ -42,7 +42,7 @@ LENGTH_MIN = 0.1
 ODOMETRY_PAIRS_MAX = 256
 """Odometry-pair results kept in memory, some 30 kB each."""
 
-F = TypeVar("F", bound=Rays)
+F = TypeVar("F", bound=LocalFeatures)
 Result = Registration | RegistrationFailed
 
 
@@ -98,9 +98,9 @@ class PairRegistrar(Generic[F]):
             loop_pair = self._pair(query_features, match_features)
         with stage("pose"):
             result = self._posed(query_features, loop_pair, odometry_pair, odometry)
-        if isinstance(result, RegistrationFailed) or isinstance(loop_pair, int):
+        if isinstance(result, RegistrationFailed):
             return result, None
-        evidence = Evidence(result.correspondences, result.scale_initial is not None, cells(query_features, loop_pair))
+        evidence = evidence_of(result)
         rule = self._acceptance
         if odometry is not None and (always or (rule is not None and rule.needs_neighbour(evidence))):
             with stage("match"):

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import pose
 from flocc_agent.perception.multiview.bundle import (
+    BundleView,
     Refined,
-    View,
     covariance_of_view,
     inverse_depths_from,
     refine,
     reprojection_errors_px,
 )
-from flocc_agent.perception.multiview.parameters import Geometry, Indices, Rays
 from flocc_agent.perception.multiview.two_view import TwoView, usac_parameters
+from flocc_agent.perception.multiview.view_parameters import Geometry, Indices, LocalFeatures
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,7 +31,7 @@ AGREEING_SHARE_MIN = 0.6
 """Share of the points seen by all that must fit, or the pairs contradict each other."""
 
 
-def three_view(query: Rays, odometry_pair: TwoView, loop_pair: TwoView, geometry: Geometry) -> Refined | None:
+def three_view(query: LocalFeatures, odometry_pair: TwoView, loop_pair: TwoView, geometry: Geometry) -> Refined | None:
     """Refine both views of a query together.
 
     Returns:
@@ -59,7 +59,7 @@ def three_view(query: Rays, odometry_pair: TwoView, loop_pair: TwoView, geometry
     return best if _is_certain(best, points, common, geometry) else None
 
 
-def _spread(pair: TwoView, indices: Indices) -> View:
+def _spread(pair: TwoView, indices: Indices) -> BundleView:
     """A pair's view over a larger, sorted set of query features."""
     places = np.searchsorted(indices, pair.query_indices)
     observed = np.zeros((len(indices), 2))
@@ -69,7 +69,7 @@ def _spread(pair: TwoView, indices: Indices) -> View:
     return replace(pair.view, observed=observed, seen=seen)
 
 
-def _by_depth_ratio(match: View, depths: Float, loop_depths: Float, common: Mask) -> Float | None:
+def _by_depth_ratio(match: BundleView, depths: Float, loop_depths: Float, common: Mask) -> Float | None:
     """Match pose with the length that makes the two pairs' depths agree at the median."""
     usable = common & (depths > INVERSE_DEPTH_MIN) & (loop_depths > INVERSE_DEPTH_MIN)
     if not np.any(usable):
@@ -79,7 +79,7 @@ def _by_depth_ratio(match: View, depths: Float, loop_depths: Float, common: Mask
     return T
 
 
-def _by_known_points(points: Float, match: View, depths: Float, common: Mask, geometry: Geometry) -> Float | None:
+def _by_known_points(points: Float, match: BundleView, depths: Float, common: Mask, geometry: Geometry) -> Float | None:
     """Match pose from the points that the odometry pair placed (perspective-n-point)."""
     usable = common & (depths > INVERSE_DEPTH_MIN)
     if int(usable.sum()) < geometry.common_points_min:
@@ -98,7 +98,7 @@ def _by_known_points(points: Float, match: View, depths: Float, common: Mask, ge
 
 
 def _refined(
-    points: Float, depths: Float, neighbour: View, match: View, T_match_query: Float, geometry: Geometry
+    points: Float, depths: Float, neighbour: BundleView, match: BundleView, T_match_query: Float, geometry: Geometry
 ) -> Refined:
     """Refine from one guess of the match's pose."""
     only_match = match.seen & ~neighbour.seen

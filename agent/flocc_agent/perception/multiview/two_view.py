@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import nearest_rotation, pose
 from flocc_agent.perception.multiview.bundle import (
+    BundleView,
     DirectionPrior,
     Refined,
-    View,
     inverse_depths_from,
     refine,
     reprojection_errors_px,
 )
-from flocc_agent.perception.multiview.parameters import Geometry, Indices, Matched, Rays
+from flocc_agent.perception.multiview.view_parameters import Geometry, Indices, LocalFeatures, Matched
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,7 +41,7 @@ class TwoView:
     refined: Refined
 
     @property
-    def view(self) -> View:
+    def view(self) -> BundleView:
         """The other image as a view of the query."""
         return self.refined.views[0]
 
@@ -52,7 +52,11 @@ class TwoView:
 
 
 def two_view(
-    query: Rays, other: Rays, matched: Matched, geometry: Geometry, prior: DirectionPrior | None = None
+    query: LocalFeatures,
+    other: LocalFeatures,
+    matched: Matched,
+    geometry: Geometry,
+    prior: DirectionPrior | None = None,
 ) -> TwoView | int:
     """Verify the matches of two images.
 
@@ -84,7 +88,9 @@ def two_view(
     return TwoView(query_indices[verified], other_indices[verified], refined)
 
 
-def _verified(points: Float, observed: Float, focal_px: float, geometry: Geometry) -> tuple[View, Float, Mask] | int:
+def _verified(
+    points: Float, observed: Float, focal_px: float, geometry: Geometry
+) -> tuple[BundleView, Float, Mask] | int:
     """Find the relative pose and verify the matches with it, the same way for loop pairs and odometry pairs.
 
     Returns:
@@ -97,7 +103,7 @@ def _verified(points: Float, observed: Float, focal_px: float, geometry: Geometr
     T_other_query, agree = found
     if int(agree.sum()) < geometry.correspondences_min:
         return int(agree.sum())
-    view = View(T_other_query, observed, agree, focal_px, unit_translation=True)
+    view = BundleView(T_other_query, observed, agree, focal_px, unit_translation=True)
     refined = refine(points, inverse_depths_from(points, T_other_query, observed), (view,), geometry.sigma_px)
     errors = reprojection_errors_px(points, refined.inverse_depths, refined.views[0])
     verified = (errors < geometry.inlier_threshold_px) & (refined.inverse_depths > INVERSE_DEPTH_MIN)
@@ -105,7 +111,7 @@ def _verified(points: Float, observed: Float, focal_px: float, geometry: Geometr
     if count < geometry.correspondences_min:
         return count
     pose_found = refined.views[0].T_view_query
-    view = View(pose_found, observed[verified], np.ones(count, np.bool_), focal_px, unit_translation=True)
+    view = BundleView(pose_found, observed[verified], np.ones(count, np.bool_), focal_px, unit_translation=True)
     return view, refined.inverse_depths[verified], verified
 
 

@@ -11,27 +11,31 @@ from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
-from flocc_agent.runtime.ros2.names import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.problems import Problems
+from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
 from flocc_agent.runtime.ros2.session import Ros2Session
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
 from flocc_agent.runtime.ros2.synchroniser import PosedImage, Synchroniser
 from flocc_agent.runtime.ros2.telling import Teller
+from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
+    NAV_SAT_FIX,
     ODOMETRY,
     TF,
     BadMessage,
@@ -66,13 +70,15 @@ class Host:
         add_keyframe: Takes (image, T_odom_camera, stamp_s); may wait.
         mount_camera: Told `T_body_camera` once it is known, before the first keyframe.
         trajectory: Gives stamps (s) and (N, 4, 4) corrected body poses of all keyframes; called off the loop's thread.
-        report: Takes an event and its fields.
+        add_measurement: Takes what was measured at the keyframe with a stamp (s).
+        report: Takes facts for people.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
     mount_camera: Callable[[Float], None]
     trajectory: Callable[[], tuple[list[float], Float]]
-    report: Callable[[str, dict[str, Any]], None]
+    add_measurement: Callable[[Measurement, float], None]
+    report: Callable[[Fact], None]
 
 
 class Ros2Adapter:
@@ -93,6 +99,7 @@ class Ros2Adapter:
         self._static = StaticFrames()
         self._counter = TrafficCounter()
         self._problems = Problems(host.report)
+        self._fixes = SatelliteFixes(host.add_measurement)
         self._heard = Counter[str]()
         self._eye: Eye | None = None
         self._T_body_camera: Float | None = None
@@ -105,7 +112,8 @@ class Ros2Adapter:
         """What was dropped or refused, by reason."""
         dropped = {f"ros2 {reason}": n for reason, n in self._synchroniser.dropped.items()}
         waiting = {f"ros2 {reason}": n for reason, n in self._counter.snapshot().dropped.items()}
-        return {**dropped, **waiting, **{f"ros2 {reason}": n for reason, n in self._problems.counts.items()}}
+        fixes = {f"ros2 {reason}": n for reason, n in self._fixes.dropped.items()}
+        return {**dropped, **waiting, **fixes, **{f"ros2 {reason}": n for reason, n in self._problems.counts.items()}}
 
     async def run(self, corrections: "asyncio.Queue[Correction | None]") -> None:
         """Open the session, live until the corrections end, close it.
@@ -152,6 +160,8 @@ class Ros2Adapter:
             wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)
             if config.camera_mounting is None:
                 wanted["tf_static"] = (f"{config.tf_topic}_static", TF, TF_STATIC)
+        if config.fix_topic:
+            wanted["fix"] = (config.fix_topic, NAV_SAT_FIX, SENSOR)
         return wanted
 
     # What comes
@@ -166,6 +176,8 @@ class Ros2Adapter:
                     self._take_image(message.payload)
                 case "camera_info":
                     self._take_camera_info(message.payload)
+                case "fix":
+                    self._take_fix(message.payload)
                 case "tf_static":
                     self._static.add(self._types.read(message.payload, TF))
         except BadMessage as error:
@@ -196,6 +208,10 @@ class Ros2Adapter:
             self._complain("image", BACK_IN_TIME)
             return
         self._posed.set()
+
+    def _take_fix(self, payload: bytes) -> None:
+        if not self._fixes.add_fix(fix_of(self._types.read(payload, NAV_SAT_FIX))):
+            self._complain("fix", BACK_IN_TIME)
 
     def _compare(self, offer: Offer) -> None:
         """Say when a node publishes one of our topics as something else: its messages would never come."""
@@ -232,6 +248,8 @@ class Ros2Adapter:
         image = await asyncio.to_thread(eye.image, message)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
+        if self._config.fix_topic:
+            self._fixes.add_keyframe(posed.stamp_ns * 1e-9)
         if self._teller is not None:
             self._teller.path_changed = True
 
@@ -262,7 +280,7 @@ class Ros2Adapter:
             waited_s += WATCH_PERIOD_S
             if self._session.is_connected() != connected:
                 connected = not connected
-                self._host.report("ros2_router", {"router": self._config.router, "connected": connected})
+                self._host.report(RouterConnected(router=self._config.router, connected=connected))
                 logger.info("ROS 2: %s to %s", "connected" if connected else "no longer connected", self._config.router)
             if waited_s == PATIENCE_S and not connected:
                 self._complain("router", f"nobody answers at {self._config.router}; is rmw_zenohd running?")

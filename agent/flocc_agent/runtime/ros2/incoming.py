@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Image
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.pictures import Levels, levels_of
-from flocc_agent.runtime.ros2.pixels import camera_of, compressed_pixels, raw_pixels, rectified_camera_of
+from flocc_agent.runtime.ros2.raw_images import camera_of, compressed_pixels, raw_pixels, rectified_camera_of
 from flocc_agent.runtime.ros2.static_frames import pose_of_numbers
 from flocc_agent.runtime.ros2.types import COMPRESSED_IMAGE, BadMessage, checked_stamp_ns
 from flocc_agent.runtime.straightening import Straightener

@@ -3,7 +3,8 @@
 import logging
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+
+from flocc_agent.runtime.facts import RosProblem
 
 logger = logging.getLogger(__name__)
 
@@ -13,7 +14,7 @@ SENTENCES_MAX = 64
 class Problems:
     """Says each sentence once."""
 
-    def __init__(self, report: Callable[[str, dict[str, Any]], None]) -> None:
+    def __init__(self, report: Callable[[RosProblem], None]) -> None:
         self.counts = Counter[str]()
         self._report = report
         self._said: set[str] = set()
@@ -30,4 +31,4 @@ class Problems:
             return
         self._said.add(told)
         logger.warning("%s", told)
-        self._report("ros2_problem", {"sentence": told})
+        self._report(RosProblem(sentence=told))

@@ -11,7 +11,17 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from flocc_agent.runtime.ros2.names import Node, Offer, Qos, Role, Topic, attachment, full_name, offers_of, read_offer
+from flocc_agent.runtime.ros2.topics import (
+    EntityRole,
+    Node,
+    Offer,
+    Qos,
+    Topic,
+    attachment,
+    full_name,
+    offers_of,
+    read_offer,
+)
 from flocc_agent.runtime.ros2.types import MessageTypes, gid_of
 from flocc_agent.runtime.zenoh_session import open_session
 
@@ -84,7 +94,7 @@ class Ros2Session:
     def publisher(self, topic: str, type_name: str, qos: Qos) -> Publisher:
         """Declare a publisher; relative topics lie in the node's namespace."""
         described = self._topic(topic, type_name, qos)
-        token = self._token(Role.PUBLISHES, described)
+        token = self._token(EntityRole.PUBLISHES, described)
         return Publisher(self._session, described, self._node.domain_id, token, self._types)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos, on_payload: Callable[[bytes], None]) -> Topic:
@@ -95,7 +105,7 @@ class Ros2Session:
 
         described = self._topic(topic, type_name, qos)
         key = described.key(self._node.domain_id)
-        token = self._session.liveliness().declare_token(self._token(Role.SUBSCRIBES, described))
+        token = self._session.liveliness().declare_token(self._token(EntityRole.SUBSCRIBES, described))
         subscriber: object
         if qos.transient_local:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth)
@@ -128,6 +138,6 @@ class Ros2Session:
     def _topic(self, topic: str, type_name: str, qos: Qos) -> Topic:
         return Topic(full_name(self._node.namespace, topic), type_name, self._types.hash(type_name), qos)
 
-    def _token(self, role: Role, topic: Topic) -> str:
+    def _token(self, role: EntityRole, topic: Topic) -> str:
         self._numbers += 1
         return self._node.endpoint_token(self._numbers, role, topic)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.effects import Correction
-from flocc_agent.runtime.ros2.names import Qos
+from flocc_agent.core.corrected import Correction
 from flocc_agent.runtime.ros2.outgoing import Outgoing
 from flocc_agent.runtime.ros2.session import Publisher, Ros2Session
+from flocc_agent.runtime.ros2.topics import Qos
 from flocc_agent.runtime.ros2.types import PATH, POSE, TEXT, TF, MessageTypes
 
 Float = NDArray[np.float64]

@@ -16,6 +16,7 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ODOMETRY = "nav_msgs/msg/Odometry"
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 
 SEC_MAX = 2**31 - 3600
 """ROS counts seconds in 32 bits; an hour is left for what is dated ahead."""

@@ -91,7 +91,7 @@ def parsed_yaml(text: str) -> Value:
 def _plain_yaml(text: str) -> str:
     """OpenCV's dialect as YAML: no `%YAML:1.0`, spaces for tabs, a space after every key's colon."""
     opencv = text.lstrip().startswith("%YAML:")
-    text = re.sub(r"\A\s*%YAML[^\n]*\n", "", text)
+    text = re.sub(r"\A(\s*)%YAML[^\n]*", r"\1", text)
     if not opencv:
         return text
     text = "\n".join(line.expandtabs(4) for line in text.splitlines())

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_agent.lenses.names import NONE, RATIONAL, READ, kind_of, plain_name, with_distortion
+from flocc_agent.lenses.lens_names import NONE, RATIONAL, READ, kind_of, plain_name, with_distortion
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import checked_pose
 from flocc_launch.datasets.calibrations.document import TwiceError
-from flocc_launch.datasets.calibrations.keys import Keys, flat_numbers, plain
+from flocc_launch.datasets.calibrations.taken_keys import Keys, flat_numbers, plain
 from flocc_launch.datasets.source import Lens
 
 Float = NDArray[np.float64]
@@ -35,9 +35,10 @@ CAMERA_MODEL = (
 DISTORTION_MODEL = ("distortion_model", "distortion_type", "dist_model")
 COEFFICIENTS = (
     "distortion_coefficients", "distortion_coeffs", "distortion", "dist_coeffs", "dist_coef", "distCoef",
+    "camera_dist_coeffs",
     "distortion_coeff", "distortion_params", "distortionCoeff", "D",
 )  # fmt: skip
-MATRIX = ("camera_matrix", "cam_matrix", "K", "camera_intrinsics", "intrinsic_matrix", "cam_K")
+MATRIX = ("camera_matrix", "camera_intrinsic", "cam_matrix", "K", "camera_intrinsics", "intrinsic_matrix", "cam_K")
 BODY_CAMERA = (
     "T_BS", "T_body_camera", "T_body_cam", "T_BC", "T_B_C", "T_SC", "T_imu_cam", "T_imu_camera", "T_IC", "T_b_c1",
     "Tbc", "body_T_cam", "body_T_cam0", "imu_T_cam", "local_transform",
@@ -51,10 +52,10 @@ CAMERA_BODY = (
     "T_camera_body",
     "T_CI",
     "T_CS",
-    "T_cam_to_body_inv",
+    "imuToCamera",
 )
 SHAPES = {
-    LensKind.FOV: (("omega", "w"),),
+    LensKind.FOV: (("omega",),),
     LensKind.OMNIDIRECTIONAL: (("xi",),),
     LensKind.DOUBLE_SPHERE: (("xi",), ("alpha",)),
     LensKind.EUCM: (("alpha",), ("beta",)),
@@ -64,7 +65,7 @@ COUNTS = (0, 4, 5, 8, 12)
 _MATTERS = re.compile(
     r"dist|^k\d|^d\d*$|^p\d|^q[wxyz]?$|coef|intrin|model|^t[a-z]{2,3}\d?$|^t[a-z]*(cam|imu|body|sensor)|extrin|^r\d*$|^xi|alpha|"
     r"^beta|mirror|fisheye|rotat|translat|skew|gamma|offset|crop|roi|binning|focal|lens|fov|poly|tau|^s\d$|omega|transform|"
-    r"prism|mount|pose|zoom|scale|resiz|^f$|^fl|^f[xyuv]|^c[xyuv]$|matrix|tocam|camto|principal|center|centre|affine|shear"
+    r"prism|mount|ext[rt]$|^rc[li]$|^pc[li]$|pose|zoom|scale|resiz|^f$|^fl|^f[xyuv]|^c[xyuv]$|matrix|tocam|camto|principal|center|centre|affine|shear"
 )
 """Plain names of keys that say something about a camera; one that is not understood is refused."""
 HARMLESS = re.compile(
@@ -74,7 +75,7 @@ HARMLESS = re.compile(
     r"depthscale|depthfactor|thdepth|thfarpoints|aabbscale|applied(transform|scale)|perviewreprojectionerrors|imagepoints|"
     r"extrinsicparameters|gridpoints|flagvalue|flags|fixprincipalpoint|ttracking|tlr|left.*|right.*|camera2.*|tcncnm1|"
     r"perviewerrors|stddevintrinsics|stddevextrinsics|intrinsicsstd|camoverlaps|rotationrate|t\d\d|posestd|calibaccel.*|"
-    r"calibgyro.*|fisheyemodelname|vignette.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile)$"
+    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile)$"
 )
 """Plain names of keys that look as if they mattered and do not: of other sensors or rectified images."""
 
@@ -93,13 +94,34 @@ def lens_of_keys(keys: Keys, size: Size | None) -> Lens:
     T_body_camera = _mounting(keys)
     _refuse_parts(keys)
     left = keys.left()
-    strange = [key for key in left if _MATTERS.search(plain(key)) and not HARMLESS.match(plain(key))]
+    strange = [key for key in left if _matters(key, keys.value(key))]
     if strange:
         raise ValueError(
             f"the key {strange[0]!r} is not understood and may be about the camera; take it out if it is not"
         )
     notes = (f"not used: {', '.join(left)}",) if left else ()
     return Lens(model, T_body_camera, notes=notes)
+
+
+def _matters(key: str, value: Any) -> bool:
+    """Whether a key that nobody took may change what the camera is."""
+    name = plain(key)
+    if isinstance(value, str) and not re.search(r"model|type|distort|lens|fisheye", name):
+        return False
+    return bool(_MATTERS.search(name)) and not HARMLESS.match(name) and not _says_nothing(value)
+
+
+def _says_nothing(value: Any) -> bool:
+    """Whether a value is zero, empty, or an identity matrix."""
+    if value in (0, False, "", "none", [], {}):
+        return True
+    try:
+        numbers = np.array(flat_numbers(value, "value"))
+    except ValueError:
+        return False
+    side = round(len(numbers) ** 0.5)
+    is_identity = side * side == len(numbers) and np.array_equal(numbers.reshape(side, side), np.eye(side))
+    return is_identity or not numbers.any()
 
 
 def _model(keys: Keys, size: Size | None) -> CameraModel:
@@ -277,10 +299,10 @@ def _two_lists(keys: Keys) -> Focal | None:
 def _scalars(keys: Keys) -> Focal | None:
     """Fx fy cx cy as keys of their own; one focal length may stand for both."""
     names = {
-        "fx": ("fx", "Camera.fx", "fl_x", "focal_x", "fu", "mu", "gamma1"),
-        "fy": ("fy", "Camera.fy", "fl_y", "focal_y", "fv", "mv", "gamma2"),
-        "cx": ("cx", "Camera.cx", "u0", "cu", "ppx"),
-        "cy": ("cy", "Camera.cy", "v0", "cv", "ppy"),
+        "fx": ("fx", "Camera.fx", "fl_x", "focal_x", "fu", "mu", "gamma1", "focalLengthX"),
+        "fy": ("fy", "Camera.fy", "fl_y", "focal_y", "fv", "mv", "gamma2", "focalLengthY"),
+        "cx": ("cx", "Camera.cx", "u0", "cu", "ppx", "principalPointX"),
+        "cy": ("cy", "Camera.cy", "v0", "cv", "ppy", "principalPointY"),
     }
     single = keys.number("f", "focal") if not any(name in keys for name in names["fx"]) else None
     values = {key: keys.number(*spellings) for key, spellings in names.items()}
@@ -317,17 +339,19 @@ def _coefficients(keys: Keys, kind: LensKind | None, name: str | None) -> list[f
 
 def _ordered(single: dict[str, float | None], names: tuple[str, ...], kind: LensKind | None) -> list[float]:
     values = [single[key] for key in names]
-    last = max((place for place, value in enumerate(values) if value), default=-1) + 1
     if kind is LensKind.EQUIDISTANT:
         missing = [key for key, value in zip(names, values, strict=True) if value is None]
         if missing:
             raise ValueError(f"of the distortion, {', '.join(missing)} is missing")
-        last = 4
-    count = next(count for count in COUNTS if count >= last)
-    gaps = [key for key, value in zip(names[5:count], values[5:count], strict=True) if value is None]
-    if gaps:
-        raise ValueError(f"of the distortion, {', '.join(gaps)} is missing: OpenCV's rational model has k4, k5 and k6")
-    return [value or 0.0 for value in values[:count]]
+        return [value or 0.0 for value in values]
+    given = [place + 1 for place, value in enumerate(values) if value is not None]
+    telling = [place + 1 for place, value in enumerate(values) if value]
+    for last in (max(given, default=0), max(telling, default=0)):
+        count = next(count for count in COUNTS if count >= last)
+        if None not in values[5:count]:
+            return [value or 0.0 for value in values[:count]]
+    missing = [key for key, value in zip(names[5:count], values[5:count], strict=True) if value is None]
+    raise ValueError(f"of the distortion, {', '.join(missing)} is missing: OpenCV's rational model has k4, k5 and k6")
 
 
 def _padded(values: list[float]) -> Float:

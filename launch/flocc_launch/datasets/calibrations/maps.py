@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flocc_launch.datasets.calibrations.keys import Keys, flat_numbers, plain
+from flocc_launch.datasets.calibrations.taken_keys import Keys, flat_numbers, plain
 
 Map = dict[str, Any]
 Cameras = dict[str, Map]
@@ -39,7 +39,7 @@ def _has(*names: str) -> Callable[[Map], bool]:
 
 def _kalibr(document: Map) -> Cameras:
     rest = {key: value for key, value in document.items() if not _is_camera(key, value)}
-    return {key: {**rest, **value} for key, value in document.items() if _is_camera(key, value)}
+    return {key: _tidied({**rest, **value}) for key, value in document.items() if _is_camera(key, value)}
 
 
 def _is_camera(key: str, value: Any) -> bool:
@@ -49,11 +49,12 @@ def _is_camera(key: str, value: Any) -> bool:
 def _listed_cameras(document: Map) -> Cameras:
     """SVO and maplab (a map `camera` beside `T_B_C`), OKVIS (all in one map)."""
     found: Cameras = {}
+    rest = {key: value for key, value in document.items() if key not in ("cameras", "label", "id")}
     for number, entry in enumerate(document["cameras"]):
         if not isinstance(entry, dict):
             raise ValueError(f"its camera {number} is no map")
         inner = entry.get("camera", {})
-        camera = {**{key: value for key, value in entry.items() if key != "camera"}, **inner}
+        camera = {**rest, **{key: value for key, value in entry.items() if key != "camera"}, **inner}
         if isinstance(distortion := camera.get("distortion"), dict) and "type" in distortion:
             extra = set(distortion) - {"type", "parameters"}
             if extra:
@@ -98,7 +99,8 @@ CAMODOCAL = {"pinhole": "radtan", "pinholefull": "rational_polynomial", "mei": "
 
 def _camodocal(document: Map) -> Cameras:
     """VINS-Mono and VINS-Fusion, by camodocal: parameters in maps of their own, whose names depend on the model."""
-    camera = {key: value for key, value in document.items() if not key.endswith("_parameters")}
+    mask = "fisheye"  # whether VINS puts a round mask on features
+    camera = {key: value for key, value in document.items() if not key.endswith("_parameters") and key != mask}
     model = plain(str(document.get("model_type", "")))
     if model in ("scaramuzza", "ocam"):
         raise ValueError(
@@ -126,6 +128,8 @@ def _basalt(document: Map) -> Cameras:
     for number, entry in enumerate(value["intrinsics"]):
         kind, numbers = plain(str(entry.get("camera_type"))), dict(entry.get("intrinsics", {}))
         numbers.pop("rpmax", None)
+        if kind == "fov":
+            numbers["omega"] = numbers.pop("w", None)
         camera: Map = {**rest, **numbers, "camera_model": {"pinhole": "none"}.get(kind, entry.get("camera_type"))}
         for name, listed in (("T_imu_cam", extrinsics), ("resolution", sizes)):
             if listed is not None and len(listed) != len(value["intrinsics"]):
@@ -136,41 +140,70 @@ def _basalt(document: Map) -> Cameras:
     return cameras
 
 
+SCENE = (
+    "frames", "scale", "offset", "aabb", "aabb_scale", "applied_scale", "applied_transform", "orientation_override",
+    "integer_depth_scale", "depth_unit_scale_factor", "ply_file_path", "from_na", "render_aabb", "up", "sharpness",
+)  # fmt: skip
+"""What transforms.json says of the scene, not of the camera."""
+NERF_MODELS = {"opencv": "opencv", "opencvfisheye": "equidistant", "pinhole": "none", "simplepinhole": "none"}
+
+
 def _nerfstudio(document: Map) -> Cameras:
     """Nerfstudio and instant-ngp: one camera for all frames, or one in each, which must be the same."""
-    rest = {key: value for key, value in document.items() if key != "frames"}
     names = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "camera_angle_x")
     frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
     own = [{name: frame[name] for name in names if name in frame} for frame in frames]
     if any(each != own[0] for each in own[1:]):
         raise ValueError("has frames of different cameras; flocc takes one camera per robot")
-    camera = {**rest, **(own[0] if own else {})}
+    camera = {key: value for key, value in document.items() if key not in SCENE} | (own[0] if own else {})
     fisheye = camera.pop("is_fisheye", None)
-    model = plain(str(camera.get("camera_model") or ("OPENCV_FISHEYE" if fisheye else "OPENCV")))
-    known = {"opencv": "opencv", "opencvfisheye": "equidistant", "pinhole": "none", "simplepinhole": "none"}
-    if model not in known:
-        raise ValueError(
-            f"the camera model is {camera['camera_model']!r}; flocc reads OPENCV, OPENCV_FISHEYE and PINHOLE"
-        )
-    camera["camera_model"] = None
-    camera["distortion_model"] = (
-        known[model] if model != "opencv" or any(k in camera for k in ("k1", "k2", "p1")) else None
-    )
+    given = camera.pop("camera_model", None)
+    model = plain(str(given or ("OPENCV_FISHEYE" if fisheye else "OPENCV")))
+    if model not in NERF_MODELS:
+        raise ValueError(f"the camera model is {given!r}; flocc reads OPENCV, OPENCV_FISHEYE and PINHOLE of nerfstudio")
+    if model != "opencv" or any(key in camera for key in ("k1", "k2", "p1")):
+        camera["distortion_model"] = NERF_MODELS[model]
     return {"camera": _with_angles(camera)}
 
 
 def _with_angles(camera: Map) -> Map:
-    """Focal lengths from fields of view, where the file has only those."""
+    """Focal lengths and principal point of files that have only fields of view."""
     angles = {axis: camera.pop(f"camera_angle_{axis}", None) for axis in "xy"}
-    if "fl_x" not in camera and angles["x"] is not None:
-        if "w" not in camera or "h" not in camera:
-            raise ValueError("has a field of view (camera_angle_x) but no w and h: add them")
-        width, height = float(camera["w"]), float(camera["h"])
-        focal = width / 2 / float(np.tan(float(angles["x"]) / 2))
-        camera |= {"fl_x": focal, "fl_y": focal, "cx": camera.get("cx", width / 2), "cy": camera.get("cy", height / 2)}
-    elif "fl_x" in camera and "fl_y" not in camera:
-        camera["fl_y"] = camera["fl_x"]
-    return camera
+    sides = {"x": camera.get("w"), "y": camera.get("h")}
+    for axis, side in sides.items():
+        angle = angles[axis]
+        if f"fl_{axis}" not in camera and angle is not None and side is not None:
+            camera[f"fl_{axis}"] = float(side) / 2 / float(np.tan(float(angle) / 2))
+    if angles["x"] is not None and "fl_x" not in camera:
+        raise ValueError("has a field of view (camera_angle_x) but no w and h: add them")
+    for axis, side in sides.items():
+        if f"c{axis}" not in camera and side is not None:
+            camera[f"c{axis}"] = float(side) / 2
+    return {**camera, "fl_y": camera.get("fl_y", camera.get("fl_x"))}
+
+
+def _vikit(document: Map) -> Cameras:
+    """Rpg's vikit (SVO 1, FAST-LIVO): keys that begin with cam_; ATAN has lengths in units of the size."""
+    camera = {key.removeprefix("cam_"): value for key, value in document.items() if key != "scale"}
+    kind = plain(str(camera.pop("model", "")))
+    models = {"pinhole": "opencv", "atan": "fov", "equidistantcamera": "equidistant", "equidistant": "equidistant"}
+    if kind not in models:
+        raise ValueError(
+            f"the camera model is {document.get('cam_model')!r}; flocc reads Pinhole, ATAN and Equidistant of vikit"
+        )
+    coefficients = [camera.pop(f"d{k}") for k in range(8) if f"d{k}" in camera]
+    if kind == "atan":
+        width, height = float(camera["width"]), float(camera["height"])
+        camera |= {"fx": camera["fx"] * width, "fy": camera["fy"] * height}
+        camera |= {"cx": camera["cx"] * width - 0.5, "cy": camera["cy"] * height - 0.5}
+        coefficients = coefficients[:1]
+    return {"camera": {**camera, "distortion": coefficients, "distortion_model": models[kind]}}
+
+
+def _record3d(document: Map) -> Cameras:
+    """Record3D's metadata: one matrix by columns; the small changes of focus in each frame are not used."""
+    told = ("poses", "initPose", "perFrameIntrinsicCoeffs", "frameTimestamps", "dw", "dh", "cameraType")
+    return {"camera": {key: value for key, value in document.items() if key not in told}}
 
 
 def _opensfm(document: Map) -> Cameras:
@@ -200,35 +233,33 @@ def _opensfm(document: Map) -> Cameras:
 
 
 def _gyroflow(document: Map) -> Cameras:
+    """Gyroflow's lens profile: beside the lens, it names products."""
     size, lens = document["calib_dimension"], document["fisheye_params"]
-    keys = ("camera_matrix", "distortion_coeffs")
-    return {
-        "camera": {
-            "width": size["w"], "height": size["h"], "distortion_model": "equidistant",
-            **{key: lens[key] for key in keys},
-        }
-    }  # fmt: skip
+    told = ("camera_brand", "camera_model", "lens_model", "camera_setting", "calib_dimension", "fisheye_params")
+    rest = {key: value for key, value in document.items() if key not in told}
+    return {"camera": {"distortion_model": "equidistant", **rest, **lens, "width": size["w"], "height": size["h"]}}
 
 
 def _depthai(document: Map) -> Cameras:
     cameras: Cameras = {}
+    rest = {key: value for key, value in document.items() if key not in ("cameraData", "imuExtrinsics")}
+    told = ("cameraType", "distortionCoeff", "extrinsics", "specHfovDeg", "lensPosition")
     for socket, given in document["cameraData"]:
-        models = {0: "none", 1: "equidistant"}
+        models = {0: None, 1: "equidistant"}
         kind = given.get("cameraType", 0)
         if kind not in models:
             raise ValueError(f"the camera type is {kind}; flocc reads 0 (perspective) and 1 (fisheye) of DepthAI")
-        coefficients = flat_numbers(given.get("distortionCoeff", []), "distortionCoeff")
-        camera = {
-            "width": given["width"], "height": given["height"], "K": given["intrinsicMatrix"],
-            "distortion": coefficients[:4] if kind == 1 and not any(coefficients[4:]) else coefficients,
-        }  # fmt: skip
-        cameras[f"CAM{socket}"] = camera | ({"distortion_model": models[kind]} if kind else {})
+        camera: Map = {key: value for key, value in given.items() if key not in told}
+        camera |= {"distortion": given.get("distortionCoeff"), "distortion_model": models[kind]}
+        camera["intrinsic_matrix"] = camera.pop("intrinsicMatrix", None)
+        cameras[f"CAM{socket}"] = {**rest, **camera}
     return cameras
 
 
 def _stereo(document: Map) -> Cameras:
-    """OpenCV's stereo sample: M1 D1 of the left camera, M2 D2 of the right one."""
-    rest = {key: value for key, value in document.items() if re.fullmatch(r"(image_)?(width|height)", key)}
+    """OpenCV's stereo sample: M1 D1 of the left camera, M2 D2 of the right one, and what lies between them."""
+    between = ("M1", "D1", "M2", "D2", "R", "T", "E", "F", "R1", "R2", "P1", "P2", "Q")
+    rest = {key: value for key, value in document.items() if key not in between}
     sides = {"left": "1", "right": "2"}
     return {
         side: {**rest, "camera_matrix": document[f"M{n}"], "distortion": document[f"D{n}"]}
@@ -237,17 +268,67 @@ def _stereo(document: Map) -> Cameras:
     }
 
 
+FOCAL = {plain(name) for name in (
+    "fx", "fl_x", "fu", "Camera.fx", "cam_fx", "focal_length", "focalLengthX", "camera_matrix", "K", "intrinsic_matrix",
+    "cam_K", "camera_intrinsics", "camera_intrinsic",
+)}  # fmt: skip
+"""Plain names of keys by which a map is one of a camera."""
+
+
+def _is_of_camera(values: Map) -> bool:
+    if any(plain(key) in FOCAL for key in values):
+        return True
+    listed = values.get("intrinsics", values.get("calibration"))
+    return isinstance(listed, list) or (isinstance(listed, dict) and "data" in listed)
+
+
+OF_OTHERS = ("type", "model", "name", "id", "label")
+"""Keys that, above a camera's map, are of what it stands in."""
+
+
+def _nested(document: Map, path: tuple[str, ...] = (), above: Map | None = None) -> Cameras:
+    """Maps of cameras inside of others, each with the plain values that stand above it."""
+    own = {key: value for key, value in document.items() if not isinstance(value, dict) and plain(key) not in OF_OTHERS}
+    around = {**(above or {}), **own}
+    found: Cameras = {}
+    for key, value in document.items():
+        if not isinstance(value, dict):
+            continue
+        if _is_of_camera(value):
+            twice = next((name for name in value if name in around and around[name] != value[name]), None)
+            if twice is not None:
+                raise ValueError(f"the keys {twice!r} and '{key}.{twice}' say different things")
+            found[".".join((*path, key))] = {**around, **value}
+        else:
+            found |= _nested(value, (*path, key), around)
+    return found
+
+
 def _plain(document: Map) -> Cameras:
     """All in one map: EuRoC, Kimera, ROS, OpenCV, RTAB-Map, MASt3R-SLAM, flocc's own, and whoever is like them."""
+    if _is_of_camera(document):
+        return {"camera": _tidied(document)}
+    inner = _nested(document)
+    return {name: _tidied(camera) for name, camera in inner.items()} if inner else {"camera": _tidied(document)}
+
+
+def _tidied(document: Map) -> Map:
+    """What single tools write in a way of their own."""
+    if "cam_fx" in document and "cam_model" in document:
+        return _vikit(document)["camera"]
     camera = dict(document)
-    for name in ("camera", "intrinsics", "calibration", "intrinsic", "cam", "camera_info", "color", "rgb"):
-        inner = camera.get(name)
-        if isinstance(inner, dict) and "data" not in inner and "rows" not in inner:
-            del camera[name]
-            twice = next((key for key in inner if key in camera and camera[key] != inner[key]), None)
-            if twice is not None:
-                raise ValueError(f"the keys {twice!r} and '{name}.{twice}' say different things")
-            camera |= inner
+    if camera.pop("distorted", True) is False and any(camera.get(key) for key in ("k1", "k2", "p1", "p2", "k3")):
+        raise ValueError("says distorted: false, but has distortion coefficients")
+    if isinstance(camera.get("scale"), int | float) and set(map(plain, camera)) <= {
+        "w",
+        "h",
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+        "scale",
+    }:
+        camera["depth_scale"] = camera.pop("scale")  # Replica's renderings
     if isinstance(listed := camera.get("calibration"), list):
         del camera["calibration"]
         numbers = flat_numbers(listed, "calibration")
@@ -258,12 +339,14 @@ def _plain(document: Map) -> Cameras:
     flags = camera.get("flags")
     if isinstance(flags, str) and "fisheye" in flags.lower() and "distortion_model" not in camera:
         camera["distortion_model"] = "fisheye"
-    return {"camera": camera}
+    return camera
 
 
 FORMS: tuple[Form, ...] = (
     Form("Basalt", lambda d: isinstance(d.get("value0"), dict) and "intrinsics" in d["value0"], _basalt),
     Form("nerfstudio transforms.json", lambda d: isinstance(d.get("frames"), list), _nerfstudio),
+    Form("vikit (SVO 1, FAST-LIVO)", _has("cam_fx", "cam_model"), _vikit),
+    Form("Record3D", _has("K", "poses"), _record3d),
     Form("DepthAI", lambda d: isinstance(d.get("cameraData"), list), _depthai),
     Form("Gyroflow", _has("fisheye_params", "calib_dimension"), _gyroflow),
     Form("SVO, maplab or OKVIS", lambda d: isinstance(d.get("cameras"), list), _listed_cameras),
@@ -280,7 +363,7 @@ FORMS: tuple[Form, ...] = (
 )
 
 REFUSED_MAPS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], str], ...] = (
-    ("a Meshroom scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
+    ("a Meshroom or OpenMVG scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
     ("a Kalibr target", lambda d: "target_type" in d, "give the camchain file that Kalibr writes"),
     ("Kalibr's IMU file", lambda d: "accelerometer_noise_density" in d and "fx" not in d and "intrinsics" not in d,
      "give the camchain file that Kalibr writes"),

@@ -200,11 +200,29 @@ def _numbers(text: str) -> Cameras:
     )
 
 
+ZED_SIZES = {"2K": [2208, 1242], "FHD": [1920, 1080], "FHD1200": [1920, 1200], "HD": [1280, 720], "SVGA": [960, 600],
+             "VGA": [672, 376]}  # fmt: skip
+
+
+def _zed(text: str) -> Cameras:
+    """SNxxxx.conf of ZED cameras: sections LEFT_CAM_HD and so on, with fx fy cx cy k1 k2 p1 p2 k3."""
+    cameras: Cameras = {}
+    pattern = r"^\[((?:LEFT|RIGHT)_CAM_\w+)\]\s*$(.*?)(?=^\[|\Z)"
+    for name, body in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
+        size = ZED_SIZES.get(name.partition("_CAM_")[2])
+        if size is None:
+            continue
+        values = dict(line.split("=", 1) for line in _lines(body) if "=" in line)
+        cameras[name] = {"resolution": size} | {key.strip(): float(value) for key, value in values.items()}
+    return cameras
+
+
 TEXT_FORMS: tuple[TextForm, ...] = (
     TextForm("COLMAP cameras.txt", _matches(r"\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s"), _colmap),
     TextForm(
         "KITTI calibration", lambda text: re.search(r"^(P\d|P_rect_\d+):", text, re.MULTILINE) is not None, _kitti
     ),
+    TextForm("ZED conf", lambda text: re.search(r"^\[LEFT_CAM_\w+\]", text, re.MULTILINE) is not None, _zed),
     TextForm("ROS camera_calibration_parsers INI", _matches(r"\[image\]"), _ini),
     TextForm("DSO camera.txt", _is_dso, _dso),
     TextForm("numbers", _matches(rf"{_NUMBER}([\s,;]+{_NUMBER})*[\s,;]*$", every=True), _numbers),
@@ -222,6 +240,10 @@ REFUSED_TEXTS: tuple[tuple[re.Pattern[str], str], ...] = (
     (
         re.compile(r"'?lensmodel'?\s*:", re.IGNORECASE),
         "is mrcal's .cameramodel; convert it with mrcal-convert-lensmodel and write YAML",
+    ),
+    (
+        re.compile(r"Intrinsic of \"|Inverse Brown Conrady"),
+        "is what rs-enumerate-devices prints; write Fx Fy PPX PPY as YAML",
     ),
     (re.compile(r"\A\s*NVM_V"), "is VisualSFM's NVM; export COLMAP's text form"),
     (re.compile(r"\A\s*# Bundle file"), "is a Bundler file; export COLMAP's text form"),

@@ -77,6 +77,14 @@ class Reader:
         assert len(self._bytes) - self._at < 4, f"{len(self._bytes) - self._at} bytes are left"
 
 
+def nav_sat_fix(
+    stamp: Stamp, frame: str, place: Sequence[float], covariance: Sequence[float], status: int = 0, known: int = 3
+) -> bytes:
+    """NavSatFix: latitude, longitude (degrees), altitude (m), covariance east, north, up."""
+    writer = Writer().header(stamp, frame).put("b", status).put("H", 1)
+    return writer.put("d", *place).put("d", *covariance).put("B", known).message()
+
+
 @dataclass(frozen=True, slots=True)
 class Stamped:
     """What is placed: time, frame, child where it has one, `x y z`, `qx qy qz qw`, covariance where it has one."""
@@ -175,7 +183,7 @@ def read_attachment(attached: bytes) -> tuple[int, int, bytes]:
 
 # REP 2016: the type hash is the SHA-256 of the type's description as JSON.
 
-SCALARS = {"uint8": 3, "int32": 6, "uint32": 7, "float64": 11, "bool": 15, "string": 17}
+SCALARS = {"int8": 2, "uint8": 3, "uint16": 5, "int32": 6, "uint32": 7, "float64": 11, "bool": 15, "string": 17}
 FIXED, UNBOUNDED = 48, 144
 DEFINITIONS = {
     "builtin_interfaces/msg/Time": "int32 sec, uint32 nanosec",
@@ -201,6 +209,9 @@ DEFINITIONS = {
     "sensor_msgs/msg/Image": "std_msgs/msg/Header header, uint32 height, uint32 width, string encoding, "
     "uint8 is_bigendian, uint32 step, uint8[] data",
     "sensor_msgs/msg/CompressedImage": "std_msgs/msg/Header header, string format, uint8[] data",
+    "sensor_msgs/msg/NavSatStatus": "int8 status, uint16 service",
+    "sensor_msgs/msg/NavSatFix": "std_msgs/msg/Header header, sensor_msgs/msg/NavSatStatus status, float64 latitude, "
+    "float64 longitude, float64 altitude, float64[9] position_covariance, uint8 position_covariance_type",
     "sensor_msgs/msg/RegionOfInterest": "uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, "
     "bool do_rectify",
     "sensor_msgs/msg/CameraInfo": "std_msgs/msg/Header header, uint32 height, uint32 width, string distortion_model, "

@@ -15,14 +15,20 @@ from tests.agent.runtime.ros2.cdr_by_hand import Stamped
 from tests.agent.runtime.ros2.raw_node import RawNode, gid, open_router
 
 from flocc_agent.config import KeyframeConfig, Ros2Config
-from flocc_agent.core.effects import Correction
+from flocc_agent.core.corrected import CorrectedLog, Correction, RecordedOdometry
+from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.interfaces import Image
-from flocc_agent.geometry import Float, pose, so3_exp, tq_from_pose
+from flocc_agent.core.measurements import GeodeticFix, Measurement
+from flocc_agent.core.reports import Fact
+from flocc_agent.geometry import Float, pose, pose7, so3_exp, tq_from_pose
+from flocc_agent.runtime.facts import RosProblem, RouterConnected
 from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 from flocc_agent.runtime.ros2.types import BadMessage, Ros2Error
+from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import LogCorrection
 
 EPOCH_S = 1_700_000_000
 SIZE = (4, 6)
@@ -64,6 +70,12 @@ class Robot:
             "/r1/camera/camera_info", INFO, cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P)
         )
 
+    def fix(self, t_ms: int) -> None:
+        payload = cdr_by_hand.nav_sat_fix(
+            stamp(t_ms), "gps", (48.0 + 1e-8 * t_ms, 11.0, 500.0), [4.0, 0, 0, 0, 4, 0, 0, 0, 9]
+        )
+        self._publish("/r1/gps/fix", "sensor_msgs/msg/NavSatFix", payload)
+
     def mounting(self) -> None:
         placed = Stamped((0, 0), "base_link", "optical", MOUNTING[:3], MOUNTING[3:])
         self._publish("/tf_static", TF, cdr_by_hand.transforms([placed]), latched=True)
@@ -75,7 +87,8 @@ class Agent:
     def __init__(self) -> None:
         self.keyframes: list[tuple[Image, Float, float]] = []
         self.mounted: list[Float] = []
-        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.measured: list[tuple[Measurement, float]] = []
+        self.facts: list[Fact] = []
         self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
         self.poses = [(EPOCH_S + 0.25, np.eye(4)), (EPOCH_S + 1.0, T_MAP_ODOM)]
 
@@ -86,15 +99,24 @@ class Agent:
         return [stamp_s for stamp_s, _ in self.poses], np.stack([T for _, T in self.poses])
 
     def host(self) -> Host:
-        return Host(self.add_keyframe, self.mounted.append, self.trajectory, lambda *event: self.events.append(event))
+        return Host(
+            self.add_keyframe,
+            self.mounted.append,
+            self.trajectory,
+            lambda measurement, stamp_s: self.measured.append((measurement, stamp_s)),
+            self.facts.append,
+        )
 
     def problems(self) -> list[str]:
-        return [fields["sentence"] for event, fields in self.events if event == "ros2_problem"]
+        return [fact.sentence for fact in self.facts if isinstance(fact, RosProblem)]
 
 
 def correction(covariance: Float | None = None) -> Correction:
     term = Term(1, LogId("r1", 0))
-    return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, 0, 1, np.zeros((0, 4, 4)))
+    nowhere = Array.of(np.zeros((0, 7)), "f4")
+    message = LogCorrection(term.leader, term, 1, term.leader, pose7(T_MAP_ODOM), None, 0, 1, nowhere)
+    own = CorrectedLog(message, RecordedOdometry(LogCopy()))
+    return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, own, {})
 
 
 @contextmanager
@@ -153,6 +175,31 @@ async def test_images_and_odometry_become_keyframes_where_the_robot_moved_enough
     np.testing.assert_allclose(agent.mounted[0], T_BODY_CAMERA, atol=1e-12)
     assert agent.problems() == []
     assert "ros2 image refused" not in adapter.counters()
+
+
+async def test_fixes_are_interpolated_to_the_stamps_of_keyframes() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port, fix_topic="gps/fix") as (agent, _):
+            steps = iter(range(0, 100_000, 50))
+
+            def step() -> None:
+                t = next(steps)
+                robot.camera_info()
+                robot.mounting()
+                if t % 200 == 50:
+                    robot.fix(t)
+                robot.image(t)
+                robot.odometry(t)
+
+            await until(lambda: len(agent.measured) >= 4, act=step)
+    given_s = {stamp_s for *_, stamp_s in agent.keyframes}
+    for fix, stamp_s in agent.measured:
+        assert stamp_s in given_s
+        assert isinstance(fix, GeodeticFix)
+        assert fix.latitude_deg == pytest.approx(48.0 + 1e-5 * (stamp_s - EPOCH_S), abs=1e-9)
+        assert np.asarray(fix.covariance_m2)[2, 2] == 9.0
+    assert agent.problems() == []
 
 
 async def test_a_correction_goes_out_as_transform_pose_path_and_frame() -> None:
@@ -287,8 +334,8 @@ async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None
         assert agent.problems() == [f"ROS 2: nobody answers at tcp/127.0.0.1:{port}; is rmw_zenohd running?"]
         with ros(port) as robot:
             await drive(robot, agent, 2)
-            linked = {"router": f"tcp/127.0.0.1:{port}", "connected": True}
-            await until(lambda: ("ros2_router", linked) in agent.events)
+            linked = RouterConnected(router=f"tcp/127.0.0.1:{port}", connected=True)
+            await until(lambda: linked in agent.facts)
 
 
 async def test_what_an_image_waits_for_is_said() -> None:

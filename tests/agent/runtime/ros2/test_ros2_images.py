@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from tests.agent.runtime.ros2 import cdr_by_hand
 
 from flocc_agent.core.interfaces import Camera, Image
-from flocc_agent.lenses import CameraModel
+from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.ros2.incoming import Eye, model_of
 from flocc_agent.runtime.ros2.types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, BadMessage, MessageTypes
+from flocc_agent.runtime.straightening import Straightener
 
 TYPES = MessageTypes()
 STAMP = (12, 34)
@@ -123,9 +124,13 @@ def test_a_damaged_compressed_image_is_refused(data: bytes) -> None:
 
 
 def lens(
-    D: tuple[float, ...] = (), rectified: bool = False, model: str = "plumb_bob", k: tuple[float, ...] = K
+    D: tuple[float, ...] = (),
+    rectified: bool = False,
+    model: str = "plumb_bob",
+    k: tuple[float, ...] = K,
+    size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> CameraModel:
-    payload = cdr_by_hand.camera_info(STAMP, "cam", (HEIGHT, WIDTH), k, D, P, model)
+    payload = cdr_by_hand.camera_info(STAMP, "cam", size, k, D, P, model)
     return model_of(TYPES.read(payload, CAMERA_INFO), rectified)
 
 
@@ -157,3 +162,82 @@ def test_a_third_radial_coefficient_is_taken_out_of_the_image() -> None:
 def test_intrinsics_that_cannot_be_used_are_refused(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(BadMessage, match=said):
         lens(**changes)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "stored", "wanted"),
+    [
+        ("rgb16", RGB.astype("<u2") << 8, RGB),
+        ("bgr16", (RGB[..., ::-1].astype("<u2") << 8), RGB),
+        ("rgba16", (np.dstack([RGB, GREY]).astype("<u2") << 8), RGB),
+        ("8UC4", np.dstack([RGB[..., ::-1], GREY]), RGB),
+    ],
+)
+def test_deep_colours_come_out_as_rgb(encoding: str, stored: NDArray[Any], wanted: NDArray[np.uint8]) -> None:
+    bright = stored.copy()
+    np.testing.assert_allclose(read(encoding, bright).pixels.astype(int), wanted.astype(int), atol=1)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "code", "channels"),
+    [("yuv422", "UYVY", 2), ("uyvy", "UYVY", 2), ("yuv422_yuy2", "YUYV", 2), ("yuyv", "YUYV", 2)],
+)
+def test_yuv_is_brought_to_rgb(encoding: str, code: str, channels: int) -> None:
+    """Chroma in the middle is grey, and luma is where the layout says."""
+    luma = np.full((HEIGHT, WIDTH), 126, np.uint8)
+    pair = [luma, np.full_like(luma, 128)]
+    stored = np.dstack(pair if code == "YUYV" else pair[::-1])
+    found = read(encoding, stored).pixels
+    assert np.ptp(found) <= 1
+    assert abs(int(found[0, 0, 0]) - round((126 - 16) * 255 / 219)) <= 1
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
+def test_planes_of_luma_and_chroma_are_put_together(encoding: str) -> None:
+    planes = np.concatenate([np.full((HEIGHT, WIDTH), 126, np.uint8), np.full((HEIGHT // 2, WIDTH), 128, np.uint8)])
+    payload = cdr_by_hand.image(STAMP, "cam", (HEIGHT, WIDTH), encoding, planes.tobytes(), WIDTH, 0)
+    found = Eye(MODEL).image(TYPES.read(payload, IMAGE)).pixels
+    assert found.shape == (HEIGHT, WIDTH, 3)
+    assert np.ptp(found) <= 1
+
+
+def test_a_colour_filter_of_sixteen_bits_is_interpolated() -> None:
+    mosaic = np.zeros((HEIGHT, WIDTH), "<u2")
+    mosaic[0::2, 0::2] = 200 << 8
+    assert read("bayer_rggb16", mosaic).pixels[2, 4].tolist() == [200, 0, 0]
+
+
+def test_a_sensor_of_twelve_bits_is_not_black_and_levels_only_widen() -> None:
+    eye = Eye(MODEL)
+
+    def seen(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+        payload = cdr_by_hand.image(STAMP, "cam", (HEIGHT, WIDTH), "mono16", pixels.tobytes(), 2 * WIDTH, 0)
+        return eye.image(TYPES.read(payload, IMAGE)).pixels[..., 0]
+
+    ramp = np.linspace(0, 4080, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype("<u2")
+    np.testing.assert_array_equal(seen(ramp), (ramp >> 4).astype(np.uint8))
+    np.testing.assert_array_equal(seen((ramp << 4).astype("<u2")), ((ramp << 4) >> 8).astype(np.uint8))
+    np.testing.assert_array_equal(seen(ramp), (ramp >> 8).astype(np.uint8))
+
+
+def test_a_live_wide_lens_is_remapped_to_a_pinhole() -> None:
+    model = lens(
+        (0.01, 0.0, 0.0, 0.0), model="equidistant", k=(50.0, 0.0, 40.0, 0.0, 50.0, 30.0, 0.0, 0.0, 1.0), size=(60, 80)
+    )
+    assert model.kind is LensKind.EQUIDISTANT
+    pixels = cv2.resize(RGB, (80, 60))
+    payload = cdr_by_hand.image(STAMP, "cam", (60, 80), "rgb8", pixels.tobytes(), 240)
+    image = Eye(model).image(TYPES.read(payload, IMAGE))
+    straightener = Straightener(model)
+    assert image.camera == straightener.camera
+    assert image.camera.width != 80
+    np.testing.assert_array_equal(image.pixels, straightener.apply(pixels))
+    narrow = Eye(model, np.radians(40.0)).image(TYPES.read(payload, IMAGE)).camera
+    assert 2 * np.degrees(np.arctan(narrow.width / 2 / narrow.fx)) == pytest.approx(40.0, abs=1.0)
+    with pytest.raises(BadMessage, match="the lens fills a pinhole of"):
+        Eye(model, np.radians(150.0))
+
+
+def test_eight_coefficients_of_a_rational_model_are_all_used() -> None:
+    D = (0.55, -2.6, 0.0007, -0.0003, 1.5, 0.43, -2.5, 1.46)
+    assert lens(D, model="rational_polynomial").distortion == D

@@ -3,7 +3,7 @@
 import pytest
 from tests.agent.runtime.ros2 import cdr_by_hand
 
-from flocc_agent.runtime.ros2.names import Node, Offer, Qos, Role, Topic, attachment, full_name, read_offer
+from flocc_agent.runtime.ros2.topics import EntityRole, Node, Offer, Qos, Topic, attachment, full_name, read_offer
 from flocc_agent.runtime.ros2.types import MessageTypes, gid_of
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -18,14 +18,14 @@ CHATTER_TOKEN = (
 def test_the_names_of_the_design_document() -> None:
     assert CHATTER.key(0) == f"0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}"
     assert TALKER.token() == "@ros2_lv/2/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/talker"
-    assert TALKER.endpoint_token(10, Role.PUBLISHES, CHATTER) == CHATTER_TOKEN
+    assert TALKER.endpoint_token(10, EntityRole.PUBLISHES, CHATTER) == CHATTER_TOKEN
 
 
 def test_names_within_a_namespace() -> None:
     node = Node(7, "ab", "/r1", "flocc_r1")
     odom = Topic(full_name("/r1", "odom"), "nav_msgs/msg/Odometry", "RIHS01_x", Qos(5, best_effort=True))
     assert odom.key(7) == "7/r1/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_x"
-    assert node.endpoint_token(3, Role.SUBSCRIBES, odom) == (
+    assert node.endpoint_token(3, EntityRole.SUBSCRIBES, odom) == (
         "@ros2_lv/7/ab/0/3/MS/%/%r1/flocc_r1/%r1%odom/nav_msgs::msg::dds_::Odometry_/RIHS01_x/2::,5:,:,:,,"
     )
     assert full_name("/r1", "/tf") == "/tf"
@@ -47,7 +47,7 @@ def test_qos_tells_only_what_differs_from_the_default(qos: Qos, told: str) -> No
 
 def test_reads_what_a_publisher_offers_and_nothing_else() -> None:
     assert read_offer(CHATTER_TOKEN) == Offer("/talker", "/chatter", "std_msgs/msg/String", STRING_HASH)
-    in_namespace = Node(0, "ab", "/r1/front", "driver").endpoint_token(1, Role.PUBLISHES, CHATTER)
+    in_namespace = Node(0, "ab", "/r1/front", "driver").endpoint_token(1, EntityRole.PUBLISHES, CHATTER)
     assert read_offer(in_namespace) == Offer("/r1/front/driver", "/chatter", "std_msgs/msg/String", STRING_HASH)
     for other in (TALKER.token(), CHATTER_TOKEN.replace("/MP/", "/MS/"), CHATTER_TOKEN + "/x", "x", ""):
         assert read_offer(other) is None

@@ -7,6 +7,7 @@ PYTHONPATH=.:protocol:agent:launch python .../store_04961b5/make.py FOLDER     #
 import asyncio
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,8 @@ async def main(folder: Path) -> None:
 
 
 def _is_merged(a: Agent, b: Agent) -> bool:
-    first, second = a.status(), b.status()
+    first: Any = a.status()  # a dictionary in that commit
+    second: Any = b.status()
     idle = not first["busy"] and not second["busy"]
     return bool(first["map_frame"] == second["map_frame"] == "map/r1" and first["logs"] == second["logs"] and idle)
 

@@ -1,0 +1,438 @@
+"""The composition root: names the concrete perception back-ends, the optimiser and the runtime.
+
+Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is imported where it is used.
+"""
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import time
+import zlib
+from collections.abc import AsyncIterator, Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend import build_iterator, build_optimiser
+from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
+from flocc_agent.core.corrected import Correction
+from flocc_agent.core.interfaces import Camera, Image, Perception
+from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
+from flocc_agent.core.reports import Fact
+from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import is_rigid
+from flocc_agent.perception.backends import build_perception
+from flocc_agent.radio import Radio
+from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
+from flocc_agent.runtime.driver import Driver
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.evidence import evidence_of
+from flocc_agent.runtime.facts import KilledByOrder
+from flocc_agent.runtime.jobs import Tools
+from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.measurement_file import Stamped
+from flocc_agent.runtime.metrics import MetricsServer
+from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.persistence import restore
+from flocc_agent.runtime.playback import play
+from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.reporting import Reporter, result_of
+from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.status import AgentStatus
+from flocc_agent.runtime.store import Store
+from flocc_agent.runtime.workers import Workers
+from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import LogId
+from flocc_protocol.keys import Admin
+
+if TYPE_CHECKING:
+    from flocc_agent.runtime.ros2.adapter import Ros2Adapter
+
+logger = logging.getLogger(__name__)
+
+Float = NDArray[np.float64]
+
+KILL_AFTER_S = 0.2
+"""Time for the answer to an operator's order to leave."""
+
+
+class Agent:
+    """One robot's agent, for the robot's own program.
+
+    Example::
+
+        async with Agent(AgentConfig(name="r1"), camera=camera) as agent:
+            await agent.add_keyframe(pixels, T_odom_body, stamp_s)      # (H, W, 3) uint8 RGB, (4, 4), seconds
+            async for correction in agent.corrections():
+                T_map_body = correction.T_map_odom @ T_odom_body
+    """
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        camera: Camera | None = None,
+        T_body_camera: Float | None = None,
+        on_report: Callable[[Reported[Fact]], None] | None = None,
+        clock_s: Callable[[], float] | None = None,
+        perception: Perception | None = None,
+    ) -> None:
+        """Prepare an agent; `async with` starts it.
+
+        Args:
+            config: Everything that can be turned.
+            camera: Intrinsics of the images; None where a recording brings its own.
+            T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
+            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
+            clock_s: Seconds since the start of the run; None counts from now.
+            perception: What it sees with; None builds what `config.perception` names.
+
+        Raises:
+            FloccError: The recording, the store, a checkpoint or the network cannot be used.
+        """
+        started_s = time.monotonic()
+        self.config = config
+        self._on_report = on_report or (lambda _: None)
+        self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
+        self._perception = perception
+        self._recording = _recording(config)
+        self._camera = self._recording.camera if self._recording else camera
+        given = np.eye(4) if T_body_camera is None else T_body_camera
+        self._T_body_camera = self._recording.T_body_camera if self._recording else given
+        self._selector = KeyframeSelector(config.keyframes)
+        self._kept = True
+        self._driver: Driver | None = None
+        self._store: Store | None = None
+        self._run: asyncio.Task[None] | None = None
+        self._playing: asyncio.Task[None] | None = None
+        self._looking: asyncio.Task[None] | None = None
+        self._ros2: Ros2Adapter | None = None
+        self._bridging: asyncio.Task[None] | None = None
+        self._radio: Radio | None = None
+        self._metrics: MetricsServer | None = None
+        self._workers: Workers | None = None
+
+    @property
+    def log(self) -> LogId:
+        """The log that this agent writes: its name and incarnation."""
+        return self._started.robot.log
+
+    async def __aenter__(self) -> "Agent":
+        """Open the store and the network, restore what the disk holds, start the loop and the playback."""
+        try:
+            self._driver = await asyncio.to_thread(self._compose)
+            if self.config.metrics.port is not None:
+                self._metrics = MetricsServer(self.config.metrics, self.config.name, self._driver.look)
+            self._run = asyncio.create_task(self._driver.run())
+            await self._driver.opened(self._run)
+        except BaseException:
+            await self._close()
+            raise
+        self._looking = asyncio.create_task(self._look_at_network())
+        if self._recording is not None:
+            self._playing = asyncio.create_task(self._play(self._recording))
+        if self._ros2 is not None:
+            self._bridging = asyncio.create_task(self._ros2.run(self._driver.subscribe()))
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Hand over, close everything; an error of the loop is raised here."""
+        assert self._run is not None
+        self.stop()
+        for task in (self._playing, self._looking):
+            if task is not None:
+                task.cancel()
+        try:
+            await self._run
+            fed = [task for task in (self._playing, self._bridging) if task is not None]
+            await asyncio.gather(*fed, return_exceptions=True)
+        finally:
+            await self._close()
+
+    async def _look_at_network(self) -> None:
+        """Say once what of the configured network is not there; the agent goes on trying."""
+        for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
+            logger.warning("%s: %s", self.config.name, fault)
+
+    async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
+        """Give the agent a keyframe; waits while too many wait for the encoder.
+
+        Args:
+            pixels: (H, W, 3) uint8, RGB, of the size that the camera says.
+            T_odom_body: (4, 4) metric odometry of the body at the time of the image.
+            stamp_s: Time of the image on the robot's clock, seconds.
+
+        Raises:
+            BadKeyframe: The pose is not finite and rigid, the image does not fit the camera, or there is no camera.
+        """
+        if self._camera is None:
+            raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
+        if not is_rigid(np.asarray(T_odom_body)) or not np.isfinite(stamp_s):
+            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: its pose is not finite and rigid")
+        try:
+            image = Image(pixels, self._camera)
+        except ValueError as error:
+            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
+        await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+        self._kept = True
+
+    async def add_frame(
+        self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float, keep: bool = False
+    ) -> bool:
+        """Give the agent any frame; it becomes a keyframe when the robot moved enough, or where `keep` says so.
+
+        Returns:
+            Whether it became one; `keep` what something was seen in.
+        """
+        if not keep and not self._selector.wants(T_odom_body):
+            self._kept = False
+            return False
+        await self.add_keyframe(pixels, T_odom_body, stamp_s)
+        self._selector.took(T_odom_body)
+        return True
+
+    def add_fix(self, position_m: Float, covariance_m2: Float, stamp_s: float | None = None) -> None:
+        """Give the agent an absolute position of the camera: `add_measurement(Fix(position_m, covariance_m2))`.
+
+        Args:
+            position_m: (3,) in a local frame such as ENU, within 1e7 m of its origin.
+            covariance_m2: (3, 3), positive definite.
+            stamp_s: Of its keyframe; None: it belongs to the one that was given last.
+
+        Raises:
+            BadMeasurement: It cannot be used, with the reason; the agent goes on without it.
+        """
+        try:
+            self.add_measurement(Fix(np.asarray(position_m), np.asarray(covariance_m2)), stamp_s)
+        except BadMeasurement as error:
+            raise self._named(error) from error
+
+    def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
+        """Give the agent what was measured at a keyframe: docs/measurements.md names the kinds.
+
+        Args:
+            measurement: One of the classes of `flocc_agent.core.measurements`; it speaks of the robot's body.
+            stamp_s: Of the keyframe that it belongs to; None: the frame that was given last.
+
+        Raises:
+            BadMeasurement: No keyframe has that stamp, or the last frame did not become one.
+        """
+        in_camera = measurement.in_camera(self._T_body_camera)
+        try:
+            if stamp_s is None and not self._kept and not isinstance(measurement, StartPose):
+                raise BadMeasurement(f"{measurement.kind}: the frame that was given last did not become a keyframe")
+            self._started.add_measurement(in_camera, stamp_s)
+        except BadMeasurement as error:
+            raise self._named(error) from error
+
+    def _named(self, error: BadMeasurement) -> BadMeasurement:
+        named = f"robot {self.config.name}: "
+        return error if str(error).startswith(named) else BadMeasurement(f"{named}{error}")
+
+    async def corrections(self) -> AsyncIterator[Correction]:
+        """Corrections as they come, the last one first; ends when the agent stops."""
+        queue = self._started.subscribe()
+        while (correction := await queue.get()) is not None:
+            yield correction
+
+    @property
+    def robot(self) -> Robot:
+        """The running core, for those who watch: to be read on the event loop's thread only, and never changed."""
+        return self._started.robot
+
+    def stop(self) -> None:
+        """Ask the agent to hand over and end."""
+        if self._driver is not None:
+            self._driver.stop()
+
+    async def finished(self) -> None:
+        """Wait until the agent stops, by `stop` or by an order.
+
+        Raises:
+            FloccError: The recording cannot be played on.
+        """
+        assert self._run is not None
+        waiting = {self._run, *(task for task in (self._playing, self._bridging) if task is not None)}
+        while self._run not in (done := (await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED))[0]):
+            waiting -= done
+            for task in done:
+                task.result()
+
+    def result(self) -> RobotResult | None:
+        """What this robot knows (`result.json`), None before it started."""
+        return None if self._driver is None else self._driver.result()
+
+    def set_radio(self, config: RadioConfig) -> None:
+        """Change the emulated links from now on."""
+        if self._radio is not None:
+            self._radio.parameters = config.parameters()
+
+    def set_slowness(self, factor: float) -> None:
+        """Make encoding, registration and optimisation take this many times as long, for tests."""
+        if self._workers is not None:
+            self._workers.slowdown = max(factor, 1.0)
+
+    def status(self) -> AgentStatus:
+        """What the agent does now, for tables and dashboards."""
+        status = self._started.status()
+        playing = self._playing is not None and not self._playing.done()
+        failure = None if self._store is None else self._store.failure
+        changed = {
+            "refused": {**status.refused, **(self._ros2.counters() if self._ros2 is not None else {})},
+            "playing": playing,
+            "busy": status.busy or playing,
+            "disk_failure": None if failure is None else str(failure),
+        }
+        return status.model_copy(update=changed)
+
+    @property
+    def _started(self) -> Driver:
+        if self._driver is None:
+            raise RuntimeError("the agent is not running; use it in 'async with'")
+        return self._driver
+
+    def _compose(self) -> Driver:
+        """Name every concrete class."""
+        config = self.config
+        self._store = _open_store(config)
+        self._workers = Workers()
+        self._radio = Radio(
+            config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())])
+        )
+        if config.ros2 is not None:
+            self._ros2 = self._adapter(config.ros2)
+        restored = restore(self._store)
+        log = self._store.identity.log
+        boot = int.from_bytes(os.urandom(6))
+        distributed = config.backend.mode is BackendMode.DISTRIBUTED
+        core_parameters = config.core.under(config.bandwidth_bytes_s)
+        core = Robot(
+            log, config.compute_class, boot, core_parameters, self._clock_s(), restored, _sealer(config), distributed
+        )
+        transport = ZenohTransport(
+            config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
+        )
+        transport.serve_admin(Admin.STATUS, self._answer_status)
+        if config.transport.chaos:
+            transport.serve_admin(Admin.CHAOS, self._disturb)
+        tools = Tools(
+            self._perception or build_perception(config.perception, config.seed),
+            build_optimiser(config.backend),
+            build_iterator(config.backend),
+            self._workers,
+            self._store,
+            transport,
+            self._clock_s,
+        )
+        return Driver(
+            core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
+        )
+
+    def _answer_status(self, _: bytes) -> bytes:
+        """Tell an operator the status, and what he may want to know of maps that have not merged."""
+        driver = self._started
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
+        status = self.status().model_dump(mode="json")
+        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
+
+    def _disturb(self, request: bytes) -> bytes:
+        """Carry out an operator's order, and say so."""
+        try:
+            order = read_order(request)
+        except BadOrder as error:
+            return str(error).encode()
+        if not order.concerns(self.config.name):
+            return b"not concerned"
+        if self._radio is not None:
+            self._radio.parameters = disturbed(self._radio.parameters, order, self._clock_s())
+        if order.kind == "slow" and order.value is not None:
+            self.set_slowness(order.value)
+        if order.kind == "kill":
+            self._on_report(Reported(self._clock_s(), self.config.name, KilledByOrder()))
+            asyncio.get_running_loop().call_later(KILL_AFTER_S, os.kill, os.getpid(), signal.SIGKILL)
+        return b"done"
+
+    async def _play(self, recording: Recording) -> None:
+        source = self.config.source
+        resumed = len(self._started.robot.gossip.logs[self.log]) > 0
+
+        async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
+            await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+
+        def measure(stamped: Stamped, frame_s: float) -> None:
+            try:
+                measurement = stamped.made(lambda stamp_s: self._started.keyframe_at(stamp_s))
+                self._started.add_measurement(measurement.in_camera(self._T_body_camera), frame_s)
+            except BadMeasurement as error:
+                logger.warning("robot %s: %s; left out", self.config.name, error)
+
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
+
+    def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
+        from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
+
+        def report(fact: Fact) -> None:
+            self._on_report(Reported(self._clock_s(), self.config.name, fact))
+
+        host = Host(
+            lambda *keyframe: self._started.add_keyframe(*keyframe),
+            lambda T_body_camera: self._started.mount_camera(T_body_camera),
+            lambda: self._started.corrected_bodies(),
+            lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
+            report,
+        )
+        return Ros2Adapter(config, self.config.name, self._selector, host)
+
+    def _on_position(self, position_m: Float) -> None:
+        if self._radio is not None:
+            self._radio.update_position(self.config.name, position_m)
+
+    async def _close(self) -> None:
+        if self._metrics is not None:
+            await self._metrics.close()
+        if self._store is not None:
+            self._store.close()
+
+
+class BadKeyframe(FloccError):
+    """A keyframe that cannot be used; the agent goes on without it."""
+
+
+def stored_result(config: AgentConfig) -> RobotResult:
+    """What a robot knew when it was killed (`result.json`), from its store."""
+    recording = _recording(config)
+    T_body_camera = np.eye(4) if recording is None else recording.T_body_camera
+    store = _open_store(config)
+    try:
+        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restore(store), _sealer(config))
+    finally:
+        store.close()
+    return result_of(robot, T_body_camera)
+
+
+def _sealer(config: AgentConfig) -> RecordSealer | None:
+    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
+
+
+def _open_store(config: AgentConfig) -> Store:
+    return Store.open(
+        None if config.folder is None else config.folder / "store",
+        config.name,
+        config.store,
+        incarnation=_drawn_incarnation() if config.incarnation is None else config.incarnation,
+        incarnation_after_loss=_drawn_incarnation(),
+    )
+
+
+def _recording(config: AgentConfig) -> Recording | None:
+    path = config.source.recording
+    return None if path is None else Recording.open(path)
+
+
+def _drawn_incarnation() -> int:
+    """A number that no earlier life of this robot had: the wall clock, in milliseconds."""
+    return time.time_ns() // 1_000_000

@@ -1,0 +1,18 @@
+"""What a closure of learned features needs, by model; docs/learned.md has the scenes and what is kept of them.
+
+XFeat's numbers are fitted, ALIKED's set by hand, about as strict.
+
+Their wrong pairs have as many correspondences as right ones (repeated facades, the other side of a street), but the
+odometry neighbour contradicts them, so it is asked nearly always.
+"""
+
+from flocc_agent.perception.multiview.acceptance import NEVER, Acceptance, Needed
+from flocc_agent.perception.multiview.view_parameters import Geometry
+
+GEOMETRY = Geometry()
+NO_RATIO = float("inf")
+"""Eq. (1) alone suffices nowhere: with a poor odometry pair ALIKED's wrong pairs reach 2.7."""
+ACCEPTANCE = {
+    "aliked-lightglue": Acceptance(Needed(60, 40, 0.0087), Needed(NEVER, 60, 0.007), NO_RATIO),
+    "xfeat-lighterglue": Acceptance(Needed(NEVER, 60, 0.0087), Needed(NEVER, 60, 0.007), 0.4),
+}

@@ -1,0 +1,174 @@
+"""The work that effects ask for: each job takes an effect and returns the event that answers it.
+
+A job runs beside the loop and computes in a worker, so that the loop stays free. It touches neither the core nor the
+inbox; whatever fails becomes the event that says so.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from flocc_agent.core.blocks import BlockProblem, BlockStep
+from flocc_agent.core.effects import Encode, FetchLatent, IterateBlock, Optimise, Register
+from flocc_agent.core.events import (
+    BlockIterated,
+    BlockIterationFailed,
+    Event,
+    GraphOptimisationFailed,
+    GraphOptimised,
+    KeyframeEncoded,
+    KeyframeEncodingFailed,
+    LatentFetched,
+    LatentFetchFailed,
+    LatentMissing,
+    PairRegistered,
+)
+from flocc_agent.core.interfaces import Image, OdometryPair, Perception
+from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
+from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
+from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.store import Store
+from flocc_agent.runtime.transport import Fetched, Transport
+from flocc_agent.runtime.workers import Workers, WorkFailed
+from flocc_agent.stages import stage
+from flocc_protocol.arrays import Array
+
+IMAGES_MAX = 8
+
+Job = Encode | FetchLatent | Register | Optimise | IterateBlock
+"""An effect that takes time and is answered by an event."""
+
+
+class ImageSlots:
+    """Images that wait for the encoder, at most `IMAGES_MAX`."""
+
+    def __init__(self) -> None:
+        self._images: dict[int, Image] = {}
+        self._count = 0
+        self._free = asyncio.Semaphore(IMAGES_MAX)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    async def put(self, image: Image) -> int:
+        """Keep an image, once there is room; gives its number."""
+        await self._free.acquire()
+        self._count += 1
+        self._images[self._count] = image
+        return self._count
+
+    @contextmanager
+    def taken(self, number: int) -> Iterator[Image]:
+        """The image of a number; its slot is free afterwards."""
+        try:
+            yield self._images[number]
+        finally:
+            del self._images[number]
+            self._free.release()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tools:
+    """What jobs work with.
+
+    Attributes:
+        perception: What images are seen with.
+        optimise: Pose graph and last solution to a solution; must be importable by a worker process.
+        iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
+        workers: Pools off the loop.
+        store: Holds latents.
+        transport: Fetches latents.
+        clock_s: Seconds since the start of the run.
+        images: Those that wait for the encoder.
+    """
+
+    perception: Perception
+    optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
+    iterate: Callable[[BlockProblem], BlockStep | OptimisationFailed]
+    workers: Workers
+    store: Store
+    transport: Transport
+    clock_s: Callable[[], float]
+    images: ImageSlots = field(default_factory=ImageSlots)
+
+
+def job_of(effect: Job, tools: Tools) -> Coroutine[Any, Any, Event]:
+    """The job that an effect asks for, not yet begun."""
+    match effect:
+        case Encode():
+            return encode(effect, tools)
+        case FetchLatent():
+            return fetch(effect, tools)
+        case Register():
+            return register(effect, tools)
+        case Optimise():
+            return optimise(effect, tools)
+        case IterateBlock():
+            return iterate(effect, tools)
+
+
+async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEncodingFailed:
+    """Describe and encode an image; its latent is in the store before the core hears of it."""
+    with tools.images.taken(effect.image) as image:
+        result = await tools.workers.run("encode", _described_and_encoded, tools.perception, image)
+    if isinstance(result, WorkFailed):
+        return KeyframeEncodingFailed(effect.keyframe, result.reason)
+    descriptor, latent = result.value
+    await asyncio.to_thread(tools.store.put_latent, effect.keyframe, latent)
+    return KeyframeEncoded(effect.keyframe, descriptor)
+
+
+def _described_and_encoded(perception: Perception, image: Image) -> tuple[Array, bytes]:
+    """An image's descriptor and latent; the worker counts the time of both."""
+    with stage("describe"):
+        descriptor = perception.describe(image)
+    with stage("encode"):
+        return descriptor, perception.encode(image)
+
+
+async def fetch(effect: FetchLatent, tools: Tools) -> LatentFetched | LatentFetchFailed:
+    """Bring a latent of another robot into the store."""
+    keyframe, holder = effect.keyframe, effect.holder
+    encode_s, began_s = tools.perception.encode_s(), tools.clock_s()
+    answer = await tools.transport.fetch_latent(holder, str(keyframe), effect.deadline_s, encode_s=encode_s)
+    if not isinstance(answer, Fetched):
+        return LatentFetchFailed(keyframe, holder, answer.problem.value)
+    tools.workers.stages.observe("fetch", tools.clock_s() - began_s)
+    await asyncio.to_thread(tools.store.put_latent, keyframe, answer.latent)
+    return LatentFetched(keyframe, holder)
+
+
+async def register(effect: Register, tools: Tools) -> PairRegistered | LatentMissing:
+    """Register two latents of the store, with the query's odometry pair for Eqs. (1) and (6)."""
+    keyframes = (effect.query, effect.match, effect.neighbour)
+    query, match, neighbour = await asyncio.to_thread(lambda: [tools.store.latent(k) for k in keyframes])
+    if query is None or match is None or neighbour is None:
+        return LatentMissing(effect.pair, keyframes[[query, match, neighbour].index(None)])
+    T_neighbour_query = pose_from_tq(np.array(effect.T_neighbour_query))
+    pair = OdometryPair(neighbour, T_neighbour_query, f"{effect.neighbour} {effect.query}")
+    result = await tools.workers.run("register", tools.perception.register, query, match, pair)
+    if isinstance(result, WorkFailed):
+        return PairRegistered(effect.pair, RegistrationFailed(RegistrationFailure.CRASHED, result.reason))
+    return PairRegistered(effect.pair, result.value)
+
+
+async def optimise(effect: Optimise, tools: Tools) -> GraphOptimised | GraphOptimisationFailed:
+    """Optimise a pose graph in the solver's process."""
+    result = await tools.workers.run("optimise", tools.optimise, effect.graph, effect.initial)
+    solution = result if isinstance(result, WorkFailed) else result.value
+    if isinstance(solution, (WorkFailed, OptimisationFailed)):
+        return GraphOptimisationFailed(effect.term, effect.round, solution.reason)
+    return GraphOptimised(effect.term, effect.round, solution)
+
+
+async def iterate(effect: IterateBlock, tools: Tools) -> BlockIterated | BlockIterationFailed:
+    """Iterate once on the own block in the solver's process."""
+    result = await tools.workers.run("optimise", tools.iterate, effect.problem)
+    step = result if isinstance(result, WorkFailed) else result.value
+    if isinstance(step, (WorkFailed, OptimisationFailed)):
+        return BlockIterationFailed(effect.number, step.reason)
+    return BlockIterated(effect.number, step)

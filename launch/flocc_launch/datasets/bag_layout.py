@@ -1,0 +1,365 @@
+"""Which topics of a bag belong together: camera, its CameraInfo, odometry, and where the camera sits on the body.
+
+Topics belong together by namespace, and frames by `frame_id`: a bag of several robots has the same topics under a
+namespace each. The mounting is the chain of static transforms from the body that odometry moves to the frame of the
+images, as a live agent takes it. Odometry may be a topic of poses, or an edge of `/tf`. What cannot be told is refused
+with what there is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.runtime.ros2.static_frames import StaticFrames
+from flocc_agent.runtime.ros2.types import BadMessage
+from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES, stamp_ns
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
+from flocc_launch.datasets.source import DatasetError
+
+Float = NDArray[np.float64]
+
+TRANSFORMS_READ_MAX = 2000
+FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
+TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk")
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """What the first message of a topic says.
+
+    Attributes:
+        frame: Its `frame_id`, without a leading slash.
+        child: The frame that it moves, or "".
+        stamp_ns: In its header.
+        bag_ns: When it was recorded.
+        coding: Encoding or format of an image.
+    """
+
+    frame: str
+    child: str
+    stamp_ns: int
+    bag_ns: int
+    coding: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSource:
+    """Where odometry comes from.
+
+    Attributes:
+        topic: Of poses, or of transforms.
+        edge: Of a topic of transforms, the parent's and the child's frame.
+    """
+
+    topic: BagTopic
+    edge: tuple[str, str] | None = None
+
+    def __str__(self) -> str:
+        return self.topic.name if self.edge is None else f"{self.topic.name}:{self.edge[0]}.{self.edge[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class RobotTopics:
+    """One robot's part of a bag.
+
+    Attributes:
+        name: Its namespace, or "" where the bag is one robot's.
+        image: BagTopic of its camera.
+        info: BagTopic of the camera's intrinsics, or None.
+        poses: Odometry, or None.
+    """
+
+    name: str
+    image: BagTopic
+    info: BagTopic | None
+    poses: PoseSource | None
+
+    def __str__(self) -> str:
+        info = self.info.name if self.info else "none"
+        return (
+            f"{self.name or 'the robot'}: images {self.image.name}, intrinsics {info}, odometry {self.poses or 'none'}"
+        )
+
+
+@dataclass(slots=True, eq=False)
+class Layout:
+    """A bag's topics with what their first messages say, and its transforms."""
+
+    bag: Bag
+    static: StaticFrames = field(default_factory=StaticFrames)
+    edges: dict[tuple[str, str], str] = field(default_factory=dict)
+    has_static: bool = False
+    left_out: list[str] = field(default_factory=list)
+    _heads: dict[str, Head | None] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, bag: Bag) -> "Layout":
+        """Read the transforms of a bag."""
+        layout = cls(bag)
+        for topic in bag.topics.values():
+            if topic.type in TRANSFORMS_TYPES:
+                layout._read_transforms(topic)
+        return layout
+
+    def _read_transforms(self, topic: BagTopic) -> None:
+        is_static = topic.name.rsplit("/", 1)[-1] == "tf_static"
+        for number, (_, _, raw) in enumerate(self.bag.raw([topic.name])):
+            if number >= TRANSFORMS_READ_MAX:
+                break
+            try:
+                message = self.bag.decoded(raw, topic)
+                if is_static:
+                    self.static.add(message)
+                    self.has_static = True
+            except (DatasetError, BadMessage):
+                continue
+            if not is_static:
+                for each in message.transforms:
+                    edge = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
+                    self.edges.setdefault(edge, topic.name)
+
+    def head(self, topic: BagTopic) -> Head | None:
+        """What a topic's first message says, or None where it has none."""
+        if topic.name not in self._heads:
+            found = self.bag.first(topic.name)
+            self._heads[topic.name] = None if found is None else _head(found[0], found[1])
+        return self._heads[topic.name]
+
+    def robots(self) -> list[RobotTopics]:
+        """The robots of a bag: one, or one of each namespace that has images and odometry of its own.
+
+        Raises:
+            DatasetError: It is not clear which topics to take.
+        """
+        images = self._of_types(IMAGE_TYPES)
+        groups = _by_namespace([topic.name for topic in images])
+        parts = {name: [topic for topic in images if topic.name in topics] for name, topics in groups.items()}
+        found = {name: self._poses_of(name, group) for name, group in parts.items()}
+        own = {name: poses for name, poses in found.items() if poses is not None}
+        if len(own) > 1 and len({str(poses) for poses in own.values()}) == len(own):
+            self.left_out = [
+                f"{name} has images but no odometry of its own, and is left out" for name in found if name not in own
+            ]
+            return [self._robot(name, parts[name], poses) for name, poses in own.items()]
+        return [self._robot("", images, None)]
+
+    def _of_types(self, types: Sequence[str]) -> list[BagTopic]:
+        return [topic for topic in self.bag.topics.values() if topic.type in types]
+
+    def _poses_of(self, name: str, images: list[BagTopic]) -> PoseSource | None:
+        own = [t for t in self._of_types(POSE_TYPES) if name in t.name.strip("/").split("/")[:-1]]
+        if len(own) == 1:
+            return PoseSource(own[0])
+        return None if own else self.edge_of(images[0])
+
+    def _robot(self, name: str, images: list[BagTopic], poses: PoseSource | None) -> RobotTopics:
+        image = self.chosen_image(images)
+        return RobotTopics(name, image, self.info_of(image), poses or self.chosen_poses(image))
+
+    def chosen_image(self, images: list[BagTopic], name: str | None = None) -> BagTopic:
+        """The camera's topic: the named one, or the only one that holds pictures.
+
+        Raises:
+            DatasetError: It is not there or of another type, or it is not clear which.
+        """
+        if name is not None:
+            return named(self.bag, IMAGE_TYPES, name)
+        kept = [topic for topic in images if not self._is_depth(topic)]
+        if images and not kept:
+            raise DatasetError(f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}")
+        by_base: dict[str, BagTopic] = {}
+        for topic in kept:
+            base = topic.name.removesuffix("/compressed")
+            best = by_base.get(base)
+            if best is None or (topic.count or 0) >= (best.count or 0):
+                by_base[base] = topic
+        if len(by_base) > 1 and (left := _left_of(by_base)) is not None:
+            return left
+        return only(self.bag, list(by_base.values()), "image", "--image-topic")
+
+    def _is_depth(self, topic: BagTopic) -> bool:
+        leaf = topic.name.rsplit("/", 1)[-1]
+        if leaf in ("compressedDepth", "theora"):
+            return True
+        head = self.head(topic)
+        return head is not None and head.coding.split(";")[0].strip() in ("16UC1", "32FC1")
+
+    def info_of(self, image: BagTopic) -> BagTopic | None:
+        """The CameraInfo of an image topic: of its namespace, else of its frame, else the only one; None where unclear.
+
+        Raises:
+            DatasetError: The one beside the images is of another frame.
+        """
+        infos = self._of_types((CAMERA_TYPE,))
+        base = image.name.removesuffix("/compressed")
+        near = [t for t in infos if t.name in (f"{base}/camera_info", f"{_parent(base)}/camera_info")]
+        near = near or [t for t in infos if _parent(t.name) == _parent(base)]
+        framed = [t for t in infos if self._frame(t) and self._frame(t) == self._frame(image)]
+        if len(near) == 1:
+            if self._frame(near[0]) and self._frame(image) and self._frame(near[0]) != self._frame(image):
+                raise DatasetError(
+                    f"{self.bag.path}: {near[0].name} is of frame {self._frame(near[0])}, but {image.name} of "
+                    f"{self._frame(image)}; name a camera file with --camera"
+                )
+            return near[0]
+        if len(framed) == 1:
+            return framed[0]
+        unframed = [t for t in infos if not (self._frame(t) and self._frame(image))]
+        related = [t for t in infos if len(_by_namespace([image.name, t.name])) == 1]
+        return infos[0] if len(infos) == 1 and (unframed or related) else None
+
+    def _frame(self, topic: BagTopic) -> str:
+        head = self.head(topic)
+        return head.frame if head else ""
+
+    def chosen_poses(self, image: BagTopic, name: str | None = None) -> PoseSource | None:
+        """Odometry: the named topic or `TOPIC:PARENT.CHILD`, the only topic of poses, or an edge of /tf.
+
+        Raises:
+            DatasetError: It is not there or of another type, or it is not clear which.
+        """
+        if name is not None and ":" in name:
+            return self._named_edge(name)
+        if name is not None:
+            return PoseSource(named(self.bag, POSE_TYPES, name))
+        candidates = self._of_types(POSE_TYPES)
+        own = [t for t in candidates if not any(word in t.name.lower() for word in TRUTH_WORDS)] or candidates
+        odometry = [t for t in own if t.type == "nav_msgs/msg/Odometry"]
+        if len(own) == 1 or len(odometry) == 1:
+            return PoseSource((odometry or own)[0])
+        return None if own else self.edge_of(image)
+
+    def other_poses(self, robot: RobotTopics) -> list[str]:
+        """Topics of poses in a robot's namespace that are not taken as its odometry."""
+        if robot.poses is None:
+            return []
+        return [
+            topic.name
+            for topic in self._of_types(POSE_TYPES)
+            if topic != robot.poses.topic and (not robot.name or robot.name in topic.name.strip("/").split("/"))
+        ]
+
+    def _named_edge(self, name: str) -> PoseSource:
+        topic_name, _, frames = name.partition(":")
+        topic = named(self.bag, TRANSFORMS_TYPES, topic_name)
+        found = [edge for edge in self.edges if ".".join(edge) == frames and self.edges[edge] == topic.name]
+        if not found:
+            edges = ", ".join(f"{topic.name}:{a}.{b}" for a, b in sorted(self.edges))
+            raise DatasetError(f"{self.bag.path}: has no transform {name}; there are {edges or 'none'}")
+        return PoseSource(topic, found[0])
+
+    def edge_of(self, image: BagTopic) -> PoseSource | None:
+        """The transform that moves the body on which the camera is mounted, or None."""
+        camera = self._frame(image)
+        moving = [edge for edge in self.edges if self.static.between(edge[1], camera) is not None or edge[1] == camera]
+        if not moving:
+            moving = [
+                e for e in self.edges if e[0].rsplit("/", 1)[-1] in FIXED_FRAMES and (e[1], e[0]) not in self.edges
+            ]
+            moving = [e for e in moving if e[1].rsplit("/", 1)[-1] not in FIXED_FRAMES]
+        if len(moving) != 1:
+            return None
+        return PoseSource(self.bag.topics[self.edges[moving[0]]], moving[0])
+
+    def mounting(self, robot: RobotTopics) -> tuple[Float, str | None]:
+        """`T_body_camera`, and a sentence where nothing says it.
+
+        Raises:
+            DatasetError: The bag has transforms, but none from the body to the camera.
+        """
+        camera = self._frame(robot.image)
+        body = self._body(robot.poses)
+        if camera == body and camera:
+            return np.eye(4), None
+        T_body_camera = self.static.between(body, camera) if body and camera else None
+        if T_body_camera is not None:
+            return T_body_camera, None
+        if body and camera and self.has_static:
+            raise DatasetError(
+                f"{self.bag.path}: no chain of static transforms leads from {body}, which {robot.poses} moves, to "
+                f"{camera}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
+            )
+        return np.eye(4), (
+            f"{self.bag.path}: nothing says where the camera ({camera or 'no frame'}) sits on the body "
+            f"({body or 'no frame'}); they are taken as one: name a camera file with T_body_camera (--camera) if not"
+        )
+
+    def _body(self, poses: PoseSource | None) -> str:
+        if poses is None:
+            return ""
+        if poses.edge is not None:
+            return poses.edge[1]
+        head = self.head(poses.topic)
+        return head.child if head else ""
+
+
+def _head(bag_ns: int, message: Any) -> Head:
+    header = getattr(message, "header", None)
+    if header is None:
+        return Head("", "", bag_ns, bag_ns)
+    poses = getattr(message, "poses", None)
+    stamped = poses[-1].header if poses is not None and len(poses) else header
+    coding = getattr(message, "encoding", None) or getattr(message, "format", None) or ""
+    child = getattr(message, "child_frame_id", "").lstrip("/")
+    return Head(header.frame_id.lstrip("/"), child, stamp_ns(stamped), bag_ns, coding)
+
+
+def _parent(name: str) -> str:
+    return name.rsplit("/", 1)[0]
+
+
+def _by_namespace(names: Sequence[str]) -> dict[str, list[str]]:
+    """Topics by the first part of their names in which they differ; leaves do not count."""
+    parts = {name: name.strip("/").split("/")[:-1] for name in names}
+    depth = 0
+    while parts and all(len(p) > depth for p in parts.values()) and len({p[depth] for p in parts.values()}) == 1:
+        depth += 1
+    groups: dict[str, list[str]] = {}
+    for name, words in parts.items():
+        groups.setdefault(words[depth] if len(words) > depth else "", []).append(name)
+    return groups
+
+
+def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
+    """The left one of two cameras whose names differ in nothing else."""
+    lefts = [name for name in topics if "left" in name.lower()]
+    if len(topics) == 2 and len(lefts) == 1:
+        other = next(name for name in topics if name != lefts[0])
+        if lefts[0].lower().replace("left", "right") == other.lower():
+            return topics[lefts[0]]
+    return None
+
+
+def named(bag: Bag, types: Sequence[str], name: str) -> BagTopic:
+    """The topic of a name.
+
+    Raises:
+        DatasetError: It is not there, or of another type.
+    """
+    topic = bag.topics.get(name)
+    if topic is None:
+        raise DatasetError(f"{bag.path}: has no topic {name}; it has {listed(list(bag.topics.values()))}")
+    if topic.type not in types:
+        raise DatasetError(f"{bag.path}: topic {name} is of type {topic.type}, not one of {', '.join(types)}")
+    return topic
+
+
+def only(bag: Bag, fitting: list[BagTopic], what: str, option: str) -> BagTopic:
+    """The only topic that fits.
+
+    Raises:
+        DatasetError: There is none, or there are several.
+    """
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise DatasetError(f"{bag.path}: has {len(fitting)} {what} topics, name one with {option}: {listed(fitting)}")
+    raise DatasetError(f"{bag.path}: has no {what} topic; it has {listed(list(bag.topics.values()))}")
+
+
+def listed(topics: list[BagTopic]) -> str:
+    """Topics as a sentence has them."""
+    return ", ".join(str(topic) for topic in topics[:12]) + (" and others" if len(topics) > 12 else "") or "no topic"

@@ -1,0 +1,52 @@
+"""What the world does to a command (a full disk, a folder of somebody else, an odd locale), as one sentence."""
+
+import errno
+import os
+import sqlite3
+import sys
+from io import TextIOWrapper
+
+from flocc_protocol.errors import FloccError
+
+ADVICE = {
+    errno.ENOSPC: "the disk is full; what was written before is kept: free some room, or choose another folder (--out)",
+    errno.EDQUOT: "your share of the disk is used up: free some room, or choose another folder (--out)",
+    errno.EROFS: "the disk is read-only: choose another folder (--out, FLOCC_CACHE)",
+    errno.EACCES: "permission denied: choose a folder of your own (--out, FLOCC_CACHE)",
+    errno.EPERM: "permission denied: choose a folder of your own (--out, FLOCC_CACHE)",
+    errno.EMFILE: "too many files are open: raise the limit (ulimit -n)",
+    errno.ENFILE: "too many files are open on this machine",
+}
+
+
+def speak_utf8() -> None:
+    """See that names and messages are UTF-8 whatever the locale says; where it is not, Python is started anew."""
+    if sys.getfilesystemencoding().lower() != "utf-8" and not sys.flags.utf8_mode:
+        os.environ["PYTHONUTF8"] = "1"
+        sys.stdout.flush()
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def sentence_of(error: BaseException) -> str | None:
+    """What a user is told of an error, or None where it is a bug."""
+    if isinstance(error, BaseExceptionGroup):
+        sentences = [sentence_of(each) for each in error.exceptions]
+        return None if None in sentences else next(iter(sentences), None)
+    if isinstance(error, FloccError):
+        return str(error)
+    if isinstance(error, OSError):
+        return _os_sentence(error)
+    if isinstance(error, UnicodeError):
+        return f"a text cannot be read or written: {error}"
+    if isinstance(error, sqlite3.OperationalError):
+        return f"a store cannot be used: {error}"
+    return None
+
+
+def _os_sentence(error: OSError) -> str:
+    told = ADVICE.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+    names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
+    return f"{' and '.join(names)}: {told}" if names else told

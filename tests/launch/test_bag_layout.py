@@ -1,0 +1,229 @@
+"""Topics, frames and clocks of a bag belong together as the bag says, or the bag is refused with what there is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.launch.bag_fixtures import ZERO_NS, BagScript, walking
+
+from flocc_agent.runtime.recording import Recording
+from flocc_launch.datasets.commands import convert, info, infos
+from flocc_launch.datasets.journeys import JourneyWatch
+from flocc_launch.datasets.source import DatasetError
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_scenario
+
+S = 10**9
+FORWARD = (-0.5, 0.5, -0.5, 0.5)
+
+
+def mounted(script: BagScript, body: str = "body") -> BagScript:
+    """The camera 0.2 m ahead and 0.3 m up, looking forward, by way of its housing."""
+    script.transform("/tf_static", ZERO_NS, (body, "housing"), (0.2, 0.0, 0.3))
+    script.transform("/tf_static", ZERO_NS, ("housing", "camera"), q_xyzw=FORWARD)
+    script.messages.sort(key=lambda message: message[2])
+    return script
+
+
+@pytest.mark.parametrize("ros1", [False, True])
+def test_the_mounting_is_the_chain_of_static_transforms(tmp_path: Path, ros1: bool) -> None:
+    bag = mounted(walking(ros1)).write(tmp_path / ("run.bag" if ros1 else "run"), "bag" if ros1 else "mcap")
+    T = Recording.open(convert(bag, tmp_path / "out")).T_body_camera
+    expected = np.array([[0, 0, 1, 0.2], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+    np.testing.assert_allclose(T, expected, atol=1e-9)
+
+
+def test_transforms_that_do_not_reach_the_camera_are_refused(tmp_path: Path) -> None:
+    bag = mounted(walking(False), "trailer").write(tmp_path / "run", "db3")
+    with pytest.raises(
+        DatasetError, match="no chain of static transforms leads from body, which /odom moves, to camera"
+    ):
+        convert(bag, tmp_path / "out")
+    assert "no chain of static transforms" in info(bag).faults[0]
+
+
+def test_a_bag_that_says_nothing_of_the_mounting_is_told_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    convert(walking(False).write(tmp_path / "run", "db3"), tmp_path / "out")
+    assert "nothing says where the camera (camera) sits on the body (body)" in caplog.text
+
+
+def test_odometry_may_be_transforms_alone(tmp_path: Path) -> None:
+    script = walking(False, odometry=None)
+    for k in range(11):
+        stamp_ns = ZERO_NS + k * S // 2
+        script.transform("/tf", stamp_ns, ("map", "odom"), (100.0, 0.0, 0.0))
+        script.transform("/tf", stamp_ns, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+        script.transform("/tf", stamp_ns, ("body", "wheel"), q_xyzw=(0.0, 1.0, 0.0, 0.0))
+    bag = mounted(script).write(tmp_path / "run", "mcap")
+    assert "odometry /tf:odom.body" in info(bag).robots[0]
+    frames = Recording.open(convert(bag, tmp_path / "out")).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])
+    named = convert(bag, tmp_path / "named", odometry_topic="/tf:odom.body")
+    assert len(Recording.open(named).frames) == 5
+    with pytest.raises(DatasetError, match=r"has no transform /tf:odom.base; there are /tf:body.wheel, /tf:map.odom"):
+        convert(bag, tmp_path / "other", odometry_topic="/tf:odom.base")
+
+
+def team() -> BagScript:
+    """Two robots with cameras, intrinsics and odometry under their namespaces."""
+    script = BagScript(False)
+    for number, name in enumerate(("Alpha", "bob_2")):
+        script.frame, script.child = f"{name}/camera", f"{name}/camera"
+        script.camera_info(f"/{name}/cam/camera_info", ZERO_NS)
+        for k in range(4):
+            script.odometry(f"/{name}/odom", ZERO_NS + k * S, float(10 * number + k))
+            script.compressed(f"/{name}/cam/image/compressed", ZERO_NS + k * S, 50 + number)
+            script.raw(f"/{name}/depth/image", ZERO_NS + k * S, np.zeros((4, 4), np.uint16), "16UC1")
+    script.messages.sort(key=lambda message: message[2])
+    return script
+
+
+def test_a_bag_of_two_robots_becomes_two_recordings(tmp_path: Path) -> None:
+    bag = team().write(tmp_path / "team", "mcap")
+    convert(bag, tmp_path / "out")
+    found = {name: Recording.open(tmp_path / "out" / name) for name in ("alpha", "bob_2")}
+    assert [recording.frames[0].T_odom_body[0, 3] for recording in found.values()] == [0.0, 10.0]
+    assert [len(recording.frames) for recording in found.values()] == [4, 4]
+    assert (
+        info(bag).robots[0].startswith("Alpha: images /Alpha/cam/image/compressed, intrinsics /Alpha/cam/camera_info")
+    )
+
+
+def test_a_bag_of_two_robots_is_launched_as_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    told: list[str] = []
+    scenario = read_scenario(str(team().write(tmp_path / "team", "db3")), {}, tell=told.append)
+    assert scenario.names() == ["alpha", "bob_2"]
+    assert "Alpha: images /Alpha/cam/image/compressed, " in told[0]
+    paths = recordings(scenario)
+    assert [Recording.open(path).frames[0].T_odom_body[0, 3] for path in paths.values()] == [0.0, 10.0]
+
+
+def test_the_left_camera_of_two_is_taken(tmp_path: Path) -> None:
+    script = walking(False, image="/left/image/compressed")
+    script.camera_info("/left/camera_info", ZERO_NS)
+    script.compressed("/right/image/compressed", ZERO_NS)
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    assert "/left/image/compressed" in (tmp_path / "out" / "source.txt").read_text()
+
+
+def test_intrinsics_of_another_frame_are_refused(tmp_path: Path) -> None:
+    script = walking(False)
+    script.messages = [message for message in script.messages if message[0] != "/cam/camera_info"]
+    script.frame = "other_camera"
+    script.camera_info("/cam/camera_info", ZERO_NS)
+    with pytest.raises(DatasetError, match="camera_info is of frame other_camera, but /cam/image/compressed of camera"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("image_ns", "odometry_ns", "note"),
+    [
+        (lambda ns: ns - ZERO_NS + 512 * S, lambda ns: ns, "are stamped by clocks -1599999488.000 s apart"),
+        (lambda ns: 0, lambda ns: 0, "stamps of /cam/image/compressed, /odom are zero"),
+        (lambda ns: ns, lambda ns: 0, "stamps of /odom are zero"),
+    ],
+)
+def test_two_clocks_are_brought_together_by_the_recorders(  # type: ignore[no-untyped-def]
+    tmp_path: Path, image_ns, odometry_ns, note: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = walking(False)
+    for topic, _, stamp_ns, message in script.messages:
+        changed = odometry_ns(stamp_ns) if topic == "/odom" else image_ns(stamp_ns)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(changed, S)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])
+    assert note in caplog.text
+
+
+def test_odometry_that_begins_anew_is_another_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = BagScript(False)
+    script.camera_info("/cam/camera_info", ZERO_NS)
+    for k in range(40):
+        script.odometry("/odom", ZERO_NS + k * S // 10, 0.2 * (k if k < 20 else k - 20))
+        script.compressed("/cam/image/compressed", ZERO_NS + k * S // 10)
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    first, second = (Recording.open(tmp_path / name) for name in ("out", "out-2"))
+    assert [frame.T_odom_body[0, 3] for frame in first.frames[-2:]] == pytest.approx([3.6, 3.8])
+    assert [frame.T_odom_body[0, 3] for frame in second.frames[:2]] == pytest.approx([0.2, 0.4], abs=0.21)
+    assert len(first.frames) + len(second.frames) >= 38
+    assert "odometry begins anew at 1600000002.000 s" in caplog.text
+
+
+def test_a_single_pose_that_jumps_is_left_out() -> None:
+    watch = JourneyWatch()
+    xs_m = [0.0, 0.1, 0.2, 9.0, 0.4, 0.5]
+    taken = [out for k, x in enumerate(xs_m) for out in watch.take(k * S // 20, (x, 0, 0, 0, 0, 0, 1))]
+    assert [numbers[0] for _, _, numbers in taken] == [0.0, 0.1, 0.2, 0.4, 0.5]
+    assert (watch.outliers, any(is_new for is_new, _, _ in taken)) == (1, False)
+
+
+def test_a_robot_that_drives_home_stays_on_its_journey() -> None:
+    watch = JourneyWatch()
+    xs_m = [0.0, 1.0, 2.0, 1.0, 0.0, 1.0]
+    taken = [out for k, x in enumerate(xs_m) for out in watch.take(k * S, (x, 0, 0, 0, 0, 0, 1))]
+    assert [(is_new, numbers[0]) for is_new, _, numbers in taken] == [(False, x) for x in xs_m]
+
+
+def write_parts(folder: Path, times: list[range]) -> Path:
+    folder.mkdir()
+    for number, seconds in enumerate(times):
+        script = BagScript(True)
+        script.camera_info("/cam/camera_info", ZERO_NS + seconds[0] * S)
+        for k in seconds:
+            script.odometry("/odom", ZERO_NS + k * S, float(k))
+            script.compressed("/cam/image/compressed", ZERO_NS + k * S)
+        script.write(folder / f"drive_{number}.bag")
+    return folder
+
+
+def test_parts_of_a_ros1_recording_are_one_robot(tmp_path: Path) -> None:
+    folder = write_parts(tmp_path / "robot", [range(0, 3), range(3, 6), range(6, 9)])
+    assert info(folder).images == 9
+    assert len(Recording.open(convert(folder, tmp_path / "out")).frames) == 9
+    assert read_scenario(str(folder), {}).dataset is not None
+
+
+def test_bags_of_the_same_time_are_a_robot_each(tmp_path: Path) -> None:
+    folder = write_parts(tmp_path / "team", [range(0, 6), range(1, 6)])
+    assert read_scenario(str(folder), {}).names() == ["drive_0", "drive_1"]
+    assert [found.images for found in infos(folder)] == [6, 5]
+
+
+@pytest.mark.parametrize("topic", ["/odom", "/cam/image/compressed"])
+def test_one_stamp_in_the_future_costs_itself(tmp_path: Path, topic: str, caplog: pytest.LogCaptureFixture) -> None:
+    script = walking(False, 20)
+    [message for name, _, _, message in script.messages if name == topic][5].header.stamp.sec = 2**31 - 1
+    recording = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out"))
+    assert len(recording.frames) == (20 if topic == "/odom" else 19)
+    assert f"{topic}: 1 of {40 if topic == '/odom' else 20} messages were left out: the stamp is zero" in caplog.text
+
+
+def test_a_robot_without_odometry_is_left_out_of_a_team(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = team()
+    for k in range(4):
+        script.compressed("/carol/cam/image/compressed", ZERO_NS + k * S)
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["alpha", "bob_2"]
+    assert "carol has images but no odometry of its own, and is left out" in caplog.text
+
+
+def test_other_topics_of_poses_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = walking(False)
+    script.pose_stamped("/vio/pose", ZERO_NS + S, 1.0)
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    assert "odometry is /odom; not taken: /vio/pose (--odometry-topic)" in caplog.text
+
+
+@pytest.mark.parametrize("spoil", ["empty storage", "no storage", "broken metadata"])
+def test_a_broken_ros_2_folder_is_one_sentence(tmp_path: Path, spoil: str) -> None:
+    bag = walking(False).write(tmp_path / "run", "db3")
+    if spoil == "broken metadata":
+        (bag / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: [\n")
+    elif spoil == "no storage":
+        next(bag.glob("*.db3")).unlink()
+    else:
+        next(bag.glob("*.db3")).write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"run: (cannot be opened|is damaged or cut off): ") as caught:
+        convert(bag, tmp_path / "out")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,188 @@
+"""What the world does to a command is one sentence with exit code 2: homes, disks, locales, networks."""
+
+import errno
+import os
+import socket
+import sqlite3
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from flocc_agent.config import TransportConfig
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.core.reports import Fact
+from flocc_agent.runtime import network_faults as network
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.facts import AgentStopped
+from flocc_agent.runtime.recording import write_camera
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_launch.commands import main as command_line
+from flocc_launch.datasets import writer
+from flocc_launch.doctor.installation import surroundings
+from flocc_launch.setup import cache
+from flocc_launch.setup.cache import CacheError, cache_folder
+from flocc_launch.setup.world_faults import sentence_of
+from flocc_launch.swarm.agent_process import Lines
+from flocc_protocol.errors import FloccError
+
+
+def write_plain(path: Path, count: int = 4) -> Path:
+    (path / "images").mkdir(parents=True)
+    for k in range(count):
+        cv2.imwrite(str(path / "images" / f"{100 + k}.000.png"), np.full((24, 32, 3), 9 * k, np.uint8))
+    write_tum(
+        path / "odometry.tum",
+        Trajectory(np.linspace(100.0, 99.0 + count, count), np.repeat(np.eye(4)[None], count, axis=0)),
+    )
+    write_camera(path / "camera.toml", Camera(32, 24, 30.0, 30.0, 16.0, 12.0), np.eye(4))
+    return path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """Exit code of the entry point."""
+    monkeypatch.setattr(sys, "argv", ["flocc", *words])
+    with pytest.raises(SystemExit) as left:
+        command_line.main()
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+def homeless(monkeypatch: pytest.MonkeyPatch, temporary: Path) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("FLOCC_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+
+
+def test_a_user_without_a_home_has_a_cache_in_the_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    homeless(monkeypatch, tmp_path)
+    assert cache_folder() == tmp_path / f"flocc-{os.getuid()}"
+
+
+def test_a_home_that_cannot_be_written_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    homeless(monkeypatch, tmp_path)
+    (tmp_path / "home").write_text("a file, where nobody can make a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    assert cache_folder() == tmp_path / f"flocc-{os.getuid()}"
+
+
+def test_no_place_at_all_names_the_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    homeless(monkeypatch, tmp_path)
+    monkeypatch.setattr(cache, "can_be_written", lambda _: False)
+    with pytest.raises(CacheError, match="name a folder with FLOCC_CACHE"):
+        cache_folder()
+
+
+def test_doctor_finds_a_folder_and_a_cache_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    assert [finding.cause for finding in surroundings(tmp_path)] == ["cache"]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "file"))
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert [(finding.cause, finding.advice != "") for finding in surroundings(tmp_path)] == [
+        ("folder", True),
+        ("cache", True),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "runs/a"), "runs/a: the disk is full; what was written"),
+        (PermissionError(errno.EACCES, "Permission denied", "/root/x"), "/root/x: permission denied: choose a folder"),
+        (OSError(errno.EROFS, "Read-only file system", "/mnt/x"), "/mnt/x: the disk is read-only"),
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "/tmp"), "/tmp: Is a directory"),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), "a text cannot be read or written: 'utf-8'"),
+        (sqlite3.OperationalError("database or disk is full"), "a store cannot be used: database or disk is full"),
+        (ExceptionGroup("tasks", [FloccError("camera.yaml: is empty")]), "camera.yaml: is empty"),
+    ],
+)
+def test_what_the_world_does_is_a_sentence(error: Exception, said: str) -> None:
+    sentence = sentence_of(error)
+    assert sentence is not None
+    assert sentence.startswith(said)
+
+
+def test_a_bug_stays_a_traceback() -> None:
+    assert sentence_of(ValueError("negative")) is None
+    assert sentence_of(ExceptionGroup("tasks", [OSError("a"), KeyError("b")])) is None
+
+
+def test_a_full_disk_ends_a_conversion_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: str, _: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", path)
+
+    monkeypatch.setattr(writer, "_write", full)
+    source = write_plain(tmp_path / "data")
+    assert run(monkeypatch, "dataset", "convert", str(source), "--out", str(tmp_path / "out")) == 2
+    assert "error: " in (told := capsys.readouterr().err)
+    assert "000000.png: the disk is full; what was written before is kept" in told
+
+
+def test_a_full_disk_ends_the_events_and_not_the_robot(caplog: pytest.LogCaptureFixture) -> None:
+    lines = Lines(Path("/dev/full"))
+    event: Reported[Fact] = Reported(1.0, "r1", AgentStopped())
+    lines.write(event)
+    lines.write(event)
+    lines.close()
+    assert caplog.text.count("/dev/full: No space left on device; events are no longer written") == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_names_with_umlauts_are_read_in_a_c_locale(tmp_path: Path, encoding: str) -> None:
+    source = write_plain(tmp_path / "Prüfung")
+    odd = {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": encoding}
+    command = [sys.executable, "-m", "flocc_launch.commands.main", "dataset", "convert", str(source), "--out"]
+    done = subprocess.run(
+        [*command, str(tmp_path / "Ausgänge")], capture_output=True, env={**os.environ, **odd}, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr.decode(errors="replace")
+    assert "Prüfung" in (tmp_path / "Ausgänge" / "source.txt").read_text(encoding="utf-8")
+
+
+def config(**fields: object) -> TransportConfig:
+    return TransportConfig.model_validate(fields)
+
+
+def test_an_interface_that_does_not_exist_is_named() -> None:
+    (fault,) = network.network_faults(config(interface="wlan7"), "a")
+    assert fault.startswith("transport.interface: the interface 'wlan7' does not exist; there is lo")
+    (fault,) = network.network_faults(config(multicast=False, control_listen=("tcp/[::]:0#iface=wlan7",)), "a")
+    assert "tcp/[::]:0#iface=wlan7: the interface 'wlan7' does not exist" in fault
+
+
+def test_a_host_that_does_not_resolve_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(host: str, _: object) -> list[object]:
+        if host != "127.0.0.1":
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+        return []
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    roster = {
+        "a": {"control": ("tcp/robot-a.invalid:7450",), "bulk": ("tcp/robot-a.invalid:7451",)},
+        "b": {"control": ("tcp/127.0.0.1:7450",), "bulk": ()},
+    }
+    (fault,) = network.network_faults(config(multicast=False, roster=roster), "c")
+    assert fault.startswith("transport.roster.a: the host 'robot-a.invalid' is not known (Name or service not known)")
+
+
+def test_no_network_but_the_machines_own_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo")])
+    (fault,) = network.network_faults(config(), "a")
+    assert fault == "no interface for multicast is up (there is lo); nobody is found until one is"
+    assert network.network_faults(config(interface="lo"), "a") == []
+    assert network.network_faults(config(multicast=False), "a") == []
