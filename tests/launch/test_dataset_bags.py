@@ -438,7 +438,7 @@ def test_raw_images_of_twelve_bits_have_one_pair_of_levels(
     bag = script.write(tmp_path / ("run.bag" if ros1 else "run"), "bag" if ros1 else "mcap")
     recording = Recording.open(convert(bag, tmp_path / "out"))
     found = [cv2.imread(str(frame.image_path), cv2.IMREAD_UNCHANGED) for frame in recording.frames]
-    assert [(each.dtype, int(each.max())) for each in found if each is not None] == [(np.uint8, 14)] * 2 + [
+    assert [(each.dtype.type, int(each.max())) for each in found if each is not None] == [(np.uint8, 14)] * 2 + [
         (np.uint8, 239)
     ] * 4
     assert "images of 16 bits use 0 to 4095, which become 0 to 255" in caplog.text
