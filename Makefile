@@ -2,12 +2,15 @@
 # make test    installs what tests need and runs all of them: ruff, mypy, import contracts, pytest
 # make swarm-test   shipped scenarios over real zenoh, a worse variant of each that must fail, observers: six minutes
 # make check   the same without installing anything
+# make campaign     the back end and others on 300 drawn graphs (DRAWS=60 for a sweep), at most an hour (LIMIT_S)
 # make clean   removes .venv and everything that was generated
 
 SHELL := /bin/bash
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
+DRAWS ?= 300
+LIMIT_S ?= 3600
 DEMO_OUT ?= runs/demo
 TEST_EXTRAS := $(shell sed -n '/^\[project.optional-dependencies\]/,/^\[/s/^\([a-z0-9]*\) = \[.*/\1/p' pyproject.toml | paste -sd,)
 
@@ -15,7 +18,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 DESCRIPTION := pyproject.toml constraints.txt
 
-.PHONY: demo test swarm-test check lint types contracts tests constraints clean
+.PHONY: demo test swarm-test check lint types contracts tests campaign constraints clean
 .DEFAULT_GOAL := check
 
 demo: $(VENV)/.demo
@@ -47,6 +50,12 @@ tests:
 
 swarm-test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -m scenarios
+
+# The back end on 300 graphs of the family, beside what others do; rows stay, so that a second run goes on.
+campaign: $(VENV)/.test
+	@mkdir -p build
+	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/python -m flocc_lab.graph_family --draws $(DRAWS) --methods "" \
+		--rows build/graph_family.jsonl --limit-s $(LIMIT_S) | tee build/graph_family.md
 
 constraints: $(VENV)/.test
 	$(BIN)/python .ci/constraints.py > constraints.new

@@ -53,7 +53,7 @@ def test_the_neighbour_is_not_heard_where_the_rule_does_not_ask_it() -> None:
     contradicted = Evidence(100, 0.1, True, 0.001, OdometryNeighbour.CONTRADICTS)
     row = Row("a", 0, 1, True, 10.0, 100, 1000, contradicted, True)
 
-    rule = fit.fitted([row])
+    rule = fit.fitted([row], 1.2)
 
     assert fit.accepts(row, rule)
     assert not fit.accepts(row, None)  # Eq. (1) is 0.1

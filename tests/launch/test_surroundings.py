@@ -15,7 +15,10 @@ import pytest
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.core.interfaces import Camera
+from flocc_agent.core.reports import Fact
 from flocc_agent.runtime import network_faults as network
+from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.facts import AgentStopped
 from flocc_agent.runtime.recording import write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.commands import main as command_line
@@ -24,6 +27,7 @@ from flocc_launch.doctor.installation import surroundings
 from flocc_launch.setup import cache
 from flocc_launch.setup.cache import CacheError, cache_folder
 from flocc_launch.setup.world_faults import sentence_of
+from flocc_launch.swarm.agent_process import Lines
 from flocc_protocol.errors import FloccError
 
 
@@ -127,6 +131,15 @@ def test_a_full_disk_ends_a_conversion_with_a_sentence(
     assert run(monkeypatch, "dataset", "convert", str(source), "--out", str(tmp_path / "out")) == 2
     assert "error: " in (told := capsys.readouterr().err)
     assert "000000.png: the disk is full; what was written before is kept" in told
+
+
+def test_a_full_disk_ends_the_events_and_not_the_robot(caplog: pytest.LogCaptureFixture) -> None:
+    lines = Lines(Path("/dev/full"))
+    event: Reported[Fact] = Reported(1.0, "r1", AgentStopped())
+    lines.write(event)
+    lines.write(event)
+    lines.close()
+    assert caplog.text.count("/dev/full: No space left on device; events are no longer written") == 1
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])

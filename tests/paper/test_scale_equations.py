@@ -35,9 +35,8 @@ def straight(length: int = 40) -> Trajectory:
 
 def problem(closures: list[LoopClosure], **config: Any) -> Problem:
     trajectories = {ALPHA: straight(), BETA: straight()}
-    poses = {log: t.T_odom_keyframe for log, t in trajectories.items()}
     settings = BackendConfig(**config)
-    return build(trajectories, dict(enumerate(closures)), (), settings, poses, np.eye(4))
+    return build(trajectories, dict(enumerate(closures)), settings)
 
 
 def test_the_probability_multiplies_the_information_matrix() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from flocc_launch.simulation.trace import TraceError, played
+from flocc_lab.traces import TraceError, played
 
 TRACES = sorted((Path(__file__).parent / "traces").glob("*.txt"))
 

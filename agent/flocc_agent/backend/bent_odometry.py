@@ -30,7 +30,7 @@ DISAGREEING_RATIO = 3.0
 """A fix this many times the median distance away is left out of its window."""
 
 
-def straightened(T_map_keyframe: Mapping[LogId, Float], closures: Mapping[int, LoopClosure]) -> dict[LogId, Float]:
+def bent_along_fixes(T_map_keyframe: Mapping[LogId, Float], closures: Mapping[int, LoopClosure]) -> dict[LogId, Float]:
     """Bend the first poses (N, 4, 4) of each log along its positions in a world; others stay as they are."""
     bent = dict(T_map_keyframe)
     for log, of_log in _positions(closures).items():

@@ -1,6 +1,6 @@
 """Descent to the nearest optimum of weighted squares: Gauss-Newton steps, shortened, then damped.
 
-Closures carry weights in [0, 1] that multiply their information; odometry and fixes always weigh 1. A closure of
+Closures carry weights in [0, 1] that multiply their information; odometry always weighs 1. A closure of
 weight 0 takes no part at all.
 """
 

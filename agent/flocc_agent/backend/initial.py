@@ -1,18 +1,31 @@
 """Where a component's poses start: at the last solution, or at the robust alignment of the odom frames."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import ROTATION_TOLERANCE_RAD, TRANSLATION_TOLERANCE_M, align
-from flocc_agent.backend.bent_odometry import straightened
+from flocc_agent.backend.bent_odometry import bent_along_fixes
 from flocc_agent.backend.screening import first_not_rigid
-from flocc_agent.core.pose_graph import AbsoluteFix, ClosureState, Component, GraphSolution, LoopClosure, Trajectory
-from flocc_agent.geometry import Float, inverse, pose, umeyama
+from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, Trajectory
+from flocc_agent.geometry import Float, inverse
 from flocc_protocol.ids import LogId
 
 JUDGES_MIN = 2
+
+
+class Aligned(NamedTuple):
+    """Where a component starts.
+
+    Attributes:
+        T_map_keyframe: (N, 4, 4) of every log, in one frame.
+        is_warm: These are the poses of an earlier solution.
+    """
+
+    T_map_keyframe: dict[LogId, Float]
+    is_warm: bool
 
 
 def initial_poses(
@@ -20,8 +33,8 @@ def initial_poses(
     closures: Mapping[int, LoopClosure],
     steepness: float,
     earlier: GraphSolution | None,
-) -> tuple[dict[LogId, Float], bool]:
-    """Poses (N, 4, 4) of every log in one frame, and whether they are those of the earlier solution.
+) -> Aligned:
+    """Poses of every log in one frame.
 
     They come from the earlier solution where it has all logs in one component and most closures of every pair of robots
     still agree with it. Otherwise the robots are placed anew: a first closure that was wrong must not outlive the right
@@ -32,13 +45,13 @@ def initial_poses(
     if component is not None:
         warm = {log: extended(component.T_map_keyframe[log], trajectories[log]) for log in trajectories}
         if all(upheld(warm, of_pair) for of_pair in by_pair(closures)):
-            return warm, True
+            return Aligned(warm, True)
     T_map_odom, aligned = align(trajectories, closures, steepness)
     judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
     if warm and all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
-        return warm, True
+        return Aligned(warm, True)
     rigid = {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}
-    return straightened(rigid, closures), False
+    return Aligned(bent_along_fixes(rigid, closures), False)
 
 
 def by_pair(closures: Mapping[int, LoopClosure]) -> list[list[LoopClosure]]:
@@ -87,18 +100,6 @@ def extended(T_map_keyframe: Float, trajectory: Trajectory) -> Float:
     T_odom = np.asarray(trajectory.T_odom_keyframe, dtype=float)
     T_map_odom = T_map_keyframe[known - 1] @ inverse(T_odom[known - 1])
     return np.concatenate([T_map_keyframe[:known], T_map_odom @ T_odom[known:]])
-
-
-def initial_world(T_map_keyframe: Mapping[LogId, Float], fixes: Sequence[AbsoluteFix]) -> Float:
-    """Pose (4, 4) of the fixes' world frame: from the first whole pose, else from all positions together."""
-    for fix in fixes:
-        if fix.R_world_keyframe is not None:
-            T_world_keyframe = pose(fix.R_world_keyframe, fix.position_m)
-            return np.asarray(T_map_keyframe[fix.keyframe.log][fix.keyframe.index] @ inverse(T_world_keyframe))
-    if not fixes:
-        return np.eye(4)
-    in_map = np.array([T_map_keyframe[fix.keyframe.log][fix.keyframe.index][:3, 3] for fix in fixes])
-    return umeyama(np.array([fix.position_m for fix in fixes]), in_map)[1]
 
 
 def trusted_closures(closures: Sequence[LoopClosure], earlier: GraphSolution) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import evenly
 from flocc_agent.backend.problem import diagonal_covariance
+from flocc_agent.backend.screening import first_not_rigid, is_covariance
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.geodesy import Place, T_enu_enu
 from flocc_agent.core.pose_graph import (
@@ -82,8 +83,8 @@ def with_factors(graph: PoseGraph, config: BackendConfig, initial: GraphSolution
     if not graph.measured:
         return Expanded(replace(graph, trajectories=trajectories), initial)
     origin = origin_of(graph.measured)
-    factors = {k: _from_origin(f, origin) for k, f in enumerate(graph.measured) if _is_here(f, trajectories)}
-    left_out = {k: "its keyframes are not there" for k in range(len(graph.measured)) if k not in factors}
+    left_out = {k: text for k, f in enumerate(graph.measured) if (text := _complaint(f, trajectories))}
+    factors = {k: _from_origin(f, origin) for k, f in enumerate(graph.measured) if k not in left_out}
     closures = {k: _whole(f) for k, f in factors.items() if f.has_rotation}
     positions: dict[tuple[LogId, LogId], list[int]] = defaultdict(list)
     for k, factor in factors.items():
@@ -154,9 +155,17 @@ def measured_odometry(trajectory: Trajectory, config: BackendConfig) -> Trajecto
     return replace(trajectory, edge_covariances=np.where(open_[:, None, None], default, covariances))
 
 
-def _is_here(factor: MeasuredFactor, trajectories: Mapping[LogId, Trajectory]) -> bool:
+def _complaint(factor: MeasuredFactor, trajectories: Mapping[LogId, Trajectory]) -> str:
+    """Why a factor cannot be used; empty where it can. What is wrong with whole poses is told by screening."""
     ends = [end for end in (factor.query, factor.match) if not is_landmark(end.log)]
-    return all(end.log in trajectories and end.index < len(trajectories[end.log]) for end in ends)
+    if not all(end.log in trajectories and end.index < len(trajectories[end.log]) for end in ends):
+        return "its keyframes are not there"
+    poses = [factor.T_query_match, *(_pose_of(end, trajectories) for end in ends)]
+    if first_not_rigid(np.array(poses)) is not None:
+        return "its pose, or the odometry there, is not a rigid pose"
+    if not factor.has_rotation and not is_covariance(factor.covariance, 3):
+        return "the covariance is not positive definite"
+    return ""
 
 
 def _from_origin(factor: MeasuredFactor, origin: Place | None) -> MeasuredFactor:

@@ -24,7 +24,9 @@ Float = NDArray[np.float64]
 AGREEING_MIN = 2
 HYPOTHESES_MAX = 200
 KEPT_RATIO_MAX = 0.5
-"""A place with which more of the used closures agree is the one where the body is, told less exactly."""
+"""A place with which more of the used closures agree is the one where the body is, told less exactly,"""
+MORE_RATIO = 1.5
+"""unless so many more closures agree with it that the used ones may have bent the body."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,9 +59,9 @@ class Places:
             crossing = self._crossing(body)
             agreeing = np.isin(self.problem.closure_ids, found.agreeing)
             here = chosen & crossing
-            more = self.votes[agreeing].sum() > self.votes[here].sum()
-            elsewhere = self.votes[here & agreeing].sum() <= KEPT_RATIO_MAX * self.votes[here].sum()
-            if more and elsewhere:
+            there, now = self.votes[agreeing].sum(), self.votes[here].sum()
+            elsewhere = self.votes[here & agreeing].sum() <= KEPT_RATIO_MAX * now
+            if there > now and (elsewhere or there >= MORE_RATIO * now):
                 yield Placement(body, self._moved(state, body, found.T_a_b), (chosen & ~crossing) | agreeing)
 
     def _poses(self, state: State) -> dict[LogId, Float]:

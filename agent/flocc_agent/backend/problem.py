@@ -1,4 +1,4 @@
-"""One component of the pose graph as arrays: odometry edges, closure edges with scale model, fixes."""
+"""One component of the pose graph as arrays: odometry edges, closure edges with scale model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 from flocc_agent.backend.clusters import cluster_labels
 from flocc_agent.backend.edges import NO_CLUSTER, Edges
 from flocc_agent.config import BackendConfig, Formulation, ScaleInitial
-from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, Trajectory
+from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.core.registration import closure_probability
-from flocc_agent.geometry import inverse, pose, quaternions
+from flocc_agent.geometry import inverse, quaternions
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-WORLD_ROTATION_SIGMA_RAD, WORLD_TRANSLATION_SIGMA_M = 10.0, 1e5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,13 +25,12 @@ class Problem:
     Attributes:
         logs: Its logs, sorted; the first is the anchor, whose first keyframe is pose 0 and does not move.
         offsets: Index of each log's first keyframe.
-        poses: Number of keyframes; a world frame, where there are fixes, is the pose after the last one.
-        edges: Odometry first, then closures, then fixes.
+        poses: Number of keyframes.
+        edges: Odometry first, then closures.
         closure_rows: Slice of the closures in `edges`.
         closure_ids: Index in the graph of each closure edge.
         clusters: Number of cluster scales.
         scale_initial: (L,) metres per network unit at gamma = 1, per closure edge.
-        has_world: Whether there is a world frame.
     """
 
     logs: tuple[LogId, ...]
@@ -44,7 +41,6 @@ class Problem:
     closure_ids: tuple[int, ...]
     clusters: int
     scale_initial: Float
-    has_world: bool
 
     def index(self, keyframe: KeyframeId) -> int:
         """Index of a keyframe's pose."""
@@ -54,20 +50,14 @@ class Problem:
 def build(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
-    fixes: Sequence[AbsoluteFix],
     config: BackendConfig,
-    T_initial: Mapping[LogId, Float],
-    T_map_world: Float,
 ) -> Problem:
     """Turn a component into arrays.
 
     Args:
         trajectories: Usable odometry of the component's logs.
         closures: Usable closures between them, by their index in the graph.
-        fixes: Usable fixes of them.
         config: The formulation, the noise model and the scale priors.
-        T_initial: (N, 4, 4) first poses of each log, in one frame.
-        T_map_world: (4, 4) first pose of the fixes' world frame, in the same frame.
     """
     logs = tuple(sorted(trajectories))
     lengths = [len(trajectories[log]) for log in logs]
@@ -80,11 +70,8 @@ def build(
     closure_part, clusters = closure_edges(used, offsets, scale_initial, config)
     parts = [*odometry, closure_part]
     first = sum(len(part) for part in odometry)
-    if fixes:
-        T_first_world = inverse(T_initial[logs[0]][0]) @ T_map_world
-        parts += [fix_edges(fixes, offsets, int(starts[-1])), world_edge(T_first_world, int(starts[-1]))]
     rows = slice(first, first + len(used))
-    return Problem(logs, offsets, int(starts[-1]), concatenate(parts), rows, ids, clusters, scale_initial, bool(fixes))
+    return Problem(logs, offsets, int(starts[-1]), concatenate(parts), rows, ids, clusters, scale_initial)
 
 
 def concatenate(parts: Sequence[Edges]) -> Edges:
@@ -206,24 +193,3 @@ def comparable(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArra
     """Whether each closure's network unit compares with others': by Eq. (6), or because units are taken as metres."""
     raw = config.scale_initial is ScaleInitial.RAW
     return np.array([raw or c.scale_initial is not None for c in closures], dtype=bool)
-
-
-def fix_edges(fixes: Sequence[AbsoluteFix], offsets: Mapping[LogId, int], world: int) -> Edges:
-    """Edges from the world frame (a pose of its own) to the keyframes that were fixed."""
-    j = np.array([offsets[f.keyframe.log] + f.keyframe.index for f in fixes])
-    L = np.zeros((len(fixes), 6, 6))
-    T_hat = np.empty((len(fixes), 4, 4))
-    for k, fix in enumerate(fixes):
-        R = fix.R_world_keyframe
-        T_hat[k] = pose(np.eye(3) if R is None else R, fix.position_m)
-        R_hat = T_hat[k, :3, :3]
-        L[k, 3:, 3:] = np.linalg.inv(np.linalg.cholesky(fix.covariance_m2)) @ R_hat
-        if R is not None:
-            L[k, :3, :3] = np.eye(3) / fix.rotation_sigma_rad
-    return plain_edges(np.full(len(j), world), j, T_hat, L)
-
-
-def world_edge(T_first_world: Float, world: int) -> Edges:
-    """A very weak edge that keeps the world frame where it started, in what the fixes leave open."""
-    S = diagonal_covariance(WORLD_ROTATION_SIGMA_RAD, WORLD_TRANSLATION_SIGMA_M)
-    return plain_edges(np.array([0]), np.array([world]), T_first_world[None], sqrt_informations(S[None]))

@@ -107,7 +107,6 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         cost=solution.solved.cost,
         cost_initial=objective.cost(solution.start, solution.solved.weights, hold=True),
         covariance_keyframe=of_keyframes,
-        T_map_world=T_map_all @ T_all[-1] if problem.has_world else None,
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.pose_graph import AbsoluteFix, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import angle_rad, between, inverse
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -31,13 +31,11 @@ class Screened:
     Attributes:
         trajectories: Logs with usable odometry, sorted.
         excluded: Reason per closure index; closures that are not named may be used.
-        fixes: Usable fixes.
         warnings: One sentence per exclusion that is not a closure's.
     """
 
     trajectories: dict[LogId, Trajectory]
     excluded: dict[int, str]
-    fixes: tuple[AbsoluteFix, ...]
     warnings: tuple[str, ...]
 
 
@@ -53,14 +51,7 @@ def screen(graph: PoseGraph) -> Screened:
             trajectories[log] = usable
     excluded = closure_complaints(graph.closures, trajectories)
     excluded.update(_duplicates(graph.closures, excluded))
-    fixes = []
-    for fix in graph.fixes:
-        complaint = _fix_complaint(fix, trajectories)
-        if complaint:
-            warnings.append(complaint)
-        else:
-            fixes.append(fix)
-    return Screened(trajectories, excluded, tuple(fixes), tuple(warnings))
+    return Screened(trajectories, excluded, tuple(warnings))
 
 
 def are_covariances(matrices: Float) -> Bool:
@@ -175,11 +166,14 @@ def _missing(keyframe: KeyframeId, trajectories: Mapping[LogId, Trajectory]) -> 
 
 
 def _duplicates(closures: Sequence[LoopClosure], excluded: Mapping[int, str]) -> dict[int, str]:
-    """Exclude all but the best closure of each pair: the highest match ratio, then the first."""
+    """Exclude all but the best closure of each pair: the highest match ratio, then the first.
+
+    Metric closures with a covariance of their own are measurements in their own right: every one counts.
+    """
     best: dict[tuple[KeyframeId, KeyframeId], int] = {}
     reasons: dict[int, str] = {}
     for k, closure in enumerate(closures):
-        if k in excluded:
+        if k in excluded or (closure.metric and closure.covariance is not None):
             continue
         low, high = sorted((closure.query, closure.match))
         other = best.setdefault((low, high), k)
@@ -204,26 +198,3 @@ def _agree(a: LoopClosure, b: LoopClosure) -> bool:
     if not (a.metric and b.metric):
         u, v = u / max(float(np.linalg.norm(u)), 1e-12), v / max(float(np.linalg.norm(v)), 1e-12)
     return float(np.linalg.norm(u - v)) <= SAME_TRANSLATION_RATIO * max(float(np.linalg.norm(u)), 1e-3)
-
-
-def _fix_complaint(fix: AbsoluteFix, trajectories: Mapping[LogId, Trajectory]) -> str:
-    name = f"fix of {fix.keyframe}"
-    complaint = _missing(fix.keyframe, trajectories)
-    if complaint:
-        return f"{name}: {complaint}"
-    if not np.all(np.isfinite(fix.position_m)) or np.shape(fix.position_m) != (3,):
-        return f"{name}: the position is not finite"
-    if not is_covariance(fix.covariance_m2, 3):
-        return f"{name}: the covariance is not positive definite"
-    R = fix.R_world_keyframe
-    if R is not None and first_not_rigid(_with_rotation(R)) is not None:
-        return f"{name}: the rotation is not a rotation"
-    if R is not None and not (np.isfinite(fix.rotation_sigma_rad) and fix.rotation_sigma_rad > 0):
-        return f"{name}: the rotation's standard deviation is not positive"
-    return ""
-
-
-def _with_rotation(R: Float) -> Float:
-    T = np.eye(4)[None].copy()
-    T[0, :3, :3] = R
-    return T

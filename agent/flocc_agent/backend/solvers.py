@@ -7,6 +7,7 @@ at its bound (`edges.GAMMA_MIN`) and the rest moves to the constrained optimum.
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend.averaging import averaged
 from flocc_agent.backend.descent import Objective, Solved, descend
 from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.graduated import graduated
@@ -19,6 +20,8 @@ Bool = NDArray[np.bool_]
 KERNEL_STEPS = 1
 ACCEPTED_WEIGHT_MIN = 0.5
 SELECTIONS_MAX = 5
+EXPLAINED_RATIO = 100.0
+"""LM looks for a better start where its first cost is so many times its degrees of freedom."""
 START_RATIOS = (1e-4, 1e-6)
 PLACEMENTS_MAX = 10
 
@@ -34,7 +37,7 @@ def solve(objective: Objective, state: State, trusted: Bool | None = None, place
     """
     solver = objective.config.solver
     if solver is Solver.LM or objective.closures.start == objective.closures.stop:
-        solved = descend(objective, state, objective.weights())
+        solved = lowest(objective, state)
     elif solver in (Solver.HUBER, Solver.CAUCHY):
         solved = reweighted(objective, state)
     else:
@@ -42,6 +45,17 @@ def solve(objective: Objective, state: State, trusted: Bool | None = None, place
             objective, state, places
         )
     return held(objective, solved)
+
+
+def lowest(objective: Objective, state: State) -> Solved:
+    """LM from a state, or from averaged rotations where noise does not explain that and they are lower."""
+    weights, edges = objective.weights(), objective.edges
+    cost, freedom = objective.cost(state, weights, hold=False), 6 * max(len(edges) - len(state.q) + 1, 1)
+    if 2.0 * cost > EXPLAINED_RATIO * freedom and len(state.scale) == 0:
+        start = averaged(edges, state, objective.linear.fixed)
+        if start is not None and objective.cost(start, weights, hold=False) < cost:
+            state = start
+    return descend(objective, state, weights)
 
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:

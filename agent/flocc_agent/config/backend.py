@@ -81,7 +81,7 @@ class BackendConfig(Section):
     one place only are placed by it; much smaller rejects closures whose scale is far from its initial value."""
     scale_prior_unknown_sigma_ratio: float = inner(20.0, gt=0)
     """The same for closures without an initial scale, around one metre per network unit."""
-    weight_by_probability: bool = inner(True)
+    weight_by_probability: bool = True
     """Multiply each closure's information by the probability of Eq. (2); off for measurements that carry a trusted
     covariance of their own."""
     inlier_probability: float = inner(0.9999, gt=0, lt=1)

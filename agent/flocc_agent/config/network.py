@@ -79,7 +79,7 @@ class TransportConfig(Section):
     """Learn robots from robots; such links are not dialled again after a cut, the roster's are."""
     lease_s: float = Field(3.0, ge=1.0)
     """A silent TCP link is given up after this; at least twice the outage to ride through, more under load."""
-    bulk_send_buffer_bytes: int = Field(65536, ge=4096)
+    bulk_send_buffer_bytes: int = inner(65536, ge=4096)
     """Kernel buffer of the bulk session; larger is faster on long links and delays control more on slow ones."""
     message_bytes_max: int = inner(1024 * 1024, ge=1024)
     """Larger messages are neither sent nor accepted; latents have their own limit."""

@@ -73,7 +73,7 @@ class _Odometry:
 
 
 class GraphAssembly:
-    """Keyframes, closures and fixes of every known log.
+    """Keyframes, closures and measurements of every known log.
 
     Attributes:
         keyframes: Number of keyframes of all logs.

@@ -107,9 +107,9 @@ class LoopClosingParameters:
     __pydantic_config__ = _FORBID
 
     match_ratio_threshold: float = 0.3
-    """R_thr: a registration with a lower match ratio, Eq. (1), is refused."""
+    """R_thr: a registration with a lower match ratio, Eq. (1), is refused; not where perception judges itself."""
     correspondences_min: int = 20
-    """A registration with fewer correspondences is refused whatever its ratio."""
+    """A registration with fewer correspondences is refused whatever its ratio; not where perception judges itself."""
     fetches_max: int = _inner(2)
     """Latents fetched at one time."""
     fetch_timeout_s: float = 10.0

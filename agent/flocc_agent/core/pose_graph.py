@@ -1,4 +1,4 @@
-"""The pose graph: odometry of every log, loop closures between keyframes, absolute fixes, and its solution.
+"""The pose graph: odometry of every log, loop closures between keyframes, what else was measured, and its solution.
 
 Nodes are keyframe *camera* poses. A log's poses are given in its own `odom` frame; a component's solution is in
 one `map` frame that is named after the component's anchor, its lowest log.
@@ -65,25 +65,6 @@ class LoopClosure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AbsoluteFix:
-    """A keyframe's position (or whole pose) in a world frame, such as GNSS in local ENU or a known start.
-
-    Attributes:
-        keyframe: The keyframe that was there.
-        position_m: (3,) of the camera in the world frame.
-        covariance_m2: (3, 3) of the position.
-        R_world_keyframe: (3, 3), or None where only the position is known.
-        rotation_sigma_rad: Standard deviation of the rotation, where it is given.
-    """
-
-    keyframe: KeyframeId
-    position_m: Float
-    covariance_m2: Float
-    R_world_keyframe: Float | None = None
-    rotation_sigma_rad: float = 0.05
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class MeasuredFactor:
     """Something measured at a keyframe besides odometry and images: a relative pose, or a relative position alone.
 
@@ -124,7 +105,6 @@ class PoseGraph:
 
     trajectories: Mapping[LogId, Trajectory]
     closures: Sequence[LoopClosure] = ()
-    fixes: Sequence[AbsoluteFix] = ()
     measured: Sequence[MeasuredFactor] = ()
 
 

@@ -75,6 +75,10 @@ class Trajectory:
         """The same motion in the frame of its first pose."""
         return Trajectory(self.stamps_s, inverse(self.T_fixed_body[0]) @ self.T_fixed_body)
 
+    def later(self, offset_s: float) -> "Trajectory":
+        """The same motion with other stamps."""
+        return Trajectory(self.stamps_s + offset_s, self.T_fixed_body)
+
     def length_m(self) -> float:
         """Distance travelled, metres."""
         return float(np.linalg.norm(np.diff(self.T_fixed_body[:, :3, 3], axis=0), axis=1).sum())

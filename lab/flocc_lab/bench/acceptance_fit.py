@@ -27,8 +27,10 @@ AGREEING = (15, 20, 25, 30, 40, 50, 60, 80, 100, NEVER)
 SIGMAS_DEG = (0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.7)
 WRONG_COST = 50
 """Right pairs that one wrong pair outweighs in the fit: at most 2 % wrong among the pairs that a step adds."""
-MARGIN = 1.35
-"""A wrong pair counts with this many times its correspondences and certainty: another scene's may have more."""
+MARGINS = (1.15, 1.25, 1.35, 1.5)
+"""A wrong pair counts with this many times its correspondences and certainty: another scene's may have more. The first
+that keeps at most `WRONG_RATIO_MAX` wrong ones of the scenes left out is taken."""
+WRONG_RATIO_MAX = 0.01
 RATIOS = (0.2, 0.25, 0.3, 0.4, 0.5, 10.0)
 RATIO_MIN = 0.3
 """The paper's rule, for comparison."""
@@ -44,21 +46,21 @@ class Kept:
     """Right ones before the rule."""
 
 
-def fitted(rows: Sequence[AcceptanceRow]) -> Acceptance:
+def fitted(rows: Sequence[AcceptanceRow], margin: float) -> Acceptance:
     """The rule that fits these rows: the ratio first, then each kind of what it leaves."""
     posed = [(row, row.evidence) for row in rows if row.evidence is not None]
-    ratio_min = max(RATIOS, key=lambda ratio: (ratio_score(rows, ratio), ratio))
+    ratio_min = max(RATIOS, key=lambda ratio: (ratio_score(rows, ratio, margin), ratio))
     with_scale, without_scale = (
-        best_needed([row for row, e in posed if e.has_scale is has_scale and not has_ratio(row, ratio_min)])
+        best_needed([row for row, e in posed if e.has_scale is has_scale and not has_ratio(row, ratio_min)], margin)
         for has_scale in (True, False)
     )
     return Acceptance(with_scale, without_scale, ratio_min)
 
 
-def ratio_score(rows: Sequence[AcceptanceRow], ratio_min: float) -> int:
+def ratio_score(rows: Sequence[AcceptanceRow], ratio_min: float, margin: float) -> int:
     """Right pairs that a threshold of Eq. (1) keeps, less what the wrong ones cost."""
     right = sum(row.is_right and has_ratio(row, ratio_min) for row in rows)
-    return right - WRONG_COST * sum(not row.is_right and has_ratio(row, ratio_min / MARGIN) for row in rows)
+    return right - WRONG_COST * sum(not row.is_right and has_ratio(row, ratio_min / margin) for row in rows)
 
 
 def has_ratio(row: AcceptanceRow, ratio_min: float) -> bool:
@@ -67,9 +69,9 @@ def has_ratio(row: AcceptanceRow, ratio_min: float) -> bool:
     return row.evidence is not None and row.correspondences >= RATIO_CORRESPONDENCES_MIN and ratio >= ratio_min
 
 
-def best_needed(rows: Sequence[AcceptanceRow]) -> Needed:
+def best_needed(rows: Sequence[AcceptanceRow], margin: float) -> Needed:
     """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
-    table = AcceptanceTable(rows)
+    table = AcceptanceTable(rows, margin)
     scored = [
         (table.score(needed), needed.alone, needed.agreeing, -needed.rotation_sigma_max_rad, needed)
         for needed in choices()
@@ -85,10 +87,10 @@ def choices() -> Iterator[Needed]:
 class AcceptanceTable:
     """Rows of one kind as arrays, for trying many rules."""
 
-    def __init__(self, rows: Sequence[AcceptanceRow]) -> None:
+    def __init__(self, rows: Sequence[AcceptanceRow], margin: float) -> None:
         evidence = [row.evidence for row in rows if row.evidence is not None]
         self._right = np.array([row.is_right for row in rows], bool)
-        factor = np.where(self._right, 1.0, MARGIN)
+        factor = np.where(self._right, 1.0, margin)
         self._count = np.array([e.correspondences for e in evidence]) * factor
         self._sigma_rad = np.array([e.rotation_sigma_rad for e in evidence]) / factor
         self._agrees = np.array([e.neighbour is OdometryNeighbour.AGREES for e in evidence], bool)
@@ -121,13 +123,26 @@ def heard(evidence: Evidence, rule: Acceptance) -> Evidence:
     return evidence if rule.needs_neighbour(evidence) else replace(evidence, neighbour=OdometryNeighbour.NOT_ASKED)
 
 
-def leave_one_out(rows: Sequence[AcceptanceRow]) -> dict[str, Kept]:
+def leave_one_out(rows: Sequence[AcceptanceRow], margin: float) -> dict[str, Kept]:
     """By scene: what the rule of all other scenes keeps of it."""
     names = sorted({row.scene for row in rows})
     return {
-        name: kept([row for row in rows if row.scene == name], fitted([row for row in rows if row.scene != name]))
+        name: kept(
+            [row for row in rows if row.scene == name], fitted([row for row in rows if row.scene != name], margin)
+        )
         for name in names
     }
+
+
+def chosen_margin(rows: Sequence[AcceptanceRow]) -> tuple[float, dict[str, Kept]]:
+    """The smallest margin with few wrong pairs in scenes left out, or the largest, and what is kept of them."""
+    left_out: dict[str, Kept] = {}
+    for margin in MARGINS:
+        left_out = leave_one_out(rows, margin)
+        wrong = sum(found.wrong for found in left_out.values())
+        if wrong <= WRONG_RATIO_MAX * sum(found.right + found.wrong for found in left_out.values()):
+            break
+    return margin, left_out
 
 
 def by_angle(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> list[Kept]:
@@ -137,13 +152,14 @@ def by_angle(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> list[Kep
 
 def report(rows: Sequence[AcceptanceRow]) -> dict[str, Any]:
     """The rule of all scenes, and tables by scene and angle, for the paper's rule, the fitted one and leave-one-out."""
-    rule = fitted(rows)
-    left_out = leave_one_out(rows)
+    margin, left_out = chosen_margin(rows)
+    rule = fitted(rows, margin)
     return {
         "rule": {
             "with_scale": _plain(rule.with_scale),
             "without_scale": _plain(rule.without_scale),
             "match_ratio_min": rule.match_ratio_min,
+            "margin": margin,
         },
         "pairs": len(rows),
         "scenes": {
@@ -166,8 +182,9 @@ def report(rows: Sequence[AcceptanceRow]) -> dict[str, Any]:
 
 def text(name: str, found: dict[str, Any]) -> str:
     """A report as lines for people: right/wrong of possible."""
-    lines = [f"{name}: {found['pairs']} pairs; with scale {found['rule']['with_scale']}"]
-    lines.append(f"  without scale {found['rule']['without_scale']}, ratio {found['rule']['match_ratio_min']}")
+    rule = found["rule"]
+    lines = [f"{name}: {found['pairs']} pairs; with scale {rule['with_scale']}"]
+    lines.append(f"  without {rule['without_scale']}, ratio {rule['match_ratio_min']}, margin {rule['margin']}")
     totals = {key: [0, 0, 0] for key in ("by_ratio", "fitted", "left_out")}
     for scene, entry in found["scenes"].items():
         shown = []

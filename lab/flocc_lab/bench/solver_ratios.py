@@ -184,7 +184,7 @@ def _costs(solved: dict[str, Any]) -> dict[str, float]:
 def problem_of(bench: Bench, config: BackendConfig) -> Problem:
     """The arrays of a formulation."""
     by_index = dict(enumerate(bench.graph.closures))
-    return build(bench.graph.trajectories, by_index, (), config, bench.T_start, np.eye(4))
+    return build(bench.graph.trajectories, by_index, config)
 
 
 def solver_of(bench: Bench, config: BackendConfig) -> Callable[[], Solved]:

@@ -111,7 +111,7 @@ def _gtsam_scale_task(file: GraphFile, config: BackendConfig) -> float:
     excluded = screen(graph).excluded
     closures = {k: c for k, c in enumerate(graph.closures) if k not in excluded}
     T_start, _ = initial_poses(graph.trajectories, closures, config.steepness, None)
-    problem = build(graph.trajectories, closures, (), config, T_start, np.eye(4))
+    problem = build(graph.trajectories, closures, config)
     factors, values = between_factors(problem, T_start)
     known = [*range(problem.closure_rows.start), factors.size() - 1]
     poses, _ = gnc_with(factors, values, known)

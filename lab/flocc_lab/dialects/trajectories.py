@@ -39,7 +39,7 @@ FAULTS = ("nan", "word", "short", "zero quaternion", "duplicate", "step back")
 
 
 @dataclass(frozen=True, slots=True)
-class TrajectoryVerdict:
+class FileVerdict:
     """What became of one file.
 
     Attributes:
@@ -125,7 +125,7 @@ def faulty(rows: list[Row], fault: str, rng: np.random.Generator) -> tuple[list[
     return out, [k for k in range(len(rows)) if k not in spoilt]
 
 
-def judge_trajectory(rng: np.random.Generator, folder: Path) -> TrajectoryVerdict:
+def judge_trajectory(rng: np.random.Generator, folder: Path) -> FileVerdict:
     """Draw a file, write it and read it."""
     truth = drawn_trajectory(rng)
     rows = rows_of(truth)
@@ -172,20 +172,20 @@ def free_form(rows: list[Row], rng: np.random.Generator) -> tuple[str, str, bool
     return f"{'wxyz' if is_wxyz else 'xyzw'} in {unit}, header {header}", text, header != "none"
 
 
-def _judged(name: str, must_read: bool, path: Path, truth: Trajectory) -> TrajectoryVerdict:
+def _judged(name: str, must_read: bool, path: Path, truth: Trajectory) -> FileVerdict:
     try:
         found, _ = read_trajectory(path)
     except FloccError as error:
-        return TrajectoryVerdict(name, must_read, "refused", str(error))
+        return FileVerdict(name, must_read, "refused", str(error))
     if len(found) != len(truth):
-        return TrajectoryVerdict(name, must_read, "wrong", f"{len(found)} poses, not {len(truth)}")
+        return FileVerdict(name, must_read, "wrong", f"{len(found)} poses, not {len(truth)}")
     off_s = float(np.max(np.abs(found.stamps_s - truth.stamps_s)))
     off = float(np.max(np.abs(found.T_fixed_body - truth.T_fixed_body)))
     is_right = off_s < 1e-3 and off < 1e-5
-    return TrajectoryVerdict(name, must_read, "right" if is_right else "wrong", f"off by {off_s:g} s and {off:g}")
+    return FileVerdict(name, must_read, "right" if is_right else "wrong", f"off by {off_s:g} s and {off:g}")
 
 
-def judge_names(rng: np.random.Generator) -> TrajectoryVerdict:
+def judge_names(rng: np.random.Generator) -> FileVerdict:
     """Draw names of images, and read their stamps."""
     count, zero_s = int(rng.integers(2, 60)), 1_700_000_000.0 + float(rng.integers(10**6))
     stamps_s = [zero_s + round(0.1 * k + 0.003 * float(rng.random()), 3) for k in range(count)]
@@ -198,17 +198,17 @@ def judge_names(rng: np.random.Generator) -> TrajectoryVerdict:
     try:
         found, _ = stamps_of_names([write(s, k) for k, s in enumerate(stamps_s)], "images")
     except FloccError as error:
-        return TrajectoryVerdict(label, must_read, "refused", str(error))
+        return FileVerdict(label, must_read, "refused", str(error))
     if found is None or which != "stamps":
         is_right = found is None and which == "numbers"
-        return TrajectoryVerdict(
+        return FileVerdict(
             label, must_read, "right" if is_right else "wrong", "numbers" if found is None else str(found[:2])
         )
     off_s = float(np.max(np.abs(np.array(found) - stamps_s)))
-    return TrajectoryVerdict(label, must_read, "right" if off_s <= 2 * exact_s else "wrong", f"off by {off_s:g} s")
+    return FileVerdict(label, must_read, "right" if off_s <= 2 * exact_s else "wrong", f"off by {off_s:g} s")
 
 
-def campaign(count: int, seed: int, folder: Path) -> list[TrajectoryVerdict]:
+def campaign(count: int, seed: int, folder: Path) -> list[FileVerdict]:
     """Verdicts on as many drawn files; two in five are names."""
     rng = np.random.default_rng(seed)
     return [judge_names(rng) if rng.random() < 0.4 else judge_trajectory(rng, folder) for _ in range(count)]

@@ -57,6 +57,23 @@ def info(source: Source, format_name: Format = None, trajectory_format: Trajecto
 
 
 @dataset.command()
+def clock(
+    source: Annotated[Path, typer.Argument(help="Folder of a data set.")],
+    odometry: Annotated[Path | None, typer.Option(help="Another trajectory than the folder's.")] = None,
+    camera: CameraFile = None,
+    trajectory_format: TrajectoryFormat = None,
+) -> None:
+    """Measure how far pictures and odometry are apart in time, by turns that both show."""
+    from flocc_launch.datasets.commands import clock as run
+
+    fit = run(source, odometry, camera, trajectory_format)
+    typer.echo(f"{'offset':14} {fit.offset_s:+.3f} s to be added to odometry: flocc dataset convert --time-offset")
+    drift = "not to be told from none" if fit.drift_ratio is None else f"{1e6 * fit.drift_ratio:+.0f} ppm"
+    typer.echo(f"{'drift':14} {drift}")
+    typer.echo(f"{'correlation':14} {fit.correlation:.2f}")
+
+
+@dataset.command()
 def convert(
     source: Source,
     out: Annotated[Path, typer.Option(help="Folder of the recording.")],
@@ -70,6 +87,9 @@ def convert(
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Write a bag's raw images as JPEG: small, but slower.")] = False,
     trajectory_format: TrajectoryFormat = None,
     field_of_view: View = None,
+    time_offset: Annotated[
+        float, typer.Option(help="Seconds to add to the stamps of a folder's odometry and ground truth.")
+    ] = 0.0,
 ) -> None:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended."""
     from flocc_launch.datasets.commands import convert as run
@@ -78,7 +98,7 @@ def convert(
         path = run(
             source, out, format_name=format_name, camera=camera, odometry=odometry, truth=truth,
             image_topic=image_topic, odometry_topic=odometry_topic, every=every, jpeg=jpeg,
-            form=trajectory_format, view_deg=field_of_view, progress=progress,
+            form=trajectory_format, view_deg=field_of_view, time_offset_s=time_offset, progress=progress,
         )  # fmt: skip
     typer.echo(f"recording: {path}")
 

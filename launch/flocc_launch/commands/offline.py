@@ -36,11 +36,14 @@ def optimise(
     from_file: Annotated[
         bool, typer.Option("--from-file-initialisation", help="Start from the file's own initialisation.")
     ] = False,
+    noise: Annotated[
+        str | None, typer.Option(help="gaussian (the file's information matrices) or isotropic (SE-Sync's objective).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Recorded; nothing in the back end is drawn by chance.")] = 0,
 ) -> None:
     """Optimise the pose graph of a file, with any formulation and solver."""
     from flocc_agent.config import Formulation, ScaleInitial, Solver
-    from flocc_launch.graph_files.optimise import optimise_file
+    from flocc_launch.graph_files.optimise import NoiseModel, optimise_file
 
     result = optimise_file(
         file,
@@ -52,6 +55,7 @@ def optimise(
         unit_scale=unit_scale,
         drop_labelled_outliers=drop_outliers,
         from_file_initialisation=from_file,
+        noise=_chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
         seed=seed,
     )
     for key in ("formulation", "solver", "cost_initial", "cost", "ate_m", "iterations", "solve_s"):

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.bag_layout import Layout
 from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
+from flocc_launch.datasets.clocks import ClockFit, measured
 from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, read_source, team_folder
 from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
@@ -31,9 +33,16 @@ from flocc_launch.datasets.video import (
     read_head,
 )
 from flocc_launch.datasets.writer import Progress, write_source
+from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)
 
+USED_NAMES = re.compile(
+    r"(odometry|trajectory|poses|vio|groundtruth|gt|ground_truth|traj|images|rgb|times|source|odometry_made)"
+    r"\.(tum|txt|csv)$|state_groundtruth|mocap0|camera|calib|intrinsics|sensor|transforms\.json$|sparse$|frame-",
+    re.IGNORECASE,
+)
+"""Names of what readers use beside images."""
 ODOMETRY_MADE = "odometry_made.txt"
 """In a recording: how its odometry was made of ground truth."""
 
@@ -104,8 +113,21 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source)),
-        notes=source.notes,
+        notes=(*source.notes, *_unused(source)),
     )
+
+
+def _unused(source: Source) -> list[str]:
+    """What lies in a data set's folder and is not used, in one sentence."""
+    root = source.path / "mav0" if (source.path / "mav0").is_dir() else source.path
+    used = {file.relative_to(root).parts[0] for _, file in source.images if file.is_relative_to(root)}
+    others = [
+        entry.name
+        for entry in sorted(root.iterdir())
+        if entry.name[0] != "." and entry.name not in used and not USED_NAMES.match(entry.name)
+    ]
+    more = f" and {len(others) - 8} more" if len(others) > 8 else ""
+    return [f"{root}: not used: {', '.join(others[:8])}{more}"] if others else []
 
 
 def _posed(source: Source, trajectory: Trajectory | None) -> int | None:
@@ -215,10 +237,26 @@ def infos(path: Path, format_name: str | None = None, form: str | None = None) -
         yield info(path, format_name, form)
         return
     for entry in team.values():
-        yield info(entry, None, form)
+        try:
+            yield info(entry, None, form)
+        except FloccError as error:
+            logger.warning("%s", error)
     others = [entry.name for entry in sorted(path.iterdir()) if entry not in team.values() and entry.name[0] != "."]
     if others:
         logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
+
+
+def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, form: str | None = None) -> ClockFit:
+    """Measure how far a data set's pictures and its trajectory (or another one) are apart in time.
+
+    Raises:
+        DatasetError: There is no trajectory or calibration, or the pictures do not tell.
+    """
+    source = read_source(path, None, camera, form if odometry is None else None, time_offset_s=None)
+    trajectory = source.odometry or source.truth if odometry is None else read_trajectory(odometry, form)[0]
+    if trajectory is None:
+        raise DatasetError(f"{path}: has neither odometry nor ground truth ({expected_files(path)})")
+    return measured(source.images, source.lens.camera if source.lens else None, trajectory)
 
 
 def convert(
@@ -238,6 +276,7 @@ def convert(
     form: str | None = None,
     robot: str | None = None,
     view_deg: float | None = None,
+    time_offset_s: float = 0.0,
     progress: Progress | None = None,
 ) -> Path:
     """Write a data set or a bag as one recording; a conversion that was cut short goes on where it ended.
@@ -258,6 +297,7 @@ def convert(
         form: Of trajectories in text (`trajectory_text.FORMS`); None finds out.
         robot: Of a bag of several robots, the one to convert; None converts all, each into a folder in `out`.
         view_deg: Horizontal field of view that is kept of a wide lens, degrees; None takes as much as there is.
+        time_offset_s: Added to the stamps of a folder's odometry and ground truth.
         progress: Called with images done and images in all.
 
     Returns:
@@ -284,10 +324,13 @@ def convert(
         for note in convert_video(path, out, camera, odometry, form, every, progress):
             logger.warning("%s", note)
         return out
-    source = _viewed(read_source(path, format_name, camera, form if odometry is None else None), view_deg)
+    own_form = form if odometry is None else None
+    source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
     _tell(source)
-    identity = _identity("convert", path, source, drift, seed)
-    given = None if odometry is None else _given_odometry(source, odometry, form)
+    identity = _identity(
+        f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
+    )
+    given = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
     write_source(source, out, moved, identity, progress)
     _note_drift(out, drift if given is None else None)
@@ -384,8 +427,9 @@ def _tell(source: Source) -> None:
         logger.warning("%s", note)
 
 
-def _given_odometry(source: Source, path: Path, form: str | None) -> Trajectory:
-    given, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+def _given_odometry(source: Source, path: Path, form: str | None, time_offset_s: float) -> Trajectory:
+    read, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
+    given = read.later(time_offset_s)
     _tell(replace(source, notes=notes))
     check_times(source, given, path)
     return given.relative_to_first()

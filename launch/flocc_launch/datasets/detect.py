@@ -31,6 +31,9 @@ from flocc_launch.datasets.reconstructions import (
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import is_video
 
+CLOCKS_DIFFER = (
+    "both must be of one clock: flocc dataset clock measures how far they are apart, and --time-offset mends it"
+)
 READERS: dict[str, Callable[[Path], Source]] = {
     "euroc": read_euroc,
     "kitti": read_kitti,
@@ -125,7 +128,11 @@ def _known_format(path: Path) -> str | None:
 
 
 def read_source(
-    path: Path, format_name: str | None = None, camera: Path | None = None, form: str | None = None
+    path: Path,
+    format_name: str | None = None,
+    camera: Path | None = None,
+    form: str | None = None,
+    time_offset_s: float | None = 0.0,
 ) -> Source:
     """Read one robot's data set.
 
@@ -134,6 +141,7 @@ def read_source(
         format_name: One of `READERS`; None detects it.
         camera: Intrinsics, where the folder has none or others are wanted.
         form: Of the trajectories of a plain folder (`trajectory_text.FORMS`); None finds out.
+        time_offset_s: Added to the stamps of trajectories; None leaves them as they are and unchecked.
 
     Raises:
         DatasetError: Unknown, or nothing in it can be used.
@@ -142,8 +150,11 @@ def read_source(
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
     source = _read(path, name, form)
+    if time_offset_s:
+        odometry, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
+        source = replace(source, odometry=odometry, truth=truth)
     for trajectory in (source.odometry, source.truth):
-        if trajectory is not None:
+        if trajectory is not None and time_offset_s is not None:
             check_times(source, trajectory)
     lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
     return _usable(replace(source, lens=lens))
@@ -190,7 +201,7 @@ def _what_stamps_look_like(source: Source, trajectory: Trajectory) -> str:
         return "the trajectory's stamps look like numbers of images, not seconds"
     unit = _time_unit(float(np.sum(steps_s)), source.images[-1][0] - source.images[0][0])
     known = unit not in (None, "seconds")
-    return f"the trajectory's stamps look like {unit}, not seconds" if known else "both must be of one clock"
+    return f"the trajectory's stamps look like {unit}, not seconds" if known else CLOCKS_DIFFER
 
 
 def _time_unit(duration_s: float, reference_s: float) -> str | None:

@@ -95,9 +95,7 @@ def weak_links(loaded: LoadedRun) -> list[Finding]:
             f"{robot} hangs on {track.map_frame} by {len(ties)} of {accepted} accepted closures; the solver did not "
             "use the rest. One false closure misplaces it."
         )
-        advice = (
-            "Let it meet the others again, or raise core.loop_closing.match_ratio_threshold so that fewer are false."
-        )
+        advice = "Let it meet the others again, or use a front end that sees further (perception.method = 'learned')."
         findings.append(Finding("weak-link", Severity.HINDERS, sentence, advice, (robot,)))
     return findings
 

@@ -115,9 +115,8 @@ def solver_dropped_closures(rows: Rows, a: RobotStatus, b: RobotStatus) -> Findi
         Severity.BLOCKS,
         f"{accepted} closures between {a.robot} and {b.robot} were accepted, but the last solution of {a.leader} keeps "
         f"them in separate parts ({solver.closures_used} closures used, {solver.closures_rejected} rejected).{warned}",
-        "The closures contradict each other or odometry, or are too few: raise "
-        "core.loop_closing.match_ratio_threshold, check the camera's intrinsics and T_body_camera, and that odometry "
-        "is metric.",
+        "The closures contradict each other or odometry, or are too few: check the camera's "
+        "intrinsics and T_body_camera, and that odometry is metric.",
         (a.robot, b.robot),
     )
 

@@ -247,8 +247,8 @@ def solver_dropped_closures(loaded: LoadedRun, a: str, b: str) -> Finding | None
         "closures-not-connecting",
         f"{count} closures between {a} and {b} were accepted, but the optimisation of round {last.round} kept them in "
         f"separate parts ({count_of(last.closures_used)} closures used, {count_of(last.closures_rejected)} rejected).",
-        "The closures contradict each other or odometry: raise core.loop_closing.match_ratio_threshold, check the "
-        "camera's intrinsics and T_body_camera, and that odometry is metric.",
+        "The closures contradict each other or odometry: check the camera's intrinsics and T_body_camera, and that "
+        "odometry is metric.",
         a,
         b,
     )

@@ -9,14 +9,14 @@ from flocc_launch.graph_files.jrl import read_jrl
 __all__ = ["GraphFile", "GraphFileError", "read_g2o", "read_graph_file", "read_jrl", "write_g2o"]
 
 
-def read_graph_file(path: Path) -> GraphFile:
+def read_graph_file(path: Path, isotropic: bool = False) -> GraphFile:
     """Read a .g2o file, a folder with one .g2o file per robot, or a .jrl file.
 
     Raises:
         GraphFileError: It is missing, of another kind or damaged; the message names the file and the line or key.
     """
     if path.is_dir() or path.suffix == ".g2o":
-        return read_g2o(path)
+        return read_g2o(path, isotropic)
     if path.suffix == ".jrl":
         return read_jrl(path)
     raise GraphFileError(f"{path}: is neither a .g2o nor a .jrl file nor a folder of .g2o files")

@@ -5,7 +5,9 @@ holds one file per robot (keys of all robots in their top byte), and maybe a `*_
 all keyframes, robot after robot.
 """
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +22,8 @@ from flocc_launch.graph_files.graph_file import (
     GraphFileError,
     Measurement,
     distinct,
+    isotropic_of,
+    log_of,
     pose_graph,
 )
 from flocc_protocol.ids import KeyframeId, LogId
@@ -27,21 +31,33 @@ from flocc_protocol.ids import KeyframeId, LogId
 Float = NDArray[np.float64]
 
 SE3_NUMBERS, SE2_NUMBERS = 7 + 21, 3 + 6
+EDGES = ("EDGE_SE3:QUAT", "EDGE_SE2")
+VERTICES = {"VERTEX_SE3:QUAT": 7, "VERTEX_SE2": 3}
+KNOWN = {*EDGES, *VERTICES, "FIX"}
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
-def read_g2o(path: Path) -> GraphFile:
-    """Read a g2o file, or all robots' files of a folder.
+def read_g2o(path: Path, isotropic: bool = False) -> GraphFile:
+    """Read a g2o file, or all robots' files of a folder; with `isotropic` noise as SE-Sync reduces it.
 
     Raises:
         GraphFileError: A file is missing or a line is damaged; the message names both.
     """
     files = _robot_files(path) if path.is_dir() else [path]
-    measurements = distinct((m for file in files for m in _measurements(file)), add_up=True)
+    lines = [line for file in files for line in _lines(file)]
+    measurements = distinct((m for line in lines if (m := _measurement(line, isotropic)) is not None), add_up=True)
     if not measurements:
         raise GraphFileError(f"{path}: has no edges")
     graph = pose_graph(measurements, str(path))
-    return GraphFile(graph, _truth(path, graph) if path.is_dir() else {})
+    vertices = dict(v for line in lines if (v := _vertex(line)) is not None)
+    return GraphFile(
+        graph,
+        _truth(path, graph) if path.is_dir() else {},
+        T_initial=_initial(vertices, graph),
+        planar=all(line.words[0] != "EDGE_SE3:QUAT" for line in lines),
+        left_out=Counter(line.words[0] for line in lines if line.words[0] not in KNOWN),
+        fixed=_fixed(lines, vertices),
+    )
 
 
 def _robot_files(folder: Path) -> list[Path]:
@@ -51,19 +67,68 @@ def _robot_files(folder: Path) -> list[Path]:
     return files
 
 
-def _measurements(path: Path) -> Iterable[Measurement]:
+@dataclass(frozen=True, slots=True)
+class Line:
+    """The words of a line that is not empty, and where it is."""
+
+    path: Path
+    number: int
+    words: list[str]
+
+
+def _lines(path: Path) -> Iterable[Line]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise GraphFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     for number, line in enumerate(lines, 1):
         words = line.split()
-        if not words or words[0] not in ("EDGE_SE3:QUAT", "EDGE_SE2"):
-            continue
-        try:
-            yield _se3(words[1:]) if words[0] == "EDGE_SE3:QUAT" else _se2(words[1:])
-        except (ValueError, np.linalg.LinAlgError) as error:
-            raise GraphFileError(f"{path}: line {number}: {error}") from error
+        if words and not words[0].startswith("#"):
+            yield Line(path, number, words)
+
+
+def _measurement(line: Line, isotropic: bool) -> Measurement | None:
+    """The edge of a line; None where it has none."""
+    kind, *numbers = line.words
+    if kind not in EDGES:
+        return None
+    try:
+        return _se3(numbers, isotropic) if kind == "EDGE_SE3:QUAT" else _se2(numbers)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
+
+
+def _vertex(line: Line) -> tuple[int, Float] | None:
+    """Key and pose of a vertex line; None where it has none."""
+    kind, *numbers = line.words
+    if kind not in VERTICES:
+        return None
+    try:
+        key, *v = int(numbers[0]), *(float(number) for number in numbers[1:])
+        if len(v) != VERTICES[kind] or not np.all(np.isfinite(v)):
+            raise ValueError(f"a vertex has {len(v)} finite numbers, expected {VERTICES[kind]}")
+        if kind == "VERTEX_SE2":
+            return key, pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
+        return key, pose(R_from_q_wxyz(np.array(v)[[6, 3, 4, 5]]), np.array(v[:3]))
+    except (ValueError, IndexError) as error:
+        raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
+
+
+def _fixed(lines: Sequence[Line], vertices: Mapping[int, Float]) -> tuple[KeyframeId, ...]:
+    """Keyframes of `FIX` lines, where the vertices say their place."""
+    keys = [int(word) for line in lines if line.words[0] == "FIX" for word in line.words[1:] if word.isdigit()]
+    found = [key for key in keys if key in vertices]
+    before = {key: sum(other < key and log_of(other) == log_of(key) for other in vertices) for key in found}
+    return tuple(KeyframeId(log_of(key), before[key]) for key in found)
+
+
+def _initial(vertices: Mapping[int, Float], graph: PoseGraph) -> dict[LogId, Float]:
+    """Poses of each log whose vertices are all there, in the order of their keys."""
+    by_log: dict[LogId, list[int]] = {}
+    for key in sorted(vertices):
+        by_log.setdefault(log_of(key), []).append(key)
+    whole = {log: keys for log, keys in by_log.items() if len(keys) == len(graph.trajectories.get(log, ()))}
+    return {log: np.array([vertices[key] for key in keys]) for log, keys in whole.items()}
 
 
 def _numbers(words: list[str], count: int) -> tuple[int, int, Float]:
@@ -81,12 +146,23 @@ def _symmetric(upper: Float, size: int) -> Float:
     return np.asarray(out + np.triu(out, 1).T)
 
 
-def _se3(words: list[str]) -> Measurement:
+def _se3(words: list[str], isotropic: bool) -> Measurement:
     """One `EDGE_SE3:QUAT`: quaternion x y z w, information with translation first."""
     first, second, v = _numbers(words, SE3_NUMBERS)
     T = pose(R_from_q_wxyz(v[[6, 3, 4, 5]]), v[:3])
     information = _symmetric(v[7:], 6)[np.ix_(ROTATION_FIRST, ROTATION_FIRST)]
-    return Measurement(first, second, T, np.linalg.inv(information))
+    return Measurement(first, second, T, isotropic_of(information) if isotropic else _covariance(information))
+
+
+def _covariance(information: Float) -> Float:
+    """The inverse of an information matrix.
+
+    Raises:
+        ValueError: It is not positive definite.
+    """
+    if np.min(np.linalg.eigvalsh(information)) <= 0.0:
+        raise ValueError("the information matrix is not positive definite")
+    return np.asarray(np.linalg.inv(information))
 
 
 def _se2(words: list[str]) -> Measurement:
@@ -94,7 +170,7 @@ def _se2(words: list[str]) -> Measurement:
     T = pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
     covariance = np.eye(6)
     planar = np.ix_([3, 4, 2], [3, 4, 2])
-    covariance[planar] = np.linalg.inv(_symmetric(v[3:], 3))
+    covariance[planar] = _covariance(_symmetric(v[3:], 3))
     return Measurement(first, second, T, covariance)
 
 

@@ -41,6 +41,9 @@ class GraphFile:
         T_initial: (N, 4, 4) poses of each log in one frame, where the file has an initialisation.
         outliers: Indices of closures that the file labels as wrong.
         T_truth: (N, 4, 4) true pose of every keyframe of each log, where the file has whole poses.
+        planar: Whether it was a file of two dimensions.
+        left_out: How many lines of each kind were not read.
+        fixed: Keyframes that the file holds where they are.
         stamps_s: (N,) time of every keyframe of each log, counted from the file's first, where it has times.
     """
 
@@ -50,6 +53,9 @@ class GraphFile:
     outliers: frozenset[int] = frozenset()
     T_truth: Mapping[LogId, Float] = field(default_factory=dict)
     stamps_s: Mapping[LogId, Float] = field(default_factory=dict)
+    planar: bool = False
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    fixed: tuple[KeyframeId, ...] = ()
 
     def without_outliers(self) -> "GraphFile":
         """The same file without the closures that it labels as wrong."""
@@ -88,32 +94,43 @@ class GraphFile:
         Twice the back end's cost is then SE-Sync's objective `sum kappa |R_j - R_i R|^2 + tau |t_j - t_i - R_i t|^2`.
         """
         trajectories = {
-            log: replace(trajectory, edge_covariances=_isotropic_all(trajectory.edge_covariances))
+            log: replace(trajectory, edge_covariances=_isotropic_all(trajectory.edge_covariances, self.planar))
             for log, trajectory in self.graph.trajectories.items()
         }
         closures = tuple(
-            c if c.covariance is None else replace(c, covariance=isotropic(c.covariance)) for c in self.graph.closures
+            c if c.covariance is None else replace(c, covariance=isotropic(c.covariance, self.planar))
+            for c in self.graph.closures
         )
         return replace(self, graph=replace(self.graph, trajectories=trajectories, closures=closures))
 
 
-def isotropic(covariance: Float) -> Float:
+def isotropic(covariance: Float, planar: bool = False) -> Float:
     """SE-Sync's isotropic noise (6, 6): `kappa = 3 / (2 tr)`, `tau = 3 / tr` of the inverse information blocks.
 
-    A planar edge (unit variance about x and y and along z, from `g2o._se2`) takes `kappa` of its one angle and
+    An edge of a planar file takes `kappa` of its one angle and
     `tau = 2 / tr`. The back end's rotation residual is half of SE-Sync's squared, hence variance `1 / (2 kappa)`.
     """
-    information = np.linalg.inv(covariance)
+    return isotropic_of(np.asarray(np.linalg.inv(covariance), dtype=np.float64), planar)
+
+
+def isotropic_of(information: Float, planar: bool = False) -> Float:
+    """The same of an information matrix, which need not be positive definite: only traces of its blocks count.
+
+    Raises:
+        ValueError: A trace is not positive.
+    """
     rotation, translation = np.linalg.inv(information[:3, :3]), np.linalg.inv(information[3:, 3:])
-    if np.array_equal(covariance[:2], np.eye(6)[:2]):
+    if np.trace(rotation) <= 0.0 or np.trace(translation) <= 0.0:
+        raise ValueError("the information matrix is not positive definite")
+    if planar:
         kappa, tau = information[2, 2], 2.0 / np.trace(translation[:2, :2])
     else:
         kappa, tau = 1.5 / np.trace(rotation), 3.0 / np.trace(translation)
     return np.diag([0.5 / kappa] * 3 + [1.0 / tau] * 3)
 
 
-def _isotropic_all(covariances: Float | None) -> Float | None:
-    return None if covariances is None else np.array([isotropic(S) for S in covariances]).reshape(-1, 6, 6)
+def _isotropic_all(covariances: Float | None, planar: bool) -> Float | None:
+    return None if covariances is None else np.array([isotropic(S, planar) for S in covariances]).reshape(-1, 6, 6)
 
 
 def unit_length(closure: LoopClosure) -> LoopClosure:

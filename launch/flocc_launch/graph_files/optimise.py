@@ -1,13 +1,14 @@
 """`flocc optimise FILE`: any formulation and solver on a pose graph from a file, and what came out of it.
 
-Every robot starts in its own odometry frame, unless the file's initialisation is asked for. For g2o files the noise
-is SE-Sync's isotropic model, so that `cost` is SE-Sync's objective. Costs in `result.json` are sums of squared
-weighted residuals, without the half.
+Every robot starts in its own odometry frame, unless the file's initialisation is asked for. The noise is
+the file's own, or SE-Sync's isotropic model, with which `cost` is SE-Sync's objective. Costs in `result.json` are sums
+of squared weighted residuals, without the half. The result lies where the file has its fixed or first vertex.
 """
 
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,18 @@ from flocc_agent.geometry import inverse
 from flocc_launch.graph_files import GraphFile, read_graph_file, write_g2o
 from flocc_launch.graph_files.graph_file import GraphFileError, ate_m, first_poses_at
 from flocc_protocol.errors import FloccError
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 
 CONVERGED_RATIO = 1e-9
+
+
+class NoiseModel(StrEnum):
+    """What is made of a file's information matrices."""
+
+    GAUSSIAN = "gaussian"
+    ISOTROPIC = "isotropic"
 
 
 class OptimiseError(FloccError):
@@ -49,6 +57,7 @@ def optimise_file(
     unit_scale: bool = False,
     drop_labelled_outliers: bool = False,
     from_file_initialisation: bool = False,
+    noise: NoiseModel = NoiseModel.GAUSSIAN,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Optimise the pose graph of a file and write `result.json`, `optimised.g2o` and corrected trajectories.
@@ -63,6 +72,7 @@ def optimise_file(
         unit_scale: Reduce translations of inter-robot closures to length one and free their scale.
         drop_labelled_outliers: Leave out closures that the file labels as wrong.
         from_file_initialisation: Start from the file's own initialisation.
+        noise: Information matrices as they are, or reduced to SE-Sync's isotropic ones.
         seed: Recorded; nothing in the back end is drawn by chance.
 
     Returns:
@@ -72,7 +82,9 @@ def optimise_file(
         GraphFileError: The file cannot be read, or lacks what was asked for.
         OptimiseError: There is no solution, or the folder cannot be written.
     """
-    file = prepared(read_graph_file(path), path, unit_scale, drop_labelled_outliers, scale_initial)
+    file = read_graph_file(path, isotropic=noise is NoiseModel.ISOTROPIC)
+    file = file.with_isotropic_noise() if noise is NoiseModel.ISOTROPIC else file
+    file = prepared(file, path, unit_scale, drop_labelled_outliers, scale_initial)
     config = file_config(formulation, solver, scale_initial, pairwise_consistency)
     initial = initialisation(file, path) if from_file_initialisation else None
     from flocc_agent.backend.optimiser import optimise
@@ -83,11 +95,12 @@ def optimise_file(
     result = {
         "file": str(path),
         "seed": seed,
+        "noise": noise.value,
         "unit_scale": unit_scale,
         "drop_labelled_outliers": drop_labelled_outliers,
         **report(file, config, solution),
     }
-    _write(out, result, solution, file.graph.closures)
+    _write(out, result, in_frame_of(file, solution), file.graph.closures)
     return result
 
 
@@ -95,8 +108,6 @@ def prepared(
     file: GraphFile, path: Path, unit_scale: bool, drop_labelled_outliers: bool, scale_initial: ScaleInitial | None
 ) -> GraphFile:
     """Apply the options that change the graph."""
-    if path.suffix != ".jrl":
-        file = file.with_isotropic_noise()
     if drop_labelled_outliers:
         if not file.outliers:
             raise GraphFileError(f"{path}: labels no outliers")
@@ -161,9 +172,13 @@ def report(file: GraphFile, config: BackendConfig, solution: GraphSolution) -> d
         "closures_used": sum(c.state is ClosureState.USED for c in solution.closures),
         "closures_rejected": _named(solution, ClosureState.REJECTED),
         "closures_excluded": _named(solution, ClosureState.EXCLUDED),
-        "warnings": list(solution.warnings),
+        "warnings": [*_unread(file), *solution.warnings],
         **label_counts(file, solution),
     }
+
+
+def _unread(file: GraphFile) -> list[str]:
+    return [f"{count} lines of kind {kind} are left out" for kind, count in sorted(file.left_out.items())]
 
 
 def label_counts(file: GraphFile, solution: GraphSolution) -> dict[str, int | None]:
@@ -190,6 +205,20 @@ def odometry_ate_m(file: GraphFile) -> float | None:
         return None
     placed = {log: first_poses_at(t.T_odom_keyframe, file.T_initial[log][0]) for log, t in trajectories.items()}
     return ate_m({log: T[:, :3, 3] for log, T in placed.items()}, file.truth_m)
+
+
+def in_frame_of(file: GraphFile, solution: GraphSolution) -> GraphSolution:
+    """The solution moved so that each component's fixed keyframe, else its first, is where the file has its vertex."""
+    return replace(solution, components=tuple(_in_frame_of(file, component) for component in solution.components))
+
+
+def _in_frame_of(file: GraphFile, component: Component) -> Component:
+    held = [k for k in file.fixed if k.log in component.logs]
+    at = held[0] if held else KeyframeId(component.anchor, 0)
+    if at.log not in file.T_initial:
+        return component
+    T_file_map = file.T_initial[at.log][at.index] @ inverse(component.T_map_keyframe[at.log][at.index])
+    return replace(component, T_map_keyframe={log: T_file_map @ T for log, T in component.T_map_keyframe.items()})
 
 
 def _named(solution: GraphSolution, state: ClosureState) -> list[dict[str, str]]:

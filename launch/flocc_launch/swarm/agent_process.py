@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -34,7 +34,10 @@ EXIT_BAD_INPUT = 2
 
 
 class Lines:
-    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported."""
+    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported.
+
+    A disk that fails ends the file, not the robot: it goes on, as it does without its store.
+    """
 
     def __init__(self, path: Path | None) -> None:
         self._file: TextIO | None = None
@@ -44,14 +47,21 @@ class Lines:
 
     def write(self, event: Reported[Fact]) -> None:
         """Append one event."""
-        if self._file is not None:
+        if self._file is None:
+            return
+        try:
             self._file.write(json.dumps(line_of(event), separators=(",", ":"), allow_nan=False) + "\n")
             self._file.flush()
+        except OSError as error:
+            logger.error("%s: %s; events are no longer written", self._file.name, error.strerror or error)
+            self.close()
 
     def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
+        """Close the file; what a full disk did not take is lost."""
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError):
+                file.close()
 
 
 async def run_agent(

@@ -13,9 +13,8 @@ from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.config import BackendConfig, Formulation, Solver
-from flocc_agent.core.pose_graph import AbsoluteFix, GraphSolution
+from flocc_agent.core.pose_graph import GraphSolution
 from flocc_lab.bench.generated_graph import GeneratedGraph, generate
-from flocc_protocol.ids import KeyframeId, LogId
 
 FORMULATIONS = (Formulation.BASE, Formulation.INDEPENDENT, Formulation.SMOOTHED, Formulation.SHARED)
 
@@ -24,18 +23,12 @@ def generated(keyframes: int = 120, closures: int = 240, seed: int = 1) -> Gener
     return generate(np.random.default_rng(seed), 3, keyframes, closures)
 
 
-def fixes_of(graph: GeneratedGraph) -> list[AbsoluteFix]:
-    log = LogId("r01")
-    truth = graph.T_world_keyframe[log]
-    return [AbsoluteFix(KeyframeId(log, k), truth[k, :3, 3], np.eye(3)) for k in range(0, 80, 10)]
-
-
-def problem_of(graph: GeneratedGraph, formulation: Formulation, fixes: list[AbsoluteFix]) -> tuple[Problem, State]:
+def problem_of(graph: GeneratedGraph, formulation: Formulation) -> tuple[Problem, State]:
     config = BackendConfig(formulation=formulation)
     closures = dict(enumerate(graph.graph.closures))
     T_initial = initial_poses(graph.graph.trajectories, closures, 4.0, None)[0]
-    problem = build(graph.graph.trajectories, closures, fixes, config, T_initial, np.eye(4))
-    poses = [T_initial[log] for log in problem.logs] + ([np.eye(4)[None]] if fixes else [])
+    problem = build(graph.graph.trajectories, closures, config)
+    poses = [T_initial[log] for log in problem.logs]
     return problem, state_of(np.concatenate(poses), problem.clusters)
 
 
@@ -62,11 +55,10 @@ def assert_same_step(iterated: np.ndarray, eliminated: np.ndarray) -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("damping", [0.0, 100.0])
-@pytest.mark.parametrize("with_fixes", [False, True])
 @pytest.mark.usefixtures("exact")
-def test_both_ways_give_the_same_step(formulation: Formulation, damping: float, with_fixes: bool) -> None:
+def test_both_ways_give_the_same_step(formulation: Formulation, damping: float) -> None:
     graph = generated()
-    problem, state = problem_of(graph, formulation, fixes_of(graph) if with_fixes else [])
+    problem, state = problem_of(graph, formulation)
     weights = np.ones(len(problem.edges))
     weights[problem.closure_rows] = np.random.default_rng(1).choice([1.0, 0.3, 1e-6], len(problem.closure_ids))
     iterated, eliminated = steps(problem, state, weights, False, damping)
@@ -76,7 +68,7 @@ def test_both_ways_give_the_same_step(formulation: Formulation, damping: float, 
 
 @pytest.mark.usefixtures("exact")
 def test_scales_that_are_held_at_their_bound_give_the_same_step() -> None:
-    problem, state = problem_of(generated(), Formulation.SMOOTHED, [])
+    problem, state = problem_of(generated(), Formulation.SMOOTHED)
     folded = State(state.q, np.zeros_like(state.t), state.scale - 1.2)
     assert np.any(residuals(problem.edges, folded, hold=True).held)
     assert_same_step(*steps(problem, folded, np.ones(len(problem.edges)), True, 0.0))
@@ -96,7 +88,7 @@ def test_a_whole_solve_reaches_the_same_optimum(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_system_that_needs_too_many_iterations_is_eliminated(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, state = problem_of(generated(), Formulation.INDEPENDENT, [])
+    problem, state = problem_of(generated(), Formulation.INDEPENDENT)
     monkeypatch.setattr(conjugate_gradients, "ITERATIONS_MOST", 1)
     iterated, eliminated = steps(problem, state, np.ones(len(problem.edges)), False, 0.0)
     np.testing.assert_array_equal(iterated, eliminated)

@@ -8,7 +8,16 @@ import pytest
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.corrections import correction_of
-from flocc_agent.core.pose_graph import AbsoluteFix, ClosureState, GraphSolution, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import (
+    WORLD,
+    ClosureState,
+    GraphSolution,
+    LoopClosure,
+    MeasuredFactor,
+    PoseGraph,
+    Trajectory,
+    landmark,
+)
 from flocc_protocol.ids import KeyframeId, LogId, Term
 
 A, B = LogId("a"), LogId("b")
@@ -29,8 +38,9 @@ def closure(k: int, y_m: float = 1.0, scale: float = 1.0) -> LoopClosure:
     return LoopClosure(KeyframeId(A, k), KeyframeId(B, k), translated(0.0, y_m, 0.0), 0.9, scale)
 
 
-def fix(x_m: float, y_m: float) -> AbsoluteFix:
-    return AbsoluteFix(KeyframeId(A, 2), np.array([x_m, y_m, 0.0]), 0.1 * np.eye(3))
+def fix(x_m: float, y_m: float) -> MeasuredFactor:
+    at = KeyframeId(A, 2)
+    return MeasuredFactor("fix", at, landmark(WORLD), at, translated(x_m, y_m, 0.0), 0.1 * np.eye(3))
 
 
 GOOD = tuple(closure(k) for k in (1, 3, 5, 6))
@@ -39,7 +49,7 @@ EXTREMES = {
     "a closure over 10,000 km": replace(PLAIN, closures=(*GOOD, closure(4, y_m=1e7))),
     "a closure of scale 1e9": replace(PLAIN, closures=(*GOOD, closure(4, scale=1e9))),
     "a closure of scale 1e-9": replace(PLAIN, closures=(*GOOD, closure(4, scale=1e-9))),
-    "a fix in UTM coordinates": replace(PLAIN, fixes=(fix(5e5, 5e6),)),
+    "a fix in UTM coordinates": replace(PLAIN, measured=(fix(5e5, 5e6),)),
     "odometry that jumps 5,000 km": replace(PLAIN, trajectories={A: trajectory(5e6), B: trajectory()}),
 }
 

@@ -1,5 +1,6 @@
 """Claim: whatever is wrong with measurements, the optimiser answers, and every pose is finite and rigid."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,16 @@ import pytest
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.config import BackendConfig, Formulation, Solver
-from flocc_agent.core.pose_graph import AbsoluteFix, GraphSolution, LoopClosure, OptimisationFailed, PoseGraph
+from flocc_agent.core.pose_graph import (
+    WORLD,
+    GraphSolution,
+    LoopClosure,
+    MeasuredFactor,
+    OptimisationFailed,
+    PoseGraph,
+    Trajectory,
+    landmark,
+)
 from flocc_agent.geometry import pose, so3_exp
 from flocc_lab.bench.generated_graph import generate
 from flocc_protocol.ids import KeyframeId, LogId
@@ -51,11 +61,23 @@ def graph(rng: np.random.Generator) -> PoseGraph:
         trajectories[log] = replace(trajectories[log], T_odom_keyframe=T)
     if rng.random() < 0.2:
         trajectories[log] = replace(trajectories[log], edge_covariances=rng.normal(size=(3, 6, 6)))
-    sigma_m2 = 10.0 ** rng.uniform(-6, 6)
-    fixes = (
-        [AbsoluteFix(KeyframeId(log, 0), rng.normal(size=3) * 100, sigma_m2 * np.eye(3))] if rng.random() < 0.3 else []
-    )
-    return PoseGraph(trajectories, closures, fixes)
+    measured = [any_factor(rng, trajectories) for _ in range(int(rng.integers(0, 12)))] if rng.random() < 0.5 else []
+    return PoseGraph(trajectories, closures, tuple(measured))
+
+
+def any_factor(rng: np.random.Generator, trajectories: Mapping[LogId, Trajectory]) -> MeasuredFactor:
+    """Something measured, of the right form but where chance damaged it."""
+    logs = list(trajectories)
+    at, other = (KeyframeId(logs[int(rng.integers(len(logs)))], int(rng.integers(0, 22))) for _ in range(2))
+    query = [at, landmark(WORLD), landmark(WORLD)][int(rng.integers(3))]
+    match = [landmark("tag/7"), other][int(rng.integers(2))] if query == at else at
+    T = pose(so3_exp(rng.normal(size=3)), 10.0 * rng.normal(size=3))
+    covariance = 10.0 ** rng.uniform(-6, 6) * np.eye(int(rng.choice([3, 6])))
+    if rng.random() < 0.2:
+        T = T * rng.choice([np.nan, 0.0, 2.0])
+    if rng.random() < 0.2:
+        covariance = covariance * rng.choice([np.nan, 0.0, -1.0])
+    return MeasuredFactor("any", at, query, match, T, covariance)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -76,6 +98,7 @@ def test_no_measurement_makes_it_raise_or_answer_with_a_broken_pose(part: int) -
             assert solution.reason
             continue
         assert len(solution.closures) == len(bad.closures)
+        assert [result.factor for result in solution.measured] == list(bad.measured)
         for component in solution.components:
             for log in component.logs:
                 assert first_not_rigid(component.T_map_keyframe[log]) is None, f"seed {seed}, robot {log}"

@@ -27,7 +27,7 @@ def objective_of(drawn: Member, solver: Solver) -> tuple[Objective, State]:
     config = BackendConfig(solver=solver, weight_by_probability=False)
     closures = dict(enumerate(drawn.graph.closures))
     T, _ = initial_poses(drawn.graph.trajectories, closures, config.steepness, None)
-    problem = build(drawn.graph.trajectories, closures, (), config, T, np.eye(4))
+    problem = build(drawn.graph.trajectories, closures, config)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     state = state_of(np.concatenate([T[log] for log in problem.logs]), problem.clusters)
     return Objective(problem.edges, problem.closure_rows, linear, config), state

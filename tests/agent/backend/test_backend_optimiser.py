@@ -13,13 +13,14 @@ from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import (
-    AbsoluteFix,
     ClosureState,
     GraphSolution,
     LoopClosure,
+    MeasuredFactor,
     OptimisationFailed,
     PoseGraph,
     Trajectory,
+    landmark,
 )
 from flocc_agent.geometry import between, inverse, pose, se3_exp, so3_exp
 from flocc_lab.bench.generated_graph import GeneratedGraph, Noise, generate
@@ -167,8 +168,11 @@ def test_fixes_of_a_world_frame_take_drift_away() -> None:
     generated = generate(rng, 1, 300, 0, noise=Noise(odometry=(0.01, 0.02)))
     (log,) = generated.graph.trajectories
     T = generated.T_world_keyframe[log]
-    fixes = [AbsoluteFix(KeyframeId(log, k), T[k][:3, 3], 0.01 * np.eye(3)) for k in range(4, 300, 5)]
-    without, with_fixes = (solved(replace(generated.graph, fixes=f), BackendConfig()) for f in ((), fixes))
+    at = [KeyframeId(log, k) for k in range(4, 300, 5)]
+    fixes = [
+        MeasuredFactor("fix", k, landmark("world"), k, pose(np.eye(3), T[k.index][:3, 3]), 0.01 * np.eye(3)) for k in at
+    ]
+    without, with_fixes = (solved(replace(generated.graph, measured=f), BackendConfig()) for f in ((), fixes))
     assert error_m(generated, with_fixes) < 0.5 * error_m(generated, without)
     (component,) = with_fixes.components
     assert component.T_map_world is not None

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from flocc_agent.config import LearnedConfig
 from flocc_agent.core.interfaces import Camera, Describer, Encoder, Image, Registrar
 from flocc_agent.geometry import inverse
-from flocc_agent.perception.classical.procedural import random_texture
 from flocc_agent.perception.learned import build
 from flocc_agent.perception.learned.weight_sources import WEIGHT_FILES, weights_folder
+from flocc_lab.codebook.procedural import random_texture
 
 Float = NDArray[np.float64]
 

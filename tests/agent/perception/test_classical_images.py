@@ -15,11 +15,11 @@ from flocc_agent.perception.classical.codebook import load_codebook, save_codebo
 from flocc_agent.perception.classical.encoder import decode_features
 from flocc_agent.perception.classical.matching import mutual_matches
 from flocc_agent.perception.classical.patches import dense_patches
-from flocc_agent.perception.classical.procedural import HEIGHT, WIDTH, random_scene, random_view
-from flocc_agent.perception.classical.training import train
 from flocc_agent.perception.multiview.picture import undistorted
 from flocc_agent.perception.multiview.two_view import TwoView, two_view
 from flocc_agent.perception.multiview.view_parameters import Geometry
+from flocc_lab.codebook.procedural import HEIGHT, WIDTH, random_scene, random_view
+from flocc_lab.codebook.training import train
 
 CAMERA = Camera(WIDTH, HEIGHT, 300.0, 300.0, WIDTH / 2, HEIGHT / 2)
 

@@ -1,4 +1,4 @@
-"""Codebook: what turns an image's patches into one vector, learnt from generated images (`training.py`).
+"""Codebook: what turns an image's patches into one vector, learnt from generated images (`flocc_lab.codebook`).
 
 VLAD (Jegou et al. 2010) with intra-normalisation (Arandjelovic and Zisserman 2013), then a projection that keeps
 what differs between scenes and weakens what differs between views of one scene.

@@ -1,4 +1,4 @@
-"""Learn the codebook from generated images: `python -m flocc_agent.perception.classical.training --out FILE`.
+"""Learn the codebook from generated images: `python -m flocc_lab.codebook.training --out FILE`.
 
 The file in the package was made with the defaults; a few minutes on one core.
 """
@@ -19,7 +19,7 @@ from flocc_agent.perception.classical.codebook import (
     vlad,
 )
 from flocc_agent.perception.classical.patches import dense_patches
-from flocc_agent.perception.classical.procedural import random_scene, random_view
+from flocc_lab.codebook.procedural import random_scene, random_view
 
 logger = logging.getLogger(__name__)
 

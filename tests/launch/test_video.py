@@ -1,0 +1,76 @@
+"""A video file is cut into its frames; where odometry or intrinsics are missing, one sentence says so."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from flocc_agent.runtime.recording import Recording
+from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_launch.datasets.commands import convert, info, infos, split
+from flocc_launch.datasets.source import DatasetError
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.shipped import read_scenario
+
+FRAMES, RATE_HZ = 30, 10.0
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    path = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), RATE_HZ, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no MP4")
+    for k in range(FRAMES):
+        writer.write(np.full((48, 64, 3), 8 * k, np.uint8))
+    writer.release()
+    return path
+
+
+def beside(video: Path, zero_s: float = 0.0) -> None:
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, 0, 3] = np.arange(40)
+    write_tum(video.with_suffix(".tum"), Trajectory(zero_s + 0.1 * np.arange(40.0), poses))
+    (video.parent / "camera.yaml").write_text("width: 64\nheight: 48\nfx: 60\nfy: 60\ncx: 32\ncy: 24\n")
+
+
+def test_frames_get_the_stamps_of_the_video(video: Path, tmp_path: Path) -> None:
+    beside(video)
+    found = info(video)
+    assert (found.format, found.images, found.odometry_poses, found.faults) == ("video", FRAMES, 40, ())
+    recording = Recording.open(convert(video, tmp_path / "out"))
+    assert [frame.stamp_s for frame in recording.frames] == pytest.approx([0.1 * k for k in range(FRAMES)], abs=0.002)
+    assert [frame.T_odom_body[0, 3] for frame in recording.frames] == pytest.approx(range(FRAMES), abs=0.03)
+    assert recording.load_image(recording.frames[20]).pixels.mean() == pytest.approx(160, abs=6)
+
+
+def test_a_video_without_odometry_says_what_is_needed(video: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"walk.mp4: a video has no odometry: give the camera's metric trajectory"):
+        convert(video, tmp_path / "out")
+    assert "a video has no odometry" in info(video).faults[0]
+    beside(video)
+    (video.parent / "camera.yaml").unlink()
+    with pytest.raises(DatasetError, match=r"walk.mp4: intrinsics are missing"):
+        convert(video, tmp_path / "out")
+
+
+def test_odometry_of_another_clock_is_refused(video: Path, tmp_path: Path) -> None:
+    beside(video, 1.6e9)
+    with pytest.raises(DatasetError, match=r"walk.tum: the trajectory is from 1600000000.000 s .* first frame"):
+        convert(video, tmp_path / "out")
+
+
+def test_a_video_is_launched_and_one_that_is_none_is_refused(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    beside(video)
+    paths = recordings(read_scenario(str(video), {}, agents=2))
+    assert [len(Recording.open(path).frames) for path in paths.values()] == [15, 15]
+    with pytest.raises(DatasetError, match="is a video; make a recording of it first"):
+        split(video, tmp_path / "parts")
+    (tmp_path / "team").mkdir()
+    (tmp_path / "team" / "broken.mp4").write_bytes(b"no video")
+    assert list(infos(tmp_path / "team")) == []
+    assert "broken.mp4: cannot be read as a video; write it as MP4" in caplog.text
