@@ -44,6 +44,21 @@ def T_earth_enu(place: Place) -> Float:
     return pose(np.column_stack([east, np.cross(up, east), up]), origin)
 
 
+def place_of(earth_m: Float) -> Place:
+    """The place of a point (3,) in the Earth-centred frame, poles and date line included.
+
+    Bowring 1976; exact to 1e-4 m within 1e5 m of the ellipsoid.
+    """
+    x, y, z = (float(value) for value in earth_m)
+    semi_minor_m, out_m = SEMI_MAJOR_M * (1.0 - FLATTENING), float(np.hypot(x, y))
+    beta = np.arctan2(z * SEMI_MAJOR_M, out_m * semi_minor_m)
+    north = z + ECCENTRICITY2 / (1.0 - ECCENTRICITY2) * semi_minor_m * np.sin(beta) ** 3
+    phi = np.arctan2(north, out_m - ECCENTRICITY2 * SEMI_MAJOR_M * np.cos(beta) ** 3)
+    surface_m = SEMI_MAJOR_M * np.sqrt(1.0 - ECCENTRICITY2 * np.sin(phi) ** 2)
+    altitude_m = out_m * np.cos(phi) + z * np.sin(phi) - surface_m
+    return Place(float(np.degrees(phi)), float(np.degrees(np.arctan2(y, x))), float(altitude_m))
+
+
 def T_enu_enu(origin: Place, place: Place) -> Float:
     """Pose (4, 4) of the frame at a place in the frame at another one, the origin."""
     return np.asarray(inverse(T_earth_enu(origin)) @ T_earth_enu(place))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.effects import Report
 from flocc_agent.core.reports import MeasurementKept, MeasurementRefused
-from flocc_agent.geometry import adjoint, inverse, is_rigid, pose, pose7
+from flocc_agent.geometry import adjoint, inverse, is_rigid, pose, pose7, upper_triangle
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
@@ -44,7 +44,6 @@ VARIANCE_MIN, VARIANCE_MAX = 1e-18, 1e18
 """Eigenvalues of a covariance (m^2 or rad^2): beyond them it says nothing that a solver's numbers can hold."""
 WAITING_MAX = 64
 """Measurements that may wait for one keyframe."""
-_UPPER = np.triu_indices(6)
 
 
 class BadMeasurement(FloccError, ValueError):
@@ -151,7 +150,7 @@ class PoseFix:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
-        return PoseFixRecord(keyframe.index, pose7(self.T_world_body), _upper(self.covariance))
+        return PoseFixRecord(keyframe.index, pose7(self.T_world_body), upper_triangle(self.covariance, "f8"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +190,9 @@ class TagSighting:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
-        return TagSightingRecord(keyframe.index, str(self.tag), pose7(self.T_body_tag), _upper(self.covariance))
+        return TagSightingRecord(
+            keyframe.index, str(self.tag), pose7(self.T_body_tag), upper_triangle(self.covariance, "f8")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,7 +231,9 @@ class RobotSighting:
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
         _check_other(self.kind, self.robot, keyframe)
-        return RobotSightingRecord(keyframe.index, self.robot, pose7(self.T_body_robot), _upper(self.covariance))
+        return RobotSightingRecord(
+            keyframe.index, self.robot, pose7(self.T_body_robot), upper_triangle(self.covariance, "f8")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -314,7 +317,9 @@ class MetricClosure:
         """As the keyframe's log keeps it."""
         if keyframe == self.match:
             raise BadMeasurement(f"closure: {keyframe} cannot be registered with itself")
-        return MetricClosureRecord(keyframe, self.match, pose7(self.T_query_match), _upper(self.covariance))
+        return MetricClosureRecord(
+            keyframe, self.match, pose7(self.T_query_match), upper_triangle(self.covariance, "f8")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,7 +344,7 @@ class OdometryCovariance:
         """As the keyframe's log keeps it."""
         if keyframe.index == 0:
             raise BadMeasurement("odometry: the first keyframe has no edge before it")
-        return OdometryCovarianceRecord(keyframe.index, _upper(self.covariance))
+        return OdometryCovarianceRecord(keyframe.index, upper_triangle(self.covariance, "f8"))
 
 
 Measurement = (
@@ -412,10 +417,6 @@ def _seen_from(T: Float, covariance: Float) -> Float:
 
 def _array(values: Float) -> Array:
     return Array.of(np.asarray(values, dtype=float).ravel(), "f8")
-
-
-def _upper(covariance: Float) -> Array:
-    return Array.of(np.asarray(covariance, dtype=float)[_UPPER], "f8")
 
 
 def belongs_to(measurement: Measurement, own: LogId, index: int) -> KeyframeId:

@@ -116,9 +116,9 @@ class Registration:
 
     def __post_init__(self) -> None:
         _check_counts(self.correspondences, self.odometry_correspondences)
-        side = (6, 6) if self.covariance is None else np.shape(self.covariance)
-        if np.shape(self.T_query_match_unscaled) != (4, 4) or side != (6, 6):
-            raise ValueError("a registration has a pose (4, 4) and a covariance (6, 6) or None")
+        covariance = np.eye(6) if self.covariance is None else self.covariance
+        if not _is_matrix(self.T_query_match_unscaled, 4) or not _is_matrix(covariance, 6):
+            raise ValueError("a registration has a pose (4, 4) and a covariance (6, 6) or None, arrays of numbers")
         for number in (self.scale_initial, self.judged_ratio):
             if not isinstance(number, float | int | np.number | None):
                 raise ValueError(f"scale and ratio of a registration are numbers or None, not {number!r}")
@@ -144,6 +144,10 @@ class RegistrationFailed:
         _check_counts(self.correspondences, self.odometry_correspondences)
         if not isinstance(self.failure, RegistrationFailure):
             raise ValueError(f"{self.failure!r} is no RegistrationFailure")
+
+
+def _is_matrix(value: object, side: int) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == (side, side) and value.dtype.kind in "fiu"
 
 
 def _check_counts(*counts: int) -> None:

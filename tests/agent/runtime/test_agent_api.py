@@ -317,6 +317,8 @@ def test_what_a_strangers_registrar_gives_wrongly_is_refused_where_it_is_made() 
         Perception(eyes, eyes, eyes).register(b"", b"", None)
     for made in (
         lambda: Registration(np.eye(3), 100, 100, 1.0),
+        lambda: Registration(np.eye(4).tolist(), 100, 100, 1.0),  # type: ignore[arg-type]
+        lambda: Registration(np.eye(4, dtype=object), 100, 100, 1.0),
         lambda: Registration(np.eye(4), -1, 100, 1.0),
         lambda: Registration(np.eye(4), 10**12, 100, 1.0),
         lambda: Registration(np.eye(4), 1.5, 100, 1.0),  # type: ignore[arg-type]
