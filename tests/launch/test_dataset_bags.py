@@ -8,6 +8,7 @@ import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from tests.launch.bag_fixtures import HEIGHT, WIDTH, ZERO_NS, BagScript, walking
@@ -467,3 +468,40 @@ def test_graco_in_its_published_layout(tmp_path: Path) -> None:
     starts = [recording.ground_truth(0.0) for recording in recordings]
     assert [float(T[0, 3]) for T in starts if T is not None] == pytest.approx([0.0, 7.0], abs=1e-3)
     assert recordings[1].camera == GRACO_GROUND.camera.agent_camera()
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_raw_images_of_twelve_bits_have_one_pair_of_levels(
+    tmp_path: Path, ros1: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Case 18: a dark start of the bag does not decide how bright the rest is."""
+    script = walking(ros1, 0)
+    ramp = np.linspace(0, 3824, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
+    for k in range(6):
+        script.odometry("/odom", ZERO_NS + k * 10**9, float(k))
+        dark = ramp / 16 if k < 2 else ramp
+        script.raw("/cam/image_raw", ZERO_NS + k * 10**9, dark.astype(np.uint16), "mono16")
+    bag = script.write(tmp_path / ("run.bag" if ros1 else "run"), "bag" if ros1 else "mcap")
+    recording = Recording.open(convert(bag, tmp_path / "out"))
+    found = [cv2.imread(str(frame.image_path), cv2.IMREAD_UNCHANGED) for frame in recording.frames]
+    assert [(each.dtype.type, int(each.max())) for each in found if each is not None] == [(np.uint8, 14)] * 2 + [
+        (np.uint8, 239)
+    ] * 4
+    assert "images of 16 bits use 0 to 4095, which become 0 to 255" in caplog.text
+
+
+def test_a_bag_of_a_wide_lens_becomes_a_pinhole(tmp_path: Path) -> None:
+    """Field of view as chosen, and images of the camera that the recording names."""
+    script = walking(False, 4)
+    info = script.messages[0][3]
+    info.distortion_model, info.d = "equidistant", np.array([0.01, 0.0, 0.0, 0.0])
+    bag = script.write(tmp_path / "run", "mcap")
+    recording = Recording.open(convert(bag, tmp_path / "out", view_deg=45.0))
+    assert recording.camera.distortion == (0.0, 0.0, 0.0, 0.0)
+    view_deg = 2 * np.degrees(np.arctan(recording.camera.width / 2 / recording.camera.fx))
+    assert view_deg == pytest.approx(45.0, abs=1.0)
+    assert len(recording.frames) == 4
+    assert recording.load_image(recording.frames[3]).pixels.shape[:2] == (
+        recording.camera.height,
+        recording.camera.width,
+    )

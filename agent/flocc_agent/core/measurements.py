@@ -33,12 +33,15 @@ from flocc_protocol.records import (
     RobotBearingRecord,
     RobotSightingRecord,
     TagSightingRecord,
+    encode_record,
 )
 
 Float = NDArray[np.float64]
 
 CONDITION_MAX = 1e12
 """Largest ratio of a covariance's eigenvalues: beyond it the matrix is numerically singular."""
+VARIANCE_MIN, VARIANCE_MAX = 1e-18, 1e18
+"""Eigenvalues of a covariance (m^2 or rad^2): beyond them it says nothing that a solver's numbers can hold."""
 WAITING_MAX = 64
 """Measurements that may wait for one keyframe."""
 _UPPER = np.triu_indices(6)
@@ -174,6 +177,9 @@ class TagSighting:
     covariance: Float
 
     def __post_init__(self) -> None:
+        tag: object = self.tag
+        if not isinstance(tag, str | int | np.integer) or isinstance(tag, bool) or not str(tag).isprintable():
+            raise BadMeasurement(f"tag: {tag!r} is no name")
         if not 1 <= len(str(self.tag)) <= TAG_LENGTH_MAX:
             raise BadMeasurement(f"tag: a name has 1 to {TAG_LENGTH_MAX} characters, not {len(str(self.tag))}")
         _check_pose(self.kind, self.T_body_tag)
@@ -223,6 +229,7 @@ class RobotSighting:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
+        _check_other(self.kind, self.robot, keyframe)
         return RobotSightingRecord(keyframe.index, self.robot, pose7(self.T_body_robot), _upper(self.covariance))
 
 
@@ -260,6 +267,7 @@ class RobotBearing:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it: a position with its covariance, in the camera."""
+        _check_other(self.kind, self.robot, keyframe)
         T = np.eye(4) if self._T_camera_body is None else self._T_camera_body
         u = T[:3, :3] @ np.asarray(self.bearing, dtype=float) / np.linalg.norm(self.bearing)
         along = np.outer(u, u)
@@ -286,6 +294,8 @@ class MetricClosure:
     T_match_camera: Float | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.match, KeyframeId):
+            raise BadMeasurement(f"closure: match {self.match!r} is no KeyframeId")
         _check_pose(self.kind, self.T_query_match)
         _check_covariance(self.kind, self.covariance, 6)
         if self.T_match_camera is not None:
@@ -363,8 +373,10 @@ def _check_covariance(kind: str, covariance: Float, side: int) -> None:
         raise BadMeasurement(f"{kind}: the covariance is not a finite ({side}, {side}) matrix")
     low, high = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[[0, -1]]
     symmetric = np.abs(matrix - matrix.T).max() <= 1e-6 * np.abs(matrix).max()
-    if not symmetric or low <= 0 or high >= CONDITION_MAX * low:
+    if not symmetric or low <= 0 or low <= high / CONDITION_MAX:
         raise BadMeasurement(f"{kind}: the covariance is not positive definite")
+    if low < VARIANCE_MIN or high > VARIANCE_MAX:
+        raise BadMeasurement(f"{kind}: the covariance is not within {VARIANCE_MIN:g} and {VARIANCE_MAX:g}")
 
 
 def _check_positive(kind: str, name: str, value: float) -> None:
@@ -373,10 +385,17 @@ def _check_positive(kind: str, name: str, value: float) -> None:
 
 
 def _check_robot(kind: str, robot: str) -> None:
+    if not isinstance(robot, str):
+        raise BadMeasurement(f"{kind}: {robot!r} is no name of a robot")
     try:
         checked_name(robot)
     except FloccError as error:
         raise BadMeasurement(f"{kind}: {error}") from error
+
+
+def _check_other(kind: str, robot: str, keyframe: KeyframeId) -> None:
+    if robot == keyframe.log.robot:
+        raise BadMeasurement(f"{kind}: a robot does not see itself")
 
 
 def _posed(R: Float, position_m: Float) -> Float:
@@ -402,6 +421,22 @@ def _upper(covariance: Float) -> Array:
 def belongs_to(measurement: Measurement, own: LogId, index: int) -> KeyframeId:
     """The keyframe that a measurement made at keyframe `index` belongs to."""
     return KeyframeId(own, 0 if isinstance(measurement, StartPose) else index)
+
+
+def record_of(measurement: Measurement, keyframe: KeyframeId) -> MeasurementRecord:
+    """The record of what was measured at a keyframe.
+
+    Raises:
+        BadMeasurement: No log may hold it: the other robots would refuse it.
+    """
+    try:
+        record = measurement.record(keyframe)
+        encode_record(record)
+    except BadMeasurement:
+        raise
+    except ValueError as error:
+        raise BadMeasurement(f"{measurement.kind}: {error}") from error
+    return record
 
 
 def measurement_report(measurement: Measurement, keyframe: KeyframeId) -> Report:
