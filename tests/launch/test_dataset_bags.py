@@ -293,6 +293,52 @@ def test_odometry_that_calls_itself_lost_is_left_out(tmp_path: Path, caplog: pyt
     assert np.max(np.loadtxt(tmp_path / "out" / "odometry.tum")[:, 1]) < 10
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_odometry_of_other_frames_is_not_mixed_in(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Two publishers of one topic: the poses of the second were taken for those of the first."""
+    script = walking(kind == "bag", count=10)
+    script.child = "other"
+    for k in range(2):
+        script.odometry("/odom", ZERO_NS + k * 10**9 + 10**8, 70.0)
+    script.messages.sort(key=lambda message: message[2])
+    recording = Recording.open(convert(script.write(bag_path(tmp_path, kind), kind), tmp_path / "out"))
+    assert max(frame.T_odom_body[0, 3] for frame in recording.frames) < 10
+    assert (
+        "2 of 22 messages were left out: a pose is of the frames camera to other, the first one of camera to body"
+        in (caplog.text)
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_intrinsics_that_change_are_refused(tmp_path: Path, kind: str) -> None:
+    script = walking(kind == "bag")
+    script.camera_info("/cam/camera_info", ZERO_NS + 2 * 10**9)
+    convert(script.write(bag_path(tmp_path, kind), kind), tmp_path / "same")
+    script.camera_info("/cam/camera_info", ZERO_NS + 3 * 10**9, 45.0)
+    (tmp_path / "zoom").mkdir()
+    bag = script.write(bag_path(tmp_path / "zoom", kind), kind)
+    with pytest.raises(DatasetError, match=r"/cam/camera_info: intrinsics differ from the first ones in 1 messages"):
+        convert(bag, tmp_path / "out")
+    assert len(Recording.open(convert(bag, tmp_path / "own", camera=camera_file(tmp_path))).frames) == 5
+
+
+def test_a_camera_that_is_not_calibrated_is_said_with_what_to_do(tmp_path: Path) -> None:
+    script = BagScript(True)
+    script.camera_info("/cam/camera_info", ZERO_NS, 0.0)
+    script.messages += walking(True).messages[1:]
+    bag = script.write(bag_path(tmp_path, "bag"))
+    with pytest.raises(DatasetError, match=r"run.bag: topic /cam/camera_info: .*; name a camera file with --camera"):
+        convert(bag, tmp_path / "out")
+
+
+def test_odometry_whose_stamp_stands_still_is_refused(tmp_path: Path) -> None:
+    script = walking(True, odometry=None)
+    for k in range(5):
+        script.odometry("/odom", ZERO_NS + 10**9, float(k))
+    with pytest.raises(DatasetError, match="4 of 5 messages were left out: the stamp is that of the pose before"):
+        convert(script.write(bag_path(tmp_path, "bag")), tmp_path / "out")
+
+
 def test_too_many_damaged_messages_are_refused(tmp_path: Path) -> None:
     script = walking(False)
     for k in range(3):
