@@ -119,8 +119,9 @@ def test_a_bag_is_cut_into_robots(own: Path, tmp_path: Path) -> None:
 
 
 def test_robots_that_are_there_are_not_counted_anew(own: Path, tmp_path: Path) -> None:
-    shutil.copytree(own, tmp_path / "team" / "a")
-    with pytest.raises(DatasetError, match=r"team: holds 1 robots \(a\), not 3"):
+    for name in "ab":
+        shutil.copytree(own, tmp_path / "team" / name)
+    with pytest.raises(DatasetError, match=r"team: holds 2 robots \(a, b\), not 3"):
         read_scenario(str(tmp_path / "team"), {}, agents=3)
 
 

@@ -54,8 +54,8 @@ def error_sentence(report: RunReport) -> str:
     aligned = report.ate_joint_odometry_aligned_m
     if after < before and aligned is not None and aligned <= after:
         return (
-            f"The joint error is {number(after, 'm')}: less than odometry from its true starts ({number(before, 'm')}), "
-            f"but not less than that odometry aligned as the map is ({number(aligned, 'm')})."
+            f"The joint error is {number(after, 'm')}: less than odometry from its true starts "
+            f"({number(before, 'm')}), but not less than that odometry aligned as the map is ({number(aligned, 'm')})."
         )
     if after < before:
         return f"The joint error fell from {number(before, 'm')} (odometry alone) to {number(after, 'm')}."
