@@ -30,6 +30,7 @@ from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.facts import KilledByOrder
+from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
@@ -46,7 +47,6 @@ from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
-from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
 
@@ -190,13 +190,14 @@ class Agent:
         T_odom_body = np.asarray(T_odom_body, dtype=float)
         if not keep and not self._selector.wants(T_odom_body):
             self._gate.let_in(T_odom_body, stamp_s, kept=False)
-            self._kept = False
             return False
         await self._add(pixels, T_odom_body, stamp_s)
         self._selector.took(T_odom_body)
         return True
 
     def _check(self, T_odom_body: Float, stamp_s: float) -> None:
+        """Refuse a pose that cannot be; what is measured next then belongs to no keyframe."""
+        self._kept = False
         if self._camera is None:
             raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
         if (fault := self._gate.fault(T_odom_body, stamp_s)) is not None:
@@ -207,10 +208,12 @@ class Agent:
         assert self._camera is not None
         try:
             image = Image(pixels, self._camera)
+            self._gate.let_in(T_odom_body, stamp_s, kept=True)
+            await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+        except BadKeyframe as error:
+            raise BadKeyframe(f"robot {self.config.name}: {error}") from error
         except ValueError as error:
             raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
-        self._gate.let_in(T_odom_body, stamp_s, kept=True)
-        await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
         self._kept = True
 
     def add_fix(self, position_m: Float, covariance_m2: Float, stamp_s: float | None = None) -> None:
@@ -237,10 +240,10 @@ class Agent:
             stamp_s: Of the keyframe that it belongs to; None: the frame that was given last.
 
         Raises:
-            BadMeasurement: No keyframe has that stamp, or the last frame did not become one.
+            BadMeasurement: No keyframe has that stamp, the last frame did not become one, or no log may hold it.
         """
-        in_camera = measurement.in_camera(self._T_body_camera)
         try:
+            in_camera = measurement.in_camera(self._T_body_camera)
             if stamp_s is None and not self._kept and not isinstance(measurement, StartPose):
                 raise BadMeasurement(f"{measurement.kind}: the frame that was given last did not become a keyframe")
             self._started.add_measurement(in_camera, stamp_s)
@@ -414,10 +417,6 @@ class Agent:
             await self._metrics.close()
         if self._store is not None:
             self._store.close()
-
-
-class BadKeyframe(FloccError):
-    """A keyframe that cannot be used; the agent goes on without it."""
 
 
 def _mounting(T_body_camera: Float, robot: str) -> Float:

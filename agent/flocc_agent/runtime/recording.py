@@ -23,7 +23,7 @@ from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, read_measurements
 from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
-from flocc_agent.runtime.pose_limits import MOUNT_MAX_M
+from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, position_fault
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_tum
@@ -177,7 +177,14 @@ def write_camera(path: Path, camera: Camera, T_body_camera: Float) -> None:
 def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
     images = read_image_list(path / "images.txt")
     posed = [(stamp_s, image, odometry.at(stamp_s)) for stamp_s, image in images]
-    frames = tuple(Frame(stamp_s, image, T) for stamp_s, image, T in posed if T is not None)
+    far = [fault for _, _, T in posed if T is not None and (fault := position_fault(T[:3, 3])) is not None]
+    if len(far) == len(images):
+        raise RecordingError(f"{path / 'odometry.tum'}: {far[0]}")
+    if far:
+        logger.warning("%s: %d of %d images were left out: of the first, %s", path, len(far), len(images), far[0])
+    frames = tuple(
+        Frame(stamp_s, image, T) for stamp_s, image, T in posed if T is not None and position_fault(T[:3, 3]) is None
+    )
     if not frames:
         first_s, last_s = odometry.stamps_s[0], odometry.stamps_s[-1]
         raise RecordingError(
@@ -185,13 +192,16 @@ def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
             f"{GAP_MAX_S:g} s) where the images of {path / 'images.txt'} are, from {images[0][0]:.3f} s to "
             f"{images[-1][0]:.3f} s"
         )
-    if len(frames) < len(images):
-        logger.warning("%s: %d of %d images lie outside of the odometry", path, len(images) - len(frames), len(images))
+    if outside := sum(T is None for _, _, T in posed):
+        logger.warning("%s: %d of %d images lie outside of the odometry", path, outside, len(images))
     return frames
 
 
 def _camera(values: dict[str, object], path: Path) -> Camera:
     sizes = {key: _number(values, key, path) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    uneven = next((key for key in ("width", "height") if sizes[key] != np.round(sizes[key])), None)
+    if uneven is not None:
+        raise RecordingError(f"{path}: camera.{uneven} must be a whole number, not {sizes[uneven]}")
     distortion = values.pop("distortion", [0.0, 0.0, 0.0, 0.0])
     if values:
         raise RecordingError(f"{path}: the key 'camera.{next(iter(values))}' does not exist")

@@ -70,6 +70,18 @@ def test_two_poses_that_cannot_be_cost_their_images_alone(tmp_path: Path, caplog
     assert "1 of 19 poses lie out of reach of the others" in caplog.text
 
 
+def test_odometry_that_lies_beyond_the_map_is_refused_or_its_images_left_out(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "r", tuple(np.linspace(0.0, 9.5, 20)))
+    far = motion(20, 0.5)
+    far.T_fixed_body[:, 0, 3] += 2e7
+    write_tum(path / "odometry.tum", far)
+    with pytest.raises(RecordingError, match="over 10000 km"):
+        Recording.open(path)
+    far.T_fixed_body[:, 0, 3] += 9.999e6 - far.T_fixed_body[9, 0, 3]
+    write_tum(path / "odometry.tum", far)
+    assert len(Recording.open(path).frames) == 10
+
+
 def test_a_camera_that_sits_far_from_its_body_is_refused(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "r")
     write_camera(path / "camera.toml", CAMERA, pose(np.eye(3), np.array([1e12, 0.0, 0.0])))
