@@ -193,14 +193,14 @@ def test_a_launch_is_shown_from_its_first_state_and_the_port_is_given_back(tmp_p
     Dashboard(folder, port).close()
 
 
-def browse(url: str, profile: Path) -> str:
+def browse(url: str, profile: Path, *more: str) -> str:
     """The page's elements after its scripts ran, in headless Chromium."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         pytest.skip("chromium is not installed")
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
     flags += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
-    flags += [f"--user-data-dir={profile}", "--virtual-time-budget=3000", "--dump-dom"]
+    flags += [f"--user-data-dir={profile}", "--virtual-time-budget=3000", "--dump-dom", *more]
     return subprocess.run([chromium, *flags, url], capture_output=True, text=True, check=True, timeout=120).stdout
 
 

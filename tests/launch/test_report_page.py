@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
+from tests.launch.test_dashboard import browse
 
 from flocc_launch.report import RunReport, finish
 from flocc_launch.report.html import page
@@ -159,3 +160,17 @@ def test_a_long_line_keeps_its_end() -> None:
     kept = thinned(points)
     assert len(kept) <= 1501
     assert (kept[0], kept[-1]) == (points[0], points[-1])
+
+
+@pytest.mark.slow
+def test_the_page_is_as_wide_as_a_phone(tmp_path: Path) -> None:
+    """In headless Chromium, whose window is no narrower than 500 px: so in a frame of 390."""
+    folder = synthetic_run.write(tmp_path / "run", Synthetic(died=("r1", 50.0)))
+    finish(folder)
+    script = "let page = this.contentDocument.documentElement; document.title = page.scrollWidth - page.clientWidth"
+    frame = f'<iframe src="run/report.html" style="width:390px;height:900px;border:0" onload="{script}"></iframe>'
+    (tmp_path / "phone.html").write_text(
+        f"<!doctype html><html><head><title>-</title></head><body>{frame}</body></html>"
+    )
+    seen = browse((tmp_path / "phone.html").as_uri(), tmp_path / "profile", "--allow-file-access-from-files")
+    assert re.findall(r"<title>(.*?)</title>", seen) == ["0"]
