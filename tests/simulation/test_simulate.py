@@ -10,6 +10,7 @@ import pytest
 from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, KeyframeTaken, LeaderFollowed
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.doctor import diagnose
 from flocc_launch.report.text import sentences
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
 from flocc_launch.scenarios.leader_faults import FaultError
@@ -66,6 +67,8 @@ def test_a_killed_robot_is_reported_and_the_rest_goes_on(tmp_path: Path) -> None
     events = RunFolder.open(tmp_path / "run").events()
     assert [(event.robot, event.t) for event in of_kind(events, AgentDied)] == [("r1", 20.0)]
     assert [span.leader for span in report.leaders][-1] == "r2"
+    killed = next(finding for finding in diagnose(RunFolder.open(tmp_path / "run")) if finding.robots == ("r1",))
+    assert (killed.cause, killed.advice) == ("agent-killed", "")
 
 
 def test_a_folder_that_holds_a_run_is_left_alone(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Findings that do not concern two robots: deaths, warnings, failures, unsteady leaders."""
 
+from collections import Counter
 from collections.abc import Callable
 
 from flocc_agent.core.reports import EncodingFailed, NameTaken, RoundSolved
@@ -10,24 +11,30 @@ from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import seconds
-from flocc_launch.runs.timeline import how_it_died
+from flocc_launch.runs.timeline import deaths_unasked, how_it_died
 
 LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3
 
 
 def deaths(loaded: LoadedRun) -> list[Finding]:
-    """Agents that died."""
+    """Agents that died; one that the scenario or an operator killed needs no advice."""
+    unasked = Counter(deaths_unasked(loaded.events))
     return [
-        Finding(
-            "agent-died",
-            Severity.HINDERS,
-            f"{event.robot} died at {seconds(event.t)} ({how_it_died(event)}).",
-            f"Read robots/{event.robot}/agent.log; start it again, it comes back with the same identity.",
-            (event.robot,),
-        )
+        _asked_death(event) if event.fact.scripted or not unasked[event.robot] else _death(event)
         for event in of_kind(loaded.events, AgentDied)
     ]
+
+
+def _death(event: Reported[AgentDied]) -> Finding:
+    sentence = f"{event.robot} died at {seconds(event.t)} ({how_it_died(event)})."
+    advice = f"Read robots/{event.robot}/agent.log; start it again, it comes back with the same identity."
+    return Finding("agent-died", Severity.HINDERS, sentence, advice, (event.robot,))
+
+
+def _asked_death(event: Reported[AgentDied]) -> Finding:
+    sentence = f"{event.robot} was killed at {seconds(event.t)}, as the scenario or an operator asked."
+    return Finding("agent-killed", Severity.NOTE, sentence, "", (event.robot,))
 
 
 def solver_warnings(loaded: LoadedRun) -> list[Finding]:

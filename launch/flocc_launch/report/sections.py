@@ -86,10 +86,14 @@ def warnings(report: RunReport) -> str:
     return element("div", element("h3", "Worth knowing"), element("ul", items), class_="callout")
 
 
+UNDER_WARNINGS = ("agent-died", "agent-killed", "solver-warning", "truth-clock", "truth-frames")
+"""Findings that the report's warnings say already."""
+
+
 def findings(loaded: LoadedRun) -> str:
     """What the doctor says that blocks or hinders."""
     found = [f for f in diagnose_loaded(loaded) if f.severity in (Severity.BLOCKS, Severity.HINDERS)]
-    found = [f for f in found if f.cause not in ("agent-died", "solver-warning")]  # these stand under warnings
+    found = [f for f in found if f.cause not in UNDER_WARNINGS]
     if not found:
         return ""
     blocked = any(f.severity is Severity.BLOCKS for f in found)
