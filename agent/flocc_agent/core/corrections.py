@@ -108,13 +108,24 @@ class Corrections:
 
     def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction that its leader made; apply it when it is this robot's."""
+        return (self.refused(peer, message) or self.take(message)) if self.is_news(message) else []
+
+    def is_news(self, message: LogCorrection) -> bool:
+        """Whether a correction is newer than the one that is held."""
         held = self._newest.get(message.log)
-        if held is not None and (message.term, message.round) <= (held.term, held.round):
-            return []
-        if held is None and len(self._newest) >= self._gossip.logs_max:
+        return held is None or (message.term, message.round) > (held.term, held.round)
+
+    def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
+        """Refuse a newer correction for which there is no room, or which its leader did not make."""
+        if message.log not in self._newest and len(self._newest) >= self._gossip.logs_max:
             return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
             return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
+        return []
+
+    def take(self, message: LogCorrection) -> list[Effect]:
+        """Keep a newer correction that was not refused; apply it when it is this robot's."""
+        held = self._newest.get(message.log)
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []

@@ -294,17 +294,16 @@ class Robot:
         return effects
 
     def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
-        """A correction of an absurd term would fence out every leader to come."""
-        refused = self.election.on_applied(sender, message.term)
-        return refused or self.corrections.on_message(sender.robot, message)
+        """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
+        if not self.corrections.is_news(message):
+            return []
+        refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
+        return refused or self.corrections.take(message)
 
     def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
-        """What others apply: a leader outbids it, and whoever has something older asks for it."""
+        """What others say they apply: whoever has something older asks for it, and a leader then outbids it."""
         news = self.corrections.news(versions)
-        if not news:
-            return []
-        refused = self.election.on_applied(sender, max(version.term for version in news))
-        return refused or self.corrections.on_versions(sender.robot, news, now)
+        return self.corrections.on_versions(sender.robot, news, now) if news else []
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""

@@ -7,17 +7,25 @@ from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.corrections import LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.parameters import GossipParameters
+from flocc_agent.core.parameters import CoreParameters, GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.robot import Restored, Robot
 from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
-from flocc_protocol.messages import CorrectionBatch, CorrectionRequest, CorrectionVersion, Envelope, LogCorrection
+from flocc_protocol.messages import (
+    CorrectionBatch,
+    CorrectionRequest,
+    CorrectionVersion,
+    Envelope,
+    Heartbeat,
+    LogCorrection,
+)
 from flocc_protocol.records import SIGNATURE_BYTES
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
@@ -175,6 +183,24 @@ def test_a_correction_of_an_absurd_term_is_refused() -> None:
     assert len(robots.facts("r1", PeerRefused)) == 1
 
 
+def test_a_forged_correction_raises_no_counter() -> None:
+    robot = Robot(R1, 0, 1, CoreParameters(), 0.0, sealer=Seals("r1"))
+    forged = replace(correction(Term(900, R2), 1), signature=Seals("r3").sign_correction(b""))
+    robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((forged,)))), 0.1)
+    assert robot.election.counter_max == 0
+    genuine = replace(forged, signature=Seals("r2").sign_correction(b""))
+    effects = robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((genuine,)))), 0.2)
+    assert robot.election.counter_max == 900
+    assert delivered(effects) == [(900, 1, False)]
+
+
+def test_versions_that_nobody_holds_raise_no_counter() -> None:
+    robot = Robot(R1, 0, 1, CoreParameters(), 0.0)
+    lie = Heartbeat(1, 7, 0, None, 0, 0, (), (CorrectionVersion(R2, Term(900, R2), 1),))
+    robot.handle(MessageReceived(Envelope(R2, lie)), 0.1)
+    assert robot.election.counter_max == 0
+
+
 def test_a_lost_correction_is_repaired_by_heartbeats() -> None:
     lost = {"count": 0}
 
@@ -225,3 +251,21 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
     assert set(robots.frames().values()) == {"map/r1"}
     changes = [fact.map_frame for fact in robots.facts("r4", CorrectionApplied) if fact.frame_changed]
     assert changes == ["map/r1"]
+
+
+def test_a_newcomer_that_believed_a_false_correction_is_won_back() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        if name == "r3":
+            robots.run(4.0)
+        robots.add(name)
+        for k in range(3):
+            robots.capture(name, float(k), look=k)
+    liar = LogId("r9")
+    lie = correction(Term(FIRST_COUNTER_MAX, liar), 1, log=R3)
+    robots.put("r3", MessageReceived(Envelope(liar, CorrectionBatch((lie,)))))
+    robots.run(80.0)
+    assert robots.frames() == {"r1": "map/r1", "r2": "map/r1", "r3": "map/r1"}
+    applied = robots.cores["r3"].corrections.applied
+    assert applied is not None
+    assert applied.term == Term(FIRST_COUNTER_MAX + 1, R1)
