@@ -70,9 +70,10 @@ class Corrections:
             "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
         }
 
-    def restore(self, message: LogCorrection, frame_changed: bool) -> None:
+    def restore(self, message: LogCorrection | None, frame_changed: bool) -> None:
         """Put back the correction that was applied before a restart; consumers may not know its frame yet."""
-        self._keep(message)
+        if message is not None:
+            self._keep(message)
         self._frame_unknown = frame_changed
 
     def announced(self) -> tuple[CorrectionVersion, ...]:

@@ -153,9 +153,13 @@ class Gossip:
         }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
-        """Put back a record that was read from disk, in order."""
+        """Put back a record that was read from disk, in order.
+
+        Raises:
+            DecodeError: It is none, or the swarm's keys do not open it.
+        """
+        record = decode_record(self._opened(log, self._held(log), data))
         copy = self.logs.setdefault(log, LogCopy())
-        record = decode_record(self._opened(log, len(copy), data))
         copy.append(kept(record), data)
         self._announce(log, copy)
         return NewRecord(log, len(copy) - 1, record)

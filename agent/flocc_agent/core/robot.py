@@ -60,6 +60,7 @@ from flocc_agent.core.reports import (
 from flocc_agent.core.rounds import Rounds, solution_report
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import (
     Answer,
@@ -425,7 +426,7 @@ class Robot:
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
-        news = [self.gossip.restore(log, data) for log, records in restored.records for data in records]
+        news = [new for log, records in restored.records for new in self._restore_log(log, records)]
         self._take([new for new in news if not isinstance(new.record, KeyframeRecord)], now)
         for new in news:
             if isinstance(new.record, ClosureRecord | RejectionRecord):
@@ -435,8 +436,16 @@ class Robot:
         self._partnered.clear()
         for keyframe in restored.latents:
             self.closing.on_held(keyframe)
-        if restored.correction is not None:
-            self.corrections.restore(restored.correction, restored.frame_changed)
+        self.corrections.restore(restored.correction, restored.frame_changed)
+
+    def _restore_log(self, log: LogId, records: Iterable[bytes]) -> Iterable[NewRecord]:
+        """A log as it is on the disk, up to a record that nobody would take any more; others have the rest."""
+        try:
+            for data in records:
+                yield self.gossip.restore(log, data)
+        except DecodeError:
+            if log == self.log:
+                raise  # whoever reads the disk checks the own log before: its numbers must not be used twice
 
     # Time
 

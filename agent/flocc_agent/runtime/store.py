@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from flocc_agent.runtime.database import Database, StoreError, StoreFailed, hold_lock
 from flocc_agent.runtime.intact import Intact, Reached
 from flocc_agent.runtime.record_tables import (
+    COLUMNS,
     MIGRATIONS,
     PUT_CORRECTION,
     PUT_FACT,
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MEMORY_LATENT_BYTES_MAX = 256 * 1024 * 1024
+ASIDE_MAX = 100_000
+"""Records that are kept aside; the oldest give way."""
 
 LATENT_SCHEMA = """
 CREATE TABLE IF NOT EXISTS latents(
@@ -66,10 +69,11 @@ class StoredRecord:
 class Store:
     """A robot's memory over restarts; `Store.open` gives one."""
 
-    def __init__(self, folder: Path | None, config: "StoreConfig") -> None:
+    def __init__(self, folder: Path | None, config: "StoreConfig", incarnation_after_loss: int) -> None:
         self.identity = StoreIdentity(LogId("nobody"), 0)
         self._folder = folder
         self._config = config
+        self._incarnation_after_loss = incarnation_after_loss
         self._lock = threading.RLock()
         self._lock_file = hold_lock(folder / "lock") if folder is not None else None
         self._intact = Intact(self._path("intact"))
@@ -100,9 +104,9 @@ class Store:
         Raises:
             StoreError: It belongs to another robot, or another process uses it.
         """
-        store = cls(folder, config)
+        store = cls(folder, config, incarnation_after_loss)
         try:
-            store._identify(robot, incarnation, incarnation_after_loss)
+            store._identify(robot, incarnation)
         except StoreError:
             store.close()
             raise
@@ -119,6 +123,16 @@ class Store:
         with self._lock:
             self._intact_is_kept = False
             self._intact.remove()
+
+    def set_aside(self, log: LogId) -> None:
+        """Keep a log's records for a person only; where it is the robot's own, begin another one."""
+        name = str(log)
+        self._records.write(f"INSERT INTO aside SELECT {COLUMNS['records']} FROM records WHERE log = ?", [(name,)])
+        self._records.write("DELETE FROM records WHERE log = ?", [(name,)])
+        self._records.write("DELETE FROM aside WHERE rowid <= (SELECT MAX(rowid) FROM aside) - ?", [(ASIDE_MAX,)])
+        if log == self.identity.log:
+            self._be(StoreIdentity(LogId(log.robot, self._incarnation_after_loss), 1))
+        self._measure()
 
     def close(self) -> None:
         """Close the files; safe to call twice."""
@@ -237,20 +251,25 @@ class Store:
 
     # --- identity
 
-    def _identify(self, robot: str, incarnation: int, incarnation_after_loss: int) -> None:
+    def _identify(self, robot: str, incarnation: int) -> None:
         """Find or choose the robot's log; a life whose end may be missing on disk is not continued."""
         written = self.fact("log")
         log = LogId.parse(written.decode()) if written is not None else None
         if log is not None and log.robot != robot:
             raise StoreError(f"{self._folder}: belongs to robot {log.robot}, not to {robot}")
         if log is not None and self._is_whole(log):
-            self.identity = StoreIdentity(log, int(self.fact("boots") or 0) + 1)
+            self._be(StoreIdentity(log, int(self.fact("boots") or 0) + 1))
         else:
             had_one = log is not None or self._intact.exists() or self._records.was_damaged
-            self.identity = StoreIdentity(LogId(robot, incarnation_after_loss if had_one else incarnation), 1)
-            logger.info("robot %s: begins the log %s", robot, self.identity.log)
-        self._reached = Reached(len(self.records(self.identity.log)), self.term_counter())
-        log_text, boots = str(self.identity.log).encode(), b"%d" % self.identity.boots
+            self._be(StoreIdentity(LogId(robot, self._incarnation_after_loss if had_one else incarnation), 1))
+
+    def _be(self, identity: StoreIdentity) -> None:
+        """Write a log from now on."""
+        self.identity = identity
+        if identity.boots == 1:
+            logger.info("robot %s: begins the log %s", identity.log.robot, identity.log)
+        self._reached = Reached(len(self.records(identity.log)), self.term_counter())
+        log_text, boots = str(identity.log).encode(), b"%d" % identity.boots
         counter = b"%d" % self._reached.term_counter
         self._put_facts([("log", log_text), ("boots", boots), ("term_counter", counter)], durable=True)
         self._reach(self._reached)
