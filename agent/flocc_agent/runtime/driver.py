@@ -228,15 +228,20 @@ class Driver:
             alarm.cancel()
 
     async def _close(self) -> None:
-        for job in list(self._jobs):
-            job.cancel()
-        await asyncio.gather(*self._jobs, return_exceptions=True)
-        await self._disk.flush()
-        self._telemetry.count_bytes(last=True)
-        await self._tools.transport.close()
-        await self._tools.workers.close()
-        for queue in self._subscribers:
-            _put_newest(queue, None)
+        """End everything, whatever fails of it: threads of an open transport would keep the process from ending."""
+        try:
+            for job in list(self._jobs):
+                job.cancel()
+            await asyncio.gather(*self._jobs, return_exceptions=True)
+            await self._disk.flush()
+            self._telemetry.count_bytes(last=True)
+        finally:
+            try:
+                await self._tools.transport.close()
+            finally:
+                await self._tools.workers.close()
+                for queue in self._subscribers:
+                    _put_newest(queue, None)
 
     def _sizes(self) -> Sizes:
         """The driver's own queues: how much is in them, and their maximum."""

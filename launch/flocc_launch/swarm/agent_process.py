@@ -6,15 +6,18 @@ orders (`{"stop": true}`, `{"radio": {...}}`) on standard input.
 
 import argparse
 import asyncio
+import errno
 import json
 import logging
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact
@@ -30,34 +33,57 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STATUS_PERIOD_S = 0.5
+RETRY_S = 5.0
+"""A disk that took no event is tried again so often."""
 EXIT_BAD_INPUT = 2
 
 
 class Lines:
-    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported.
+    """The agent's own `events.jsonl`, written line by line so that a kill loses nothing that was reported.
 
-    A disk that fails ends the file, not the robot: it goes on, as it does without its store.
+    A disk that fails costs lines, not the robot. It is said once; every `RETRY_S` the file is tried again.
     """
 
-    def __init__(self, path: Path | None) -> None:
-        self._file: TextIO | None = None
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a", encoding="utf-8")
+    def __init__(self, path: Path | None, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._path = path
+        self._clock_s = clock_s
+        self._file: FileIO | None = None
+        self._lost = 0
+        self._retry_s = float("-inf")
 
     def write(self, event: Reported[Fact]) -> None:
-        """Append one event."""
-        if self._file is None:
+        """Append one event, or count it as lost."""
+        if self._path is None:
+            return
+        if self._file is None and self._clock_s() < self._retry_s:
+            self._lost += 1
             return
         try:
-            self._file.write(json.dumps(line_of(event), separators=(",", ":"), allow_nan=False) + "\n")
-            self._file.flush()
+            self._append(self._path, json.dumps(line_of(event), separators=(",", ":"), allow_nan=False))
         except OSError as error:
-            logger.error("%s: %s; events are no longer written", self._file.name, error.strerror or error)
+            if not self._lost:
+                logger.error("%s: %s; events are not written meanwhile", self._path, error.strerror or error)
+            self._lost += 1
+            self._retry_s = self._clock_s() + RETRY_S
             self.close()
+        else:
+            if self._lost:
+                logger.warning("%s: events are written again; %d were lost", self._path, self._lost)
+            self._lost = 0
+
+    def _append(self, path: Path, line: str) -> None:
+        """Write a line whole or not at all."""
+        if self._file is None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("ab", buffering=0)
+        data = line.encode() + b"\n"
+        written = self._file.write(data)
+        if written != len(data):
+            self._file.truncate(self._file.tell() - written)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def close(self) -> None:
-        """Close the file; what a full disk did not take is lost."""
+        """Close the file."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -119,7 +145,10 @@ async def _run(
     finally:
         for task in background:
             task.cancel()
-        _write_result(config.folder, agent.result())
+        try:
+            _write_result(config.folder, agent.result())
+        except OSError as error:
+            logger.error("%s: the result is not written: %s", config.name, error.strerror or error)
         lines.write(Reported(time.monotonic() - epoch_s, config.name, AgentStopped()))
         lines.close()
 
