@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.gossip import Sealer
+from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
@@ -118,11 +118,14 @@ class Corrections:
 
     def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Refuse a newer correction for which there is no room, or which its leader did not make."""
-        if message.log not in self._newest and len(self._newest) >= self._gossip.logs_max:
+        if message.log not in self._newest and not self._is_room(message.log):
             return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
             return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
         return []
+
+    def _is_room(self, log: LogId) -> bool:
+        return len(self._newest) < self._gossip.logs_max and lives(self._newest, log.robot) < LIVES_MAX
 
     def take(self, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction that was not refused; apply it when it is this robot's."""

@@ -9,6 +9,7 @@ from flocc_agent.core.corrections import LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
+from flocc_agent.core.gossip import LIVES_MAX
 from flocc_agent.core.parameters import CoreParameters, GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
@@ -156,6 +157,14 @@ def test_a_jump_in_whose_middle_the_robot_died_is_told_after_the_restart() -> No
     again.restore(kept.correction, kept.frame_changed)
     assert delivered(again.on_message("r2", correction(Term(1, R2), 3))) == [(1, 3, True)]
     assert delivered(again.on_message("r2", correction(Term(1, R2), 4))) == [(1, 4, False)]
+
+
+def test_corrections_of_many_logs_of_one_robot_leave_room_for_others() -> None:
+    machine = corrections()
+    for life in range(2 * GossipParameters().logs_max):
+        machine.on_message("r9", correction(Term(1, R2), 1, log=LogId("r9", life)))
+    assert machine.sizes()["corrections"][0] == LIVES_MAX
+    assert delivered(machine.on_message("r2", correction(Term(1, R2), 1))) == [(1, 1, False)]
 
 
 def test_a_relay_cannot_forge_a_correction() -> None:
