@@ -309,7 +309,7 @@ class Driver:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
         logger.error(
             "%s: %s holds records of this robot's log that are not on its disk (an older copy of the disk, or a second "
-            "robot of this name): what it records now reaches nobody. Restart it; it then begins a log of its own",
+            "robot of this name): what it records now reaches nobody; at its next start it begins a log of its own",
             self.robot.log,
             peer,
         )

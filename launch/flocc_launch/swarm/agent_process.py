@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import AgentConfig, RadioConfig, validated
-from flocc_agent.core.reports import Fact
+from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped
 from flocc_agent.runtime.robot_result import RobotResult
@@ -28,6 +28,7 @@ from flocc_agent.runtime.status import AgentStatus
 from flocc_launch.setup.world_faults import sentence_of
 
 if TYPE_CHECKING:
+    from flocc_agent.agent import Agent
     from flocc_launch.dashboard.own import AgentSource
 
 logger = logging.getLogger(__name__)
@@ -122,35 +123,76 @@ async def _run(
     lines: Lines,
     source: "AgentSource | None",
 ) -> None:
-    from flocc_agent.agent import Agent
+    """Live; where the robot's own log turns out to be lost, live once more, with another log.
 
-    def on_report(event: Reported[Fact]) -> None:
-        lines.write(event)
-        if source is not None:
-            source.take(event)
-
-    agent = Agent(config, on_report=on_report, clock_s=lambda: time.monotonic() - epoch_s)
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, agent.stop)
-    background: list[asyncio.Task[None]] = []
+    Once at most, since without keys anybody can end a log; and not under a launcher, which expects one life.
+    """
+    life = _Life(config, epoch_s, lines, source)
     try:
-        async with agent:
-            if source is not None:
-                source.attach(agent)
-            background = [asyncio.create_task(_tell(agent, on_status))]
-            if orders is not None:
-                background.append(asyncio.create_task(_obey(agent, orders)))
-            await agent.finished()
+        await life.live(on_status, orders)
+        if life.log_ended and not life.stopped and orders is None:
+            logger.warning("%s: begins anew, with another log", config.name)
+            await life.live(on_status, orders)
     finally:
-        for task in background:
-            task.cancel()
-        try:
-            _write_result(config.folder, agent.result())
-        except OSError as error:
-            logger.error("%s: the result is not written: %s", config.name, error.strerror or error)
         lines.write(Reported(time.monotonic() - epoch_s, config.name, AgentStopped()))
         lines.close()
+
+
+class _Life:
+    """One agent from its start to its end.
+
+    Attributes:
+        log_ended: Others hold records of this robot's log that it did not write.
+        stopped: A signal ended it.
+    """
+
+    def __init__(self, config: AgentConfig, epoch_s: float, lines: Lines, source: "AgentSource | None") -> None:
+        self.log_ended = self.stopped = False
+        self._config = config
+        self._epoch_s = epoch_s
+        self._lines = lines
+        self._source = source
+        self._agent: Agent | None = None
+
+    async def live(self, on_status: Callable[[AgentStatus], None], orders: asyncio.StreamReader | None) -> None:
+        """Run an agent until it is told to stop, or its log ended."""
+        from flocc_agent.agent import Agent
+
+        may_renew = orders is None and not self.log_ended
+        on_report = self._ends_with_its_log if may_renew else self._report
+        agent = Agent(self._config, on_report=on_report, clock_s=lambda: time.monotonic() - self._epoch_s)
+        self._agent = agent
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, self._stop)
+        background: list[asyncio.Task[None]] = []
+        try:
+            async with agent:
+                if self._source is not None:
+                    self._source.attach(agent)
+                background = [asyncio.create_task(_tell(agent, on_status))]
+                if orders is not None:
+                    background.append(asyncio.create_task(_obey(agent, orders)))
+                await agent.finished()
+        finally:
+            for task in background:
+                task.cancel()
+            _keep_result(self._config, agent.result())
+
+    def _stop(self) -> None:
+        self.stopped = True
+        if self._agent is not None:
+            self._agent.stop()
+
+    def _report(self, event: Reported[Fact]) -> None:
+        self._lines.write(event)
+        if self._source is not None:
+            self._source.take(event)
+
+    def _ends_with_its_log(self, event: Reported[Fact]) -> None:
+        self._report(event)
+        if self._agent is not None and isinstance(event.fact, LogForked) and event.fact.log == self._agent.log:
+            self.log_ended = True
+            self._agent.stop()
 
 
 @contextmanager
@@ -179,6 +221,14 @@ def recover_result(config: AgentConfig) -> None:
 
     if config.folder is not None and (config.folder / "store").exists():
         _write_result(config.folder, stored_result(config))
+
+
+def _keep_result(config: AgentConfig, result: RobotResult | None) -> None:
+    """Write the result, unless the disk does not take it."""
+    try:
+        _write_result(config.folder, result)
+    except OSError as error:
+        logger.error("%s: the result is not written: %s", config.name, error.strerror or error)
 
 
 def _write_result(folder: Path | None, result: RobotResult | None) -> None:
