@@ -31,6 +31,8 @@ from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.facts import KilledByOrder
+from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
+from flocc_agent.runtime.given_keyframes import checked_keyframe
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
@@ -46,7 +48,6 @@ from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
-from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.keys import Admin
 
@@ -167,17 +168,20 @@ class Agent:
             stamp_s: Time of the image on the robot's clock, seconds.
 
         Raises:
-            BadKeyframe: The pose is not finite and rigid, the image does not fit the camera, or there is no camera.
+            BadKeyframe: The pose is not finite and rigid, the image does not fit the camera, there is no camera, or
+                pose or stamp are beyond what a log may hold.
         """
+        self._kept = False
         if self._camera is None:
             raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
-        if not is_rigid(np.asarray(T_odom_body)) or not np.isfinite(stamp_s):
-            raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: its pose is not finite and rigid")
         try:
+            checked_keyframe(T_odom_body, stamp_s)
             image = Image(pixels, self._camera)
+            await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
+        except BadKeyframe as error:
+            raise BadKeyframe(f"robot {self.config.name}: {error}") from error
         except ValueError as error:
             raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
-        await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
         self._kept = True
 
     async def add_frame(
@@ -187,9 +191,14 @@ class Agent:
 
         Returns:
             Whether it became one; `keep` what something was seen in.
+
+        Raises:
+            BadKeyframe: As `add_keyframe`; of a frame that does not become a keyframe, the pose alone is looked at.
         """
+        self._kept = False
+        if not is_rigid(np.asarray(T_odom_body, dtype=float)):
+            raise BadKeyframe(f"robot {self.config.name}: frame at {stamp_s} s: its pose is not finite and rigid")
         if not keep and not self._selector.wants(T_odom_body):
-            self._kept = False
             return False
         await self.add_keyframe(pixels, T_odom_body, stamp_s)
         self._selector.took(T_odom_body)
@@ -219,10 +228,10 @@ class Agent:
             stamp_s: Of the keyframe that it belongs to; None: the frame that was given last.
 
         Raises:
-            BadMeasurement: No keyframe has that stamp, or the last frame did not become one.
+            BadMeasurement: No keyframe has that stamp, the last frame did not become one, or no log may hold it.
         """
-        in_camera = measurement.in_camera(self._T_body_camera)
         try:
+            in_camera = measurement.in_camera(self._T_body_camera)
             if stamp_s is None and not self._kept and not isinstance(measurement, StartPose):
                 raise BadMeasurement(f"{measurement.kind}: the frame that was given last did not become a keyframe")
             self._started.add_measurement(in_camera, stamp_s)
@@ -395,10 +404,6 @@ class Agent:
             await self._metrics.close()
         if self._store is not None:
             self._store.close()
-
-
-class BadKeyframe(FloccError):
-    """A keyframe that cannot be used; the agent goes on without it."""
 
 
 def stored_result(config: AgentConfig) -> RobotResult:

@@ -229,9 +229,9 @@ def symmetric(upper: Float) -> Float:
     return out
 
 
-def upper_triangle(covariance: Float) -> Array:
-    """Upper triangle (21,) of a covariance (6, 6), as the wire has it: float32."""
-    return Array.of(covariance[_UPPER], "f4")
+def upper_triangle(covariance: Float, dtype: str = "f4") -> Array:
+    """Upper triangle (21,) of a covariance (6, 6), as the wire has it."""
+    return Array.of(np.asarray(covariance, dtype=float)[_UPPER], dtype)
 
 
 def umeyama(source: Float, target: Float, with_scale: bool = False) -> tuple[float, Float]:

@@ -44,6 +44,17 @@ ALTITUDE_MAX_M = 1e5
 SCALE_INITIAL_MIN, SCALE_INITIAL_MAX = 1e-9, 1e9
 
 
+def checked_descriptor(descriptor: Array) -> Array:
+    """The same.
+
+    Raises:
+        ValueError: No record holds it.
+    """
+    if len(descriptor.shape) != 1 or not 1 <= descriptor.shape[0] <= DESCRIPTOR_DIMENSION_MAX:
+        raise ValueError(f"a descriptor is a vector of 1 to {DESCRIPTOR_DIMENSION_MAX}, not {descriptor.shape}")
+    return descriptor
+
+
 @dataclass(frozen=True, slots=True)
 class KeyframeRecord:
     """A keyframe: its number, stamp, odometry and place descriptor.
@@ -61,9 +72,8 @@ class KeyframeRecord:
     descriptor: Array | None
 
     def __post_init__(self) -> None:
-        shape = (1,) if self.descriptor is None else self.descriptor.shape
-        if len(shape) != 1 or not 1 <= shape[0] <= DESCRIPTOR_DIMENSION_MAX:
-            raise ValueError(f"a descriptor is a vector of 1 to {DESCRIPTOR_DIMENSION_MAX}, not {shape}")
+        if self.descriptor is not None:
+            checked_descriptor(self.descriptor)
 
 
 @dataclass(frozen=True, slots=True)

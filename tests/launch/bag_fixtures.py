@@ -114,9 +114,9 @@ class BagScript:
         kind = "nav_msgs/msg/Path"
         self.add(topic, kind, stamps_ns[-1], self.type(kind)(self.header(stamps_ns[-1]), poses))
 
-    def camera_info(self, topic: str, stamp_ns: int) -> None:
+    def camera_info(self, topic: str, stamp_ns: int, focal_px: float = 30.0) -> None:
         region = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
-        K = np.array([30.0, 0, 16, 0, 31, 12, 0, 0, 1])
+        K = np.array([focal_px, 0, 16, 0, 31, 12, 0, 0, 1])
         D, R, P = np.array([0.1, 0.2, 0.3, 0.4, 0.0]), np.eye(3).ravel(), np.zeros(12)
         kind = "sensor_msgs/msg/CameraInfo"
         message = self.type(kind)(self.header(stamp_ns), HEIGHT, WIDTH, "plumb_bob", D, K, R, P, 0, 0, region)

@@ -8,6 +8,7 @@ import pytest
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_protocol.errors import FloccError
 
 ORB3 = """%YAML:1.0
 File.version: "1.0"
@@ -257,3 +258,65 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "cameras.bin").write_bytes(b"\0\1")
     with pytest.raises(DatasetError, match=r"is a binary file.*model_converter --output_type TXT"):
         read_lens(tmp_path / "cameras.bin")
+
+
+FLAT = "width: 160\nheight: 120\nfx: 150.5\nfy: 151.5\ncx: 80.0\ncy: 60.0\n"
+LISTS = [f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("c.yaml", FLAT + "a: &a [*a]\n", "nested too deeply"),
+        ("c.json", '{"a":' * 100000 + "1" + "}" * 100000, "nested too deeply"),
+        ("c.yaml", "a0: &a0 [1, 1]\n" + "".join(LISTS) + FLAT, "more than 200000 values"),
+        ("c.yaml", FLAT.replace("160", ".inf"), "an image cannot have infx120 pixels"),
+        ("c.yaml", FLAT.replace("150.5", "nan"), "must be finite"),
+        ("c.txt", "P0: 0 0 80 0 0 0 60 0 0 0 1 0\n", "no focal length"),
+        ("c.txt", "1 PINHOLE 160 120 150.5 151.5 abc 60\n", "camera 1 has abc where a number must be"),
+        ("c.yaml", "width: 160\nheight: 120\nfx: 0.94\nfy: 1.26\ncx: 0.5\ncy: 0.5\n", "parts of the image's size"),
+        ("c.yaml", FLAT.replace("80.0", "800.0"), r"\(800, 60\) lies outside of images of 160x120"),
+        ("c.yaml", FLAT + "T_BS: [[1, 0, 0, 65], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n", "mounting in metres"),
+        ("c.yaml", FLAT + "R: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nt: [0.1, 0, 0]\n", "the key 't' is not understood"),
+        ("c.yaml", FLAT + "projection: equidistant\n", "the key 'projection' is not understood"),
+        ("c.yaml", FLAT + "units: mm\n", "the key 'units' is not understood"),
+        ("c.yaml", FLAT + "a: \x07\n", "is no YAML: unacceptable character"),
+        (
+            "c.toml",
+            "[camera]\n" + FLAT.replace(":", " =").replace("160", "160.5"),
+            "camera.width must be a whole number",
+        ),
+    ],
+)
+def test_numbers_of_another_unit_and_files_without_an_end_are_refused(
+    tmp_path: Path, name: str, text: str, sentence: str
+) -> None:
+    with pytest.raises(DatasetError if name != "c.toml" else FloccError, match=sentence) as caught:
+        read(tmp_path, text, name, (160, 120))
+    assert "\n" not in str(caught.value)
+
+
+def test_maps_that_are_taken_over_count_as_written(tmp_path: Path) -> None:
+    """YAML's `<<`, which is how several cameras share what is the same in each."""
+    shared = f"common: &common\n  resolution: [160, 120]\n  distortion_model: radtan\n  distortion_coeffs: {D[:4]}\n"
+    camera = "cam0:\n  <<: *common\n  camera_model: pinhole\n  intrinsics: [150.5, 151.5, 80.0, 60.0]\n"
+    assert read(tmp_path, shared + camera).camera == PINHOLE
+    assert read(tmp_path, FLAT + "<<: &more {distortion: [-0.3, 0.1, 0.001, -0.002]}\n").camera == PINHOLE
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "iso-8859-1", "utf-8"])
+def test_xml_is_read_in_the_encoding_that_it_names(tmp_path: Path, encoding: str) -> None:
+    numbers = f"<rows>3</rows><cols>3</cols><data>{' '.join(map(str, K))}</data>"
+    matrix = f'<camera_matrix type_id="opencv-matrix">{numbers}</camera_matrix>'
+    text = f"<?xml version='1.0' encoding='{encoding}'?><!-- Größe --><opencv_storage><image_width>160</image_width>"
+    text += f"<image_height>120</image_height>{matrix}</opencv_storage>"
+    (tmp_path / "c.xml").write_bytes(text.encode(encoding))
+    assert read_lens(tmp_path / "c.xml").camera == CameraModel(160, 120, 150.5, 151.5, 80.0, 60.0, ())
+
+
+def test_toml_with_a_mark_is_read_and_what_is_no_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text("[camera]\n" + FLAT.replace(":", " ="), encoding="utf-8-sig")
+    assert read_lens(tmp_path / "c.toml").camera.fx == 150.5
+    (tmp_path / "endless.yaml").symlink_to("/dev/zero")
+    with pytest.raises(DatasetError, match="is not a file"):
+        read_lens(tmp_path / "endless.yaml")

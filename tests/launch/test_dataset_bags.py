@@ -8,6 +8,7 @@ import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from tests.launch.bag_fixtures import HEIGHT, WIDTH, ZERO_NS, BagScript, walking
@@ -292,6 +293,52 @@ def test_odometry_that_calls_itself_lost_is_left_out(tmp_path: Path, caplog: pyt
     assert np.max(np.loadtxt(tmp_path / "out" / "odometry.tum")[:, 1]) < 10
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_odometry_of_other_frames_is_not_mixed_in(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+    """Two publishers of one topic: the poses of the second were taken for those of the first."""
+    script = walking(kind == "bag", count=10)
+    script.child = "other"
+    for k in range(2):
+        script.odometry("/odom", ZERO_NS + k * 10**9 + 10**8, 70.0)
+    script.messages.sort(key=lambda message: message[2])
+    recording = Recording.open(convert(script.write(bag_path(tmp_path, kind), kind), tmp_path / "out"))
+    assert max(frame.T_odom_body[0, 3] for frame in recording.frames) < 10
+    assert (
+        "2 of 22 messages were left out: a pose is of the frames camera to other, the first one of camera to body"
+        in (caplog.text)
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_intrinsics_that_change_are_refused(tmp_path: Path, kind: str) -> None:
+    script = walking(kind == "bag")
+    script.camera_info("/cam/camera_info", ZERO_NS + 2 * 10**9)
+    convert(script.write(bag_path(tmp_path, kind), kind), tmp_path / "same")
+    script.camera_info("/cam/camera_info", ZERO_NS + 3 * 10**9, 45.0)
+    (tmp_path / "zoom").mkdir()
+    bag = script.write(bag_path(tmp_path / "zoom", kind), kind)
+    with pytest.raises(DatasetError, match=r"/cam/camera_info: intrinsics differ from the first ones in 1 messages"):
+        convert(bag, tmp_path / "out")
+    assert len(Recording.open(convert(bag, tmp_path / "own", camera=camera_file(tmp_path))).frames) == 5
+
+
+def test_a_camera_that_is_not_calibrated_is_said_with_what_to_do(tmp_path: Path) -> None:
+    script = BagScript(True)
+    script.camera_info("/cam/camera_info", ZERO_NS, 0.0)
+    script.messages += walking(True).messages[1:]
+    bag = script.write(bag_path(tmp_path, "bag"))
+    with pytest.raises(DatasetError, match=r"run.bag: topic /cam/camera_info: .*; name a camera file with --camera"):
+        convert(bag, tmp_path / "out")
+
+
+def test_odometry_whose_stamp_stands_still_is_refused(tmp_path: Path) -> None:
+    script = walking(True, odometry=None)
+    for k in range(5):
+        script.odometry("/odom", ZERO_NS + 10**9, float(k))
+    with pytest.raises(DatasetError, match="4 of 5 messages were left out: the stamp is that of the pose before"):
+        convert(script.write(bag_path(tmp_path, "bag")), tmp_path / "out")
+
+
 def test_too_many_damaged_messages_are_refused(tmp_path: Path) -> None:
     script = walking(False)
     for k in range(3):
@@ -421,3 +468,40 @@ def test_graco_in_its_published_layout(tmp_path: Path) -> None:
     starts = [recording.ground_truth(0.0) for recording in recordings]
     assert [float(T[0, 3]) for T in starts if T is not None] == pytest.approx([0.0, 7.0], abs=1e-3)
     assert recordings[1].camera == GRACO_GROUND.camera.agent_camera()
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_raw_images_of_twelve_bits_have_one_pair_of_levels(
+    tmp_path: Path, ros1: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Case 18: a dark start of the bag does not decide how bright the rest is."""
+    script = walking(ros1, 0)
+    ramp = np.linspace(0, 3824, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
+    for k in range(6):
+        script.odometry("/odom", ZERO_NS + k * 10**9, float(k))
+        dark = ramp / 16 if k < 2 else ramp
+        script.raw("/cam/image_raw", ZERO_NS + k * 10**9, dark.astype(np.uint16), "mono16")
+    bag = script.write(tmp_path / ("run.bag" if ros1 else "run"), "bag" if ros1 else "mcap")
+    recording = Recording.open(convert(bag, tmp_path / "out"))
+    found = [cv2.imread(str(frame.image_path), cv2.IMREAD_UNCHANGED) for frame in recording.frames]
+    assert [(each.dtype.type, int(each.max())) for each in found if each is not None] == [(np.uint8, 14)] * 2 + [
+        (np.uint8, 239)
+    ] * 4
+    assert "images of 16 bits use 0 to 4095, which become 0 to 255" in caplog.text
+
+
+def test_a_bag_of_a_wide_lens_becomes_a_pinhole(tmp_path: Path) -> None:
+    """Field of view as chosen, and images of the camera that the recording names."""
+    script = walking(False, 4)
+    info = script.messages[0][3]
+    info.distortion_model, info.d = "equidistant", np.array([0.01, 0.0, 0.0, 0.0])
+    bag = script.write(tmp_path / "run", "mcap")
+    recording = Recording.open(convert(bag, tmp_path / "out", view_deg=45.0))
+    assert recording.camera.distortion == (0.0, 0.0, 0.0, 0.0)
+    view_deg = 2 * np.degrees(np.arctan(recording.camera.width / 2 / recording.camera.fx))
+    assert view_deg == pytest.approx(45.0, abs=1.0)
+    assert len(recording.frames) == 4
+    assert recording.load_image(recording.frames[3]).pixels.shape[:2] == (
+        recording.camera.height,
+        recording.camera.width,
+    )

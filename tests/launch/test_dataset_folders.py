@@ -1,6 +1,8 @@
 """Every folder format is read as its publisher describes it, and what is wrong with one is said in one sentence."""
 
+import json
 import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -20,6 +22,7 @@ from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.source import DatasetError
+from flocc_protocol.errors import FloccError
 
 Float = NDArray[np.float64]
 
@@ -327,3 +330,103 @@ def test_real_kitti_and_euroc_files_are_read(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"MH_01.vislam.txt:1: nothing says whether the quaternion is x y z w"):
         read_trajectory(vio)
     assert len(read_trajectory(vio, "tum")[0]) > 1000
+
+
+def test_images_go_by_their_numbers_in_every_reader(tmp_path: Path) -> None:
+    """As text, 10 comes before 2, and every pose would be of another image."""
+    wanted = [f"{k}.png" for k in range(12)]
+    kitti = write_kitti(tmp_path / "00", 12, 12)
+    for file in (kitti / "image_0").iterdir():
+        file.rename(file.with_name(f"{int(file.stem)}.png"))
+    assert [file.name for _, file in read_source(kitti).images] == wanted
+    scenes = write_sevenscenes(tmp_path / "s", 12)
+    for file in sorted(scenes.iterdir()):
+        file.rename(file.with_name(f"frame-{int(file.name[6:12])}{file.name[12:]}"))
+    found = read_source(scenes)
+    assert found.truth is not None
+    np.testing.assert_allclose(found.truth.T_fixed_body, moving(12), atol=1e-9)
+    colmap = tmp_path / "c"
+    for name in wanted:
+        write_image(colmap / "images" / name)
+    (colmap / "cameras.txt").write_text("1 PINHOLE 32 24 7 8 16 12\n")
+    (colmap / "images.txt").write_text("".join(f"{k + 1} 1 0 0 0 0 0 {k} 1 {k}.png\n\n" for k in range(12)))
+    assert [file.name for _, file in read_source(colmap).images] == wanted
+
+
+@pytest.mark.parametrize("times", [True, False])
+def test_a_missing_image_of_kitti_shifts_no_other(tmp_path: Path, times: bool) -> None:
+    path = write_kitti(tmp_path / "00", 6, 6)
+    (path / "image_0" / "000002.png").unlink()
+    if not times:
+        (path / "times.txt").unlink()
+    source = read_source(path)
+    stamps_s = {int(file.stem): stamp_s for stamp_s, file in source.images}
+    assert stamps_s == pytest.approx({k: 0.1 * k for k in (0, 1, 3, 4, 5)})
+    assert source.truth is not None
+    assert len(source.truth) == 6
+    assert len(source.faults) >= 1
+
+
+def test_a_missing_image_of_a_raw_drive_shifts_no_other(tmp_path: Path) -> None:
+    for k in (0, 1, 3):
+        write_image(tmp_path / "image_00" / "data" / f"{k:010d}.png")
+    stamps = "".join(f"2011-09-26 13:02:{25 + k}.500000000\n" for k in range(4))
+    (tmp_path / "image_00" / "timestamps.txt").write_text(stamps)
+    images = read_source(tmp_path).images
+    assert [stamp_s - images[0][0] for stamp_s, _ in images] == [0, 1, 3]
+
+
+def test_euroc_images_that_are_no_stamps_are_listed_or_said(tmp_path: Path) -> None:
+    path = write_euroc(tmp_path / "MH_01")
+    write_image(path / "mav0/cam0/data" / "overview.png")
+    assert any("1 of 4 images were left out, as overview.png is no" in note for note in read_source(path).notes)
+    stamps = []
+    for k, file in enumerate(sorted((path / "mav0/cam0/data").glob("14*.png"))):
+        stamps.append(int(file.stem))
+        file.rename(file.with_name(f"{k:06d}.png"))
+    with pytest.raises(DatasetError, match="no stamps in nanoseconds"):
+        read_source(path)
+    lines = "".join(f"{stamp},{k:06d}.png\n" for k, stamp in enumerate(stamps))
+    (path / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename\n" + lines)
+    assert [stamp_s for stamp_s, _ in read_source(path).images] == pytest.approx([stamp * 1e-9 for stamp in stamps])
+
+
+@pytest.mark.parametrize("form", ["{t} rgb\\{n}", "{t} rgb/{n} {t} depth/{n}", "{t} rgb/{n}"])
+def test_lists_are_read_as_windows_and_associations_write_them(tmp_path: Path, form: str) -> None:
+    path = write_plain(tmp_path / "p", 4)
+    (path / "images").rename(path / "rgb")
+    names = sorted(file.name for file in (path / "rgb").iterdir())
+    (path / "images.txt").write_text("".join(form.format(t=name[:-4], n=name) + "\n" for name in names))
+    assert [file.name for _, file in read_source(path).images] == names
+
+
+def test_a_list_of_nothing_that_exists_names_the_first(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p", 4)
+    (path / "images.txt").write_text("1.0 other/1.png\n2.0 other/2.png\n")
+    with pytest.raises(DatasetError, match=r"images.txt:1: the image .*other/1.png does not exist \(and 1 others\)"):
+        read_source(path)
+
+
+@pytest.mark.parametrize("name", ["camera.toml", "groundtruth.tum"])
+def test_a_link_to_nowhere_is_said(tmp_path: Path, name: str) -> None:
+    path = write_plain(tmp_path / "p", 4)
+    (path / name).unlink()
+    (path / name).symlink_to("/nowhere")
+    with pytest.raises(FloccError, match=rf"{name}: cannot be read: No such file"):
+        read_source(path)
+
+
+def test_the_trajectory_that_was_not_taken_is_said(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p", 4)
+    shutil.copy(path / "groundtruth.tum", path / "gt.txt")
+    told = read_source(path).notes
+    assert any(note.endswith("groundtruth.tum: was taken as the groundtruth, not gt.txt") for note in told)
+
+
+def test_two_poses_of_one_image_are_refused(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png")
+    frames = [{"file_path": "a.png", "transform_matrix": moving(2)[k].tolist()} for k in range(2)]
+    table = {"w": 32, "h": 24, "fl_x": 7, "fl_y": 8, "cx": 16, "cy": 12, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    with pytest.raises(DatasetError, match=r"gives a.png two poses"):
+        read_source(tmp_path)

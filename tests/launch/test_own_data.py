@@ -71,6 +71,16 @@ def test_a_folder_of_data_sets_is_a_robot_each(own: Path, tmp_path: Path) -> Non
     assert frames == {"husky": 4, "robot-a": COUNT}
 
 
+def test_a_folder_around_one_data_set_is_that_data_set(own: Path, tmp_path: Path) -> None:
+    around = tmp_path / "download"
+    shutil.copytree(own, around / "drive")
+    (around / "README.txt").write_text("who recorded it\n", encoding="utf-8")
+    told: list[str] = []
+    scenario = read_scenario(str(around), {}, agents=2, tell=told.append)
+    assert scenario.names() == ["r1", "r2"]
+    assert told[0].startswith(f"data: {around / 'drive'}, cut by time into 2 robots")
+
+
 def test_robots_that_recorded_together_keep_their_distance_in_time(own: Path, tmp_path: Path) -> None:
     team = tmp_path / "team"
     for name in ("early", "late"):
@@ -109,8 +119,9 @@ def test_a_bag_is_cut_into_robots(own: Path, tmp_path: Path) -> None:
 
 
 def test_robots_that_are_there_are_not_counted_anew(own: Path, tmp_path: Path) -> None:
-    shutil.copytree(own, tmp_path / "team" / "a")
-    with pytest.raises(DatasetError, match=r"team: holds 1 robots \(a\), not 3"):
+    for name in "ab":
+        shutil.copytree(own, tmp_path / "team" / name)
+    with pytest.raises(DatasetError, match=r"team: holds 2 robots \(a, b\), not 3"):
         read_scenario(str(tmp_path / "team"), {}, agents=3)
 
 

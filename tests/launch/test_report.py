@@ -10,12 +10,14 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported, UnknownFact
+from flocc_agent.runtime.facts import AgentDied, KilledByOrder
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.report import RunReport, evaluate, finish, read_report
 from flocc_launch.report.build import judged
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, event_from_line
-from flocc_launch.runs.timeline import merged_after_s
+from flocc_launch.runs.timeline import deaths_unasked, merged_after_s
 from flocc_launch.runs.trajectory_errors import ate_m
 
 ROBOTS = ["r1", "r2", "r3"]
@@ -251,3 +253,14 @@ def test_a_run_without_any_event_has_a_report(tmp_path: Path) -> None:
     report = finish(folder)
     assert (report.closures.accepted, report.leaders, report.bytes) == (0, [], {})
     assert (report.ate_joint_m, report.merged_after_s, report.duration_s) == (None, None, 0.0)
+
+
+def test_an_order_to_kill_explains_one_death_of_its_robot_and_no_later_one() -> None:
+    died = AgentDied(signal=9, exit_code=None, scripted=False)
+    told: list[tuple[float, Fact]] = [
+        (1.0, KilledByOrder()),
+        (1.2, died),
+        (8.0, died),
+        (9.0, AgentDied(signal=9, exit_code=None, scripted=True)),
+    ]
+    assert deaths_unasked([Reported(t, "r1", each) for t, each in told]) == ["r1"]

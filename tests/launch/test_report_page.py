@@ -108,6 +108,11 @@ def test_the_verdict_says_what_became_of_the_maps(tmp_path: Path) -> None:
 def test_the_verdict_does_not_hide_a_correction_that_did_not_help(tmp_path: Path) -> None:
     report = html_of(tmp_path)[1].model_copy(update={"ate_joint_m": 2.0})
     assert verdict(report).endswith("The joint error is 2.00 m, not better than odometry alone (1.64 m).")
+    between = {"ate_joint_m": 1.0, "ate_joint_odometry_aligned_m": 0.9}
+    assert verdict(report.model_copy(update=between)).endswith(
+        "The joint error is 1.00 m: less than odometry from its true starts (1.64 m), "
+        "but not less than that odometry aligned as the map is (0.900 m)."
+    )
 
 
 def test_the_verdict_claims_nothing_for_a_single_robot(tmp_path: Path) -> None:

@@ -19,6 +19,9 @@ READ: dict[str, tuple[Callable[[int], str], float]] = {
     "phone": (lambda k: f"PXL_20231114_2213{20000 + 100 * k:05d}", ZERO_S),
     "ISO with dashes": (lambda k: f"2023-11-14T22-13-20.{k}00000", ZERO_S),
     "date with microseconds": (lambda k: f"2023-11-14_22-13-20-{k * 10**5:06d}", ZERO_S),
+    "a zone": (lambda k: f"2023-11-15T00:13:20.{k}+02:00", ZERO_S),
+    "a zone in the west": (lambda k: f"2023-11-14T20:13:20.{k}-02:00", ZERO_S),
+    "some without a point": (lambda k: f"{ZERO_S + 0.1 * k:.1f}".removesuffix(".0"), ZERO_S),
     "milliseconds": (lambda k: f"{ZERO_S * 1000 + 100 * k}", ZERO_S),
     "a counter and microseconds": (lambda k: f"{k:04d}_{ZERO_S * 10**6 + 10**5 * k}", ZERO_S),
     "nanoseconds": (lambda k: f"cam0_{ZERO_S * NS + 10**8 * k}", ZERO_S),
@@ -62,9 +65,30 @@ def test_numbers_of_images_are_no_stamps(written: Callable[[int], str]) -> None:
             "1 to 9 digits after .* a fraction of a second, or nanoseconds without",
         ),
         (lambda k: f"{ZERO_S + k}_{17 + k * 1013 % 90000}", "can be a fraction of a second or a number of its own"),
+        (lambda k: f"20231114_2213{k:02d}_{k:03d}", "can be their fraction or count images"),
+        (lambda k: f"20231114_2213{k:02d}_{k}", "can be their fraction or count images"),
+        (lambda k: f"20231114_2213{k // 2:02d}" + "_1" * (k % 2), "can be their fraction or count images"),
         (lambda k: f"{10**10 + 4 * k}", "can be seconds or milliseconds"),
     ],
 )
 def test_two_readings_are_refused_with_both(written: Callable[[int], str], sentence: str) -> None:
     with pytest.raises(DatasetError, match=f"images: .*{sentence}.*; list the images in images.txt"):
         stamps_of_names([written(k) for k in range(60)], "images")
+
+
+@pytest.mark.parametrize(
+    ("written", "first_s"),
+    [
+        (lambda k: f"DJI_202311142213{20 + k}_{k + 7:04d}_W", ZERO_S),
+        (lambda k: f"Photo 2023-11-14 10.13.{20 + k} PM", ZERO_S),
+        (lambda k: f"Photo 2023-11-14 12.13.{20 + k} AM", ZERO_S - 22 * 3600),
+    ],
+)
+def test_dates_with_a_counter_or_half_a_day(written: Callable[[int], str], first_s: float) -> None:
+    """A drone's counter was read as 0.0007 s, ten in the evening as ten in the morning."""
+    assert stamps_of_names([written(k) for k in range(10)], "images")[0] == [first_s + k for k in range(10)]
+
+
+@pytest.mark.parametrize("written", [lambda k: "9" * 400 + str(k), lambda k: "9" * 400 + f".{k}"])
+def test_a_number_without_an_end_is_no_stamp(written: Callable[[int], str]) -> None:
+    assert stamps_of_names([written(k) for k in range(10)], "images")[0] is None

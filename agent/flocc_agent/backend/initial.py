@@ -1,6 +1,7 @@
 """Where a component's poses start: at the last solution, or at the robust alignment of the odom frames."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,25 @@ from flocc_protocol.ids import LogId
 JUDGES_MIN = 2
 
 
+class Aligned(NamedTuple):
+    """Where a component starts.
+
+    Attributes:
+        T_map_keyframe: (N, 4, 4) of every log, in one frame.
+        is_warm: These are the poses of an earlier solution.
+    """
+
+    T_map_keyframe: dict[LogId, Float]
+    is_warm: bool
+
+
 def initial_poses(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
     steepness: float,
     earlier: GraphSolution | None,
-) -> tuple[dict[LogId, Float], bool]:
-    """Poses (N, 4, 4) of every log in one frame, and whether they are those of the earlier solution.
+) -> Aligned:
+    """Poses of every log in one frame.
 
     They come from the earlier solution where it has all logs in one component and most closures of every pair of robots
     still agree with it. Otherwise the robots are placed anew: a first closure that was wrong must not outlive the right
@@ -32,13 +45,13 @@ def initial_poses(
     if component is not None:
         warm = {log: extended(component.T_map_keyframe[log], trajectories[log]) for log in trajectories}
         if all(upheld(warm, of_pair) for of_pair in by_pair(closures)):
-            return warm, True
+            return Aligned(warm, True)
     T_map_odom, aligned = align(trajectories, closures, steepness)
     judges = [pair for pair in aligned.values() if len(pair.agreeing) >= JUDGES_MIN]
     if warm and all(upheld(warm, [closures[k] for k in pair.agreeing]) for pair in judges):
-        return warm, True
+        return Aligned(warm, True)
     rigid = {log: T_map_odom[log] @ trajectory.T_odom_keyframe for log, trajectory in trajectories.items()}
-    return bent_along_fixes(rigid, closures), False
+    return Aligned(bent_along_fixes(rigid, closures), False)
 
 
 def by_pair(closures: Mapping[int, LoopClosure]) -> list[list[LoopClosure]]:

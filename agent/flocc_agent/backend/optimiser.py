@@ -8,26 +8,25 @@ exclusions with a reason; what cannot be solved keeps its odometry. Deterministi
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import votes
-from flocc_agent.backend.consistency import inconsistent
 from flocc_agent.backend.descent import Objective
-from flocc_agent.backend.edges import state_of
-from flocc_agent.backend.initial import initial_poses, trusted_closures
-from flocc_agent.backend.joining import too_few
+from flocc_agent.backend.edges import State, state_of
+from flocc_agent.backend.filtering import Filtered, filtered
+from flocc_agent.backend.initial import Aligned, initial_poses, trusted_closures
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.placing import Places
-from flocc_agent.backend.problem import build
-from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component, rejected
+from flocc_agent.backend.problem import Problem, build
+from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
-    ClosureResult,
     ClosureState,
     GraphSolution,
     LoopClosure,
@@ -121,52 +120,32 @@ def _solve_and_split(
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
 ) -> SolvedLogs:
-    """Solve; where too few closures join maps, or are left to, solve each component with the closures that it has."""
+    """Filter and solve; what the closures left do not hold together is solved apart, with the closures that it has."""
     began = time.perf_counter()
-    dropped = inconsistent(trajectories, closures, config) if config.pairwise_consistency else {}
-    turned_away = {k: rejected(closures[k], reason) for k, reason in dropped.items()}
-    turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
-    outcome = SolvedLogs((), {})
-    groups = _groups(trajectories, closures, turned_away)
-    if len(groups) == 1:
-        kept = {k: c for k, c in closures.items() if k not in turned_away}
-        outcome = _solve_connected(trajectories, kept, config, initial, wanted)
-        turned_away |= {k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED}
-        turned_away |= _joining_too_few(trajectories, closures, turned_away, config)
-        groups = _groups(trajectories, closures, turned_away)
-    if len(groups) == 1:
-        timings_s = {"consistency": time.perf_counter() - began - sum(outcome.timings_s.values()), **outcome.timings_s}
-        return replace(outcome, closures={**outcome.closures, **turned_away}, timings_s=timings_s)
-    left = {k: c for k, c in closures.items() if k not in turned_away}
-    screened = Screened(dict(trajectories), {}, ())
-    plain = config.model_copy(update={"pairwise_consistency": False})
-    parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in groups]
-    return _joined(parts, turned_away, outcome)
+    kept = filtered(trajectories, closures, config)
+    filtering_s = time.perf_counter() - began
+    outcome = SolvedLogs((), {}, timings_s={"consistency": filtering_s})
+    if kept.is_connected:
+        outcome = _solve_connected(kept, config, initial, wanted)
+        outcome = replace(outcome, timings_s={"consistency": filtering_s, **outcome.timings_s})
+        kept = kept.without({k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED})
+    if kept.is_connected:
+        return replace(outcome, closures={**outcome.closures, **kept.turned_away})
+    return _split(kept, outcome, config, initial, wanted)
 
 
-def _joining_too_few(
-    trajectories: Mapping[LogId, Trajectory],
-    closures: Mapping[int, LoopClosure],
-    turned_away: Mapping[int, ClosureResult],
+def _split(
+    kept: Filtered,
+    before: SolvedLogs,
     config: BackendConfig,
-) -> dict[int, ClosureResult]:
-    """Those of the remaining closures that are too few to join maps."""
-    left = {k: c for k, c in closures.items() if k not in turned_away}
-    reason = f"fewer than {config.closures_to_join_min} closures join these maps"
-    return {k: rejected(left[k], reason) for k in too_few(list(trajectories), left, config.closures_to_join_min)}
-
-
-def _groups(
-    trajectories: Mapping[LogId, Trajectory],
-    closures: Mapping[int, LoopClosure],
-    turned_away: Mapping[int, ClosureResult],
-) -> tuple[tuple[LogId, ...], ...]:
-    """The logs that the remaining closures connect."""
-    return components_of(list(trajectories), [c for k, c in closures.items() if k not in turned_away])
-
-
-def _joined(parts: Sequence[SolvedLogs], turned_away: Mapping[int, ClosureResult], before: SolvedLogs) -> SolvedLogs:
-    closures = dict(turned_away)
+    initial: GraphSolution | None,
+    wanted: Sequence[KeyframeId],
+) -> SolvedLogs:
+    """Solve each group that the closures left connect by itself."""
+    screened = Screened(dict(kept.trajectories), {}, ())
+    plain = config.model_copy(update={"pairwise_consistency": False})
+    parts = [_solve_group(logs, kept.left, screened, plain, initial, wanted) for logs in kept.groups]
+    closures = dict(kept.turned_away)
     for part in parts:
         closures.update(part.closures)
     return SolvedLogs(
@@ -185,28 +164,54 @@ def summed_timings(outcomes: Sequence[SolvedLogs]) -> dict[str, float]:
 
 
 def _solve_connected(
-    trajectories: Mapping[LogId, Trajectory],
-    closures: Mapping[int, LoopClosure],
-    config: BackendConfig,
-    initial: GraphSolution | None,
-    wanted: Sequence[KeyframeId],
+    kept: Filtered, config: BackendConfig, initial: GraphSolution | None, wanted: Sequence[KeyframeId]
 ) -> SolvedLogs:
+    """Align the odom frames, pose the problem, solve it, collect what consumers get (Sec. III-C)."""
     times = [time.perf_counter()]
-    T_initial, warm = initial_poses(trajectories, closures, config.steepness, initial)
+    aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
     times.append(time.perf_counter())
-    problem = build(trajectories, closures, config)
-    state = state_of(np.concatenate([T_initial[log] for log in problem.logs]), problem.clusters)
-    linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
-    objective = Objective(problem.edges, problem.closure_rows, linear, config)
-    trusted = trusted_closures([closures[k] for k in problem.closure_ids], initial) if warm and initial else None
-    says = votes([closures[k] for k in problem.closure_ids], config.cluster_keyframes_max)
-    places = Places(problem, trajectories, closures, says, config.steepness)
-    solved = solve(objective, state, trusted, places)
+    posed = _posed(kept, aligned, config, initial)
+    solved = solve(posed.objective, posed.start, posed.trusted, posed.places)
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())
-    solution = Solution(problem, objective, state, solved, trajectories, closures)
+    solution = Solution(posed.problem, posed.objective, posed.start, solved, kept.trajectories, kept.left)
     outcome = collect(solution, wanted)
     times.append(time.perf_counter())
     spans_s = np.diff(times).tolist()
     return replace(outcome, timings_s=dict(zip(("alignment", "solver", "results"), spans_s, strict=True)))
+
+
+@dataclass(frozen=True, slots=True)
+class Posed:
+    """A component as the solver takes it.
+
+    Attributes:
+        problem: Poses, scales and edges as arrays.
+        objective: What is minimised.
+        start: Where it starts.
+        trusted: Which closures (L,) an earlier solution did not reject; None where the start is not that solution.
+        places: Where rejected closures would put robots.
+    """
+
+    problem: Problem
+    objective: Objective
+    start: State
+    trusted: NDArray[np.bool_] | None
+    places: Places
+
+
+def _posed(kept: Filtered, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None) -> Posed:
+    """The problem of aligned logs and the closures that are left."""
+    closures = kept.left
+    problem = build(kept.trajectories, closures, config)
+    in_order = [closures[k] for k in problem.closure_ids]
+    linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
+    says = votes(in_order, config.cluster_keyframes_max)
+    return Posed(
+        problem,
+        Objective(problem.edges, problem.closure_rows, linear, config),
+        state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters),
+        trusted_closures(in_order, initial) if aligned.is_warm and initial is not None else None,
+        Places(problem, kept.trajectories, closures, says, config.steepness),
+    )

@@ -110,7 +110,7 @@ def read_toml(path: Path) -> dict[str, object]:
         ConfigError: It is missing, unreadable or not TOML; the message names the file (and line).
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except tomllib.TOMLDecodeError as error:

@@ -24,7 +24,10 @@ Float = NDArray[np.float64]
 
 
 class RecordedOdometry:
-    """A log's keyframes as they were recorded; it reads on as the log grows."""
+    """A log's keyframes as they were recorded; it reads on as the log grows.
+
+    The place of a keyframe that a later version wrote is taken by the next one, as in the pose graph.
+    """
 
     def __init__(self, copy: LogCopy) -> None:
         self._copy = copy
@@ -47,8 +50,9 @@ class RecordedOdometry:
         self._read += len(records)
         for record in records:
             if isinstance(record, KeyframeRecord):
-                self._stamps_s.append(record.stamp_s)
-                self._T_odom_camera.append(pose_from_tq(np.array(record.T_odom_camera)))
+                unread = record.index - len(self._stamps_s)
+                self._stamps_s += [record.stamp_s] * (unread + 1)
+                self._T_odom_camera += [pose_from_tq(np.array(record.T_odom_camera))] * (unread + 1)
 
 
 class CorrectedLog:
@@ -82,13 +86,12 @@ class CorrectedLog:
         Between two keyframes it is interpolated: odometry between them is not in the log.
         """
         stamps_s = self._odometry.stamps_s()
-        after = bisect_left(stamps_s, stamp_s)
-        if after == len(stamps_s) or (after == 0 and stamps_s[0] != stamp_s):
+        after = bisect_right(stamps_s, stamp_s)
+        before, last = self.pose_of(after - 1), self.pose_of(after)
+        if before is None or stamps_s[after - 1] == stamp_s:
+            return before
+        if last is None:
             return None
-        last = self.pose_of(after)
-        before = self.pose_of(after - 1)
-        if last is None or before is None or stamps_s[after] == stamp_s:
-            return last
         share = (stamp_s - stamps_s[after - 1]) / (stamps_s[after] - stamps_s[after - 1])
         return interpolated(before, last, share)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_protocol.arrays import Array
+from flocc_protocol.records import checked_descriptor
 
 Float = NDArray[np.float64]
 
@@ -142,16 +143,34 @@ class Perception:
     registrar: Registrar
 
     def describe(self, image: Image) -> Array:
-        """Compute an image's place descriptor, as it travels: (D,) int8."""
-        return Array.int8(self.describer.describe(image))
+        """Compute an image's place descriptor, as it travels: (D,) int8.
+
+        Raises:
+            ValueError: The describer gave what no record holds.
+        """
+        return checked_descriptor(Array.int8(np.asarray(self.describer.describe(image), dtype=float)))
 
     def encode(self, image: Image) -> bytes:
-        """Compute the latent of an image."""
-        return self.encoder.encode(image)
+        """Compute the latent of an image.
+
+        Raises:
+            TypeError: The encoder gave no bytes.
+        """
+        latent = self.encoder.encode(image)
+        if not isinstance(latent, bytes):
+            raise TypeError(f"a latent is bytes, not {type(latent).__name__}")
+        return latent
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
-        """Register the match's latent with the query's."""
-        return self.registrar.register(query, match, odometry)
+        """Register the match's latent with the query's.
+
+        Raises:
+            TypeError: The registrar gave no result.
+        """
+        result = self.registrar.register(query, match, odometry)
+        if not isinstance(result, Registration | RegistrationFailed):
+            raise TypeError(f"a registration is a Registration or RegistrationFailed, not {type(result).__name__}")
+        return result
 
     def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
         """Give what is sent of a stored latent; see `PictureEncoder.part`."""

@@ -1,7 +1,7 @@
 """Measurements in their text form: a kind, names and numbers, as files beside a data set and scenarios have them."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from typing import Any, get_args
 
 import numpy as np
@@ -30,28 +30,43 @@ def measurement_of(kind: str, values: Mapping[str, Any]) -> Measurement:
     if unknown:
         raise BadMeasurement(f"{kind}: {unknown[0]!r} is not one of its fields: {', '.join(known)}")
     try:
-        return cls(**{name: _read(name, value) for name, value in values.items()})
+        return cls(**{field.name: _read(field, values[field.name]) for field in fields(cls) if field.name in values})
     except TypeError as error:
         if missing := [field for field in known if field not in values and _is_needed(cls, field)]:
             raise BadMeasurement(f"{kind}: {missing[0]} is missing") from error
         raise BadMeasurement(f"{kind}: a field has a value of the wrong type") from error
     except BadMeasurement:
         raise
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise BadMeasurement(f"{kind}: {error}") from error
+
+
+def _typed(value: Any, types: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, types):
+        raise TypeError(f"{value!r} is of the wrong type")
+    return value
 
 
 def _is_needed(cls: type[Measurement], name: str) -> bool:
     return next(field.default is MISSING for field in fields(cls) if field.name == name)
 
 
-def _read(name: str, value: Any) -> Any:
-    """One field of a text form."""
-    if name == "match":
-        return KeyframeId.parse(value)
-    if not isinstance(value, list):
-        return value
-    numbers = np.array(value, dtype=float)
+def _read(field: Field[Any], value: Any) -> Any:
+    """One field of a text form; what its class checks stays as it is.
+
+    Raises:
+        TypeError: It is of another type than the field.
+    """
+    name = field.name
+    if field.type is KeyframeId:
+        return KeyframeId.parse(_typed(value, str))
+    if field.type is float:
+        return float(_typed(value, int | float))
+    if field.type is str:
+        return str(_typed(value, str | int))
+    if value is None and field.default is None:
+        return None
+    numbers = np.array(_typed(value, list), dtype=float)
     if name.startswith("T_") and numbers.shape == (7,):
         return pose_from_tq(numbers)
     if name.startswith("R_") and numbers.shape == (4,):

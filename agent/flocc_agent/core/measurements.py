@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.effects import Report
 from flocc_agent.core.reports import MeasurementKept, MeasurementRefused
-from flocc_agent.geometry import adjoint, inverse, is_rigid, pose, pose7
+from flocc_agent.geometry import adjoint, inverse, is_rigid, pose, pose7, upper_triangle
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.errors import FloccError
@@ -33,15 +33,17 @@ from flocc_protocol.records import (
     RobotBearingRecord,
     RobotSightingRecord,
     TagSightingRecord,
+    encode_record,
 )
 
 Float = NDArray[np.float64]
 
 CONDITION_MAX = 1e12
 """Largest ratio of a covariance's eigenvalues: beyond it the matrix is numerically singular."""
+VARIANCE_MIN, VARIANCE_MAX = 1e-18, 1e18
+"""Eigenvalues of a covariance (m^2 or rad^2): beyond them it says nothing that a solver's numbers can hold."""
 WAITING_MAX = 64
 """Measurements that may wait for one keyframe."""
-_UPPER = np.triu_indices(6)
 
 
 class BadMeasurement(FloccError, ValueError):
@@ -148,7 +150,7 @@ class PoseFix:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
-        return PoseFixRecord(keyframe.index, pose7(self.T_world_body), _upper(self.covariance))
+        return PoseFixRecord(keyframe.index, pose7(self.T_world_body), upper_triangle(self.covariance, "f8"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +176,9 @@ class TagSighting:
     covariance: Float
 
     def __post_init__(self) -> None:
+        tag: object = self.tag
+        if not isinstance(tag, str | int | np.integer) or isinstance(tag, bool) or not str(tag).isprintable():
+            raise BadMeasurement(f"tag: {tag!r} is no name")
         if not 1 <= len(str(self.tag)) <= TAG_LENGTH_MAX:
             raise BadMeasurement(f"tag: a name has 1 to {TAG_LENGTH_MAX} characters, not {len(str(self.tag))}")
         _check_pose(self.kind, self.T_body_tag)
@@ -185,7 +190,9 @@ class TagSighting:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
-        return TagSightingRecord(keyframe.index, str(self.tag), pose7(self.T_body_tag), _upper(self.covariance))
+        return TagSightingRecord(
+            keyframe.index, str(self.tag), pose7(self.T_body_tag), upper_triangle(self.covariance, "f8")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +230,10 @@ class RobotSighting:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it."""
-        return RobotSightingRecord(keyframe.index, self.robot, pose7(self.T_body_robot), _upper(self.covariance))
+        _check_other(self.kind, self.robot, keyframe)
+        return RobotSightingRecord(
+            keyframe.index, self.robot, pose7(self.T_body_robot), upper_triangle(self.covariance, "f8")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,6 +270,7 @@ class RobotBearing:
 
     def record(self, keyframe: KeyframeId) -> MeasurementRecord:
         """As the keyframe's log keeps it: a position with its covariance, in the camera."""
+        _check_other(self.kind, self.robot, keyframe)
         T = np.eye(4) if self._T_camera_body is None else self._T_camera_body
         u = T[:3, :3] @ np.asarray(self.bearing, dtype=float) / np.linalg.norm(self.bearing)
         along = np.outer(u, u)
@@ -286,6 +297,8 @@ class MetricClosure:
     T_match_camera: Float | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.match, KeyframeId):
+            raise BadMeasurement(f"closure: match {self.match!r} is no KeyframeId")
         _check_pose(self.kind, self.T_query_match)
         _check_covariance(self.kind, self.covariance, 6)
         if self.T_match_camera is not None:
@@ -304,7 +317,9 @@ class MetricClosure:
         """As the keyframe's log keeps it."""
         if keyframe == self.match:
             raise BadMeasurement(f"closure: {keyframe} cannot be registered with itself")
-        return MetricClosureRecord(keyframe, self.match, pose7(self.T_query_match), _upper(self.covariance))
+        return MetricClosureRecord(
+            keyframe, self.match, pose7(self.T_query_match), upper_triangle(self.covariance, "f8")
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -329,7 +344,7 @@ class OdometryCovariance:
         """As the keyframe's log keeps it."""
         if keyframe.index == 0:
             raise BadMeasurement("odometry: the first keyframe has no edge before it")
-        return OdometryCovarianceRecord(keyframe.index, _upper(self.covariance))
+        return OdometryCovarianceRecord(keyframe.index, upper_triangle(self.covariance, "f8"))
 
 
 Measurement = (
@@ -363,8 +378,10 @@ def _check_covariance(kind: str, covariance: Float, side: int) -> None:
         raise BadMeasurement(f"{kind}: the covariance is not a finite ({side}, {side}) matrix")
     low, high = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[[0, -1]]
     symmetric = np.abs(matrix - matrix.T).max() <= 1e-6 * np.abs(matrix).max()
-    if not symmetric or low <= 0 or high >= CONDITION_MAX * low:
+    if not symmetric or low <= 0 or low <= high / CONDITION_MAX:
         raise BadMeasurement(f"{kind}: the covariance is not positive definite")
+    if low < VARIANCE_MIN or high > VARIANCE_MAX:
+        raise BadMeasurement(f"{kind}: the covariance is not within {VARIANCE_MIN:g} and {VARIANCE_MAX:g}")
 
 
 def _check_positive(kind: str, name: str, value: float) -> None:
@@ -373,10 +390,17 @@ def _check_positive(kind: str, name: str, value: float) -> None:
 
 
 def _check_robot(kind: str, robot: str) -> None:
+    if not isinstance(robot, str):
+        raise BadMeasurement(f"{kind}: {robot!r} is no name of a robot")
     try:
         checked_name(robot)
     except FloccError as error:
         raise BadMeasurement(f"{kind}: {error}") from error
+
+
+def _check_other(kind: str, robot: str, keyframe: KeyframeId) -> None:
+    if robot == keyframe.log.robot:
+        raise BadMeasurement(f"{kind}: a robot does not see itself")
 
 
 def _posed(R: Float, position_m: Float) -> Float:
@@ -395,13 +419,25 @@ def _array(values: Float) -> Array:
     return Array.of(np.asarray(values, dtype=float).ravel(), "f8")
 
 
-def _upper(covariance: Float) -> Array:
-    return Array.of(np.asarray(covariance, dtype=float)[_UPPER], "f8")
-
-
 def belongs_to(measurement: Measurement, own: LogId, index: int) -> KeyframeId:
     """The keyframe that a measurement made at keyframe `index` belongs to."""
     return KeyframeId(own, 0 if isinstance(measurement, StartPose) else index)
+
+
+def record_of(measurement: Measurement, keyframe: KeyframeId) -> MeasurementRecord:
+    """The record of what was measured at a keyframe.
+
+    Raises:
+        BadMeasurement: No log may hold it: the other robots would refuse it.
+    """
+    try:
+        record = measurement.record(keyframe)
+        encode_record(record)
+    except BadMeasurement:
+        raise
+    except ValueError as error:
+        raise BadMeasurement(f"{measurement.kind}: {error}") from error
+    return record
 
 
 def measurement_report(measurement: Measurement, keyframe: KeyframeId) -> Report:

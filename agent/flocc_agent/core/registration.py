@@ -7,6 +7,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_protocol.ids import INDEX_MAX
+
 Float = NDArray[np.float64]
 
 ODOMETRY_CORRESPONDENCES_MIN = 20
@@ -112,6 +114,15 @@ class Registration:
     odometry_confidence: float | None = None
     judged_ratio: float | None = None
 
+    def __post_init__(self) -> None:
+        _check_counts(self.correspondences, self.odometry_correspondences)
+        covariance = np.eye(6) if self.covariance is None else self.covariance
+        if not _is_matrix(self.T_query_match_unscaled, 4) or not _is_matrix(covariance, 6):
+            raise ValueError("a registration has a pose (4, 4) and a covariance (6, 6) or None, arrays of numbers")
+        for number in (self.scale_initial, self.judged_ratio):
+            if not isinstance(number, float | int | np.number | None):
+                raise ValueError(f"scale and ratio of a registration are numbers or None, not {number!r}")
+
 
 @dataclass(frozen=True, slots=True)
 class RegistrationFailed:
@@ -128,3 +139,17 @@ class RegistrationFailed:
     detail: str = ""
     correspondences: int = 0
     odometry_correspondences: int = 0
+
+    def __post_init__(self) -> None:
+        _check_counts(self.correspondences, self.odometry_correspondences)
+        if not isinstance(self.failure, RegistrationFailure):
+            raise ValueError(f"{self.failure!r} is no RegistrationFailure")
+
+
+def _is_matrix(value: object, side: int) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == (side, side) and value.dtype.kind in "fiu"
+
+
+def _check_counts(*counts: int) -> None:
+    if any(not isinstance(count, int | np.integer) or not 0 <= count <= INDEX_MAX for count in counts):
+        raise ValueError(f"counts of correspondences are whole numbers from 0 to {INDEX_MAX}, not {counts}")

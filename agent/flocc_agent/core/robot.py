@@ -38,10 +38,12 @@ from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.measurements import (
     WAITING_MAX,
+    BadMeasurement,
     Measurement,
     belongs_to,
     measurement_refused,
     measurement_report,
+    record_of,
 )
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
@@ -86,7 +88,6 @@ from flocc_protocol.records import (
     Record,
     RejectionRecord,
     UnknownRecord,
-    encode_record,
 )
 
 NOBODY = -1
@@ -360,9 +361,8 @@ class Robot:
 
     def _append_measurement(self, measurement: Measurement, keyframe: KeyframeId, now: float) -> list[Effect]:
         try:
-            record = measurement.record(keyframe)
-            encode_record(record)
-        except ValueError as error:
+            record = record_of(measurement, keyframe)
+        except BadMeasurement as error:
             return [measurement_refused(measurement, keyframe, str(error))]
         return [*self._append(record, now), measurement_report(measurement, keyframe)]
 

@@ -14,6 +14,21 @@ from flocc_protocol.errors import FloccError
 GROUP = "flocc.perception"
 """Group of entry points that name a `Builder`."""
 
+RAISED_BY_STRANGERS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    NameError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+)
+"""What importing and building a stranger's back-end may raise; an exception of its own is its own affair."""
+
 Builder = Callable[[PerceptionConfig, int], Perception]
 """Makes a back-end of its configuration and the run's seed; what belongs to a stranger's stands in `options`."""
 
@@ -50,13 +65,13 @@ def methods() -> dict[str, str]:
 
 
 def _installed(config: PerceptionConfig, seed: int) -> Perception:
-    """Build what another package brings; whatever its code raises is told in one sentence."""
+    """Build what another package brings; what goes wrong in its code is told in one sentence."""
     point = _entry_point(config.method)
     whose = f"perception {config.method!r} of {_package(point)} ({point.value})"
     try:
         built = point.load()(config, seed)
-    except (ImportError, AttributeError, TypeError, ValueError, OSError, RuntimeError) as error:
-        raise PerceptionError(f"{whose} cannot be built: {error or type(error).__name__}") from error
+    except RAISED_BY_STRANGERS as error:
+        raise PerceptionError(f"{whose} cannot be built: {str(error) or type(error).__name__}") from error
     if not isinstance(built, Perception):
         raise PerceptionError(f"{whose} gives a {type(built).__name__}, not a flocc_agent.core.interfaces.Perception")
     return built

@@ -134,7 +134,7 @@ def _role(name: str) -> str | None:
         return "stamp"
     if _STAMP.fullmatch(_without_unit(bare)):
         return "stamp"
-    found = re.fullmatch(r"(?P<group>.*?)[_.]?(?P<axis>[xyzw])", bare)
+    found = re.fullmatch(r"(?P<group>.*?)[_./]?(?P<axis>[xyzw])", bare)
     if found is None:
         return None
     if _QUATERNION.fullmatch(found["group"]):

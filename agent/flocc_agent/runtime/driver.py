@@ -31,7 +31,7 @@ from flocc_agent.core.effects import (
 )
 from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Leaving, Measured, MessageReceived
 from flocc_agent.core.interfaces import Image
-from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.measurements import Measurement, belongs_to, record_of
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.reports import (
     Fact,
@@ -40,10 +40,9 @@ from flocc_agent.core.reports import (
     PeerRefused,
 )
 from flocc_agent.core.robot import Robot
-from flocc_agent.geometry import pose7
 from flocc_agent.runtime.admission import Refusal, admitted
 from flocc_agent.runtime.event_lines import Reported
-from flocc_agent.runtime.given_keyframes import GivenKeyframes
+from flocc_agent.runtime.given_keyframes import GivenKeyframes, checked_keyframe
 from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, job_of
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import DiskQueue, Persist
@@ -109,18 +108,24 @@ class Driver:
     # For the robot's own program
 
     async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
-        """Take a keyframe in; waits while too many images wait for the encoder."""
+        """Take a keyframe in; waits while too many images wait for the encoder.
+
+        Raises:
+            BadKeyframe: No log may hold it.
+        """
+        T, stamp_s = checked_keyframe(T_odom_camera, stamp_s), float(stamp_s)
         number = await self._tools.images.put(image)
         self._given.add(stamp_s)
-        self.put(KeyframeCaptured(stamp_s, pose7(T_odom_camera), number))
+        self.put(KeyframeCaptured(stamp_s, T, number))
 
     def add_measurement(self, measurement: Measurement, stamp_s: float | None = None) -> None:
         """Take in what was measured at the keyframe that was given last, or at the one with this stamp.
 
         Raises:
-            BadMeasurement: There is no such keyframe.
+            BadMeasurement: There is no such keyframe, or no log may hold the measurement.
         """
         index = self._given.index_of(measurement, stamp_s)
+        record_of(measurement, belongs_to(measurement, self.robot.log, index))
         self.put(Measured(measurement, index))
 
     def keyframe_at(self, stamp_s: float) -> KeyframeId:

@@ -112,8 +112,10 @@ def reported_of(text: str) -> Reported[Fact]:
     """
     try:
         line = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise BadLine(f"is cut off or not JSON: {error.msg}") from error
+    except RecursionError as error:
+        raise BadLine("is nested too deeply") from error
+    except ValueError as error:
+        raise BadLine(f"is cut off or not JSON: {error}") from error
     try:
         head = _Head.model_validate(line)
         return Reported(head.t, head.robot, _fact_of(head.event, line))

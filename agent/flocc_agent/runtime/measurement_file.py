@@ -14,11 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flocc_agent.core.geodesy import Place, direction_of, up_at
 from flocc_agent.core.measurement_text import measurement_of
-from flocc_agent.core.measurements import BadMeasurement, Fix, GeodeticFix, Measurement, MetricClosure
+from flocc_agent.core.measurements import BadMeasurement, Fix, GeodeticFix, Measurement, MetricClosure, StartPose
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
 
 NAME = "measurements.jsonl"
 APART_MAX_S = 0.05
@@ -26,6 +30,8 @@ APART_MAX_S = 0.05
 GAP_MAX_S = 2.0
 """Positions farther apart in time are not interpolated."""
 LINES_MAX = 1_000_000
+STAMP_MAX_S = 1e12
+"""A stamp beyond this is none that a keyframe could have."""
 
 _NOBODY = KeyframeId(LogId("nobody"), 0)
 
@@ -91,7 +97,7 @@ def read_measurements(path: Path, frames_s: Sequence[float]) -> RecordedMeasurem
     if not path.exists():
         return NOTHING
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: cannot be read: {error}") from error
     if len(lines) > LINES_MAX:
@@ -132,18 +138,20 @@ def _between(a: Measurement, b: Measurement, share: float) -> Measurement:
     assert isinstance(a, GeodeticFix)
     assert isinstance(b, GeodeticFix)
     covariance = (1 - share) * np.asarray(a.covariance_m2) + share * np.asarray(b.covariance_m2)
-    east_deg = math.remainder(b.longitude_deg - a.longitude_deg, 360.0)
-    return GeodeticFix(
-        (1 - share) * a.latitude_deg + share * b.latitude_deg,
-        math.remainder(a.longitude_deg + share * east_deg, 360.0),
-        (1 - share) * a.altitude_m + share * b.altitude_m,
-        covariance,
-    )
+    latitude_deg, longitude_deg = direction_of((1 - share) * _up(a) + share * _up(b))
+    altitude_m = (1 - share) * a.altitude_m + share * b.altitude_m
+    return GeodeticFix(latitude_deg, longitude_deg, altitude_m, covariance)
+
+
+def _up(fix: GeodeticFix) -> Float:
+    return up_at(Place(fix.latitude_deg, fix.longitude_deg, fix.altitude_m))
 
 
 def _read_line(line: str, where: str) -> Stamped:
     try:
         row = json.loads(line)
+    except RecursionError as error:
+        raise RecordingError(f"{where}: is nested too deeply") from error
     except ValueError as error:
         raise RecordingError(f"{where}: is cut off or not JSON: {error}") from error
     if not isinstance(row, dict):
@@ -156,16 +164,18 @@ def _stamped(row: dict[str, Any], where: str) -> Stamped:
     for name, value in (("stamp_s", stamp_s), ("match_stamp_s", match_s)):
         if value is None and name == "match_stamp_s":
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= STAMP_MAX_S:
             raise RecordingError(f"{where}: {name} must be a number of seconds, not {value!r}")
     if not isinstance(kind, str):
         raise RecordingError(f"{where}: kind must be the name of a kind, not {kind!r}")
     if kind == MetricClosure.kind and match_s is not None:
-        row.setdefault("match", str(_NOBODY))
+        if "match" in row:
+            raise RecordingError(f"{where}: closure has match or match_stamp_s, not both")
+        row["match"] = str(_NOBODY)
     elif match_s is not None:
         raise RecordingError(f"{where}: {kind} has no match_stamp_s")
     try:
-        return Stamped(float(stamp_s), measurement_of(kind, row), match_s)
+        return Stamped(float(stamp_s), measurement_of(kind, row), None if match_s is None else float(match_s))
     except BadMeasurement as error:
         raise RecordingError(f"{where}: {error}") from error
 
@@ -181,6 +191,8 @@ def _placed(stamped: Sequence[tuple[int, Stamped]], path: Path, frames_s: Sequen
             continue
         frame_s = _frame_at(one.stamp_s, frames_s, f"{path}:{number}")
         kept.add(frame_s)
+        if isinstance(one.measurement, StartPose) and frame_s != frames_s[0]:
+            raise RecordingError(f"{path}:{number}: start is of the first frame, at {frames_s[0]} s")
         if one.match_stamp_s is not None:
             match_s = _frame_at(one.match_stamp_s, frames_s, f"{path}:{number}")
             if match_s >= frame_s:

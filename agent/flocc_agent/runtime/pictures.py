@@ -90,6 +90,8 @@ def picture_head(path: Path) -> PictureHead:
     Raises:
         PictureError: It cannot be read, is cut off, or of another format.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise PictureError("is not a file")
     try:
         with path.open("rb") as file:
             try:

@@ -191,6 +191,9 @@ def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
 
 def _camera(values: dict[str, object], path: Path) -> Camera:
     sizes = {key: _number(values, key, path) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    uneven = next((key for key in ("width", "height") if sizes[key] != np.round(sizes[key])), None)
+    if uneven is not None:
+        raise RecordingError(f"{path}: camera.{uneven} must be a whole number, not {sizes[uneven]}")
     distortion = values.pop("distortion", [0.0, 0.0, 0.0, 0.0])
     if values:
         raise RecordingError(f"{path}: the key 'camera.{next(iter(values))}' does not exist")

@@ -62,7 +62,7 @@ def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None
             index=record.index,
             stamp_s=record.stamp_s,
             T_odom_body=list(pose7(T_odom_camera[i] @ T_camera_body)),
-            T_map_body=None if applied is None else list(pose7(T_map_body[i])),
+            T_map_body=None if applied is None else list(pose7(T_map_body[record.index])),
         )
         for i, record in enumerate(records)
     ]

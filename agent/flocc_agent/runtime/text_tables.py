@@ -55,6 +55,8 @@ def read_text(path: Path) -> str:
         RecordingError: It cannot be read, or is no text.
     """
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise RecordingError(f"{path}: is not a file")
         if path.stat().st_size > BYTES_MAX:
             raise RecordingError(f"{path}: has more than {BYTES_MAX >> 20} MiB, too many for a text")
         encoded = path.read_bytes()

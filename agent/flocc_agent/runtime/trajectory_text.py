@@ -36,6 +36,9 @@ FORMS = {
 """Names for `--trajectory-format`; any other value is itself a line that names the columns."""
 MATRIX_FORM = "kitti"
 DAMAGED_RATIO_MAX = 0.2
+POSITION_MAX_M = 1e8
+NUMBER_MAX = 1e20
+"""More than nanoseconds since 1970."""
 ROWS_TRIED_MAX = 2000
 STRAY_STEPS_MIN = 20.0
 SAID_STEP_MAX_S = 600.0
@@ -109,7 +112,8 @@ def read_poses(path: Path, form: str | None = None, otherwise: str | None = None
     """
     table = read_table(path)
     if not table.rows:
-        raise RecordingError(f"{path}: holds no pose")
+        first = f"; it begins with {table.headers[0][1][:60]!r}" if table.headers else ""
+        raise RecordingError(f"{path}: holds no pose{first}")
     columns = _columns(table, form, otherwise)
     if columns is None:
         return _matrices(table)
@@ -162,7 +166,7 @@ def _named_form(form: str, path: Path) -> Columns:
 def _by_numbers(table: Table, count: int) -> Columns | None:
     some = table.rows[:: max(1, len(table.rows) // ROWS_TRIED_MAX)]
     rows = np.array([row for row in (_numbers(fields) for _, fields in some) if len(row) == count])
-    rows = rows[np.all(np.isfinite(rows), axis=1)] if rows.size else rows
+    rows = rows[np.all(np.abs(rows) < NUMBER_MAX, axis=1)] if rows.size else rows
     if len(rows) == 0:
         raise _of_first_row(table, count)
     if (count in (12, 16) and _are_matrices(rows)) or (count in (13, 17) and _are_matrices(rows[:, 1:])):
@@ -292,8 +296,10 @@ def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], t
     """Stamp and pose of each row that is whole, its line, and what was left out."""
     wanted = _wanted(columns)
     good, lines, damaged = [], [], []
+    count = max(_usual_count(table), max(wanted) + 1)
     for line, fields in table.rows:
-        why = _damage(fields, columns)
+        glued = f"has {len(fields)} columns, other rows have {count}" if len(fields) > count else None
+        why = glued or _damage(fields, columns)
         if why is None:
             good.append([float(fields[index]) for index in wanted])
             lines.append(line)
@@ -325,6 +331,8 @@ def _damage(fields: list[str], columns: Columns) -> str | None:
     norm = float(np.linalg.norm(numbers[4:8]))
     if not (np.all(np.isfinite(numbers[1:4])) and np.isfinite(norm)):
         return "the pose has a number that is not finite"
+    if max(map(abs, numbers[1:4])) > POSITION_MAX_M / columns.metres:
+        return f"the position {max(numbers[1:4], key=abs):g} is nowhere on Earth"
     if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
         return f"the pose is not rigid (its quaternion has length {norm:.4g}, not 1)"
     return None
@@ -423,6 +431,11 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     if np.any(differ):
         index = np.nonzero(differ)[0]
         unlike = sum(not np.allclose(T[k], T[k - 1], atol=1e-6) for k in index[:10000])
+        if unlike > DAMAGED_RATIO_MAX * len(stamps_s):
+            raise RecordingError(
+                f"{path}:{lines[index[0]]}: {unlike} of {len(stamps_s)} rows have the stamp of the row before, "
+                f"{stamps_s[index[0]]:.6f} s, and another pose; write stamps with all their digits"
+            )
         if unlike:
             notes.append(f"{path}: {unlike} rows repeat a stamp with another pose; the first of each was taken")
     return Trajectory(stamps_s[moved], T[moved]), tuple(notes)

@@ -60,14 +60,7 @@ class SceneView:
         Raises:
             DatasetError: The image cannot be read.
         """
-        import cv2
-
-        pixels = decoded(read_bytes(self.file), str(self.file))
-        if pixels.ndim == 2:
-            rgb = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
-        else:
-            rgb = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
-        return Image(np.asarray(rgb, np.uint8), self.camera)
+        return Image(decoded(read_bytes(self.file), str(self.file)), self.camera)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,8 +203,6 @@ def _jpegs(folder: Path) -> list[Path]:
 
 def _uncalibrated(file: Path) -> Image:
     """An image whose intrinsics do not matter."""
-    import cv2
-
-    pixels = cv2.cvtColor(decoded(read_bytes(file), str(file)), cv2.COLOR_BGR2RGB)
+    pixels = decoded(read_bytes(file), str(file))
     height, width = pixels.shape[:2]
-    return Image(np.asarray(pixels, np.uint8), Camera(width, height, width, width, width / 2, height / 2))
+    return Image(pixels, Camera(width, height, width, width, width / 2, height / 2))

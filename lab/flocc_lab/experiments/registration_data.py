@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -204,7 +203,14 @@ class RegistrationData:
         self.encoded = {name: Encoded(scene, self.skills) for name, scene in self.scenes.items()}
 
 
-@lru_cache(maxsize=1)
 def data_of(settings: RegistrationSettings) -> RegistrationData:
     """Data of the settings, made once in each process."""
-    return RegistrationData(settings)
+    key = repr(settings)
+    if key not in _held:
+        _held.clear()
+        _held[key] = RegistrationData(settings)
+    return _held[key]
+
+
+_held: dict[str, RegistrationData] = {}
+"""Data of the last settings, by all that they say."""

@@ -37,6 +37,8 @@ CHECKPOINT_MESSAGES = 1000
 STRAY = "the stamp is zero, or more than a minute off that of the others"
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
+HEADER_BYTES = 12
+"""Of a raw message before the name of its frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +165,10 @@ def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens
     if first is None:
         raise DatasetError(f"{bag.path}: topic {robot.info.name} has no message that can be read")
     T_body_camera, note = (None, None) if options.odometry else layout.mounting(robot)
-    lens = lens_of(first[1], robot.info)
+    try:
+        lens = lens_of(first[1], robot.info)
+    except DatasetError as error:
+        raise DatasetError(f"{bag.path}: {error}; name a camera file with --camera") from error
     lens = lens if T_body_camera is None else replace(lens, T_body_camera=T_body_camera)
     return lens, [note] if note else []
 
@@ -230,6 +235,9 @@ class _Conversion:
     _log: PoseWriter = field(init=False)
     _done_s: float | None = field(init=False, default=None)
     _pictures: ImageWriter = field(init=False)
+    _last_pose: tuple[float, ...] = ()
+    _first_info: bytes | None = None
+    _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
     _pose_span_s: tuple[float, float] | None = None
 
@@ -238,7 +246,8 @@ class _Conversion:
         start_ns = self._restored()
         source = self.robot.poses
         decoder = None if source is None else _decoder(self.bag, source)
-        names = [self.robot.image.name, *([] if source is None else [source.topic.name])]
+        info = self.robot.info if self.options.camera is None else None
+        names = [topic.name for topic in (self.robot.image, source and source.topic, info) if topic]
         image_topic, total = self.robot.image, self.robot.image.count or 0
         levels = sampled_levels(self.bag, image_topic)
         if levels != FULL:
@@ -253,6 +262,8 @@ class _Conversion:
                     self._add_image(raw, bag_ns)
                     if progress is not None:
                         progress(self.images.seen, max(total, self.images.seen))
+                elif topic is info:
+                    self._see_info(raw)
                 elif decoder is not None:
                     self._add_poses(decoder, raw, bag_ns)
         except BaseException:
@@ -288,6 +299,18 @@ class _Conversion:
         (self.out / "bag_state.json").unlink(missing_ok=True)
         self.kept += writer.count
 
+    def _see_info(self, raw: bytes) -> None:
+        """See that intrinsics stay as they are; headers differ, what is behind them hardly ever."""
+        body = raw[HEADER_BYTES:]
+        self._first_info = self._first_info or body
+        if body == self._first_info or self.robot.info is None:
+            return
+        try:
+            found = lens_of(self.bag.decoded(raw, self.robot.info), self.robot.info).camera
+        except DatasetError:
+            return
+        self._infos_differ += found != self.lens.camera
+
     def _add_poses(self, decoder: "PoseDecoder | TransformDecoder", raw: bytes, bag_ns: int) -> None:
         self.poses.seen += 1
         try:
@@ -304,8 +327,11 @@ class _Conversion:
                 if is_new:
                     self._begin_journey(good_ns, bag_ns)
                 self._pose_span_s = _wider(self._pose_span_s, (good_ns - self.zero_ns) * 1e-9)
-                if not self._log.add(good_ns, good) and len(posed) == 1:
+                if len(posed) == 1 and good_ns == self._log.last_ns and good != self._last_pose:
+                    self.poses.damage("the stamp is that of the pose before")
+                elif not self._log.add(good_ns, good) and len(posed) == 1:
                     self.poses.step_back(self._log.last_ns * 1e-9, good_ns * 1e-9)
+                self._last_pose = good
 
     def _begin_journey(self, stamp_ns: int, bag_ns: int) -> None:
         """Go on in another recording, since odometry is of another frame from here."""
@@ -398,6 +424,11 @@ class _Conversion:
             (self.faults if tally.is_too_much() else self.notes).extend(sentences)
             if tally.seen == 0:
                 self.faults.append(f"{self.bag.path}: topic {topic.name} has no message")
+        if self._infos_differ and self.robot.info is not None:
+            self.faults.append(
+                f"{self.bag.path}: topic {self.robot.info.name}: intrinsics differ from the first ones in "
+                f"{self._infos_differ} messages, as of a camera that zooms; name a camera file with --camera"
+            )
         apart = self._apart()
         if apart is not None:
             self.faults.append(apart)

@@ -34,6 +34,8 @@ class PoseDecoder:
         self._straight: bool | None = None if topic.type in STRINGS else False
         self._covariance = topic.type in WITH_COVARIANCE
         self._tail = 0
+        self._names = b""
+        self._frames: tuple[str, str] | None = None
 
     def __call__(self, raw: bytes) -> list[Posed]:
         """Poses of one message, in order.
@@ -43,10 +45,10 @@ class PoseDecoder:
         """
         if self._straight:
             try:
-                stamp_ns, numbers, covariance, tail = self._read(raw)
+                stamp_ns, numbers, covariance, names, tail = self._read(raw)
             except struct.error:
                 return self._decoded(raw)
-            if tail != self._tail:
+            if tail != self._tail or names != self._names:
                 return self._decoded(raw)
             if covariance >= LOST_COVARIANCE:
                 raise _lost(self._topic)
@@ -58,20 +60,33 @@ class PoseDecoder:
 
     def _decoded(self, raw: bytes) -> list[Posed]:
         message = self._bag.decoded(raw, self._topic)
+        self._see_frames(message)
         covariance = getattr(getattr(message, "pose", None), "covariance", None)
         if covariance is not None and len(covariance) and covariance[0] >= LOST_COVARIANCE:
             raise _lost(self._topic)
         return list(poses(message, self._topic))
 
+    def _see_frames(self, message: Any) -> None:
+        """See that poses are of the frames of the first one.
+
+        Raises:
+            DatasetError: They are of others, as of another robot or of a map.
+        """
+        frames = (message.header.frame_id.lstrip("/"), getattr(message, "child_frame_id", "").lstrip("/"))
+        self._frames = self._frames or frames
+        if frames != self._frames:
+            here, first = (" to ".join(name or "''" for name in names) for names in (frames, self._frames))
+            raise DatasetError(f"topic {self._topic.name}: a pose is of the frames {here}, the first one of {first}")
+
     def _agrees(self, raw: bytes, expected: Posed) -> bool:
         try:
-            stamp_ns, numbers, _, self._tail = self._read(raw)
+            stamp_ns, numbers, _, self._names, self._tail = self._read(raw)
             return (stamp_ns, checked_numbers(numbers, self._topic)) == expected
         except (struct.error, DatasetError):
             return False
 
-    def _read(self, raw: bytes) -> tuple[int, tuple[float, ...], float, int]:
-        """Stamp, pose, the first number behind it, and the bytes from the pose on; what is behind is not looked at.
+    def _read(self, raw: bytes) -> tuple[int, tuple[float, ...], float, bytes, int]:
+        """Stamp, pose, the first number behind it, the frames' names, and how many bytes there are from the pose on.
 
         The pose follows the frames' names, in CDR at a multiple of eight bytes.
         """
@@ -82,11 +97,12 @@ class PoseDecoder:
             if not ros1:
                 at = (at + 3) & ~3
             at += 4 + int.from_bytes(raw[at : at + 4], "little")
+        names = raw[12:at]
         if not ros1:
             at = 4 + ((at - 4 + 7) & ~7)
         numbers: Any = struct.unpack_from("<7d", raw, at)
         covariance = struct.unpack_from("<d", raw, at + 56)[0] if self._covariance else 0.0
-        return seconds * 10**9 + nanoseconds, numbers, covariance, len(raw) - at
+        return seconds * 10**9 + nanoseconds, numbers, covariance, names, len(raw) - at
 
 
 class TransformDecoder:

@@ -1,6 +1,8 @@
 """What the readers of folders share: lists of images, the files in a folder, a camera beside them."""
 
+import os
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +11,7 @@ from typing import TypeVar
 
 from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.stamp_units import since_1970
-from flocc_agent.runtime.text_tables import number_lines, text_lines
+from flocc_agent.runtime.text_tables import is_number, number_lines, text_lines
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens
@@ -33,8 +35,12 @@ def unequal(folder: Path, images: int, stamps_file: Path, stamps: int, poses: in
     return (f"{folder}: has {images} images, but {stamps_file} has {stamps} stamps",)
 
 
-def listed_images(path: Path) -> tuple[tuple[tuple[float, Path], ...], tuple[str, ...]]:
+def listed_images(path: Path, folder: Path | None = None) -> tuple[tuple[tuple[float, Path], ...], tuple[str, ...]]:
     """Images of a list with lines `stamp_s relative/path`, and a fault where some are missing.
+
+    Args:
+        path: The list.
+        folder: What names are relative to; None is that of the list.
 
     Raises:
         DatasetError: A line is of another form, time goes backwards, or no image is there.
@@ -44,16 +50,18 @@ def listed_images(path: Path) -> tuple[tuple[tuple[float, Path], ...], tuple[str
     for line, text in text_lines(path):
         try:
             stamp, name = re.split(r"[\s,;]+", text, maxsplit=1)
-            stamp_s, file = seconds_of(float(stamp)), path.parent / name.strip()
+            stamp_s, file = seconds_of(float(stamp)), listed_file(folder or path.parent, name.strip())
         except ValueError:
             raise DatasetError(f"{path}:{line}: must be 'stamp_s relative/path', not {text[:80]!r}") from None
         if images and stamp_s <= images[-1][0]:
             raise DatasetError(f"{path}:{line}: time goes backwards, from {images[-1][0]:.6f} s to {stamp_s:.6f} s")
-        if file.is_file():
+        if file is not None:
             images.append((stamp_s, file))
         else:
-            missing.append(f"{path}:{line}: the image {file} does not exist")
+            missing.append(f"{path}:{line}: the image {(folder or path.parent) / name.strip()} does not exist")
     faults = tuple(missing[:1]) if len(missing) < 2 else (f"{missing[0]} (and {len(missing) - 1} others)",)
+    if faults and not images:
+        raise DatasetError(faults[0])
     return some(tuple(images), path), faults
 
 
@@ -77,16 +85,36 @@ def increasing_stamps_s(path: Path) -> list[float]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Image files of a folder, by name.
+    """Image files of a folder, in the order of the numbers in their names.
 
     Raises:
         DatasetError: It is no folder.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder")
-    return sorted(
-        file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
-    )
+    files = (f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith("."))
+    return sorted(files, key=natural)
+
+
+def natural(file: Path) -> tuple[object, ...]:
+    """Order in which frame2 comes before frame10."""
+    parts = re.split(r"(\d+)", str(file.with_suffix("")))
+    return (*((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts), (1, 0, file.suffix))
+
+
+def image_rows(files: Sequence[Path], rows: int) -> Sequence[int]:
+    """Which row of a table each image belongs to: that of its number where images are missing, else one by one."""
+    numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
+    by_number = len(numbers) == len(files) < rows and max(numbers, default=rows) < rows
+    return numbers if by_number else range(len(files))
+
+
+def listed_file(folder: Path, name: str) -> Path | None:
+    """A file that a list names, also as Windows, macOS or an association of colour and depth write it."""
+    words = name.split()
+    names = [name, name.replace("\\", "/"), *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
+    names += words[:1] if len(words) == 3 and is_number(words[1]) else []
+    return next((file for each in names if (file := folder / each).is_file()), None)
 
 
 def some(images: tuple[T, ...], where: Path) -> tuple[T, ...]:
@@ -116,7 +144,7 @@ def camera_file(
     path: Path, images: Sequence[tuple[float, Path]] = (), size: tuple[int, int] | None = None
 ) -> Lens | None:
     """The camera that a file in a folder describes, or None; a file without a size takes that of the images."""
-    files = [path / name for name in CAMERA_FILES if (path / name).is_file()]
+    files = [path / name for name in CAMERA_FILES if os.path.lexists(path / name)]
     files += sorted(path.glob("*-camchain.yaml")) if path.is_dir() else []
     if not files:
         return None

@@ -15,14 +15,16 @@ from flocc_agent.runtime.trajectory_text import DAMAGED_RATIO_MAX, read_trajecto
 from flocc_launch.datasets.files import (
     camera_file,
     image_files,
+    image_rows,
     increasing_stamps_s,
     listed_images,
+    natural,
     some,
     unequal,
 )
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.kitti_raw import rectified_lens
-from flocc_launch.datasets.pixels import image_size
+from flocc_launch.datasets.pixels import Stamped, image_size
 from flocc_launch.datasets.plain import trajectories_beside
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
@@ -55,8 +57,7 @@ def read_tum_rgbd(path: Path) -> Source:
 def read_euroc(path: Path) -> Source:
     """Read an EuRoC ASL sequence's left camera: `mav0/cam0`, ground truth of the IMU body."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
-    folder = mav / "cam0" / "data"
-    images = tuple((int(file.stem) * 1e-9, file) for file in image_files(folder) if file.stem.isdecimal())
+    images, faults, image_notes = _euroc_images(mav / "cam0")
     lens = (
         read_lens(mav / "cam0" / "sensor.yaml")
         if (mav / "cam0" / "sensor.yaml").exists()
@@ -67,8 +68,25 @@ def read_euroc(path: Path) -> Source:
     if file is not None:
         truth, truth_notes = read_trajectory(file, otherwise="euroc")
         notes = (*notes, *truth_notes)
-    images = tuple(sorted(some(images, folder)))
-    return Source(path, "euroc", images, lens, odometry=odometry, truth=truth, notes=notes)
+    notes = (*image_notes, *notes)
+    return Source(path, "euroc", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+
+
+def _euroc_images(cam: Path) -> tuple[Stamped, tuple[str, ...], tuple[str, ...]]:
+    """Images that are named by nanoseconds, or as data.csv lists them; faults, and a note on those left out."""
+    folder, listing = cam / "data", cam / "data.csv"
+    files = some(tuple(image_files(folder)), folder)
+    stamped = tuple((int(file.stem) * 1e-9, file) for file in files if len(file.stem) > 9 and file.stem.isdecimal())
+    if stamped:
+        odd = [file for file in files if not (len(file.stem) > 9 and file.stem.isdecimal())]
+        note = f"{folder}: {len(odd)} of {len(files)} images were left out, as {{}} is no stamp in nanoseconds"
+        return stamped, (), (note.format(odd[0].name),) if odd else ()
+    if listing.exists():
+        return *listed_images(listing, folder), ()
+    raise DatasetError(
+        f"{folder}: the names of the images are no stamps in nanoseconds ({files[0].name}): name them so, or list them "
+        f"in {listing} with lines 'stamp_ns,name'"
+    )
 
 
 def read_kitti(path: Path) -> Source:
@@ -78,11 +96,17 @@ def read_kitti(path: Path) -> Source:
         raise DatasetError(f"{path}: has no folder image_0")
     files = image_files(folder)
     times = path / "times.txt"
-    stamps_s = increasing_stamps_s(times) if times.exists() else [i / KITTI_RATE_HZ for i in range(len(files))]
-    truth, faults = _kitti_truth(path, stamps_s)
-    count = len(files) if truth is None else len(truth)
-    faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, len(stamps_s), count))
-    images = tuple(zip(stamps_s, files, strict=False))
+    poses, poses_file = _kitti_poses(path)
+    stamps_s = increasing_stamps_s(times) if times.exists() else _rate_stamps_s(max(len(files), len(poses)))
+    stamps = len(stamps_s) if times.exists() else len(files)
+    count = min(len(poses), len(stamps_s))
+    truth = Trajectory(np.array(stamps_s[:count]), np.array(poses[:count])) if count else None
+    fault = f"{poses_file}: has {len(poses)} poses, but the sequence has {stamps} images or stamps"
+    faults = (fault,) if poses_file is not None and len(poses) != stamps else ()
+    of_images = len(files) if truth is None else min(count, stamps)
+    faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, stamps, of_images))
+    rows = image_rows(files, len(stamps_s))
+    images = tuple((stamps_s[row], file) for row, file in zip(rows, files, strict=True) if row < len(stamps_s))
     calibration, number = path / "calib.txt", "2" if folder.name == "image_2" else "0"
     lens = camera_file(path, images)
     if lens is None and calibration.exists() and files:
@@ -90,25 +114,26 @@ def read_kitti(path: Path) -> Source:
     return Source(path, "kitti", some(images, folder), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
 
 
-def _kitti_truth(path: Path, stamps_s: list[float]) -> tuple[Trajectory | None, tuple[str, ...]]:
+def _rate_stamps_s(count: int) -> list[float]:
+    return [k / KITTI_RATE_HZ for k in range(count)]
+
+
+def _kitti_poses(path: Path) -> tuple[list[Float], Path | None]:
     candidates = [path / "poses.txt", path.parent.parent / "poses" / f"{path.name}.txt", path / f"{path.name}.txt"]
     file = next((candidate for candidate in candidates if candidate.exists()), None)
     if file is None:
-        return None, ()
+        return [], None
     poses = []
     for line, values in number_lines(file, 12):
         T = np.vstack([np.array(values[:12]).reshape(3, 4), [0, 0, 0, 1]])
         poses.append(checked_pose(T, f"{file}:{line}"))
-    count = min(len(poses), len(stamps_s))
-    fault = f"{file}: has {len(poses)} poses, but the sequence has {len(stamps_s)} images or stamps"
-    truth = Trajectory(np.array(stamps_s[:count]), np.array(poses[:count])) if count else None
-    return truth, (fault,) if len(poses) != len(stamps_s) else ()
+    return poses, file
 
 
 def read_sevenscenes(path: Path) -> Source:
     """Read a 7-Scenes sequence: numbered colour images with 4x4 poses beside them, stamped at 30 Hz by their number."""
     images, poses, damaged = [], [], []
-    for file in sorted(path.glob("frame-*.color.*")):
+    for file in sorted(path.glob("frame-*.color.*"), key=natural):
         number = file.name[6:].partition(".")[0]
         pose_file = path / f"frame-{number}.pose.txt"
         try:

@@ -4,6 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import read_camera
 from flocc_agent.runtime.text_tables import RecordingError
@@ -17,6 +19,14 @@ from flocc_launch.datasets.source import DatasetError, Lens
 Size = tuple[int, int]
 FOLLOWED = (("cam0_calib", "body_T_cam0"), ("relative_config_imucam", None))
 """Keys of VINS-Fusion's and OpenVINS's settings that name the calibration, and where the mounting then is."""
+
+
+MOUNTING_MAX_M = 20.0
+"""A camera further from its body was measured in another unit."""
+FORM_ERRORS = (
+    ValueError, RecordingError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError, RecursionError,
+)  # fmt: skip
+"""What a file raises that is not of the form it seems."""
 
 
 def forms_read() -> list[str]:
@@ -39,17 +49,39 @@ def read_lens(path: Path, size: Size | None = None) -> Lens:
     path, chosen = _file_and_camera(path)
     if path.suffix == ".toml":
         camera, T_body_camera = read_camera(path)
-        return Lens(CameraModel.of_camera(camera), T_body_camera)
+        return _believable(Lens(CameraModel.of_camera(camera), T_body_camera), path)
     text = read_text(path)
     try:
-        return _lens(path, text, chosen, size)
-    except (ValueError, RecordingError, TypeError, KeyError, IndexError) as error:
+        return _believable(_lens(path, text, chosen, size), path)
+    except FORM_ERRORS as error:
         sentence = (
             str(error) if isinstance(error, ValueError | RecordingError) else f"is not of the form it seems ({error!r})"
         )
+        if isinstance(error, RecursionError):
+            sentence = "is nested too deeply for a calibration"
         if "intrinsics are missing" in sentence or "is no YAML" in sentence:
             sentence += f"; flocc reads {'; '.join(forms_read())}"
         raise DatasetError(f"{path}: {sentence}") from error
+
+
+def _believable(lens: Lens, path: Path) -> Lens:
+    """The lens, whose numbers are pixels and metres.
+
+    Raises:
+        DatasetError: They are of another unit, or of images of another size.
+    """
+    camera, t_m = lens.camera, float(np.linalg.norm(lens.T_body_camera[:3, 3]))
+    size = f"{camera.width}x{camera.height}"
+    if max(camera.cx, camera.cy) <= 1.0 and min(camera.width, camera.height) > 2:
+        raise DatasetError(f"{path}: the intrinsics are parts of the image's size {size}; write them in pixels")
+    if not (0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height):
+        raise DatasetError(
+            f"{path}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of images of {size}; the "
+            "intrinsics are of images of another size"
+        )
+    if t_m > MOUNTING_MAX_M:
+        raise DatasetError(f"{path}: the camera is {t_m:g} m from its body; write the mounting in metres")
+    return lens
 
 
 def _file_and_camera(path: Path) -> tuple[Path, str | None]:

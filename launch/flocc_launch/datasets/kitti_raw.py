@@ -6,7 +6,7 @@ The calibration stands in the drive's folder or in the one above.
 from pathlib import Path
 
 from flocc_agent.runtime.text_tables import numbered_lines
-from flocc_launch.datasets.files import camera_file, image_files, some, unequal
+from flocc_launch.datasets.files import camera_file, image_files, image_rows, some, unequal
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import image_size
 from flocc_launch.datasets.plain import trajectories_beside
@@ -33,7 +33,9 @@ def read_kitti_raw(path: Path) -> Source:
         raise DatasetError(f"{path}: has none of {', '.join(CAMERAS)} with a folder data")
     files = image_files(folder / "data")
     stamps_s = _stamps_s(folder / "timestamps.txt")
-    images = some(tuple(zip(stamps_s, files, strict=False)), folder / "data")
+    rows = image_rows(files, len(stamps_s))
+    images = tuple((stamps_s[row], file) for row, file in zip(rows, files, strict=True) if row < len(stamps_s))
+    some(images, folder / "data")
     faults = unequal(folder / "data", len(files), folder / "timestamps.txt", len(stamps_s), len(files))
     odometry, truth, notes = trajectories_beside(path, None, [stamp_s for stamp_s, _ in images])
     if (path / "oxts").is_dir():

@@ -3,7 +3,6 @@
 Names vary, so several are taken; what was looked for is said where nothing fits.
 """
 
-import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -68,21 +67,25 @@ def expected_files(path: Path) -> str:
 
 
 def _has_trajectory(path: Path) -> bool:
-    return any(_trajectory_file(path, stems) is not None for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
+    return any(_trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
 
 
-def _trajectory_file(path: Path, stems: tuple[str, ...]) -> Path | None:
-    """The first file of one of the names, whatever their capitals; nothing in what is no folder."""
+def _trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
+    """Files of one of the names, whatever their capitals; a link to nowhere is one, and its reader says so."""
     there = {entry.name.lower(): entry for entry in sorted(path.iterdir())} if path.is_dir() else {}
     names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
-    return next((there[name] for name in names if name in there and there[name].is_file()), None)
+    return [there[name] for name in names if name in there and not there[name].is_dir()]
 
 
 def _first_trajectory(
     path: Path, stems: tuple[str, ...], form: str | None, stamps_s: list[float] | None
 ) -> tuple[Trajectory | None, tuple[str, ...]]:
-    file = _trajectory_file(path, stems)
-    return (None, ()) if file is None else read_trajectory(file, form, stamps_s)
+    files = _trajectory_files(path, stems)
+    if not files:
+        return None, ()
+    trajectory, notes = read_trajectory(files[0], form, stamps_s)
+    others = ", ".join(file.name for file in files[1:])
+    return trajectory, (*notes, f"{files[0]}: was taken as the {stems[0]}, not {others}") if others else notes
 
 
 def _image_folder(path: Path) -> Path:
@@ -97,7 +100,7 @@ def _image_folder(path: Path) -> Path:
 def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
     """Images with the stamps that their names say, or None where names only count."""
     folder = _image_folder(path)
-    files = some(tuple(sorted(image_files(folder), key=_natural)), folder)
+    files = some(tuple(image_files(folder)), folder)
     stamps_s, how = stamps_of_names([file.stem for file in files], folder)
     if stamps_s is None:
         return None, (), how
@@ -113,7 +116,7 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
 def _stamped_by_order(path: Path, trajectory: Trajectory | None) -> tuple[Stamped, tuple[str, ...]]:
     """Numbered images, with the stamps of as many poses."""
     folder = _image_folder(path)
-    files = sorted(image_files(folder), key=_natural)
+    files = image_files(folder)
     if trajectory is None:
         raise DatasetError(
             f"{folder}: the images have no stamps ({files[0].name}): name them by seconds, or list them in "
@@ -122,8 +125,3 @@ def _stamped_by_order(path: Path, trajectory: Trajectory | None) -> tuple[Stampe
     images = tuple(zip((float(stamp_s) for stamp_s in trajectory.stamps_s), files, strict=False))
     faults = unequal(folder, len(files), path, len(files), len(trajectory))
     return images, tuple(f"{fault}; name images by their stamps to say which belongs to which" for fault in faults)
-
-
-def _natural(file: Path) -> tuple[object, ...]:
-    """Order in which frame2 comes before frame10."""
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", file.stem))

@@ -15,7 +15,7 @@ from flocc_agent.geometry import R_from_q_wxyz, inverse, pose
 from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.files import image_files
+from flocc_launch.datasets.files import image_files, listed_file, natural
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -69,6 +69,8 @@ def read_colmap(path: Path) -> Source:
         except ValueError as error:
             raise DatasetError(f"{where}: {error}") from error
         name = " ".join(words[9:])
+        if name in poses:
+            raise DatasetError(f"{where}: gives {name} a second pose")
         poses[name], used[name] = inverse(checked_pose(T_camera_world, where)), int(words[8])
     if not poses:
         raise DatasetError(
@@ -91,10 +93,16 @@ def read_transforms(path: Path) -> Source:
         table: Any = json.loads(read_text(file))
         frames = table["frames"]
         poses = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=float) for f in frames}
-    except (ValueError, KeyError, TypeError) as error:
+        twice = next(
+            (f["file_path"] for f in frames if not np.array_equal(poses[str(f["file_path"])], f["transform_matrix"])),
+            None,
+        )
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"{file}: is no transforms.json of nerfstudio ({type(error).__name__}: {error})") from error
     if not poses:
         raise DatasetError(f"{file}: has no frames")
+    if twice is not None:
+        raise DatasetError(f"{file}: gives {twice} two poses")
     wrong = next((name for name, T in poses.items() if T.shape != (4, 4)), None)
     if wrong is not None:
         raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
@@ -110,7 +118,11 @@ def _source(
     path: Path, name: str, folder: Path, poses: dict[str, Float], lens: Lens | None, calibration: Path | None = None
 ) -> Source:
     """Images with their poses in the order of their names, and a lens, or one of a file that may not say their size."""
-    found = {key: file for key in sorted(poses) if (file := _file(folder, key)) is not None}
+    found = {
+        key: file
+        for key in sorted(poses, key=lambda name: natural(Path(name)))
+        if (file := _file(folder, key)) is not None
+    }
     if not found:
         raise DatasetError(f"{folder}: has none of the {len(poses)} images, of which the first is {next(iter(poses))}")
     stamps_s, _ = stamps_of_names([Path(key).stem for key in found], folder)
@@ -135,10 +147,8 @@ def _source(
 
 def _file(folder: Path, name: str) -> Path | None:
     """An image by its name, which instant-ngp writes without suffix."""
-    exact = folder / name
-    if exact.is_file():
-        return exact
-    return next((file for suffix in (".png", ".jpg", ".jpeg") if (file := folder / (name + suffix)).is_file()), None)
+    names = (name + suffix for suffix in ("", ".png", ".jpg", ".jpeg"))
+    return next((file for each in names if (file := listed_file(folder, each)) is not None), None)
 
 
 def read_replica(path: Path) -> Source:

@@ -18,13 +18,17 @@ from flocc_launch.datasets.source import DatasetError
 
 DIGITS_MIN = 9
 """Shorter numbers only count images."""
+DIGITS_MAX, LENGTH_MAX = 19, 40
+"""Longer ones are no stamps."""
 FRACTIONS_S = {3: 1e-3, 6: 1e-6, 9: 1e-9}
 WAY_OUT = "list the images in images.txt with lines 'stamp_s relative/path'"
 
 _DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])[-_.T ]{0,3}"
-    r"([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d|60)(?:[-_.,]?(\d{1,9}))?(?!\d)"
+    r"([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d|60)(?:([-_.,]?)(\d{1,9}))?(?!\d)"
 )
+_AFTER_DATE = re.compile(r"\s*(?:(Z)\b|([+-])(\d\d):?(\d\d)(?!\d)|([AaPp])\.?[Mm]\b)")
+"""What may follow a date: its zone, or the half of the day."""
 
 
 def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] | None, str]:
@@ -37,10 +41,10 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     Raises:
         DatasetError: Names have two readings.
     """
-    dates = [date_s(stem) for stem in stems]
-    if all(dates):
-        return [moment_s for moment_s in dates if moment_s is not None], "dates, read as UTC"
-    split = [re.findall(r"\d+\.\d+|\d+", stem) for stem in stems]
+    dates = _dates_s(stems, folder)
+    if dates is not None:
+        return dates, "dates, read as UTC"
+    split = [[word for word in re.findall(r"\d+\.\d+|\d+", stem) if len(word) <= LENGTH_MAX] for stem in stems]
     if len({len(numbers) for numbers in split}) != 1 or not split[0]:
         return _single_long(split, stems, folder)
     columns = list(zip(*split, strict=True))
@@ -50,8 +54,42 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     return _one_number(columns, stems, folder)
 
 
-def date_s(stem: str) -> float | None:
-    """Seconds since 1970 of a date in a text, read as UTC, or None."""
+def _dates_s(stems: Sequence[str], folder: object) -> list[float] | None:
+    """Seconds since 1970 of names that all hold a date; None where one does not.
+
+    A number behind the seconds is their fraction after a point, or where it has 3, 6 or 9 digits that do not count the
+    images; of 4, 5, 7 or 8 digits it counts.
+
+    Raises:
+        DatasetError: It can be either.
+    """
+    found = [_DATE.search(stem) for stem in stems]
+    apart = [each[8] for each in found if each is not None and each[7] in ("-", "_")]
+    counts = bool(apart) and {len(digits) for digits in apart} in ({4}, {5}, {7}, {8})
+    dates = [date_s(stem, fraction=not counts) for stem in stems]
+    if not all(date is not None for date in dates):
+        return None
+    steps = {int(b) - int(a) for a, b in pairwise(apart)}
+    if not counts and apart and (len(apart) < len(stems) or not _are_fractions(apart) or steps == {1}):
+        raise DatasetError(
+            f"{folder}: names such as {stems[-1]} have a number behind the seconds, which can be their fraction or "
+            f"count images; {WAY_OUT}"
+        )
+    return [date for date in dates if date is not None]
+
+
+def _are_fractions(words: Sequence[str]) -> bool:
+    widths = {len(word) for word in words}
+    return len(widths) == 1 and widths <= set(FRACTIONS_S)
+
+
+def date_s(stem: str, fraction: bool = True) -> float | None:
+    """Seconds since 1970 of a date in a text, in the zone that it names, else read as UTC; or None.
+
+    Args:
+        stem: The text.
+        fraction: Whether a number behind the seconds is their fraction.
+    """
     found = _DATE.search(stem)
     if found is None:
         return None
@@ -60,7 +98,20 @@ def date_s(stem: str) -> float | None:
         moment = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC)
     except ValueError:
         return None
-    return moment.timestamp() + (float(f"0.{found[7]}") if found[7] else 0.0) + (second == 60)
+    part_s = float(f"0.{found[8]}") if found[8] and fraction else 0.0
+    return moment.timestamp() + part_s + (second == 60) + _shift_s(_AFTER_DATE.match(stem, found.end()), hour)
+
+
+def _shift_s(after: re.Match[str] | None, hour: int) -> float:
+    """Seconds to add for a zone or a half of the day behind a date."""
+    if after is None:
+        return 0.0
+    if after[2]:
+        ahead_s = 3600.0 * int(after[3]) + 60.0 * int(after[4])
+        return -ahead_s if after[2] == "+" else ahead_s
+    if after[5] and 1 <= hour <= 12:
+        return 3600.0 * (12 * (after[5] in "Pp") - 12 * (hour == 12))
+    return 0.0
 
 
 def _varies(column: Sequence[str]) -> bool:
@@ -93,7 +144,7 @@ def _seconds_and_fraction(
 
 
 def _one_number(columns: list[tuple[str, ...]], stems: Sequence[str], folder: object) -> tuple[list[float] | None, str]:
-    decimal = [column for column in columns if all("." in word for word in column) and _varies(column)]
+    decimal = [column for column in columns if _are_decimal(column) and _varies(column)]
     if len(decimal) == 1:
         _check_padding(decimal[0], folder)
         return [float(word) for word in decimal[0]], "seconds"
@@ -108,6 +159,12 @@ def _one_number(columns: list[tuple[str, ...]], stems: Sequence[str], folder: ob
     return readings[0]
 
 
+def _are_decimal(column: Sequence[str]) -> bool:
+    """Whether numbers have points, or are seconds since 1970 of which some were written without."""
+    pointed = ["." in word for word in column]
+    return all(pointed) or (any(pointed) and all(since_1970(float(word)) == "seconds" for word in column))
+
+
 def _single_long(split: list[list[str]], stems: Sequence[str], folder: object) -> tuple[list[float] | None, str]:
     """Stamps of names that are not alike, where each holds one number that is long enough."""
     found = [[word for word in numbers if "." in word or _is_long(word)] for numbers in split]
@@ -117,7 +174,8 @@ def _single_long(split: list[list[str]], stems: Sequence[str], folder: object) -
 
 
 def _is_long(word: str) -> bool:
-    return len(word.lstrip("0")) >= DIGITS_MIN or since_1970(float(word)) is not None
+    digits = len(word.lstrip("0"))
+    return DIGITS_MIN <= digits <= DIGITS_MAX or since_1970(float(word)) is not None
 
 
 def _in_unit(column: Sequence[str], folder: object) -> tuple[list[float], str]:

@@ -51,6 +51,12 @@ def error_sentence(report: RunReport) -> str:
         return "There is no ground truth, so the error is not known."
     if after is None or before is None:
         return ""
+    aligned = report.ate_joint_odometry_aligned_m
+    if after < before and aligned is not None and aligned <= after:
+        return (
+            f"The joint error is {number(after, 'm')}: less than odometry from its true starts "
+            f"({number(before, 'm')}), but not less than that odometry aligned as the map is ({number(aligned, 'm')})."
+        )
     if after < before:
         return f"The joint error fell from {number(before, 'm')} (odometry alone) to {number(after, 'm')}."
     return f"The joint error is {number(after, 'm')}, not better than odometry alone ({number(before, 'm')})."

@@ -159,6 +159,17 @@ def how_it_died(event: Reported[AgentDied]) -> str:
 
 
 def deaths_unasked(events: Events) -> list[str]:
-    """Robots that died without a fault of the scenario or an operator's order, once for each death, in order."""
-    ordered = {event.robot for event in of_kind(events, KilledByOrder)}
-    return [e.robot for e in of_kind(events, AgentDied) if not e.fact.scripted and e.robot not in ordered]
+    """Robots that died without a fault of the scenario or an operator's order, once for each death, in order.
+
+    An order explains one death, the next one of its robot.
+    """
+    ordered: set[str] = set()
+    unasked: list[str] = []
+    for event in events:
+        if is_of(event, KilledByOrder):
+            ordered.add(event.robot)
+        elif is_of(event, AgentDied) and event.robot in ordered:
+            ordered.discard(event.robot)
+        elif is_of(event, AgentDied) and not event.fact.scripted:
+            unasked.append(event.robot)
+    return unasked

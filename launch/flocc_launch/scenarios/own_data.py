@@ -57,6 +57,8 @@ class OwnData:
         """
         single = is_bag(path) or is_dataset(path) or is_video(path)
         folders = _single(path) if single else _team(path)
+        if not single and len(folders) == 1:
+            return cls.open(next(iter(folders.values())), agents)
         single = single and len(folders) == 1
         if not single and agents not in (None, len(folders)):
             raise DatasetError(f"{path}: holds {len(folders)} robots ({', '.join(folders)}), not {agents}")

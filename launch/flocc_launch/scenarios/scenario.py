@@ -29,6 +29,7 @@ from flocc_agent.config import (
 from flocc_agent.core.parameters import CoreParameters
 from flocc_launch.datasets.drift import DriftKind
 from flocc_protocol.ids import checked_name
+from flocc_protocol.records import TAG_LENGTH_MAX
 
 RobotName = Annotated[str, AfterValidator(checked_name)]
 
@@ -109,12 +110,21 @@ class TracksScenario(Section):
         return self
 
 
+TagName = Annotated[str, Field(min_length=1, max_length=TAG_LENGTH_MAX)]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Origin = tuple[
+    Annotated[float, Field(ge=-90, le=90)],
+    Annotated[float, Field(ge=-180, le=180)],
+    Annotated[float, Field(ge=-1e4, le=5e4)],
+]
+
+
 class SensorsScenario(Section):
     """What robots measure besides odometry and images, drawn of their true poses (docs/measurements.md)."""
 
     seed: int = Field(7, ge=0)
     """Seed of the noise."""
-    tags: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
+    tags: dict[TagName, tuple[Coordinate, Coordinate, Coordinate]] = Field(default_factory=dict)
     """Tag to its place in the world, `[x, y, z]` in metres."""
     tag_range_m: float = Field(4.0, gt=0)
     """How far a robot sees a tag, all round."""
@@ -128,7 +138,7 @@ class SensorsScenario(Section):
     """Robots with positions in the world (`fix`), one at every frame."""
     gnss_robots: tuple[RobotName, ...] = ()
     """Robots with GNSS (`gnss`), one fix at every frame."""
-    gnss_origin: tuple[float, float, float] = (48.0, 11.0, 500.0)
+    gnss_origin: Origin = (48.0, 11.0, 500.0)
     """Latitude and longitude in degrees and height in metres of the world's origin, whose x looks east."""
     start_robots: tuple[RobotName, ...] = ()
     """Robots that know where they start."""
@@ -138,11 +148,11 @@ class SensorsScenario(Section):
     """How often a robot says how exact its odometry is (`odometry`)."""
     sighting_every_s: float = Field(2.0, gt=0)
     """Least pause between two sightings of one thing by one robot."""
-    rotation_sigma_rad: float = Field(0.01, gt=0)
+    rotation_sigma_rad: float = Field(0.01, ge=1e-6, le=1)
     """Noise of every rotation and direction."""
-    translation_sigma_m: float = Field(0.05, gt=0)
+    translation_sigma_m: float = Field(0.05, ge=1e-6, le=1e3)
     """Noise of every distance and relative position."""
-    position_sigma_m: float = Field(0.3, gt=0)
+    position_sigma_m: float = Field(0.3, ge=1e-6, le=1e3)
     """Noise of every fix."""
 
 

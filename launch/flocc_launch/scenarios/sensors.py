@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.geodesy import Place, T_enu_enu
+from flocc_agent.core.geodesy import Place, T_earth_enu, place_of
 from flocc_agent.geometry import inverse, pose, se3_exp, tq_from_pose
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_launch.scenarios.scenario import SensorsScenario
@@ -17,8 +17,6 @@ Row = dict[str, Any]
 
 WRONG_M = (2.0, 6.0)
 """How far a wrong sighting is off."""
-METRES_PER_DEGREE = 111_320.0
-PLACES_STEPS = 6
 
 
 def sense(sensors: SensorsScenario, truths: Mapping[str, Trajectory]) -> dict[str, list[Row]]:
@@ -105,14 +103,9 @@ def _bearing(stamp_s: float, robot: str, T: Float, sensors: SensorsScenario) -> 
 
 
 def place_at(origin: Place, enu_m: Float) -> Place:
-    """The place of a point (3,) given east, north and up of an origin: Newton's method on `T_enu_enu`."""
-    place = np.array(origin, dtype=float)
-    for _ in range(PLACES_STEPS):
-        east, north, up = enu_m - T_enu_enu(origin, Place(*place))[:3, 3]
-        north_deg = north / METRES_PER_DEGREE
-        east_deg = east / (METRES_PER_DEGREE * np.cos(np.radians(place[0])))
-        place = place + np.array([north_deg, east_deg, up])
-    return Place(*(float(value) for value in place))
+    """The place of a point (3,) given east, north and up of an origin."""
+    T_earth_origin = T_earth_enu(origin)
+    return place_of(T_earth_origin[:3, :3] @ enu_m + T_earth_origin[:3, 3])
 
 
 def _every(stamps_s: Float, pause_s: float | None, where: NDArray[np.bool_] | None = None) -> list[int]:

@@ -5,6 +5,7 @@ all that it depends on, so that a scenario with images runs again in seconds.
 """
 
 import hashlib
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,17 @@ from flocc_protocol.arrays import Array
 Float = NDArray[np.float64]
 
 
+CACHE_FORM = b"2"
+"""Changes with what a file of the cache holds."""
+
+
 class ImageEyes:
     """A perception back-end that looks at captures."""
 
     def __init__(self, perception: Perception, config: PerceptionConfig, cache: Path | None) -> None:
         self._perception = perception
         self._cache = cache if config.method in OWN else None  # of a stranger's code nobody knows what it depends on
-        self._config_key = b"" if self._cache is None else repr(config).encode() + _code_hash()
+        self._config_key = b"" if self._cache is None else CACHE_FORM + repr(config).encode() + _code_hash()
 
     def encode(self, capture: Capture) -> tuple[Array, bytes]:
         """Descriptor and latent of a keyframe."""
@@ -54,7 +59,7 @@ class ImageEyes:
         if path.exists():
             return _result(msgpack.unpackb(path.read_bytes()))
         result = self._perception.register(query, match, odometry)
-        _write(path, _fields(result))
+        _write(path, _packed(result))
         return result
 
     def _path(self, *parts: bytes) -> Path:
@@ -85,27 +90,27 @@ def _write(path: Path, fields: Any) -> None:
     partial.replace(path)
 
 
-def _fields(result: Registration | RegistrationFailed) -> list[Any]:
-    if isinstance(result, RegistrationFailed):
-        return [result.failure.name, result.detail, result.correspondences, result.odometry_correspondences]
-    covariance = None if result.covariance is None else result.covariance.astype(np.float64).tobytes()
-    T = result.T_query_match_unscaled.astype(np.float64).tobytes()
-    return [T, covariance, result.correspondences, result.odometry_correspondences, result.scale_initial]
+def _packed(result: Registration | RegistrationFailed) -> list[Any]:
+    """Every field of a result, so that one from the cache is the one that was computed."""
+    values = [getattr(result, field.name) for field in fields(result)]
+    return [type(result).__name__, [_plain(value) for value in values]]
 
 
-def _result(fields: list[Any]) -> Registration | RegistrationFailed:
-    if len(fields) == 4:
-        name, detail, correspondences, odometry_correspondences = fields
-        return RegistrationFailed(RegistrationFailure[name], detail, correspondences, odometry_correspondences)
-    T, covariance, correspondences, odometry_correspondences, scale_initial = fields
-    return Registration(
-        _matrix(T, 4),
-        correspondences,
-        odometry_correspondences,
-        scale_initial,
-        None if covariance is None else _matrix(covariance, 6),
-    )
+def _plain(value: Any) -> Any:
+    if isinstance(value, RegistrationFailure):
+        return value.name
+    if isinstance(value, np.ndarray):
+        return [list(value.shape), value.astype(np.float64).tobytes()]
+    return value.item() if isinstance(value, np.generic) else value
 
 
-def _matrix(data: bytes, size: int) -> Float:
-    return np.frombuffer(data).reshape(size, size).copy()
+def _result(packed: list[Any]) -> Registration | RegistrationFailed:
+    name, values = packed
+    if name == RegistrationFailed.__name__:
+        return RegistrationFailed(RegistrationFailure[values[0]], *values[1:])
+    read: list[Any] = [_matrix(*value) if isinstance(value, list) else value for value in values]
+    return Registration(*read)
+
+
+def _matrix(shape: list[int], data: bytes) -> Float:
+    return np.frombuffer(data).reshape(shape).copy()

@@ -235,7 +235,8 @@ class _Launch:
         match fault.kind:
             case FaultKind.KILL:
                 for agent in concerned:
-                    self._killed.add(agent.name)
+                    if agent.running:
+                        self._killed.add(agent.name)
                     agent.kill()
                     await agent.wait(STOP_NOW_S)
             case FaultKind.RESTART:

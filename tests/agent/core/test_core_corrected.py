@@ -89,3 +89,12 @@ def test_keyframes_that_come_later_move_with_the_end_until_more_is_known() -> No
     recorded(copy, 2, 3)
     assert log.pose_of(2) == pytest.approx(TURN @ at(2.0), abs=1e-6)
     assert log.last() == pytest.approx(TURN @ at(3.0), abs=1e-6)
+
+
+def test_a_keyframe_keeps_its_number_behind_one_that_a_later_version_wrote() -> None:
+    copy = LogCopy()
+    recorded(copy, 0, 2)
+    log = CorrectedLog(correction(0, 1, at(0.0), at(1.0), TURN @ at(2.0)), RecordedOdometry(copy))
+    assert log.pose_of(2) == pytest.approx(TURN @ at(2.0), abs=1e-6)
+    assert log.pose_of(3) is None
+    assert log.pose_at(4.0) == pytest.approx(TURN @ at(2.0), abs=1e-6)

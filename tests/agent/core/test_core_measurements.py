@@ -127,6 +127,37 @@ def test_as_many_measurements_wait_for_a_keyframe_as_the_limit_says() -> None:
     assert held == most == WAITING_MAX
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_in_any_order_each_fix_stands_behind_its_own_keyframe(seed: int) -> None:
+    """Fixes of earlier, last and failed keyframes, while encodings end or not: x says whose each is."""
+    rng = np.random.default_rng(seed)
+    robots = Robots(work=unable)
+    robots.add("r1")
+    given, wanted = 0, []
+    for _ in range(60):
+        match rng.integers(3):
+            case 0:
+                robots.capture("r1", 5.0 * given, look=given)
+                given += 1
+            case 1 if given:
+                index = int(rng.integers(given))
+                robots.put("r1", Measured(fix(5.0 * index), index))
+                wanted.append(index)
+            case _:
+                robots.run(float(rng.uniform(0.0, 0.15)))
+    robots.run(1.0)
+    keyframes: list[float] = []
+    fixes: list[int] = []
+    for record in own_log(robots):
+        if isinstance(record, KeyframeRecord):
+            keyframes.append(record.T_odom_camera[0])
+        elif isinstance(record, FixRecord):
+            assert keyframes[record.index] == float(record.position_m.numpy()[0])
+            fixes.append(record.index)
+    assert keyframes == [5.0 * k for k in range(given)]
+    assert sorted(fixes) == sorted(wanted)
+
+
 # --- what users give -------------------------------------------------------------------------------------------------
 
 

@@ -72,6 +72,9 @@ def test_no_package_takes_a_name_of_flocc(tmp_path: Path, monkeypatch: pytest.Mo
     [
         ("import nowhere_to_be_found", "cannot be built: No module named 'nowhere_to_be_found'"),
         ("def build(config, seed): raise ValueError('no weights')", "cannot be built: no weights"),
+        ("def build(config, seed): return {}['weights']", "cannot be built: 'weights'"),
+        ("def build(config, seed): return 1 / 0", "cannot be built: division by zero"),
+        ("def build(config, seed): raise AssertionError", "cannot be built: AssertionError"),
         ("def build(config, seed): return 3", "gives a int, not a flocc_agent.core.interfaces.Perception"),
     ],
 )

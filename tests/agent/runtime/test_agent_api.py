@@ -1,7 +1,9 @@
 """The Python API: bad keyframes and fixes are refused with one sentence, and the agent goes on."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +12,23 @@ from flocc_agent import Agent, AgentConfig
 from flocc_agent.agent import BadKeyframe
 from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.interfaces import Camera
-from flocc_agent.core.measurements import BadMeasurement, Fix, StartPose, TagSighting
+from flocc_agent.core.interfaces import Camera, Image, OdometryPair, Perception
+from flocc_agent.core.measurements import (
+    BadMeasurement,
+    Fix,
+    Measurement,
+    MetricClosure,
+    OdometryCovariance,
+    RobotBearing,
+    StartPose,
+    TagSighting,
+)
+from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.reports import EncodingFailed, Fact
 from flocc_agent.geometry import Float, pose
 from flocc_agent.perception.synthetic import pose_image
-from flocc_protocol.ids import LogId
+from flocc_agent.runtime.event_lines import Reported
+from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import Envelope, Heartbeat, LogDigest, RecordBatch, Records
 from flocc_protocol.records import FixRecord, KeyframeRecord, PoseFixRecord, encode_record
 
@@ -176,3 +190,142 @@ async def test_what_belongs_to_no_keyframe_is_refused_at_the_call() -> None:
             agent.add_measurement(fix)
         with pytest.raises(BadMeasurement, match="not positive definite"):
             agent.add_measurement(TagSighting("7", np.eye(4), np.zeros((6, 6))))
+
+
+async def test_a_keyframe_that_no_log_may_hold_is_refused_at_the_call() -> None:
+    """Stamps in nanoseconds, and a robot beyond the map: once each ended the agent."""
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        with pytest.raises(BadKeyframe, match=r"robot r1: keyframe at 1\.7e"):
+            await agent.add_keyframe(pixels, at_m(0.0), 1.7e18)
+        with pytest.raises(BadKeyframe, match="within the map"):
+            await agent.add_keyframe(pixels, at_m(1e8), 1.0)
+        await agent.add_keyframe(pixels, at_m(0.0), 1.0)
+        assert await recorded(agent, 1) == [("keyframe", 0, 0.0)]
+
+
+async def test_what_was_measured_at_a_refused_frame_is_not_tied_to_the_one_before() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        await agent.add_frame(pixels, at_m(0.0), 1.0)
+        for T in bad_poses():
+            with pytest.raises(BadKeyframe):
+                await agent.add_frame(pixels, T, 2.0)
+            with pytest.raises(BadMeasurement, match="did not become a keyframe"):
+                agent.add_fix(np.zeros(3), np.eye(3))
+
+
+async def test_what_is_measured_after_a_restart_is_not_tied_to_the_life_before(tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(config, camera()) as agent:
+        await agent.add_keyframe(pixels, at_m(0.0), 1.0)
+        await recorded(agent, 1)
+    async with Agent(config, camera()) as agent:
+        assert log_of(agent) == [("keyframe", 0, 0.0)]
+        with pytest.raises(BadMeasurement, match="no keyframe was given yet"):
+            agent.add_fix(np.zeros(3), np.eye(3))
+        agent.add_fix(np.array([7.0, 0.0, 0.0]), np.eye(3), stamp_s=1.0)
+        assert await recorded(agent, 2) == [("keyframe", 0, 0.0), ("fix", 0, 7.0)]
+
+
+async def test_a_stamp_names_the_nearest_keyframe_and_of_two_alike_the_newer() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera()) as agent:
+        for k, stamp_s in enumerate((1.0, 1.0004, 1.0008, 1.0012, 5.0, 5.0)):
+            await agent.add_keyframe(pixels, at_m(float(k)), stamp_s)
+        agent.add_fix(np.array([3.0, 0.0, 0.0]), np.eye(3), stamp_s=1.0012)
+        agent.add_fix(np.array([5.0, 0.0, 0.0]), np.eye(3), stamp_s=5.0)
+        found = await recorded(agent, 8)
+    assert [entry for entry in found if entry[0] == "fix"] == [("fix", 3, 3.0), ("fix", 5, 5.0)]
+
+
+@pytest.mark.parametrize(
+    ("made", "complaint"),
+    [
+        (lambda log: MetricClosure(KeyframeId(log, 0), np.eye(4), np.eye(6)), "cannot be registered with itself"),
+        (lambda log: OdometryCovariance(np.eye(6)), "no edge before it"),
+        (lambda log: RobotBearing(log.robot, np.array([1.0, 0.0, 0.0]), 1.0, 0.1, 0.1), "does not see itself"),
+        (lambda log: StartPose(at_m(9_999_999.0), np.eye(6)), "beyond 1e"),
+    ],
+)
+async def test_what_no_log_may_hold_is_refused_at_the_call(
+    made: Callable[[LogId], Measurement], complaint: str
+) -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    async with Agent(CONFIG, camera(), T_body_camera=at_m(5.0)) as agent:
+        await agent.add_keyframe(pixels, at_m(0.0), 1.0)
+        with pytest.raises(BadMeasurement, match=f"robot r1: .*{complaint}"):
+            agent.add_measurement(made(agent.log))
+
+
+class Careless:
+    """A front end of somebody else, with one mistake."""
+
+    dimension = 8
+    model = "careless"
+
+    def __init__(self, descriptor: object, latent: object) -> None:
+        self._descriptor = descriptor
+        self._latent = latent
+
+    def describe(self, image: Image) -> Any:
+        return self._descriptor
+
+    def encode(self, image: Image) -> Any:
+        return self._latent
+
+    def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Any:
+        return None
+
+
+UNIT = np.eye(8)[0]
+
+
+@pytest.mark.parametrize(
+    ("descriptor", "latent"),
+    [
+        (np.ones((2, 4)), b""),
+        (np.ones(0), b""),
+        (np.float32(1.0), b""),
+        (np.ones(5000), b""),
+        (np.full(8, np.nan), b""),
+        ("grey", b""),
+        (None, b""),
+        (UNIT, None),
+        (UNIT, "grey"),
+        (UNIT, np.ones(3)),
+    ],
+    ids=range(10),
+)
+async def test_what_a_strangers_front_end_gives_wrongly_fails_the_keyframe_alone(
+    descriptor: object, latent: object
+) -> None:
+    """Once each of these ended the agent, or put into its store what nobody can read."""
+    eyes = Careless(descriptor, latent)
+    told: list[Reported[Fact]] = []
+    perception = Perception(eyes, eyes, eyes)
+    async with Agent(CONFIG, camera(), perception=perception, on_report=told.append) as agent:
+        await agent.add_keyframe(pose_image(np.eye(4), "r1/0").pixels, at_m(0.0), 1.0)
+        assert await recorded(agent, 1) == [("keyframe", 0, 0.0)]
+    assert [reported.fact.keyframe.index for reported in told if isinstance(reported.fact, EncodingFailed)] == [0]
+
+
+def test_what_a_strangers_registrar_gives_wrongly_is_refused_where_it_is_made() -> None:
+    eyes = Careless(UNIT, b"")
+    with pytest.raises(TypeError, match="not NoneType"):
+        Perception(eyes, eyes, eyes).register(b"", b"", None)
+    for made in (
+        lambda: Registration(np.eye(3), 100, 100, 1.0),
+        lambda: Registration(np.eye(4).tolist(), 100, 100, 1.0),  # type: ignore[arg-type]
+        lambda: Registration(np.eye(4, dtype=object), 100, 100, 1.0),
+        lambda: Registration(np.eye(4), -1, 100, 1.0),
+        lambda: Registration(np.eye(4), 10**12, 100, 1.0),
+        lambda: Registration(np.eye(4), 1.5, 100, 1.0),  # type: ignore[arg-type]
+        lambda: Registration(np.eye(4), 100, 100, 1.0, np.eye(3)),
+        lambda: Registration(np.eye(4), 100, 100, "far"),  # type: ignore[arg-type]
+        lambda: RegistrationFailed("dark"),  # type: ignore[arg-type]
+        lambda: RegistrationFailed(RegistrationFailure.NO_MODEL, "", -1),
+    ):
+        with pytest.raises(ValueError, match=r"registration|counts|RegistrationFailure"):
+            made()

@@ -99,6 +99,8 @@ def test_a_key_of_a_newer_version_is_ignored() -> None:
     [
         ('{"t": 1, "robot": "r1", "event": "leader", "ter', "cut off or not JSON"),
         ("[1, 2]", "top level"),
+        ("[" * 100_000, "nested too deeply"),
+        ('{"t": ' + "9" * 5000 + "}", "not JSON"),
         ('{"robot": "r1", "event": "agent_stopped"}', "t: Field required"),
         ('{"t": NaN, "robot": "r1", "event": "agent_stopped"}', "t: Input should be a finite number"),
         ('{"t": 1, "robot": "r1", "event": "latent_lost", "keyframe": "r1/x"}', "keyframe: "),

@@ -99,3 +99,43 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RecordingError, match=r"measurements\.jsonl: cannot be read"):
         read_measurements(path, FRAMES_S)
+
+
+def test_gnss_is_interpolated_over_a_pole(tmp_path: Path) -> None:
+    rows = [
+        f'{{"stamp_s": {t}, "kind": "gnss", "latitude_deg": 89.9999, "longitude_deg": {east}, "altitude_m": 0.0, '
+        '"covariance_m2": [1, 1, 4]}'
+        for t, east in ((0.5, 0.0), (1.5, 180.0))
+    ]
+    (stamped,) = read_measurements(written(tmp_path, *rows), FRAMES_S).at(1.0)
+    assert isinstance(stamped.measurement, GeodeticFix)
+    assert stamped.measurement.latitude_deg == pytest.approx(90.0, abs=1e-9)
+
+
+WHOLE = f'"T_query_match": [0, 0, 0, 1, 0, 0, 0], "covariance": {SIXES}'
+BAD_TAG = '{"stamp_s": 1, "kind": "tag", "tag": %s, "T_body_tag": [1, 0, 0, 1, 0, 0, 0], "covariance": ' + SIXES + "}"
+GNSS = (
+    '{"stamp_s": 1, "kind": "gnss", "latitude_deg": %s, "longitude_deg": 1, "altitude_m": 0, '
+    '"covariance_m2": [1, 1, 1]}'
+)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f'{{"stamp_s": {"9" * 400}, "kind": "fix"}}',
+        "[" * 100_000,
+        f'{{"stamp_s": 1, "kind": "odometry", "covariance": [{"9" * 400}]}}',
+        f'{{"stamp_s": 1, "kind": "closure", "match": 5, {WHOLE}}}',
+        f'{{"stamp_s": 1, "kind": "closure", "match": null, {WHOLE}}}',
+        f'{{"stamp_s": 2, "kind": "closure", "match": "r2/3", "match_stamp_s": 1, {WHOLE}}}',
+        f'{{"stamp_s": 2, "kind": "closure", "match_stamp_s": {"9" * 400}, {WHOLE}}}',
+        *(BAD_TAG % tag for tag in ("null", "[1]", '{"a": 1}', "true", '"\\ud800"', '"a\\nb"')),
+        *(GNSS % value for value in ("[1]", "true", '"1"', "null")),
+        f'{{"stamp_s": 2, "kind": "start", "T_world_body": [0, 0, 0, 1, 0, 0, 0], "covariance": {SIXES}}}',
+    ],
+)
+def test_a_value_of_a_kind_that_nobody_expects_is_named(tmp_path: Path, line: str) -> None:
+    path = written(tmp_path, TAG, line)
+    with pytest.raises(RecordingError, match=rf"{path}:2: "):
+        read_measurements(path, FRAMES_S)

@@ -253,3 +253,57 @@ def test_a_stamp_in_the_future_costs_its_row(tmp_path: Path) -> None:
     found, notes = read_trajectory(write(tmp_path, "f.tum", tum(poses).encode()))
     assert len(found) == 39
     assert "f.tum:21: 1 rows with a stamp far ahead of those around them were left out" in notes[0]
+
+
+@pytest.mark.parametrize("glue", ["\x0b", "\x85", "\u2028", " "])
+def test_rows_that_became_one_are_left_out_and_counted(tmp_path: Path, glue: str) -> None:
+    """A line end that is none, or got lost: of two poses in a line, one was read, and nothing said."""
+    lines = GOOD.splitlines(keepends=True)
+    path = tmp_path / "odometry.tum"
+    path.write_text("".join(lines[:4]) + lines[4].strip() + glue + "".join(lines[5:]), encoding="utf-8")
+    trajectory, notes = read_trajectory(path)
+    assert len(trajectory) == 8
+    assert "1 of 9 rows were left out, the first at line 5: has 16 columns, other rows have 8" in notes[0]
+
+
+@pytest.mark.parametrize("form", ["{:g}", "{:.6e}", "0"])
+def test_stamps_that_lost_their_digits_are_refused(tmp_path: Path, form: str) -> None:
+    path = tmp_path / "odometry.tum"
+    text = [f"{form.format(s)} {' '.join(map(str, (*t, *q)))}\n" for s, t, q in rows()]
+    path.write_text("".join(text))
+    with pytest.raises(
+        RecordingError, match=r"tum:2: 9 of 10 rows have the stamp of the row before, .* all their digits"
+    ):
+        read_trajectory(path)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("position", ["1e300", "-1e12"])
+@pytest.mark.parametrize("name", ["odometry.tum", "KeyFrameTrajectory.txt"])
+def test_a_position_that_is_nowhere_is_left_out(tmp_path: Path, position: str, name: str) -> None:
+    lines = tum([(s, t, q) for s, t, q in rows(12)]).splitlines(keepends=True)
+    words = lines[5].split()
+    lines[5] = " ".join([words[0], position, *words[2:]]) + "\n"
+    header = "" if name.endswith(".tum") else "# timestamp tx ty tz qx qy qz qw\n"
+    (tmp_path / name).write_text(header + "".join(lines))
+    trajectory, notes = read_trajectory(tmp_path / name)
+    assert len(trajectory) == 11
+    assert "is nowhere on Earth" in notes[0]
+
+
+def test_plotjugglers_header_is_read(tmp_path: Path) -> None:
+    names = [f"/odom/pose/pose/{group}" for group in ("position/x", "position/y", "position/z")]
+    names += [f"/odom/pose/pose/orientation/{axis}" for axis in "xyzw"] + ["/odom/twist/twist/linear/x"]
+    path = tmp_path / "odom.csv"
+    path.write_text(",".join(["__time", *names]) + "\n" + "".join(row(s, *t, *q, 9.0) for s, t, q in rows()))
+    trajectory, _ = read_trajectory(path)
+    np.testing.assert_allclose(trajectory.T_fixed_body[:, :3, 3], [t for _, t, _ in rows()], atol=1e-6)
+
+
+def test_what_is_no_trajectory_is_shown_and_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "odometry.txt").write_text("<!DOCTYPE html>\n<body>404</body>\n")
+    with pytest.raises(RecordingError, match="holds no pose; it begins with '<!DOCTYPE html>'"):
+        read_trajectory(tmp_path / "odometry.txt")
+    (tmp_path / "endless.tum").symlink_to("/dev/zero")
+    with pytest.raises(RecordingError, match="is not a file"):
+        read_trajectory(tmp_path / "endless.tum")

@@ -21,6 +21,7 @@ from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.facts import RouterConnected
+from flocc_agent.runtime.given_keyframes import BadKeyframe
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
@@ -230,7 +231,7 @@ class Ros2Adapter:
             while (posed := self._synchroniser.next()) is not None:
                 try:
                     await self._consider(posed)
-                except BadMessage as error:
+                except (BadMessage, BadKeyframe) as error:
                     self._refuse("image", str(error))
 
     async def _consider(self, posed: PosedImage) -> None:

@@ -64,9 +64,15 @@ class SatelliteFixes:
         for stamp_s in self._keyframes_s:
             fix = position_at(fixes, stamp_s)
             if fix is not None:
-                self._add_measurement(fix.measurement, stamp_s)
+                self._give(fix.measurement, stamp_s)
             elif not fixes or fixes[-1].stamp_s < stamp_s:
                 waiting.append(stamp_s)
             else:
                 self.dropped[f"keyframe without fixes within {GAP_MAX_S:g} s"] += 1
         self._keyframes_s = waiting
+
+    def _give(self, measurement: Measurement, stamp_s: float) -> None:
+        try:
+            self._add_measurement(measurement, stamp_s)
+        except BadMeasurement as error:
+            self.dropped[str(error)] += 1

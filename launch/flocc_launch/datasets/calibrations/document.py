@@ -16,6 +16,8 @@ Value = Any
 """dict[str, Value], list[Value], str, int, float, bool or None."""
 
 BYTES_MAX = 16 * 1024 * 1024
+NODES_MAX = 200_000
+"""Values of a YAML file; one that refers to its own parts again and again would be endless."""
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?f?")
 _WHOLE = re.compile(r"[-+]?\d+")
 _WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
@@ -40,6 +42,8 @@ def read_text(path: Path) -> str:
         DatasetError: It cannot be read, is large, or is no text.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise DatasetError(f"{path}: is not a file")
         data = path.read_bytes() if path.stat().st_size <= BYTES_MAX else None
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -80,8 +84,9 @@ def parsed_yaml(text: str) -> Value:
         line = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
         raise ValueError(f"is no YAML{line}: {error.problem}") from error
     except YAMLError as error:
-        raise ValueError(f"is no YAML: {error}") from error
-    values = [value for node in nodes if (value := _built(node)) is not None]
+        raise ValueError(f"is no YAML: {' '.join(str(error).split())}") from error
+    builder = _Builder()
+    values = [value for node in nodes if (value := builder(node)) is not None]
     bare = [_without_header(value) for value in values]
     if any(value != bare[0] for value in bare[1:]):
         raise TwiceError(f"has {len(values)} documents that say different things; keep one of them")
@@ -98,16 +103,36 @@ def _plain_yaml(text: str) -> str:
     return re.sub(r"^(\s*[\w.]+):(?=[-+\d\[\"'.])", r"\1: ", text, flags=re.MULTILINE)
 
 
-def _built(node: Any) -> Value:
-    from ruamel.yaml.nodes import MappingNode, SequenceNode
+class _Builder:
+    """Values of YAML's nodes, at most `NODES_MAX` of them."""
 
-    if isinstance(node, SequenceNode):
-        return [_built(item) for item in node.value]
-    if isinstance(node, MappingNode):
-        return merged(
-            (str(key.value), _built(value), f" in line {key.start_mark.line + 1}") for key, value in node.value
-        )
-    return str(node.value) if node.style in ('"', "'") else scalar(str(node.value))
+    def __init__(self) -> None:
+        self._count = 0
+
+    def __call__(self, node: Any) -> Value:
+        from ruamel.yaml.nodes import MappingNode, SequenceNode
+
+        self._count += 1
+        if self._count > NODES_MAX:
+            raise ValueError(f"has more than {NODES_MAX} values, which is no calibration")
+        if isinstance(node, SequenceNode):
+            return [self(item) for item in node.value]
+        if isinstance(node, MappingNode):
+            return self._map(node)
+        return str(node.value) if node.style in ('"', "'") else scalar(str(node.value))
+
+    def _map(self, node: Any) -> dict[str, Value]:
+        """A map; what `<<` takes over from others stands where the map itself says nothing."""
+        pairs = [(str(key.value), self(value), f" in line {key.start_mark.line + 1}") for key, value in node.value]
+        own = merged(pair for pair in pairs if pair[0] != "<<")
+        taken = [
+            each for key, value, _ in pairs if key == "<<" for each in (value if isinstance(value, list) else [value])
+        ]
+        if not all(isinstance(each, dict) for each in taken):
+            raise ValueError("has a key '<<' that names no map")
+        for each in taken:
+            own = {**each, **own}
+        return own
 
 
 def merged(pairs: Iterable[tuple[str, Value, str]]) -> dict[str, Value]:
@@ -118,10 +143,15 @@ def merged(pairs: Iterable[tuple[str, Value, str]]) -> dict[str, Value]:
     """
     values: dict[str, Value] = {}
     for key, value, where in pairs:
-        if key in values and values[key] != value:
+        if key in values and not same(values[key], value):
             raise TwiceError(f"the key {key!r} stands twice with different values{where}")
         values[key] = value
     return values
+
+
+def same(a: Value, b: Value) -> bool:
+    """Whether two values are equal, where no number is equal to itself too."""
+    return bool(a == b) or (isinstance(a, float) and isinstance(b, float) and a != a and b != b)
 
 
 def scalar(text: str) -> Value:
@@ -160,7 +190,7 @@ def parsed_xml(text: str) -> Value:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("is XML with a document type, which no calibration needs")
     try:
-        root = ElementTree.fromstring(text.encode() if text.lstrip().startswith("<?xml") else text)
+        root = ElementTree.fromstring(re.sub(r"\A\s*<\?xml.*?\?>", "", text, flags=re.DOTALL))
     except ElementTree.ParseError as error:
         raise ValueError(f"is no XML: {error}") from error
     if root.tag != "opencv_storage":

@@ -22,6 +22,7 @@ Float = NDArray[np.float64]
 Focal = tuple[float, float, float, float]
 Size = tuple[int, int]
 
+SIDE_MAX = 1 << 20
 CAMERA_MODEL = (
     "camera_model",
     "model_type",
@@ -68,6 +69,7 @@ _MATTERS = re.compile(
     r"prism|mount|ext[rt]$|^rc[li]$|^pc[li]$|pose|zoom|scale|resiz|^f$|^fl|^f[xyuv]|^c[xyuv]$|matrix|tocam|camto|principal|center|centre|affine|shear"
 )
 """Plain names of keys that say something about a camera; one that is not understood is refused."""
+HARMLESS_UNITS = ("", "m", "meter", "meters", "metre", "metres", "px", "pixel", "pixels")
 HARMLESS = re.compile(
     r"^(camera(1|2)?(fps|rgb|bf|newwidth|newheight|id|name|label)|imu.*|acc.*|gyr.*|orbextractor.*|viewer.*|stereo.*|"
     r"loopclosing.*|system.*|rgbd.*|tn?cncnm1|timeshift.*|rectificationmatrix|projectionmatrix|p|r|header|seq|stamp|"
@@ -94,7 +96,8 @@ def lens_of_keys(keys: Keys, size: Size | None) -> Lens:
     T_body_camera = _mounting(keys)
     _refuse_parts(keys)
     left = keys.left()
-    strange = [key for key in left if _matters(key, keys.value(key))]
+    apart = [key for key in left if plain(key) in ("t", "tvec")] if any(plain(key) == "r" for key in left) else []
+    strange = [key for key in (*apart, *left) if key in apart or _matters(key, keys.value(key))]
     if strange:
         raise ValueError(
             f"the key {strange[0]!r} is not understood and may be about the camera; take it out if it is not"
@@ -106,6 +109,10 @@ def lens_of_keys(keys: Keys, size: Size | None) -> Lens:
 def _matters(key: str, value: Any) -> bool:
     """Whether a key that nobody took may change what the camera is."""
     name = plain(key)
+    if isinstance(value, str) and kind_of(value) not in (None, LensKind.PINHOLE):
+        return True
+    if isinstance(value, str) and re.search(r"units?$", name):
+        return plain(value) not in HARMLESS_UNITS
     if isinstance(value, str) and not re.search(r"model|type|distort|lens|fisheye", name):
         return False
     return bool(_MATTERS.search(name)) and not HARMLESS.match(name) and not _says_nothing(value)
@@ -196,6 +203,8 @@ def _size(keys: Keys) -> Size | None:
     if said[0] != said[-1]:
         raise TwiceError(f"gives two image sizes, {said[0]} and {said[-1]}")
     wide, high = said[0]
+    if not (0 < wide <= SIDE_MAX and 0 < high <= SIDE_MAX):
+        raise ValueError(f"an image cannot have {wide:g}x{high:g} pixels")
     if wide != int(wide) or high != int(high):
         raise ValueError(f"the image size {wide:g}x{high:g} is not whole")
     return int(wide), int(high)

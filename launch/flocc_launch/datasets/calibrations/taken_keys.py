@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from flocc_launch.datasets.calibrations.document import TwiceError, scalar
+from flocc_launch.datasets.calibrations.document import TwiceError, same, scalar
 
 
 def plain(key: str) -> str:
@@ -40,7 +40,7 @@ class Keys:
         self.used.update(plain(name) for name in names)
         if not found:
             return None
-        different = next((key for key, value in found if value != found[0][1]), None)
+        different = next((key for key, value in found if not same(value, found[0][1])), None)
         if different is not None:
             raise TwiceError(f"the keys {found[0][0]!r} and {different!r} say different things")
         return found[0][1]

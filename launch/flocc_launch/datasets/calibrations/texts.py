@@ -68,6 +68,9 @@ def _colmap(text: str) -> Cameras:
         identifier, model, *numbers = line.split()
         if model not in _COLMAP:
             raise ValueError(f"the camera model is {model!r}; flocc reads {', '.join(_COLMAP)} of COLMAP")
+        odd = next((word for word in numbers if not re.fullmatch(_NUMBER, word)), None)
+        if odd is not None or len(numbers) < 2:
+            raise ValueError(f"camera {identifier} has {odd or 'no size'} where a number must be")
         width, height, *parameters = (float(number) for number in numbers)
         names = _COLMAP[model]
         if len(parameters) != len(names):
@@ -128,6 +131,8 @@ def _are_numbers(row: str) -> bool:
 def _offset(P: list[float]) -> list[list[float]]:
     """Pose of a rectified camera in camera 0, of the fourth column of its projection."""
     z = P[11]
+    if P[0] <= 0 or P[5] <= 0:
+        raise ValueError("a projection has no focal length")
     x, y = (P[3] - P[2] * z) / P[0], (P[7] - P[6] * z) / P[5]
     return [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, -y], [0.0, 0.0, 1.0, -z], [0.0, 0.0, 0.0, 1.0]]
 
