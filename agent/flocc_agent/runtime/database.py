@@ -6,7 +6,8 @@ import os
 import shutil
 import sqlite3
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -18,6 +19,8 @@ logger = logging.getLogger(__name__)
 MEMORY = ":memory:"
 DAMAGED_MAX = 1000
 BUSY_TIMEOUT_S = 5.0
+RETRY_S = 10.0
+"""A full disk is tried again at the first write after so long."""
 WAL_BYTES_MAX = 16 * 1024 * 1024
 VERSION_MARK = 0x464C0000
 """`application_id` of a file is this plus its schema version."""
@@ -82,7 +85,7 @@ class Database:
     """A file in WAL mode, or memory. Any thread may use it.
 
     Attributes:
-        failure: Why memory took the file's place; None while the disk works. Logged once, when it happens.
+        failure: Why memory takes the file's place; None while the disk works. Logged once, when it happens.
         was_damaged: Whether the file was found damaged and a fresh one begun.
         rescued: What the fresh one took over; None when nothing was damaged, or nothing could be saved.
     """
@@ -94,6 +97,8 @@ class Database:
         on_failed: Callable[[], None],
         migrations: Sequence[Migration] = (),
         inspection: Inspection | None = None,
+        carried: Mapping[str, str] | None = None,
+        on_recovered: Callable[[], None] = lambda: None,
     ) -> None:
         """Open or begin the file.
 
@@ -103,6 +108,9 @@ class Database:
             on_failed: Called once when the disk fails.
             migrations: Each brings a file from the schema version of its place here to the next one.
             inspection: Reads all of it now and looks for damage, which takes seconds per gigabyte; None does not.
+
+            carried: Table -> columns that go from memory to the file once a full disk has room again.
+            on_recovered: Called when that happened.
 
         Raises:
             LaterSchema: The file's schema version is above the number of migrations.
@@ -115,6 +123,9 @@ class Database:
         self._on_failed = on_failed
         self._migrations = migrations
         self._inspection = inspection
+        self._carried = dict(carried or {})
+        self._on_recovered = on_recovered
+        self._retry_s = float("inf")
         self._lock = threading.RLock()
         self._connections: list[sqlite3.Connection] = []
         self._open()
@@ -167,9 +178,11 @@ class Database:
         """Execute a statement for all rows in one transaction, and give the count of changed rows.
 
         Durable, it has survived a power cut when this returns; otherwise a crash of this process at most.
-        When the disk fails, the rows go to memory, and so does everything from then on.
+        When the disk fails, the rows go to memory, and so does everything until a full disk has room again.
         """
         with self._lock:
+            if time.monotonic() >= self._retry_s:
+                self._return_to_file()
             try:
                 return self._write(statement, rows, durable)
             except sqlite3.Error as error:
@@ -203,8 +216,28 @@ class Database:
         """Say so once, and put memory before the file."""
         self.failure = StoreFailed(f"{self._path}: the disk failed ({error}); the robot goes on in memory")
         logger.error("%s", self.failure)
+        if self._connections and self._carried and not _is_damage(error):
+            self._retry_s = time.monotonic() + RETRY_S
         self._connections.insert(0, _connect(MEMORY, self._schema, self._migrations))
         self._on_failed()
+
+    def _return_to_file(self) -> None:
+        """Bring what memory took in the file's place onto the disk, all or nothing."""
+        memory, file = self._connections
+        try:
+            file.execute("PRAGMA synchronous=FULL")
+            with file:
+                for table, columns in self._carried.items():
+                    rows = memory.execute(f"SELECT {columns} FROM {table}").fetchall()
+                    marks = ", ".join("?" * len(columns.split(", ")))
+                    file.executemany(f"INSERT OR REPLACE INTO {table}({columns}) VALUES ({marks})", rows)
+        except sqlite3.Error:
+            self._retry_s = time.monotonic() + RETRY_S
+            return
+        memory.close()
+        self._connections, self.failure, self._retry_s = [file], None, float("inf")
+        logger.warning("%s: the disk works again; what was in memory meanwhile is on it", self._path)
+        self._on_recovered()
 
     def close(self) -> None:
         """Close the file; safe to call twice."""

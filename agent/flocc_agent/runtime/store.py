@@ -5,10 +5,10 @@ cache whose entries carry a hash. An own record has survived even a power cut wh
 lose the last moments before one, and gossip brings them again.
 
 No failure of the disk stops the robot: of a damaged file what is sound goes into a fresh one and the file is kept
-aside; when writing fails the store goes on in memory and says so in `failure`. Where anything may be missing that
-others heard of this robot, it comes back with a new incarnation, so that no number of its log is ever used twice;
-its earlier log is then another's, of which gossip brings what peers hold. Methods are synchronous; any thread may
-call them.
+aside; when writing fails the store goes on in memory until there is room again, and says so in `failure`. Where
+anything may be missing that others heard of this robot, it comes back with a new incarnation, so that no number of
+its log is ever used twice; its earlier log is then another's, of which gossip brings what peers hold. Methods are
+synchronous; any thread may call them.
 """
 
 import hashlib
@@ -79,8 +79,22 @@ class Store:
         self._intact = Intact(self._path("intact"))
         self._intact_is_kept = True
         self._reached = Reached(0, 0)
-        self._records = Database(self._path("robot.sqlite"), SCHEMA, self._intact.remove, MIGRATIONS, RecordTables())
-        self._latents = Database(self._path("latents.sqlite"), LATENT_SCHEMA, self._forget_latents)
+        self._records = Database(
+            self._path("robot.sqlite"),
+            SCHEMA,
+            self._intact.remove,
+            MIGRATIONS,
+            RecordTables(),
+            COLUMNS,
+            lambda: self._reach(self._reached),
+        )
+        self._latents = Database(
+            self._path("latents.sqlite"),
+            LATENT_SCHEMA,
+            self._forget_latents,
+            carried={"latents": "keyframe, sha256, bytes, data"},
+            on_recovered=self._measure,
+        )
         self._others_bytes = self._latent_bytes = 0
 
     @classmethod
