@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.gossip import Sealer
+from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
@@ -73,9 +73,10 @@ class Corrections:
             "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
         }
 
-    def restore(self, message: LogCorrection, frame_changed: bool) -> None:
+    def restore(self, message: LogCorrection | None, frame_changed: bool) -> None:
         """Put back the correction that was applied before a restart; consumers may not know its frame yet."""
-        self._keep(message)
+        if message is not None:
+            self._keep(message)
         self._frame_unknown = frame_changed
 
     def announced(self) -> tuple[CorrectionVersion, ...]:
@@ -111,13 +112,27 @@ class Corrections:
 
     def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction that its leader made; apply it when it is this robot's."""
+        return (self.refused(peer, message) or self.take(message)) if self.is_news(message) else []
+
+    def is_news(self, message: LogCorrection) -> bool:
+        """Whether a correction is newer than the one that is held."""
         held = self._newest.get(message.log)
-        if held is not None and (message.term, message.round) <= (held.term, held.round):
-            return []
-        if held is None and len(self._newest) >= self._gossip.logs_max:
+        return held is None or (message.term, message.round) > (held.term, held.round)
+
+    def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
+        """Refuse a newer correction for which there is no room, or which its leader did not make."""
+        if message.log not in self._newest and not self._is_room(message.log):
             return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
             return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
+        return []
+
+    def _is_room(self, log: LogId) -> bool:
+        return len(self._newest) < self._gossip.logs_max and lives(self._newest, log.robot) < LIVES_MAX
+
+    def take(self, message: LogCorrection) -> list[Effect]:
+        """Keep a newer correction that was not refused; apply it when it is this robot's."""
+        held = self._newest.get(message.log)
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
