@@ -24,6 +24,8 @@ from flocc_launch.report.model import (
     TrackError,
 )
 from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.moments import mean_errors, moments_of
+from flocc_launch.runs.right_closures import judged_closures, mean_f1
 from flocc_launch.runs.timeline import (
     corrections_of,
     deaths_unasked,
@@ -51,7 +53,8 @@ def build(loaded: LoadedRun) -> RunReport:
     run, tracks = loaded.run, loaded.tracks
     frames = sorted({track.map_frame for track in tracks.values() if track.map_frame is not None})
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
-    by_robot = bytes_by_robot(loaded)
+    by_robot, moments = bytes_by_robot(loaded), moments_of(loaded.events, tracks)
+    during = mean_errors(moments, tracks)
     report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
@@ -71,6 +74,11 @@ def build(loaded: LoadedRun) -> RunReport:
         ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames},
         ate_m={robot.robot: robot.corrected.ate_m for robot in robots},
         ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
+        iate_m=None if during is None else during.corrected_m,
+        iate_odometry_m=None if during is None else during.odometry_m,
+        iate_moments=0 if during is None else during.moments,
+        if1=mean_f1(moments, judged_closures(loaded)),
+        odometry_scale=dict.fromkeys(loaded.robots),
         bytes=total_bytes(by_robot),
         bytes_by_robot=by_robot,
         links=links_of(loaded.events),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import LISTED_MAX, Corrections
+from flocc_agent.core.corrections import KNOTS_MAX, LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
@@ -260,6 +260,21 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
     assert set(robots.frames().values()) == {"map/r1"}
     changes = [fact.map_frame for fact in robots.facts("r4", CorrectionApplied) if fact.frame_changed]
     assert changes == ["map/r1"]
+
+
+def test_people_are_told_some_keyframes_of_a_correction_and_the_last_one() -> None:
+    long = np.array([pose7(pose(np.eye(3), np.array([k, 0.0, 0.0]))) for k in range(40)])
+    message = LogCorrection(R1, Term(1, R2), 1, R2, pose7(np.eye(4)), None, 2, 3, Array.of(long, "f4"))
+    (told,) = (e.fact for e in corrections().on_message("r2", message) if isinstance(e, Report))
+    assert isinstance(told, CorrectionApplied)
+    assert told.knots == tuple(2 + 3 * k for k in range(0, 40, 3))
+    assert len(told.knots) <= KNOTS_MAX
+    assert told.knots[-1] == 2 + 3 * 39
+    assert [T[0] for T in told.T_map_body] == list(range(0, 40, 3))
+    empty = LogCorrection(R1, Term(2, R2), 1, R2, pose7(np.eye(4)), None, 0, 1, Array.of(np.zeros((0, 7)), "f4"))
+    (told,) = (e.fact for e in corrections().on_message("r2", empty) if isinstance(e, Report))
+    assert isinstance(told, CorrectionApplied)
+    assert (told.knots, told.T_map_body) == ((), ())
 
 
 def test_a_newcomer_that_believed_a_false_correction_is_won_back() -> None:
