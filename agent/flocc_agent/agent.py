@@ -326,14 +326,13 @@ class Agent:
         )
         if config.ros2 is not None:
             self._ros2 = self._adapter(config.ros2)
-        restored = restore(self._store)
+        sealer = _sealer(config)
+        restored = restore(self._store, sealer)
         log = self._store.identity.log
         boot = int.from_bytes(os.urandom(6))
         distributed = config.backend.mode is BackendMode.DISTRIBUTED
         core_parameters = config.core.under(config.bandwidth_bytes_s)
-        core = Robot(
-            log, config.compute_class, boot, core_parameters, self._clock_s(), restored, _sealer(config), distributed
-        )
+        core = Robot(log, config.compute_class, boot, core_parameters, self._clock_s(), restored, sealer, distributed)
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
         )
@@ -439,7 +438,9 @@ def stored_result(config: AgentConfig) -> RobotResult:
     T_body_camera = np.eye(4) if recording is None else recording.T_body_camera
     store = _open_store(config)
     try:
-        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restore(store), _sealer(config))
+        sealer = _sealer(config)
+        restored = restore(store, sealer)
+        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restored, sealer)
     finally:
         store.close()
     return result_of(robot, T_body_camera)

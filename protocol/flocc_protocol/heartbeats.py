@@ -43,7 +43,7 @@ class Heartbeat:
         boot: Random per start; two boots that are heard alternately share one name by mistake.
         compute_class: 0 (small) to 9 (server with a GPU).
         leader: The followed leader, None while there is none.
-        term_counter_max: Highest term counter the sender knows of.
+        term_counter_max: Highest term counter the sender knows of; hearsay, which nobody acts on.
         load: Registrations waiting at the sender.
         digests: What the sender holds of some logs: those that grew lately, and the others in turn.
         corrections: Which corrections the sender holds, of some logs in the same way.

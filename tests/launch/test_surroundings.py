@@ -1,12 +1,17 @@
 """What the world does to a command is one sentence with exit code 2: homes, disks, locales, networks."""
 
+import contextlib
 import errno
+import json
 import os
+import signal
 import socket
 import sqlite3
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -22,12 +27,14 @@ from flocc_agent.runtime.facts import AgentStopped
 from flocc_agent.runtime.recording import write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.commands import main as command_line
+from flocc_launch.commands.common import EXIT_TRY_AGAIN
 from flocc_launch.datasets import writer
 from flocc_launch.doctor.installation import surroundings
 from flocc_launch.setup import cache
 from flocc_launch.setup.cache import CacheError, cache_folder
 from flocc_launch.setup.world_faults import sentence_of
-from flocc_launch.swarm.agent_process import Lines
+from flocc_launch.swarm import agent_process
+from flocc_launch.swarm.agent_process import RETRY_S, Lines
 from flocc_protocol.errors import FloccError
 
 
@@ -133,13 +140,84 @@ def test_a_full_disk_ends_a_conversion_with_a_sentence(
     assert "000000.png: the disk is full; what was written before is kept" in told
 
 
-def test_a_full_disk_ends_the_events_and_not_the_robot(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_disk_costs_events_and_not_the_robot(caplog: pytest.LogCaptureFixture) -> None:
     lines = Lines(Path("/dev/full"))
     event: Reported[Fact] = Reported(1.0, "r1", AgentStopped())
     lines.write(event)
     lines.write(event)
     lines.close()
-    assert caplog.text.count("/dev/full: No space left on device; events are no longer written") == 1
+    assert caplog.text.count("/dev/full: No space left on device; events are not written meanwhile") == 1
+
+
+def test_events_are_written_again_once_there_is_room(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    now_s = [0.0]
+    path = tmp_path / "r1" / "events.jsonl"
+    path.parent.write_text("in the way")
+    lines = Lines(path, lambda: now_s[0])
+    for t in (0.0, 1.0, RETRY_S + 1.0):
+        now_s[0] = t
+        lines.write(Reported(t, "r1", AgentStopped()))
+    assert caplog.text.count("events are not written meanwhile") == 1
+    path.parent.unlink()
+    for t in (RETRY_S + 2.0, 3 * RETRY_S, 3 * RETRY_S + 1.0):
+        now_s[0] = t
+        lines.write(Reported(t, "r1", AgentStopped()))
+    lines.close()
+    assert [json.loads(line)["t"] for line in path.read_text().splitlines()] == [3 * RETRY_S, 3 * RETRY_S + 1.0]
+    assert "events are written again; 4 were lost" in caplog.text
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of one mebibyte."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def until(true: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_an_agent_lives_through_a_full_disk_and_records_again(tmp_path: Path, small_disk: Path) -> None:
+    config, log = tmp_path / "agent.toml", tmp_path / "log"
+    config.write_text(f'name = "r1"\nfolder = "{small_disk}"\n[transport]\nmulticast = false\n')
+    command = [sys.executable, "-m", "flocc_launch.commands.main", "agent", "--config", str(config)]
+    with log.open("wb") as output, subprocess.Popen(command, stderr=output, stdout=output) as agent:
+        until((small_disk / "events.jsonl").exists)
+        with (small_disk / "filler").open("wb", buffering=0) as filler, contextlib.suppress(OSError):
+            while filler.write(bytes(4096)):
+                pass
+        until(lambda: "events are not written meanwhile" in log.read_text())
+        (small_disk / "filler").unlink()
+        until(lambda: "events are written again" in log.read_text())
+        agent.send_signal(signal.SIGTERM)
+        assert agent.wait(20.0) == 0
+    assert log.read_text().count("events are not written meanwhile") == 1
+    assert all(json.loads(line) for line in (small_disk / "events.jsonl").read_text().splitlines())
+    assert json.loads((small_disk / "events.jsonl").read_text().splitlines()[-1])["event"] == "agent_stopped"
+
+
+def test_an_agent_whose_disk_fails_it_ends_with_a_code_that_systemd_restarts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def fails(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "full", "/var/lib/flocc/x")
+
+    monkeypatch.setattr(agent_process, "run_agent", fails)
+    config = tmp_path / "agent.toml"
+    config.write_text('name = "r1"\n')
+    assert run(monkeypatch, "agent", "--config", str(config)) == EXIT_TRY_AGAIN
+    assert "error: /var/lib/flocc/x: the disk is full" in capsys.readouterr().err
+    assert run(monkeypatch, "agent", "--config", str(tmp_path / "none.toml")) == 2
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])

@@ -2,9 +2,11 @@
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, KeyframeTaken, LeaderFollowed
@@ -12,6 +14,8 @@ from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor import diagnose
 from flocc_launch.report.text import sentences
+from flocc_launch.runs.loaded_run import load
+from flocc_launch.runs.moments import errors_then_m, moments_of
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError
 from flocc_launch.scenarios.leader_faults import FaultError
 from flocc_launch.scenarios.scenario import Scenario
@@ -45,6 +49,21 @@ def test_robots_on_virtual_time_merge_and_meet_their_expectations(tmp_path: Path
     assert all(expectation.met for expectation in report.expectations)
     assert report.driver == "simulate"
     assert report.ate_joint_m is not None
+
+
+def test_what_the_last_corrections_told_is_the_final_map(tmp_path: Path) -> None:
+    report = simulate(scenario(simulation={"optimiser": "backend"}), tmp_path / "run")
+    loaded = load(RunFolder.open(tmp_path / "run"))
+    moments = moments_of(loaded.events, loaded.tracks)
+    everything = {robot: len(track) for robot, track in loaded.tracks.items()}
+    last = errors_then_m(replace(moments[-1], keyframes=everything), loaded.tracks)
+    assert last is not None
+    assert last == pytest.approx((report.ate_joint_m, report.ate_joint_odometry_m), abs=2e-3)
+    errors = [found for moment in moments if (found := errors_then_m(moment, loaded.tracks)) is not None]
+    assert report.iate_moments == len(errors) > 1
+    assert (report.iate_m, report.iate_odometry_m) == pytest.approx(tuple(np.mean(errors, axis=0)))
+    assert report.if1 is not None
+    assert report.if1 > 0.9
 
 
 def test_a_run_folder_is_whole(tmp_path: Path) -> None:

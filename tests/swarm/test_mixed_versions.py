@@ -78,7 +78,8 @@ async def test_one_robot_writes_records_that_the_others_do_not_know(tmp_path: Pa
         def settled() -> bool:
             held = logs(agents)
             equal = held[0] == held[1] == held[2] and len(held[0]) == 3
-            return equal and not any(agent.status().busy for agent in agents)
+            corrected = all(agent.status().map_frame is not None for agent in agents)
+            return equal and corrected and not any(agent.status().busy for agent in agents)
 
         await reached(settled, lambda: [agent.status() for agent in agents])
         theirs = r1.robot.gossip.logs[LogId("r3")]

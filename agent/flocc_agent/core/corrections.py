@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.gossip import Sealer
+from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose7, tq_from_poses, upper_triangle
+from flocc_agent.geometry import pose7, pose_from_tq, tq_from_poses, upper_triangle
 from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import (
@@ -35,6 +36,8 @@ ANSWERS_MAX = 8
 """Messages with which one request is answered."""
 LISTED_MAX = 400
 """Keyframes listed in a correction; a longer trajectory is thinned and interpolated, so that messages stay small."""
+KNOTS_MAX = 16
+"""Keyframes whose poses people are told with each correction; the report interpolates between them."""
 TRANSLATION_TOLERANCE_M = 1e-3
 ROTATION_TOLERANCE_RAD = 1e-4
 """A correction that moves no keyframe further is not sent again in one term: nobody would see the difference."""
@@ -70,9 +73,10 @@ class Corrections:
             "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
         }
 
-    def restore(self, message: LogCorrection, frame_changed: bool) -> None:
+    def restore(self, message: LogCorrection | None, frame_changed: bool) -> None:
         """Put back the correction that was applied before a restart; consumers may not know its frame yet."""
-        self._keep(message)
+        if message is not None:
+            self._keep(message)
         self._frame_unknown = frame_changed
 
     def announced(self) -> tuple[CorrectionVersion, ...]:
@@ -108,13 +112,27 @@ class Corrections:
 
     def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction that its leader made; apply it when it is this robot's."""
+        return (self.refused(peer, message) or self.take(message)) if self.is_news(message) else []
+
+    def is_news(self, message: LogCorrection) -> bool:
+        """Whether a correction is newer than the one that is held."""
         held = self._newest.get(message.log)
-        if held is not None and (message.term, message.round) <= (held.term, held.round):
-            return []
-        if held is None and len(self._newest) >= self._gossip.logs_max:
+        return held is None or (message.term, message.round) > (held.term, held.round)
+
+    def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
+        """Refuse a newer correction for which there is no room, or which its leader did not make."""
+        if message.log not in self._newest and not self._is_room(message.log):
             return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
             return [Report(PeerRefused(peer=peer, reason="correction without its leader's signature"))]
+        return []
+
+    def _is_room(self, log: LogId) -> bool:
+        return len(self._newest) < self._gossip.logs_max and lives(self._newest, log.robot) < LIVES_MAX
+
+    def take(self, message: LogCorrection) -> list[Effect]:
+        """Keep a newer correction that was not refused; apply it when it is this robot's."""
+        held = self._newest.get(message.log)
         self._keep(message)
         self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
@@ -187,6 +205,7 @@ class Corrections:
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
+        knots, T_map_camera = told_knots(message)
         fact = CorrectionApplied(
             term=message.term.counter,
             leader=message.term.leader.robot,
@@ -194,8 +213,18 @@ class Corrections:
             map_frame=map_frame(message.anchor),
             frame_changed=changed,
             T_map_odom=message.T_map_odom,
+            knots=knots,
+            T_map_body=T_map_camera,
         )
         return [PersistCorrection(message, changed), Deliver(message, changed), Report(fact)]
+
+
+def told_knots(message: LogCorrection) -> tuple[tuple[int, ...], tuple[Pose7, ...]]:
+    """Numbers and poses of at most `KNOTS_MAX` evenly spread keyframes of a correction, the last listed among them."""
+    rows = message.T_map_camera.numpy()
+    step = max(1, -(-len(rows) // KNOTS_MAX))
+    chosen = range((len(rows) - 1) % step, len(rows), step)
+    return tuple(message.first + message.step * k for k in chosen), tuple(pose7(pose_from_tq(rows[k])) for k in chosen)
 
 
 def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:

@@ -4,8 +4,11 @@ Rules:
 - Rank is compute class first, then lowest log. The best-ranked robot of a connected group leads it.
 - A leader's own counter (`beat`) grows with each of its heartbeats. Followers pass the highest one on, with the
   hops it travelled; a leader whose beat stands still is lost, however often its name is repeated.
-- A term is (counter, leader). Whoever claims one takes a counter above all it heard of, and a leader that hears of
-  a counter not below its own claims anew, so that what it says is never older than what its followers applied.
+- A term is (counter, leader). Whoever claims one takes a counter above all that it knows to be used, and a leader
+  that learns of one not below its own claims anew, so that what it says is never older than what followers applied.
+- A counter is used when its leader says so itself, or a correction of it is here. What others say of counters proves
+  nothing. Each proof raises the known counter by at most `COUNTER_JUMP_MAX`, so that no lie puts it out of reach for
+  the others; a robot that knows of none yet takes the first one as it is, up to `FIRST_COUNTER_MAX`.
 
 `TRANSITIONS` is the whole machine: what may happen in which role, and which role follows. `LeaderElection.tick` says
 what a role does when its time is up.
@@ -35,7 +38,10 @@ ANSWER_TIMEOUT_S = 0.6
 """Without an ANSWER for this long the robot claims a term: more than a round trip with a lost message."""
 COORDINATOR_TIMEOUT_S = 2.0
 """After an ANSWER the robot waits this long for a leader, then asks again: three times as long as that one asks."""
-COUNTER_JUMP_MAX = 2**20
+COUNTER_JUMP_MAX = 1000
+"""One proof raises the known counter by at most this; a robot that was away for longer needs several."""
+FIRST_COUNTER_MAX = 2**16
+"""What a robot that knows of no term yet believes at once; the rest of a greater one comes as for everybody."""
 LOST_MAX = 64
 PEERS_MAX = 256
 
@@ -137,7 +143,7 @@ class LeaderElection:
 
     @property
     def counter_max(self) -> int:
-        """Highest term counter heard of."""
+        """Highest term counter that is known to be used."""
         return self._counter_max
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -154,12 +160,11 @@ class LeaderElection:
     def on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Learn of a robot in range and of the leader it follows."""
         self._meet(sender, heartbeat.compute_class)
-        refused = self._learn_counter(sender, heartbeat.term_counter_max)
-        if refused:
-            return refused
-        if heartbeat.leader is None:
+        advert = heartbeat.leader
+        if advert is None:
             return self._renew_if_overtaken(now)
-        return self._on_advert(heartbeat.leader, now) + self._renew_if_overtaken(now)
+        refused = self._learn_counter(sender, advert.term.counter) if _is_first_hand(sender, advert) else []
+        return [*refused, *self._on_advert(advert, now), *self._renew_if_overtaken(now)]
 
     def _meet(self, sender: LogId, compute_class: int) -> None:
         known = self._peers.get(sender.robot)
@@ -190,10 +195,10 @@ class LeaderElection:
     def on_coordinator(self, sender: LogId, message: Coordinator, now: float) -> list[Effect]:
         """Hear a claim from the claimer itself; nobody claims a term for another robot."""
         advert = message.advert
-        if advert.term.leader != sender or advert.hops != 0:
+        if not _is_first_hand(sender, advert):
             return [_refused(sender, "claims a term for another robot")]
         refused = self._learn_counter(sender, advert.term.counter)
-        return refused or self._on_advert(advert, now) + self._renew_if_overtaken(now)
+        return [*refused, *self._on_advert(advert, now), *self._renew_if_overtaken(now)]
 
     def on_handover(self, sender: LogId, message: Handover, now: float) -> list[Effect]:
         """The leader leaves in order: elect at once."""
@@ -203,7 +208,7 @@ class LeaderElection:
         return self._lose_leader("handed over", now, beat=COUNTER_MAX)
 
     def on_applied(self, sender: LogId, term: Term) -> list[Effect]:
-        """Somebody has a correction of this term; what is refused must not be applied here.
+        """Somebody gave a correction of this term that its leader made; what is refused must not be applied here.
 
         A leader whose own term is older claims anew with its next `tick`, since nobody would apply what it says.
         """
@@ -328,10 +333,15 @@ class LeaderElection:
         return self._start(now) if outranks and self._role is Role.FOLLOWING else []
 
     def _learn_counter(self, sender: LogId, counter: int) -> list[Effect]:
-        if counter > self._counter_max + COUNTER_JUMP_MAX:
-            return [_refused(sender, f"term counter {counter} is absurd")]
-        self._counter_max = max(self._counter_max, counter)
-        return []
+        """A counter is proven to be used; what is far above all that is known is refused, and still raises it a bit."""
+        reach = self._counter_max + COUNTER_JUMP_MAX if self._counter_max else FIRST_COUNTER_MAX
+        self._counter_max = max(self._counter_max, min(counter, reach))
+        return [_refused(sender, "a term counter far above all others")] if counter > reach else []
+
+
+def _is_first_hand(sender: LogId, advert: LeaderAdvert) -> bool:
+    """Whether a leader speaks of its own term."""
+    return advert.term.leader == sender and advert.hops == 0
 
 
 def _leader_report(term: Term) -> Report:

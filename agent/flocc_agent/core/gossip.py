@@ -7,7 +7,7 @@ What is said of this robot's own log is only a reason to ask for the records; a 
 is what shows that somebody else writes its log.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -41,6 +41,8 @@ from flocc_protocol.records import (
 DECODED_MAX = 1024
 RECORDS_MAX = 200_000
 """Records that are kept of one log: a keyframe and a closure each second for a day. Further ones are refused."""
+LIVES_MAX = 16
+"""Logs that are kept of one robot name: as often may it lose its disk while the swarm remembers it."""
 
 
 class Sealer(Protocol):
@@ -153,9 +155,13 @@ class Gossip:
         }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
-        """Put back a record that was read from disk, in order."""
+        """Put back a record that was read from disk, in order.
+
+        Raises:
+            DecodeError: It is none, or the swarm's keys do not open it.
+        """
+        record = decode_record(self._opened(log, self._held(log), data))
         copy = self.logs.setdefault(log, LogCopy())
-        record = decode_record(self._opened(log, len(copy), data))
         copy.append(kept(record), data)
         self._announce(log, copy)
         return NewRecord(log, len(copy) - 1, record)
@@ -211,11 +217,20 @@ class Gossip:
 
     def _behind(self, peer: str, log: LogId, count: int) -> list[Effect]:
         """Another robot has more of a log, or says so: note whom to ask."""
-        if log not in self.logs and len(self.logs) >= self._parameters.logs_max:
-            return self._refused(peer, "too many logs")
+        refusal = self._no_room(log)
+        if refusal is not None:
+            return self._refused(peer, refusal)
         if (log, peer) not in self._forked:
             self._pulls.on_ahead(peer, log, count)
         return []
+
+    def _no_room(self, log: LogId) -> str | None:
+        """Why a log cannot be taken in; None when it can, or is here. No robot takes the room of all others."""
+        if log in self.logs:
+            return None
+        if len(self.logs) >= self._parameters.logs_max:
+            return "too many logs"
+        return "too many logs of one robot" if lives(self.logs, log.robot) >= LIVES_MAX else None
 
     def on_request(self, sender: LogId, request: RecordRequest) -> list[Effect]:
         """Send what follows, as much of all logs as fits a message."""
@@ -258,8 +273,9 @@ class Gossip:
         if not copy.continues(batch):
             self._pulls.on_level(peer, batch.log)
             return [], self._fork(peer, batch.log, "two writers of one log")
-        if batch.log not in self.logs and len(self.logs) >= self._parameters.logs_max:
-            return [], self._refused(peer, "too many logs")
+        refusal = self._no_room(batch.log)
+        if refusal is not None:
+            return [], self._refused(peer, refusal)
         new, effects = self._take(peer, copy, batch)
         if new:
             self.logs[batch.log] = copy
@@ -329,6 +345,11 @@ class Gossip:
             return []
         remember(self._told, (peer, reason), None)
         return [Report(PeerRefused(peer=peer, reason=reason))]
+
+
+def lives(logs: Iterable[LogId], robot: str) -> int:
+    """How many of these logs are of one robot name."""
+    return sum(log.robot == robot for log in logs)
 
 
 def _is_full(message: Records) -> bool:

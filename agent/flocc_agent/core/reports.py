@@ -345,7 +345,18 @@ class BlockMoved:
 
 @fact("correction")
 class CorrectionApplied:
-    """This robot applied a correction."""
+    """This robot applied a correction.
+
+    Attributes:
+        term: Counter of the term of the leader that made it.
+        leader: Its name.
+        round: Number of the round in that term.
+        map_frame: Frame of the poses.
+        frame_changed: It is another one than before.
+        T_map_odom: Of the newest keyframe and all later ones.
+        knots: Numbers of some of the robot's keyframes, growing; the last one that was solved for is among them.
+        T_map_body: Where they lie; bodies and cameras as in `KeyframeTaken`.
+    """
 
     term: int
     leader: str | None = None
@@ -353,3 +364,5 @@ class CorrectionApplied:
     map_frame: str
     frame_changed: bool = False
     T_map_odom: Pose7
+    knots: tuple[int, ...] = ()
+    T_map_body: tuple[Pose7, ...] = ()

@@ -62,6 +62,7 @@ from flocc_agent.core.reports import (
 from flocc_agent.core.rounds import Rounds, solution_report
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import (
     Answer,
@@ -295,17 +296,16 @@ class Robot:
         return effects
 
     def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
-        """A correction of an absurd term would fence out every leader to come."""
-        refused = self.election.on_applied(sender, message.term)
-        return refused or self.corrections.on_message(sender.robot, message)
+        """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
+        if not self.corrections.is_news(message):
+            return []
+        refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
+        return refused or self.corrections.take(message)
 
     def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
-        """What others apply: a leader outbids it, and whoever has something older asks for it."""
+        """What others say they apply: whoever has something older asks for it, and a leader then outbids it."""
         news = self.corrections.news(versions)
-        if not news:
-            return []
-        refused = self.election.on_applied(sender, max(version.term for version in news))
-        return refused or self.corrections.on_versions(sender.robot, news, now)
+        return self.corrections.on_versions(sender.robot, news, now) if news else []
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""
@@ -426,7 +426,7 @@ class Robot:
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
-        news = [self.gossip.restore(log, data) for log, records in restored.records for data in records]
+        news = [new for log, records in restored.records for new in self._restore_log(log, records)]
         self._take([new for new in news if not isinstance(new.record, KeyframeRecord)], now)
         for new in news:
             if isinstance(new.record, ClosureRecord | RejectionRecord):
@@ -436,8 +436,16 @@ class Robot:
         self._partnered.clear()
         for keyframe in restored.latents:
             self.closing.on_held(keyframe)
-        if restored.correction is not None:
-            self.corrections.restore(restored.correction, restored.frame_changed)
+        self.corrections.restore(restored.correction, restored.frame_changed)
+
+    def _restore_log(self, log: LogId, records: Iterable[bytes]) -> Iterable[NewRecord]:
+        """A log as it is on the disk, up to a record that nobody would take any more; others have the rest."""
+        try:
+            for data in records:
+                yield self.gossip.restore(log, data)
+        except DecodeError:
+            if log == self.log:
+                raise  # whoever reads the disk checks the own log before: its numbers must not be used twice
 
     # Time
 

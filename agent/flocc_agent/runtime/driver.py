@@ -233,15 +233,20 @@ class Driver:
             alarm.cancel()
 
     async def _close(self) -> None:
-        for job in list(self._jobs):
-            job.cancel()
-        await asyncio.gather(*self._jobs, return_exceptions=True)
-        await self._disk.flush()
-        self._telemetry.count_bytes(last=True)
-        await self._tools.transport.close()
-        await self._tools.workers.close()
-        for queue in self._subscribers:
-            _put_newest(queue, None)
+        """End everything, whatever fails of it: threads of an open transport would keep the process from ending."""
+        try:
+            for job in list(self._jobs):
+                job.cancel()
+            await asyncio.gather(*self._jobs, return_exceptions=True)
+            await self._disk.flush()
+            self._telemetry.count_bytes(last=True)
+        finally:
+            try:
+                await self._tools.transport.close()
+            finally:
+                await self._tools.workers.close()
+                for queue in self._subscribers:
+                    _put_newest(queue, None)
 
     def _sizes(self) -> Sizes:
         """The driver's own queues: how much is in them, and their maximum."""
@@ -309,7 +314,7 @@ class Driver:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
         logger.error(
             "%s: %s holds records of this robot's log that are not on its disk (an older copy of the disk, or a second "
-            "robot of this name): what it records now reaches nobody. Restart it; it then begins a log of its own",
+            "robot of this name): what it records now reaches nobody; at its next start it begins a log of its own",
             self.robot.log,
             peer,
         )

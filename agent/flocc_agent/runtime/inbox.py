@@ -21,6 +21,8 @@ BATCH_MAX = 256
 PAUSE_S = 0.02
 """Least time between two batches that have room for more; a message waits half of it on average, on a busy robot."""
 BURST_S = 2.0
+SILENT_S = 600.0
+"""A name that was not heard for so long gives up its place to another one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +127,10 @@ class _Bucket:
 
 
 class RateLimiter:
-    """Token buckets per peer: a sustained rate of messages and bytes, with bursts of two seconds' worth."""
+    """Token buckets per peer: a sustained rate of messages and bytes, with bursts of two seconds' worth.
+
+    Where as many peers are known as may be, one that was not heard for `SILENT_S` gives its place to a new one.
+    """
 
     def __init__(self, messages_per_s: float, bytes_per_s: float, peers_max: int) -> None:
         self._messages_per_s = messages_per_s
@@ -135,18 +140,29 @@ class RateLimiter:
 
     def refusal(self, peer: str, payload_bytes: int, now_s: float) -> str | None:
         """Account for a message; say why it must be dropped, None when it may pass."""
-        bucket = self._buckets.get(peer)
+        bucket = self._buckets.pop(peer, None)
         if bucket is None:
-            if len(self._buckets) >= self._peers_max:
+            if not self._is_room(now_s):
                 return "too-many-peers"
             full = (self._messages_per_s * BURST_S, self._bytes_per_s * BURST_S)
-            bucket = self._buckets[peer] = _Bucket(*full, now_s)
+            bucket = _Bucket(*full, now_s)
+        self._buckets[peer] = bucket  # last, so that the first one is silent for longest
         self._fill(bucket, now_s)
         if bucket.messages < 1.0 or bucket.payload_bytes < payload_bytes:
             return "rate"
         bucket.messages -= 1.0
         bucket.payload_bytes -= payload_bytes
         return None
+
+    def _is_room(self, now_s: float) -> bool:
+        """Whether one more peer may be heard, if need be in a silent one's place."""
+        if len(self._buckets) < self._peers_max:
+            return True
+        name, longest = next(iter(self._buckets.items()))
+        if now_s - longest.filled_s < SILENT_S:
+            return False
+        del self._buckets[name]
+        return True
 
     def _fill(self, bucket: _Bucket, now_s: float) -> None:
         elapsed_s = max(0.0, now_s - bucket.filled_s)

@@ -1,15 +1,21 @@
 """Between the core and the store: what a robot keeps, and what it finds when it starts."""
 
 import asyncio
+import logging
 from collections.abc import Iterable
 from typing import assert_never
 
 from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
+from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.robot import Restored
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_agent.runtime.stored_correction import correction_in, stored
+from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import BATCHES_MAX, RECORDS_BATCH_MAX, LogCorrection
+from flocc_protocol.messages import BATCHES_MAX, RECORDS_BATCH_MAX, LogCorrection, encode_correction
+from flocc_protocol.records import decode_record
+
+logger = logging.getLogger(__name__)
 
 Persist = PersistRecord | PersistTerm | PersistCorrection
 
@@ -95,23 +101,51 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
                 assert_never(effect)
 
 
-def restore(store: Store) -> Restored:
-    """Read everything back; of another robot's log as far as it has no gap."""
-    own = store.identity.log
+def restore(store: Store, sealer: Sealer | None = None) -> Restored:
+    """Read everything back; of another robot's log as far as it has no gap.
+
+    A log that the swarm does not take any more is set aside: of a robot that is no member, or signed with other keys or
+    with none. Where it is the robot's own, the robot begins another one.
+    """
+    read = {log: _prefix(store, log) for log in store.logs()}
+    for log, records in list(read.items()):
+        fault = _fault(log, records if log == store.identity.log else records[:1], sealer)
+        if fault is not None:
+            del read[log]
+            store.set_aside(log)
+            logger.warning("%s: its %d records on the disk are set aside: %s", log, len(records), fault)
     return Restored(
-        records=tuple((log, _prefix(store, log)) for log in store.logs()),
+        records=tuple(read.items()),
         latents=tuple(store.latent_keyframes()),
         term_counter=store.term_counter(),
-        correction=_correction(store, own),
+        correction=_correction(store, store.identity.log, sealer),
         frame_changed=store.fact(FRAME_CHANGED) == b"1",
     )
 
 
-def _correction(store: Store, own: LogId) -> LogCorrection | None:
-    """The correction that was applied last, unless an earlier incarnation wrote it."""
+def _fault(log: LogId, records: Iterable[bytes], sealer: Sealer | None) -> str | None:
+    """Why the swarm would refuse these records; others' signatures were checked when they came, so one is enough."""
+    try:
+        for number, data in enumerate(records):
+            decode_record(data if sealer is None else sealer.opened(log, number, data))
+    except DecodeError as error:
+        return str(error)
+    return None
+
+
+def _correction(store: Store, own: LogId, sealer: Sealer | None) -> LogCorrection | None:
+    """The correction that was applied last, unless for an earlier incarnation, or of a leader nobody would believe."""
     kept = store.correction(own.robot)
     correction = None if kept is None else correction_in(kept)
-    return correction if correction is not None and correction.log == own else None
+    if correction is None or correction.log != own:
+        return None
+    try:
+        if sealer is not None:
+            sealer.check_correction(correction.term.leader, encode_correction(correction), correction.signature)
+    except DecodeError as error:
+        logger.warning("%s: the correction on the disk is forgotten: %s", own, error)
+        return None
+    return correction
 
 
 def _prefix(store: Store, log: LogId) -> tuple[bytes, ...]:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from flocc_agent.core.corrected import CorrectedLog, RecordedOdometry
 from flocc_agent.core.pose_graph import GraphSolution, map_frame
 from flocc_agent.core.registration import closure_probability
-from flocc_agent.core.reports import ClosureAccepted, Fact, KeyframeTaken
+from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse, pose7, pose_from_tq
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
+from flocc_protocol.codec import Pose7
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -43,11 +44,23 @@ class Reporter:
     def _completed(self, fact: Fact) -> Fact:
         match fact:
             case KeyframeTaken():
-                T_odom_body = pose_from_tq(np.array(fact.T_odom_body)) @ inverse(self.T_body_camera)
-                return replace(fact, T_odom_body=pose7(T_odom_body))
+                return replace(fact, T_odom_body=self._body(fact.T_odom_body))
+            case CorrectionApplied():
+                return replace(fact, T_map_body=tuple(_rounded(self._body(T)) for T in fact.T_map_body))
             case ClosureAccepted():
                 return replace(fact, probability=round(closure_probability(fact.ratio, self.steepness), 6))
         return fact
+
+    def _body(self, T_camera: Pose7) -> Pose7:
+        """The body's pose, of the camera's in the same frame."""
+        return pose7(pose_from_tq(np.array(T_camera)) @ inverse(self.T_body_camera))
+
+
+def _rounded(pose: Pose7) -> Pose7:
+    """A pose to a tenth of a millimetre and some microradians, so that lines stay short."""
+    x, y, z, *q = pose
+    w, i, j, k = (round(part, 5) for part in q)
+    return round(x, 4), round(y, 4), round(z, 4), w, i, j, k
 
 
 def result_of(robot: Robot, T_body_camera: Float, solution: GraphSolution | None = None) -> RobotResult:

@@ -4,14 +4,15 @@ Two SQLite files: `robot.sqlite` holds everything small and is checked at each s
 cache whose entries carry a hash. An own record has survived even a power cut when `put_record` returns; others' may
 lose the last moments before one, and gossip brings them again.
 
-No failure of the disk stops the robot: a damaged file is kept aside and a fresh one begun, and when writing fails the
-store goes on in memory and says so in `failure`. After either, the robot comes back with a new incarnation, so that
-no number of its log is ever used twice. Methods are synchronous; any thread may call them.
+No failure of the disk stops the robot: of a damaged file what is sound goes into a fresh one and the file is kept
+aside; when writing fails the store goes on in memory until there is room again, and says so in `failure`. Where
+anything may be missing that others heard of this robot, it comes back with a new incarnation, so that no number of
+its log is ever used twice; its earlier log is then another's, of which gossip brings what peers hold. Methods are
+synchronous; any thread may call them.
 """
 
 import hashlib
 import logging
-import sqlite3
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,7 +20,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flocc_agent.runtime.database import Database, StoreError, StoreFailed, hold_lock
-from flocc_agent.runtime.stored_correction import from_envelope
+from flocc_agent.runtime.intact import Intact, Reached
+from flocc_agent.runtime.record_tables import (
+    COLUMNS,
+    MIGRATIONS,
+    PUT_CORRECTION,
+    PUT_FACT,
+    PUT_RECORD,
+    SCHEMA,
+    RecordTables,
+    row,
+)
 from flocc_protocol.ids import KeyframeId, LogId
 
 if TYPE_CHECKING:
@@ -28,31 +39,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MEMORY_LATENT_BYTES_MAX = 256 * 1024 * 1024
+ASIDE_MAX = 100_000
+"""Records that are kept aside; the oldest give way."""
 
-RECORD_SCHEMA = """
-CREATE TABLE IF NOT EXISTS records(
-    log TEXT, number INTEGER, data BLOB NOT NULL, PRIMARY KEY(log, number)) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS corrections(robot TEXT PRIMARY KEY, data BLOB NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS facts(name TEXT PRIMARY KEY, data BLOB NOT NULL) WITHOUT ROWID;
-"""
 LATENT_SCHEMA = """
 CREATE TABLE IF NOT EXISTS latents(
     age INTEGER PRIMARY KEY AUTOINCREMENT, keyframe TEXT UNIQUE, sha256 BLOB NOT NULL, bytes INTEGER NOT NULL,
     data BLOB NOT NULL);
 """
-
-
-def _free_corrections_of_messages(connection: sqlite3.Connection) -> None:
-    """Schema 0 kept corrections as messages of protocol version 2."""
-    kept = connection.execute("SELECT robot, data FROM corrections").fetchall()
-    for robot, data in kept:
-        connection.execute(
-            "UPDATE corrections SET data = ? WHERE robot = ?", (from_envelope(robot, data) or b"", robot)
-        )
-
-
-MIGRATIONS = (_free_corrections_of_messages,)
-"""Each brings `robot.sqlite` one schema version up; never changed once released, only added to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +69,32 @@ class StoredRecord:
 class Store:
     """A robot's memory over restarts; `Store.open` gives one."""
 
-    def __init__(self, folder: Path | None, config: "StoreConfig") -> None:
+    def __init__(self, folder: Path | None, config: "StoreConfig", incarnation_after_loss: int) -> None:
         self.identity = StoreIdentity(LogId("nobody"), 0)
         self._folder = folder
         self._config = config
+        self._incarnation_after_loss = incarnation_after_loss
         self._lock = threading.RLock()
         self._lock_file = hold_lock(folder / "lock") if folder is not None else None
-        self._records = Database(self._path("robot.sqlite"), RECORD_SCHEMA, True, self._forget_intact, MIGRATIONS)
-        self._latents = Database(self._path("latents.sqlite"), LATENT_SCHEMA, False, self._forget_latents)
+        self._intact = Intact(self._path("intact"))
+        self._intact_is_kept = True
+        self._reached = Reached(0, 0)
+        self._records = Database(
+            self._path("robot.sqlite"),
+            SCHEMA,
+            self._intact.remove,
+            MIGRATIONS,
+            RecordTables(),
+            COLUMNS,
+            lambda: self._reach(self._reached),
+        )
+        self._latents = Database(
+            self._path("latents.sqlite"),
+            LATENT_SCHEMA,
+            self._forget_latents,
+            carried={"latents": "keyframe, sha256, bytes, data"},
+            on_recovered=self._measure,
+        )
         self._others_bytes = self._latent_bytes = 0
 
     @classmethod
@@ -106,9 +118,9 @@ class Store:
         Raises:
             StoreError: It belongs to another robot, or another process uses it.
         """
-        store = cls(folder, config)
+        store = cls(folder, config, incarnation_after_loss)
         try:
-            store._identify(robot, incarnation, incarnation_after_loss)
+            store._identify(robot, incarnation)
         except StoreError:
             store.close()
             raise
@@ -122,7 +134,19 @@ class Store:
 
     def end_log(self) -> None:
         """The robot's own log cannot be continued: the next start begins another one; this one stays valid."""
-        self._forget_intact()
+        with self._lock:
+            self._intact_is_kept = False
+            self._intact.remove()
+
+    def set_aside(self, log: LogId) -> None:
+        """Keep a log's records for a person only; where it is the robot's own, begin another one."""
+        name = str(log)
+        self._records.write(f"INSERT INTO aside SELECT {COLUMNS['records']} FROM records WHERE log = ?", [(name,)])
+        self._records.write("DELETE FROM records WHERE log = ?", [(name,)])
+        self._records.write("DELETE FROM aside WHERE rowid <= (SELECT MAX(rowid) FROM aside) - ?", [(ASIDE_MAX,)])
+        if log == self.identity.log:
+            self._be(StoreIdentity(LogId(log.robot, self._incarnation_after_loss), 1))
+        self._measure()
 
     def close(self) -> None:
         """Close the files; safe to call twice."""
@@ -142,9 +166,11 @@ class Store:
         own = self.identity.log
         with self._lock:
             kept = [record for record in records if record.log == own or self._is_room_for(record)]
-        rows = [(str(record.log), record.number, record.data) for record in kept]
-        durable = any(record.log == own for record in kept)
-        self._records.write("INSERT OR IGNORE INTO records VALUES (?, ?, ?)", rows, durable)
+            rows = [row("records", str(record.log), record.number, record.data) for record in kept]
+            own_numbers = [record.number for record in kept if record.log == own]
+            self._records.write(PUT_RECORD, rows, durable=bool(own_numbers))
+            if own_numbers:
+                self._reach(Reached(max(own_numbers) + 1, self._reached.term_counter))
 
     def _is_room_for(self, record: StoredRecord) -> bool:
         if self._others_bytes + len(record.data) > self._config.record_bytes_max:
@@ -201,13 +227,14 @@ class Store:
 
     def latent_keyframes(self) -> list[KeyframeId]:
         """Give all keyframes whose latents are kept, sorted."""
-        return sorted({KeyframeId.parse(name) for (name,) in self._latents.read("SELECT keyframe FROM latents")})
+        names = {name for (name,) in self._latents.read("SELECT keyframe FROM latents")}
+        return sorted(keyframe for name in names if (keyframe := _keyframe(name)) is not None)
 
     # --- small things
 
     def put_correction(self, robot: str, data: bytes) -> None:
         """Keep the last correction that was applied for a robot."""
-        self._records.write("INSERT OR REPLACE INTO corrections VALUES (?, ?)", [(robot, data)])
+        self._records.write(PUT_CORRECTION, [row("corrections", robot, data)])
 
     def correction(self, robot: str) -> bytes | None:
         """Give the last correction that was applied for a robot."""
@@ -216,7 +243,9 @@ class Store:
 
     def put_term_counter(self, counter: int) -> None:
         """Keep the highest term counter that this robot claimed; it is safe when this returns."""
-        self._put_facts([("term_counter", b"%d" % counter)], durable=True)
+        with self._lock:
+            self._put_facts([("term_counter", b"%d" % counter)], durable=True)
+            self._reach(Reached(self._reached.records, counter))
 
     def term_counter(self) -> int:
         """Give the highest term counter that this robot claimed, 0 before the first."""
@@ -232,44 +261,59 @@ class Store:
         return bytes(rows[0][0]) if rows else None
 
     def _put_facts(self, facts: list[tuple[str, bytes]], durable: bool = False) -> None:
-        self._records.write("INSERT OR REPLACE INTO facts VALUES (?, ?)", facts, durable)
+        self._records.write(PUT_FACT, [row("facts", *fact) for fact in facts], durable)
 
     # --- identity
 
-    def _identify(self, robot: str, incarnation: int, incarnation_after_loss: int) -> None:
+    def _identify(self, robot: str, incarnation: int) -> None:
         """Find or choose the robot's log; a life whose end may be missing on disk is not continued."""
         written = self.fact("log")
         log = LogId.parse(written.decode()) if written is not None else None
         if log is not None and log.robot != robot:
             raise StoreError(f"{self._folder}: belongs to robot {log.robot}, not to {robot}")
-        intact = self._path("intact")
-        was_cut = log is not None and intact is not None and not intact.exists()
-        if log is None or was_cut:
-            was_lost = was_cut or self._records.was_damaged
-            self.identity = StoreIdentity(LogId(robot, incarnation_after_loss if was_lost else incarnation), 1)
-            logger.info("robot %s: begins the log %s", robot, self.identity.log)
+        if log is not None and self._is_whole(log):
+            self._be(StoreIdentity(log, int(self.fact("boots") or 0) + 1))
         else:
-            self.identity = StoreIdentity(log, int(self.fact("boots") or 0) + 1)
-        self._mark_intact()
-        log_text, boots = str(self.identity.log).encode(), b"%d" % self.identity.boots
-        self._put_facts([("log", log_text), ("boots", boots)], durable=True)
+            had_one = log is not None or self._intact.exists() or self._records.was_damaged
+            self._be(StoreIdentity(LogId(robot, self._incarnation_after_loss if had_one else incarnation), 1))
 
-    def _mark_intact(self) -> None:
-        """Leave a file that can be removed when the disk is full, to tell the next start that the log was cut."""
-        intact = self._path("intact")
-        if intact is not None and self._records.failure is None:
-            try:
-                intact.touch()
-            except OSError as error:
-                logger.error("%s: cannot be written: %s", intact, error.strerror)
+    def _be(self, identity: StoreIdentity) -> None:
+        """Write a log from now on."""
+        self.identity = identity
+        if identity.boots == 1:
+            logger.info("robot %s: begins the log %s", identity.log.robot, identity.log)
+        self._reached = Reached(len(self.records(identity.log)), self.term_counter())
+        log_text, boots = str(identity.log).encode(), b"%d" % identity.boots
+        counter = b"%d" % self._reached.term_counter
+        self._put_facts([("log", log_text), ("boots", boots), ("term_counter", counter)], durable=True)
+        self._reach(self._reached)
 
-    def _forget_intact(self) -> None:
-        intact = self._path("intact")
-        try:
-            if intact is not None:
-                intact.unlink(missing_ok=True)
-        except OSError as error:
-            logger.error("%s: cannot be removed: %s", intact, error.strerror)
+    def _is_whole(self, log: LogId) -> bool:
+        """Whether nothing of the own log is missing that others may have heard."""
+        if self._folder is None:
+            return True
+        if not self._intact.exists():
+            return False
+        held, rescued = Reached(len(self.records(log)), self.term_counter()), self._records.rescued
+        reached = self._intact.reached(str(log))
+        if self._records.was_damaged:
+            return held == reached and rescued is not None and rescued.is_small_whole
+        if reached is None or (held.records >= reached.records and held.term_counter >= reached.term_counter):
+            return True
+        logger.warning(
+            "%s: holds %d records of %s, and held %d: it went back in time; the robot begins a new log",
+            self._folder,
+            held.records,
+            log,
+            reached.records,
+        )
+        return False
+
+    def _reach(self, reached: Reached) -> None:
+        """Note how far the own log came, unless the disk failed and it must not be continued."""
+        self._reached = reached
+        if self._records.failure is None and self._intact_is_kept:
+            self._intact.write(str(self.identity.log), reached)
 
     def _forget_latents(self) -> None:
         self._latent_bytes = 0
@@ -282,3 +326,11 @@ class Store:
 
     def _path(self, name: str) -> Path | None:
         return self._folder / name if self._folder is not None else None
+
+
+def _keyframe(name: str) -> KeyframeId | None:
+    """The keyframe of a latent's entry; None where the entry is damaged."""
+    try:
+        return KeyframeId.parse(name)
+    except ValueError:
+        return None

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
+EXIT_TRY_AGAIN = 75
+"""An agent's disk or machine was at its end: systemd starts it again, which it does not after bad input."""
 
 
 PROGRESS_LINE_PERIOD_S = 15.0

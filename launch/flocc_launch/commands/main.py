@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from flocc_launch.commands.common import EXIT_BAD_INPUT, progress_bar, show_report
+from flocc_launch.commands.common import EXIT_BAD_INPUT, EXIT_TRY_AGAIN, progress_bar, show_report
 from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
 from flocc_launch.commands.offline import add_offline, run_campaign
 from flocc_launch.commands.tools import add_tools
-from flocc_launch.setup.world_faults import sentence_of, speak_utf8
+from flocc_launch.setup.world_faults import may_pass, sentence_of, speak_utf8
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -76,10 +76,10 @@ def main() -> None:
         fail(sentence)
 
 
-def fail(sentence: str) -> NoReturn:
+def fail(sentence: str, code: int = EXIT_BAD_INPUT) -> NoReturn:
     """Print an error and leave."""
     typer.echo(f"error: {sentence}", err=True)
-    sys.exit(EXIT_BAD_INPUT)
+    sys.exit(code)
 
 
 @app.command(short_help="Robots in a generated town, real zenoh: one map, one report.")
@@ -184,7 +184,12 @@ def agent(
     if bandwidth is not None:
         given["bandwidth_bytes_s"] = 1000.0 * bandwidth
     read = AgentConfig.read(config, changes or ()).model_copy(update=given)
-    asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
+    try:
+        asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
+    except Exception as error:
+        if not may_pass(error):
+            raise
+        fail(str(sentence_of(error)), EXIT_TRY_AGAIN)
 
 
 @app.command(short_help="Compute a run's report anew: errors, closures, bytes, leaders.")

@@ -25,6 +25,8 @@ from flocc_launch.report.model import (
 )
 from flocc_launch.runs.ground_truth import frame_sentences, in_separate_frames, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.moments import mean_errors, moments_of
+from flocc_launch.runs.right_closures import judged_closures, mean_f1
 from flocc_launch.runs.timeline import (
     corrections_of,
     deaths_unasked,
@@ -52,7 +54,8 @@ def build(loaded: LoadedRun) -> RunReport:
     run, tracks = loaded.run, loaded.tracks
     frames = frames_of(tracks)
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
-    by_robot = bytes_by_robot(loaded)
+    by_robot, moments = bytes_by_robot(loaded), moments_of(loaded.events, tracks)
+    during = mean_errors(moments, tracks)
     apart = in_separate_frames(tracks)
     living = survivors(tracks, [robot.robot for robot in robots if robot.end == "died"])
     report = RunReport(
@@ -75,6 +78,11 @@ def build(loaded: LoadedRun) -> RunReport:
         ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames if not apart},
         ate_m={robot.robot: robot.corrected.ate_m for robot in robots},
         ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
+        iate_m=None if during is None else during.corrected_m,
+        iate_odometry_m=None if during is None else during.odometry_m,
+        iate_moments=0 if during is None else during.moments,
+        if1=mean_f1(moments, judged_closures(loaded)),
+        odometry_scale=dict.fromkeys(loaded.robots),
         bytes=total_bytes(by_robot),
         bytes_by_robot=by_robot,
         links=links_of(loaded.events),

@@ -175,6 +175,18 @@ class RunReport(Record):
     """Robot -> ATE of its corrected trajectory after its own SE(3) alignment."""
     ate_odometry_m: dict[str, float | None]
     """Robot -> the same of its odometry."""
+    iate_m: float | None = None
+    """Joint ATE of what was believed during the run, the mean over all rounds that found one joint map."""
+    iate_odometry_m: float | None = None
+    """The same, over the same moments, of odometry that starts at its true first poses."""
+    iate_moments: int = 0
+    """Rounds over which both are averaged."""
+    if1: float | None = None
+    """F1 of the closures kept against those that agree with ground truth, the mean over all rounds."""
+    odometry_scale: dict[str, float | None] = Field(default_factory=dict)
+    """Robot -> scale of its odometry; null where nobody estimated it."""
+    maps_used: list[str] = Field(default_factory=list)
+    """Maps of earlier runs that this one began with; this version begins every run without one."""
     bytes: dict[str, int]
     """Kind -> bytes sent by all robots."""
     bytes_by_robot: dict[str, RobotBytes]

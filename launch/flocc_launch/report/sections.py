@@ -38,6 +38,7 @@ def tiles(report: RunReport) -> str:
         (seconds(report.merged_after_s), "until one map" if report.merged_after_s else "not merged into one map"),
         ate_tile(report),
         (count_of(report.closures.accepted_inter_robot), "closures between robots accepted"),
+        (number(report.iate_m, "m"), f"mean ATE during the run; F1 of closures {number(report.if1)}"),
         (count_of(report.closures.rejected), "candidates rejected"),
         (size_of(sum(report.bytes.values())) if report.bytes else "–", "sent by all robots"),
         (seconds(report.duration_s), duration_text(report)),
@@ -173,11 +174,13 @@ def errors_part(report: RunReport, errors: str) -> str:
             ]
         )
     rows.append(["all, jointly", number(report.ate_joint_odometry_m), number(report.ate_joint_m), "", ""])
+    rows.append(["during the run", number(report.iate_odometry_m), number(report.iate_m), "", ""])
     heads = ["", "ATE before#", "after, m#", "RPE before#", "after, m#"]
     note = (
         "Per robot: each trajectory aligned on its own. Jointly: odometry stands at its true first poses "
         f"({number(report.ate_joint_odometry_aligned_m, 'm')} after one alignment for all), the corrected "
-        "trajectories after one alignment for all robots together."
+        "trajectories after one alignment for all robots together. During the run: the joint error of what was "
+        f"believed after each of the {count_of(report.iate_moments)} rounds that found one map, on average."
     )
     left = element(
         "figure",
@@ -185,7 +188,7 @@ def errors_part(report: RunReport, errors: str) -> str:
         errors,
         element("figcaption", "Dashed: odometry from its true start. Solid: corrected."),
     )
-    right = element("div", element("h3", "Translation error, RMSE"), table(heads, rows, sums=1), noted(note))
+    right = element("div", element("h3", "Translation error, RMSE"), table(heads, rows, sums=2), noted(note))
     return element("div", left, right, class_="pair")
 
 

@@ -21,6 +21,8 @@ def sentences(report: RunReport) -> list[str]:
         f"robots), {count_of(closures.rejected)} rejected of {count_of(closures.candidates)} candidates",
         f"joint ATE     {number(report.ate_joint_m, 'm')}{of_the_dead(report)}; odometry at its true starts "
         f"{number(report.ate_joint_odometry_m, 'm')}, aligned {number(report.ate_joint_odometry_aligned_m, 'm')}",
+        f"during it     ATE {number(report.iate_m, 'm')}; odometry {number(report.iate_odometry_m, 'm')} "
+        f"(mean of {count_of(report.iate_moments)} rounds in one map); F1 of closures {number(report.if1)}",
         f"sent          {size_of(bytes_sent) if report.bytes else '–'}"
         + "".join(f", {kind} {size_of(n)}" for kind, n in sorted(report.bytes.items(), key=lambda item: -item[1])),
         f"leaders       {', '.join(f'{span.leader} (term {span.term})' for span in report.leaders) or 'none'}",

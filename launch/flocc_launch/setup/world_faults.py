@@ -18,6 +18,9 @@ ADVICE = {
     errno.ENFILE: "too many files are open on this machine",
 }
 
+PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE, errno.ENOMEM}
+"""What may be over by itself, or after somebody made room."""
+
 
 def speak_utf8() -> None:
     """See that names and messages are UTF-8 whatever the locale says; where it is not, Python is started anew."""
@@ -28,6 +31,11 @@ def speak_utf8() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def may_pass(error: BaseException) -> bool:
+    """Whether the same command may succeed later: the disk or the machine was at its end, not the input wrong."""
+    return isinstance(error, sqlite3.Error) or (isinstance(error, OSError) and error.errno in PASSING)
 
 
 def sentence_of(error: BaseException) -> str | None:
@@ -41,7 +49,7 @@ def sentence_of(error: BaseException) -> str | None:
         return _os_sentence(error)
     if isinstance(error, UnicodeError):
         return f"a text cannot be read or written: {error}"
-    if isinstance(error, sqlite3.OperationalError):
+    if isinstance(error, sqlite3.Error):
         return f"a store cannot be used: {error}"
     return None
 

@@ -6,18 +6,21 @@ orders (`{"stop": true}`, `{"radio": {...}}`) on standard input.
 
 import argparse
 import asyncio
+import errno
 import json
 import logging
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import AgentConfig, RadioConfig, validated
-from flocc_agent.core.reports import Fact
+from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped
 from flocc_agent.runtime.robot_result import RobotResult
@@ -25,39 +28,63 @@ from flocc_agent.runtime.status import AgentStatus
 from flocc_launch.setup.world_faults import sentence_of
 
 if TYPE_CHECKING:
+    from flocc_agent.agent import Agent
     from flocc_launch.dashboard.own import AgentSource
 
 logger = logging.getLogger(__name__)
 
 STATUS_PERIOD_S = 0.5
+RETRY_S = 5.0
+"""A disk that took no event is tried again so often."""
 EXIT_BAD_INPUT = 2
 
 
 class Lines:
-    """The agent's own `events.jsonl`, flushed line by line so that a kill loses nothing that was reported.
+    """The agent's own `events.jsonl`, written line by line so that a kill loses nothing that was reported.
 
-    A disk that fails ends the file, not the robot: it goes on, as it does without its store.
+    A disk that fails costs lines, not the robot. It is said once; every `RETRY_S` the file is tried again.
     """
 
-    def __init__(self, path: Path | None) -> None:
-        self._file: TextIO | None = None
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a", encoding="utf-8")
+    def __init__(self, path: Path | None, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._path = path
+        self._clock_s = clock_s
+        self._file: FileIO | None = None
+        self._lost = 0
+        self._retry_s = float("-inf")
 
     def write(self, event: Reported[Fact]) -> None:
-        """Append one event."""
-        if self._file is None:
+        """Append one event, or count it as lost."""
+        if self._path is None:
+            return
+        if self._file is None and self._clock_s() < self._retry_s:
+            self._lost += 1
             return
         try:
-            self._file.write(json.dumps(line_of(event), separators=(",", ":"), allow_nan=False) + "\n")
-            self._file.flush()
+            self._append(self._path, json.dumps(line_of(event), separators=(",", ":"), allow_nan=False))
         except OSError as error:
-            logger.error("%s: %s; events are no longer written", self._file.name, error.strerror or error)
+            if not self._lost:
+                logger.error("%s: %s; events are not written meanwhile", self._path, error.strerror or error)
+            self._lost += 1
+            self._retry_s = self._clock_s() + RETRY_S
             self.close()
+        else:
+            if self._lost:
+                logger.warning("%s: events are written again; %d were lost", self._path, self._lost)
+            self._lost = 0
+
+    def _append(self, path: Path, line: str) -> None:
+        """Write a line whole or not at all."""
+        if self._file is None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("ab", buffering=0)
+        data = line.encode() + b"\n"
+        written = self._file.write(data)
+        if written != len(data):
+            self._file.truncate(self._file.tell() - written)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def close(self) -> None:
-        """Close the file; what a full disk did not take is lost."""
+        """Close the file."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -96,30 +123,17 @@ async def _run(
     lines: Lines,
     source: "AgentSource | None",
 ) -> None:
-    from flocc_agent.agent import Agent
+    """Live; where the robot's own log turns out to be lost, live once more, with another log.
 
-    def on_report(event: Reported[Fact]) -> None:
-        lines.write(event)
-        if source is not None:
-            source.take(event)
-
-    agent = Agent(config, on_report=on_report, clock_s=lambda: time.monotonic() - epoch_s)
-    loop = asyncio.get_running_loop()
-    for number in ending_signals():
-        loop.add_signal_handler(number, agent.stop)
-    background: list[asyncio.Task[None]] = []
+    Once at most, since without keys anybody can end a log; and not under a launcher, which expects one life.
+    """
+    life = _Life(config, epoch_s, lines, source)
     try:
-        async with agent:
-            if source is not None:
-                source.attach(agent)
-            background = [asyncio.create_task(_tell(agent, on_status))]
-            if orders is not None:
-                background.append(asyncio.create_task(_obey(agent, orders)))
-            await agent.finished()
+        await life.live(on_status, orders)
+        if life.log_ended and not life.stopped and orders is None:
+            logger.warning("%s: begins anew, with another log", config.name)
+            await life.live(on_status, orders)
     finally:
-        for task in background:
-            task.cancel()
-        _write_result(config.folder, agent.result())
         lines.write(Reported(time.monotonic() - epoch_s, config.name, AgentStopped()))
         lines.close()
 
@@ -128,6 +142,63 @@ def ending_signals() -> list[signal.Signals]:
     """Signals that end a run in order: also that of a closed terminal, unless `nohup` has it ignored."""
     ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
+
+
+class _Life:
+    """One agent from its start to its end.
+
+    Attributes:
+        log_ended: Others hold records of this robot's log that it did not write.
+        stopped: A signal ended it.
+    """
+
+    def __init__(self, config: AgentConfig, epoch_s: float, lines: Lines, source: "AgentSource | None") -> None:
+        self.log_ended = self.stopped = False
+        self._config = config
+        self._epoch_s = epoch_s
+        self._lines = lines
+        self._source = source
+        self._agent: Agent | None = None
+
+    async def live(self, on_status: Callable[[AgentStatus], None], orders: asyncio.StreamReader | None) -> None:
+        """Run an agent until it is told to stop, or its log ended."""
+        from flocc_agent.agent import Agent
+
+        may_renew = orders is None and not self.log_ended
+        on_report = self._ends_with_its_log if may_renew else self._report
+        agent = Agent(self._config, on_report=on_report, clock_s=lambda: time.monotonic() - self._epoch_s)
+        self._agent = agent
+        for number in ending_signals():
+            asyncio.get_running_loop().add_signal_handler(number, self._stop)
+        background: list[asyncio.Task[None]] = []
+        try:
+            async with agent:
+                if self._source is not None:
+                    self._source.attach(agent)
+                background = [asyncio.create_task(_tell(agent, on_status))]
+                if orders is not None:
+                    background.append(asyncio.create_task(_obey(agent, orders)))
+                await agent.finished()
+        finally:
+            for task in background:
+                task.cancel()
+            _keep_result(self._config, agent.result())
+
+    def _stop(self) -> None:
+        self.stopped = True
+        if self._agent is not None:
+            self._agent.stop()
+
+    def _report(self, event: Reported[Fact]) -> None:
+        self._lines.write(event)
+        if self._source is not None:
+            self._source.take(event)
+
+    def _ends_with_its_log(self, event: Reported[Fact]) -> None:
+        self._report(event)
+        if self._agent is not None and isinstance(event.fact, LogForked) and event.fact.log == self._agent.log:
+            self.log_ended = True
+            self._agent.stop()
 
 
 @contextmanager
@@ -156,6 +227,14 @@ def recover_result(config: AgentConfig) -> None:
 
     if config.folder is not None and (config.folder / "store").exists():
         _write_result(config.folder, stored_result(config))
+
+
+def _keep_result(config: AgentConfig, result: RobotResult | None) -> None:
+    """Write the result, unless the disk does not take it."""
+    try:
+        _write_result(config.folder, result)
+    except OSError as error:
+        logger.error("%s: the result is not written: %s", config.name, error.strerror or error)
 
 
 def _write_result(folder: Path | None, result: RobotResult | None) -> None:

@@ -5,19 +5,28 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import LISTED_MAX, Corrections
+from flocc_agent.core.corrections import KNOTS_MAX, LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
+from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.parameters import GossipParameters
+from flocc_agent.core.gossip import LIVES_MAX
+from flocc_agent.core.parameters import CoreParameters, GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.robot import Restored, Robot
 from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
-from flocc_protocol.messages import CorrectionBatch, CorrectionRequest, CorrectionVersion, Envelope, LogCorrection
+from flocc_protocol.messages import (
+    CorrectionBatch,
+    CorrectionRequest,
+    CorrectionVersion,
+    Envelope,
+    Heartbeat,
+    LogCorrection,
+)
 from flocc_protocol.records import SIGNATURE_BYTES
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
@@ -150,6 +159,14 @@ def test_a_jump_in_whose_middle_the_robot_died_is_told_after_the_restart() -> No
     assert delivered(again.on_message("r2", correction(Term(1, R2), 4))) == [(1, 4, False)]
 
 
+def test_corrections_of_many_logs_of_one_robot_leave_room_for_others() -> None:
+    machine = corrections()
+    for life in range(2 * GossipParameters().logs_max):
+        machine.on_message("r9", correction(Term(1, R2), 1, log=LogId("r9", life)))
+    assert machine.sizes()["corrections"][0] == LIVES_MAX
+    assert delivered(machine.on_message("r2", correction(Term(1, R2), 1))) == [(1, 1, False)]
+
+
 def test_a_relay_cannot_forge_a_correction() -> None:
     machine = Corrections(R1, GossipParameters(), Seals("r1"))
     genuine = replace(correction(Term(1, R2), 1), signature=Seals("r2").sign_correction(b""))
@@ -173,6 +190,24 @@ def test_a_correction_of_an_absurd_term_is_refused() -> None:
     robots.put("r1", MessageReceived(Envelope(R2, CorrectionBatch((hostile,)))))
     assert robots.effects("r1", Deliver) == []
     assert len(robots.facts("r1", PeerRefused)) == 1
+
+
+def test_a_forged_correction_raises_no_counter() -> None:
+    robot = Robot(R1, 0, 1, CoreParameters(), 0.0, sealer=Seals("r1"))
+    forged = replace(correction(Term(900, R2), 1), signature=Seals("r3").sign_correction(b""))
+    robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((forged,)))), 0.1)
+    assert robot.election.counter_max == 0
+    genuine = replace(forged, signature=Seals("r2").sign_correction(b""))
+    effects = robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((genuine,)))), 0.2)
+    assert robot.election.counter_max == 900
+    assert delivered(effects) == [(900, 1, False)]
+
+
+def test_versions_that_nobody_holds_raise_no_counter() -> None:
+    robot = Robot(R1, 0, 1, CoreParameters(), 0.0)
+    lie = Heartbeat(1, 7, 0, None, 0, 0, (), (CorrectionVersion(R2, Term(900, R2), 1),))
+    robot.handle(MessageReceived(Envelope(R2, lie)), 0.1)
+    assert robot.election.counter_max == 0
 
 
 def test_a_lost_correction_is_repaired_by_heartbeats() -> None:
@@ -225,3 +260,36 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
     assert set(robots.frames().values()) == {"map/r1"}
     changes = [fact.map_frame for fact in robots.facts("r4", CorrectionApplied) if fact.frame_changed]
     assert changes == ["map/r1"]
+
+
+def test_people_are_told_some_keyframes_of_a_correction_and_the_last_one() -> None:
+    long = np.array([pose7(pose(np.eye(3), np.array([k, 0.0, 0.0]))) for k in range(40)])
+    message = LogCorrection(R1, Term(1, R2), 1, R2, pose7(np.eye(4)), None, 2, 3, Array.of(long, "f4"))
+    (told,) = (e.fact for e in corrections().on_message("r2", message) if isinstance(e, Report))
+    assert isinstance(told, CorrectionApplied)
+    assert told.knots == tuple(2 + 3 * k for k in range(0, 40, 3))
+    assert len(told.knots) <= KNOTS_MAX
+    assert told.knots[-1] == 2 + 3 * 39
+    assert [T[0] for T in told.T_map_body] == list(range(0, 40, 3))
+    empty = LogCorrection(R1, Term(2, R2), 1, R2, pose7(np.eye(4)), None, 0, 1, Array.of(np.zeros((0, 7)), "f4"))
+    (told,) = (e.fact for e in corrections().on_message("r2", empty) if isinstance(e, Report))
+    assert isinstance(told, CorrectionApplied)
+    assert (told.knots, told.T_map_body) == ((), ())
+
+
+def test_a_newcomer_that_believed_a_false_correction_is_won_back() -> None:
+    robots = Robots()
+    for name in ("r1", "r2", "r3"):
+        if name == "r3":
+            robots.run(4.0)
+        robots.add(name)
+        for k in range(3):
+            robots.capture(name, float(k), look=k)
+    liar = LogId("r9")
+    lie = correction(Term(FIRST_COUNTER_MAX, liar), 1, log=R3)
+    robots.put("r3", MessageReceived(Envelope(liar, CorrectionBatch((lie,)))))
+    robots.run(80.0)
+    assert robots.frames() == {"r1": "map/r1", "r2": "map/r1", "r3": "map/r1"}
+    applied = robots.cores["r3"].corrections.applied
+    assert applied is not None
+    assert applied.term == Term(FIRST_COUNTER_MAX + 1, R1)

@@ -1,17 +1,19 @@
 """Bully election with terms, over several hops."""
 
 import random
+from dataclasses import replace
 
 import pytest
 from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
 from flocc_agent.core.election import ANSWER_TIMEOUT_S, COUNTER_JUMP_MAX, TRANSITIONS, LeaderElection, Role, Turn
-from flocc_agent.core.events import Leaving
+from flocc_agent.core.events import Leaving, MessageReceived
 from flocc_agent.core.parameters import CoreParameters, ElectionParameters
+from flocc_agent.core.reports import PeerRefused
 from flocc_agent.core.robot import Restored
-from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import Answer, Coordinator, Election, Handover, Heartbeat, LeaderAdvert
+from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
+from flocc_protocol.messages import Answer, Coordinator, Election, Envelope, Handover, Heartbeat, LeaderAdvert
 
 R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
@@ -163,10 +165,22 @@ def test_an_answer_makes_a_robot_wait_and_ask_again() -> None:
     assert machine.tick(3.6) == [Unicast("r1", Election(0))]
 
 
-def test_a_claim_is_above_every_counter_heard_of() -> None:
+def leads(log: LogId, counter: int, beat: int = 1) -> Heartbeat:
+    """What a leader says of itself."""
+    return heartbeat(LeaderAdvert(Term(counter, log), 0, beat, hops=0), counter)
+
+
+def test_a_claim_is_above_every_counter_that_is_used() -> None:
+    machine = election(R1)
+    machine.on_heartbeat(R2, leads(R2, 41), 0.0)
+    assert claims(machine.tick(1.5)) == [Term(42, R1)]
+
+
+def test_what_a_robot_says_of_others_counters_changes_nothing() -> None:
     machine = election(R1)
     machine.on_heartbeat(R2, heartbeat(None, counter=41), 0.0)
-    assert claims(machine.tick(1.5)) == [Term(42, R1)]
+    machine.on_heartbeat(R2, heartbeat(LeaderAdvert(Term(77, R3), 0, 1, hops=0), 77), 0.1)
+    assert claims(machine.tick(1.5)) == [Term(1, R1)]
 
 
 def test_a_claim_is_persisted_before_it_is_announced() -> None:
@@ -180,10 +194,10 @@ def test_a_restarted_leader_claims_a_counter_above_its_last() -> None:
     assert claims(machine.tick(1.5)) == [Term(8, R1)]
 
 
-def test_a_leader_claims_anew_when_it_hears_of_a_higher_counter() -> None:
+def test_a_leader_claims_anew_when_another_leads_with_a_higher_counter() -> None:
     machine = election(R1)
     machine.tick(1.5)
-    assert claims(machine.on_heartbeat(R2, heartbeat(None, counter=9), 2.0)) == [Term(10, R1)]
+    assert claims(machine.on_heartbeat(R2, leads(R2, 9), 2.0)) == [Term(10, R1)]
 
 
 def test_a_leader_claims_anew_when_others_applied_an_equal_counter_of_another() -> None:
@@ -202,11 +216,43 @@ def test_nobody_claims_a_term_for_another() -> None:
     assert machine.term is None
 
 
-def test_an_absurd_counter_is_refused() -> None:
+@pytest.mark.parametrize("message", [leads(R2, TERM_COUNTER_MAX), Coordinator(LeaderAdvert(Term(2**40, R2), 0, 1, 0))])
+def test_one_claim_raises_the_counter_by_so_much_at_most(message: Heartbeat | Coordinator) -> None:
+    machine = election(R1, counter=5)
+    hear = machine.on_heartbeat if isinstance(message, Heartbeat) else machine.on_coordinator
+    told = hear(R2, message, 0.0)  # type: ignore[arg-type]
+    assert [effect.fact for effect in told if isinstance(effect, Report)] == [
+        PeerRefused(peer="r2", reason="a term counter far above all others")
+    ]
+    assert machine.counter_max == 5 + COUNTER_JUMP_MAX
+
+
+def test_a_robot_without_history_takes_the_counter_as_it_is() -> None:
     machine = election(R1)
-    refused = machine.on_heartbeat(R2, heartbeat(None, counter=COUNTER_JUMP_MAX + 1), 0.0)
-    assert [type(effect) for effect in refused] == [Report]
-    assert machine.counter_max == 0
+    assert Report not in map(type, machine.on_heartbeat(R2, leads(R2, 60_000), 0.0))
+    assert claims(machine.tick(1.5)) == [Term(60_001, R1)]
+
+
+def test_a_robot_that_was_away_for_many_terms_learns_of_them_step_by_step() -> None:
+    machine = election(R1, counter=5)
+    for beat in range(4):
+        machine.on_heartbeat(R2, leads(R2, 5 + 3 * COUNTER_JUMP_MAX, beat), 0.1 * beat)
+    assert machine.counter_max == 5 + 3 * COUNTER_JUMP_MAX
+    assert claims(machine.tick(1.5)) == [Term(6 + 3 * COUNTER_JUMP_MAX, R1)]
+
+
+def test_heartbeats_with_huge_counters_shut_nobody_out() -> None:
+    robots = Robots()
+    for name in ("r1", "r2"):
+        robots.add(name)
+    robots.run(4.0)
+    liar = LogId("r9")
+    for k in range(1, 4):
+        for name in ("r1", "r2"):
+            robots.put(name, MessageReceived(Envelope(liar, replace(heartbeat(counter=k * 1_000_000), sequence=k))))
+    robots.add("r3")
+    robots.run(6.0)
+    assert robots.leaders() == dict.fromkeys(("r1", "r2", "r3"), "1:r1")
 
 
 def test_no_leader_is_followed_beyond_the_greatest_number_of_hops() -> None:

@@ -6,7 +6,7 @@ from itertools import pairwise
 from tests.agent.core.virtual_time import Robots, keyframe
 
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
-from flocc_agent.core.gossip import Gossip
+from flocc_agent.core.gossip import LIVES_MAX, Gossip
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pulls import BACKOFF_MAX_S, REQUEST_PERIOD_S
 from flocc_agent.core.reports import Fact, LogForked, PeerRefused
@@ -177,6 +177,20 @@ def test_logs_beyond_the_maximum_are_refused_without_asking() -> None:
     digests = writer(R3, 4).digests()
     assert facts(reader.on_digests(R3, digests, 0.0)) == [PeerRefused]
     assert reader.on_digests(R3, digests, 1.0) == []
+
+
+def test_many_logs_of_one_robot_leave_room_for_others() -> None:
+    reader, liar = Gossip(R1, PARAMETERS), LogId("r9")
+    told: list[type[Fact]] = []
+    for life in range(PARAMETERS.logs_max):
+        log = LogId("r9", life)
+        told += facts(reader.on_records(liar, batch(writer(log, 1), log, 0), 0.0)[1])
+    assert len(reader.logs) == 1 + LIVES_MAX
+    assert told == [PeerRefused]
+    late = writer(R2, 3)
+    assert requests(reader.on_digests(R2, late.digests(), 1.0)) == [("r2", 0)]
+    reader.on_records(R2, batch(late, R2, 0), 1.0)
+    assert len(reader.logs[R2]) == 3
 
 
 def test_claims_of_what_nobody_has_do_not_fill_the_memory() -> None:

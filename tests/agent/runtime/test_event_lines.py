@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.effects import Report
-from flocc_agent.core.reports import KINDS, ClosureAccepted, KeyframeTaken, NeighbourUp, fact
+from flocc_agent.core.reports import KINDS, ClosureAccepted, CorrectionApplied, KeyframeTaken, NeighbourUp, fact
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import BadLine, Reported, UnknownFact, line_of, of_kind, reported_of
 from flocc_agent.runtime.reporting import Reporter
@@ -130,3 +130,15 @@ def test_the_driver_adds_what_the_core_cannot_know() -> None:
     probable = reporter.reported(accepted, 1.0).fact
     assert isinstance(probable, ClosureAccepted)
     assert probable.probability == 0.5
+
+
+def test_the_driver_turns_the_poses_of_a_correction_into_the_bodys_and_rounds_them() -> None:
+    T_body_camera = pose_from_tq(np.array([0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    told = CorrectionApplied(
+        term=1, round=2, map_frame="map/r1", T_map_odom=(0.0, 0, 0, 1.0, 0, 0, 0),
+        knots=(1, 4), T_map_body=((2.0, 0, 0, 1.0, 0, 0, 0), (3.00004, 1, 0, 0.0, 0, 0, 1.0)),
+    )  # fmt: skip
+    completed = Reporter("r1", T_body_camera, steepness=4.0).reported(told, 1.0)
+    assert isinstance(completed.fact, CorrectionApplied)
+    assert completed.fact.T_map_body == ((1.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (3.5, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    assert reported_of(json.dumps(line_of(completed))) == completed

@@ -178,6 +178,32 @@ def test_after_a_full_disk_no_number_is_used_twice(tmp_path: Path) -> None:
     assert again.records(OWN)[0] == StoredRecord(OWN, 0, b"on disk")
 
 
+def test_a_disk_that_has_room_again_takes_everything_and_the_log_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flocc_agent.runtime.database.RETRY_S", 0.0)
+    store = Store.open(tmp_path, "r1", CONFIG)
+    store.put_record(OWN, 0, bytes(1000))
+    store.put_latent(KeyframeId(OWN, 0), b"on disk")
+    fill_disk(store)
+    for number in range(1, 50):
+        store.put_record(OWN, number, bytes(1000))
+        store.put_latent(KeyframeId(OWN, number), bytes(10_000))
+    store.put_term_counter(7)
+    assert not (tmp_path / "intact").exists()
+    for each in (store._records, store._latents):
+        each._connections[-1].execute("PRAGMA max_page_count=1000000")
+    store.put_record(OWN, 50, bytes(1000))
+    store.put_latent(KeyframeId(OWN, 50), bytes(10_000))
+    assert store.failure is None
+    assert caplog.text.count("robot.sqlite: the disk works again") == 1
+    again = reopened(store, tmp_path)
+    assert (again.identity.log, again.identity.boots, again.term_counter()) == (OWN, 2, 7)
+    assert [record.number for record in again.records(OWN)] == list(range(51))
+    assert [keyframe.index for keyframe in again.latent_keyframes()] == list(range(51))
+    assert again.latent(KeyframeId(OWN, 49)) == bytes(10_000)
+
+
 def test_a_folder_that_cannot_be_made_means_memory(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     store = Store.open(tmp_path / "file" / "r1", "r1", CONFIG)

@@ -16,9 +16,10 @@ from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.robot import Robot
 from flocc_agent.perception.synthetic import pose_image
-from flocc_agent.runtime.database import LaterSchema
+from flocc_agent.runtime.database import VERSION_MARK, LaterSchema
 from flocc_agent.runtime.persistence import restore
-from flocc_agent.runtime.store import MIGRATIONS, Store
+from flocc_agent.runtime.record_tables import MIGRATIONS
+from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.stored_correction import correction_in, stored
 from flocc_protocol.codec import to_bytes
 from flocc_protocol.ids import LogId
@@ -99,9 +100,10 @@ def test_a_store_of_a_later_schema_is_left_alone_and_named(tmp_path: Path) -> No
     opened(path).close()
     with sqlite3.connect(path / "robot.sqlite") as connection:
         connection.execute(f"PRAGMA user_version={len(MIGRATIONS) + 1}")
+        connection.execute(f"PRAGMA application_id={VERSION_MARK + len(MIGRATIONS) + 1}")
     connection.close()
     before = (path / "robot.sqlite").read_bytes()
-    with pytest.raises(LaterSchema, match=r"robot.sqlite: is of schema 2, a later flocc's"):
+    with pytest.raises(LaterSchema, match=r"robot.sqlite: is of schema 3, a later flocc's"):
         opened(path)
     assert (path / "robot.sqlite").read_bytes() == before
 
