@@ -156,9 +156,9 @@ def test_a_page_on_a_port_in_use_is_one_sentence(
 
 
 @pytest.mark.swarm
-@pytest.mark.parametrize("command", ["doctor", "view"])
+@pytest.mark.parametrize(("command", "said"), [("doctor", "nobody is there: in 3 s no agent"), ("view", "no ")])
 def test_a_swarm_that_nobody_answers_for_is_one_sentence(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if command == "view":
         pytest.importorskip("rerun")
@@ -171,4 +171,4 @@ def test_a_swarm_that_nobody_answers_for_is_one_sentence(
     )
     save = ["--save", str(tmp_path / "run.rrd")] if command == "view" else []
     assert run(monkeypatch, command, "--config", str(config), *save) == 2
-    assert sentence(capsys).startswith("error: swarm nobody: no ")
+    assert sentence(capsys).startswith(f"error: swarm nobody: {said}")
