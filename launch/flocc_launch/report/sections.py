@@ -51,7 +51,8 @@ def duration_text(report: RunReport) -> str:
     """On which clock the run was that long."""
     if report.wall_s is None:
         return "run, virtual time" if report.driver == "simulate" else "run"
-    return f"run; {seconds(report.wall_s)} of wall time"
+    wall = seconds(report.wall_s)
+    return "run" if wall == seconds(report.duration_s) else f"run; {wall} of wall time"
 
 
 def ate_tile(report: RunReport) -> tuple[str, str]:
