@@ -144,7 +144,8 @@ def _split(
     """Solve each group that the closures left connect by itself."""
     screened = Screened(dict(kept.trajectories), {}, ())
     plain = config.model_copy(update={"pairwise_consistency": False})
-    parts = [_solve_group(logs, kept.left, screened, plain, initial, wanted) for logs in kept.groups]
+    left = kept.left
+    parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in kept.groups]
     closures = dict(kept.turned_away)
     for part in parts:
         closures.update(part.closures)

@@ -28,13 +28,13 @@ def with_direction(pose7: Numbers) -> Numbers:
     return pose7
 
 
-def checked_keyframe(text: str) -> str:
+def checked_keyframe_id(text: str) -> str:
     """Return the text of a keyframe identifier, or say that it is none."""
     KeyframeId.parse(text)
     return text
 
 
-Keyframe = Annotated[str, AfterValidator(checked_keyframe)]
+Keyframe = Annotated[str, AfterValidator(checked_keyframe_id)]
 """A keyframe as text, such as `r1/12`."""
 Pose7 = Annotated[list[float], Field(min_length=7, max_length=7), AfterValidator(with_direction)]
 """Seven finite numbers: translation x y z in metres, quaternion w x y z."""

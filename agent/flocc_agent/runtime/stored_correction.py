@@ -4,17 +4,14 @@ A message is understood by one protocol version; a store is opened by many. So w
 its form, and a later form keeps a reader for the earlier ones (docs/compatibility.md).
 """
 
-from dataclasses import replace
 from typing import Any
 
-from flocc_protocol.arrays import Array
 from flocc_protocol.codec import (
     ARRAY,
     COUNT,
     LOG_ID,
     POSE,
     TERM,
-    Pose7,
     blob,
     from_bytes,
     integer,
@@ -23,32 +20,14 @@ from flocc_protocol.codec import (
     to_bytes,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import MESSAGE_BYTES_MAX, LogCorrection
 from flocc_protocol.records import SIGNATURE_BYTES
 
 FORM = 1
 
 
-def _built(
-    log: LogId,
-    term: Term,
-    round: int,
-    anchor: LogId,
-    T_map_odom: Pose7,
-    covariance: Array | None,
-    first: int,
-    step: int,
-    T_map_camera: Array,
-    signature: bytes,
-) -> LogCorrection:
-    return replace(
-        LogCorrection(log, term, round, anchor, T_map_odom, covariance, first, step, T_map_camera), signature=signature
-    )
-
-
 _FIELDS = struct(
-    _built,
+    LogCorrection,
     log=LOG_ID,
     term=TERM,
     round=COUNT,

@@ -48,11 +48,6 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
-def videos_in(folder: Path) -> list[Path]:
-    """Video files in a folder."""
-    return sorted(file for file in folder.iterdir() if is_video(file))
-
-
 def read_head(path: Path) -> Video:
     """Read a video's head.
 
