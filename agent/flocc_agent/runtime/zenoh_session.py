@@ -15,6 +15,7 @@ from typing import Any
 import zenoh
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.linger import keep_lingers_off
 from flocc_agent.runtime.security import secure_settings
 from flocc_agent.runtime.transport import TransportError
 
@@ -27,7 +28,8 @@ RETRY_MAX_S = 1.0
 """Bulk links are idle most of the time, and each sends four signs of life per lease: with 30 robots that is as many
 messages as their heartbeats. Control links are never idle."""
 RUNTIME = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
-"""One thread for all that zenoh does on links: waking six for small messages costs a quarter more."""
+"""One thread for all that zenoh does on links: waking six for small messages costs a quarter more. Nothing may hold
+it up, hence `linger`."""
 
 
 class Plane(Enum):
@@ -91,6 +93,7 @@ def open_session(settings: dict[str, Any], whose: str) -> zenoh.Session:
     """
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)  # read when the process opens its first session
     zenoh.init_log_from_env_or("off")
+    keep_lingers_off()
     zenoh_config = zenoh.Config()
     for path, value in settings.items():
         try:
