@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported
@@ -90,7 +91,7 @@ def screenshots(run: Path, out: Path) -> list[Path]:
     if sheet is not None:
         drawn = closure.with_suffix(".png")
         shoot(f"{page.as_uri()}#{sheet[1]}", drawn, CLOSURE_PX)
-        cv2.imwrite(str(closure), cv2.imread(str(drawn)), [cv2.IMWRITE_JPEG_QUALITY, 80])
+        cv2.imwrite(str(closure), np.asarray(cv2.imread(str(drawn))), [cv2.IMWRITE_JPEG_QUALITY, 80])
         drawn.unlink()
     shoot_phone(page.as_uri(), phone)
     with Dashboard(folder, port=0) as served:
@@ -127,7 +128,8 @@ def shoot_split(run: Path, out: Path) -> Path:
 
 def split_s(events: Sequence[Reported[Fact]], robots: Sequence[str]) -> float | None:
     """End of the longest time in which not all robots were in one group of hearers; None where they always were."""
-    state, since_s, longest = SwarmState(robots), 0.0, (SPLIT_MIN_S, None)
+    state, since_s = SwarmState(robots), 0.0
+    longest: tuple[float, float | None] = SPLIT_MIN_S, None
     for event in events:
         before_s = state.t
         state.apply(event)
