@@ -201,7 +201,7 @@ class RclpyNode:
                     continue
                 self._seen.add(key)
                 fit, reason = qos_check_compatible(end.qos_profile, subscription.qos_profile)
-                misfit = "" if fit is not QoSCompatibility.ERROR else _misfit(end.qos_profile, subscription, reason)
+                misfit = "" if fit != QoSCompatibility.ERROR else _misfit(end.qos_profile, subscription, reason)
                 hashed = str(getattr(end, "topic_type_hash", ""))
                 node = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
                 known = hashed if hashed.startswith("RIHS01_") else topic.hash
