@@ -68,18 +68,11 @@ class Heartbeat:
 _ANY_DIGEST = struct(LogDigest, log=LOG_ID, count=COUNT, checksum=CHECKSUM)
 
 
-@lru_cache(maxsize=REPEATED_MAX, typed=True)
-def _digest(robot: Any, incarnation: Any, count: Any, checksum: Any) -> LogDigest:
+@lru_cache(maxsize=REPEATED_MAX)
+def _digest(raw: Any) -> LogDigest:
     """Heartbeats repeat most of what they say: the same digest comes back as the same object, checked once."""
-    return _ANY_DIGEST.unpack([[robot, incarnation], count, checksum])
-
-
-def _unpack_digest(value: Any) -> LogDigest:
-    try:
-        (robot, incarnation), count, checksum = value
-        return _digest(robot, incarnation, count, checksum)
-    except (TypeError, ValueError) as error:
-        raise DecodeError("expected a digest") from error
+    assert _ANY_DIGEST.build is not None
+    return _ANY_DIGEST.build(raw)
 
 
 def _pack_digest(value: LogDigest) -> LogDigest:
@@ -90,7 +83,7 @@ def _pack_digest(value: LogDigest) -> LogDigest:
     return value
 
 
-_DIGEST = Codec(_pack_digest, _unpack_digest)
+_DIGEST = Codec(_pack_digest, _ANY_DIGEST.wire, _digest)
 
 
 CODECS: Kinds = {

@@ -8,9 +8,11 @@ module that is named after what it says; a new one is listed in `Message`, and i
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from flocc_protocol import candidate_pairs, elections, heartbeats, log_corrections, record_batches, separators
 from flocc_protocol.candidate_pairs import OFFERS_MAX, CandidateOffer, CandidatePair
-from flocc_protocol.codec import LOG_ID, LOGS_MAX, MESSAGE_BYTES_MAX, Codec, from_bytes, to_bytes
+from flocc_protocol.codec import LOG_ID, LOGS_MAX, MESSAGE_BYTES_MAX, Codec, Reader, listed, packed
 from flocc_protocol.elections import (
     COMPUTE_CLASS_MAX,
     COUNTER_MAX,
@@ -134,7 +136,21 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     **separators.CODECS,
 }
 _KINDS: dict[type[Message], str] = {cls: kind for kind, (cls, _) in _CODECS.items()}
+_READERS = {kind: Reader(codec, MESSAGE_BYTES_MAX) for kind, (_, codec) in _CODECS.items()}
 MESSAGE_KINDS: tuple[str, ...] = tuple(_CODECS)
+
+
+def _envelope(raw: tuple[int, str, tuple[str, int], msgspec.Raw]) -> Envelope:
+    _, kind, sender, fields = raw
+    read = _READERS.get(kind)
+    if read is None or LOG_ID.build is None:
+        raise DecodeError("a message is of a known kind")
+    return Envelope(LOG_ID.build(sender), read(fields))
+
+
+_read: Reader[Envelope] = Reader(
+    Codec(packed, listed(int, str, LOG_ID.wire, msgspec.Raw), _envelope), MESSAGE_BYTES_MAX
+)
 
 
 def kind_of(message: Message) -> str:
@@ -153,7 +169,7 @@ def encode(envelope: Envelope) -> bytes:
         body = _CODECS[kind][1].pack(envelope.message)
     except DecodeError as error:
         raise ValueError(f"{kind}: {error}") from error
-    data = to_bytes([PROTOCOL_VERSION, kind, LOG_ID.pack(envelope.sender), body])
+    data = packed([PROTOCOL_VERSION, kind, LOG_ID.pack(envelope.sender), body])
     assert len(data) <= MESSAGE_BYTES_MAX, f"{kind} of {len(data)} bytes is larger than a message may be"
     return data
 
@@ -179,7 +195,4 @@ def decode(data: bytes) -> Envelope:
     version = version_of(data)
     if version != PROTOCOL_VERSION:
         raise UnknownVersion(f"protocol version {version}, this robot speaks {PROTOCOL_VERSION}")
-    value = from_bytes(data, MESSAGE_BYTES_MAX)
-    if type(value) is not list or len(value) != 4 or type(value[1]) is not str or value[1] not in _CODECS:
-        raise DecodeError("a message is version, kind, sender and fields")
-    return Envelope(LOG_ID.unpack(value[2]), _CODECS[value[1]][1].unpack(value[3]))
+    return _read(data)

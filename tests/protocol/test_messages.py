@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -70,6 +71,14 @@ def test_any_message_reads_back(sender: LogId, message: Message) -> None:
 @pytest.mark.parametrize("message", MESSAGES, ids=kind_of)
 def test_every_example_reads_back(message: Message) -> None:
     assert decode(encode(Envelope(BOB, message))) == Envelope(BOB, message)
+
+
+@pytest.mark.parametrize("envelope", ENVELOPES, ids=lambda envelope: kind_of(envelope.message))
+def test_plain_messagepack_reads_and_writes_the_same_bytes(envelope: Envelope) -> None:
+    data = encode(envelope)
+    read = msgpack.unpackb(data)
+    assert read[:3] == [PROTOCOL_VERSION, kind_of(envelope.message), list(envelope.sender)]
+    assert msgpack.packb(read) == data
 
 
 def test_there_is_an_example_of_every_kind() -> None:

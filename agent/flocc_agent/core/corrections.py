@@ -108,7 +108,7 @@ class Corrections:
     def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
         """Pass corrections on, so many that a request cannot call forth a flood."""
         held = [self._newest[log] for log in request.logs if log in self._newest]
-        return [Unicast(peer, batch) for batch in CorrectionBatch.packed(held)[:ANSWERS_MAX]]
+        return [Unicast(peer, batch) for batch in CorrectionBatch.batched(held)[:ANSWERS_MAX]]
 
     def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction that its leader made; apply it when it is this robot's."""
@@ -178,7 +178,7 @@ class Corrections:
                 message = self._signed(message)
                 published.append(message)
                 effects += self.on_message(self._own.robot, message)
-        return [*(Broadcast(batch) for batch in CorrectionBatch.packed(published)), *effects]
+        return [*(Broadcast(batch) for batch in CorrectionBatch.batched(published)), *effects]
 
     def _signed(self, message: LogCorrection) -> LogCorrection:
         if self._sealer is None:

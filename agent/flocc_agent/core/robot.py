@@ -160,7 +160,10 @@ class Robot:
         self.assembly = GraphAssembly()
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
-        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
+        listens_until_s = now + parameters.election.startup_s if restored.records else float("-inf")
+        self.closing = LoopClosing(
+            log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral, listens_until_s
+        )
         self.corrections = Corrections(log, parameters.gossip, sealer)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
