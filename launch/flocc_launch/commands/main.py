@@ -60,6 +60,7 @@ def options(
 
 
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
+ROS_ARGS = "All that follows goes to ROS 2: -p KEY:=VALUE, -r FROM:=TO, --params-file FILE."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
@@ -75,7 +76,7 @@ def main() -> None:
     """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
     speak_utf8()
     try:
-        app(prog_name="flocc")
+        app(with_ros_args(sys.argv[1:]), prog_name="flocc")
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -83,6 +84,17 @@ def main() -> None:
         if sentence is None:
             raise
         fail(sentence)
+
+
+def with_ros_args(words: list[str]) -> list[str]:
+    """Words of a command line with each one between `--ros-args` and its end (or `--`) as that option's value."""
+    if "--ros-args" not in words:
+        return words
+    at = words.index("--ros-args")
+    given, rest = words[at + 1 :], list[str]()
+    if "--" in given:
+        given, rest = given[: given.index("--")], given[given.index("--") + 1 :]
+    return [*words[:at], *rest, *(f"--ros-args={word}" for word in given)]
 
 
 def fail(sentence: str, code: int = EXIT_BAD_INPUT) -> NoReturn:
@@ -194,6 +206,7 @@ def agent(
         float | None, typer.Option(min=0.001, help="Budget of this robot, kilobytes per second.")
     ] = None,
     verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
+    ros_args: Annotated[list[str] | None, typer.Option("--ros-args", help=ROS_ARGS)] = None,
 ) -> None:
     """Run one robot's agent until it is stopped."""
     import asyncio
@@ -210,7 +223,7 @@ def agent(
         given["bandwidth_bytes_s"] = 1000.0 * bandwidth
     read = AgentConfig.read(config, changes or ()).model_copy(update=given)
     try:
-        asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
+        asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard, ros_args=ros_args or ()))
     except Exception as error:
         if not may_pass(error):
             raise
