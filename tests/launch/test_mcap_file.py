@@ -225,7 +225,7 @@ def test_what_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path: Pat
 
 def test_without_the_package_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, run: RunFolder) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(FoxgloveMissing, match=r"pip install 'flocc\[mcap\]'"):
+    with pytest.raises(FoxgloveMissing, match=r"pip install '\.\[mcap\]'"):
         write_mcap(run, run.path / "run.mcap")
 
 

@@ -216,11 +216,17 @@ def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
     json_out: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Write trajectories and errors as PNG and SVG.")] = False,
+    pictures: Annotated[
+        int | None, typer.Option(min=0, max=200, help="Pairs of keyframes that the report shows as pictures; else 24.")
+    ] = None,
 ) -> None:
     """Evaluate a run folder anew: ATE and RPE against ground truth, closures, bytes, leaders."""
     from flocc_launch.report.evaluate import evaluate as run_evaluation
 
-    typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
+    with progress_bar("matching pictures") as progress:
+        said = run_evaluation(run, evo, json_out, plot, pictures, progress)
+    typer.echo(said)
 
 
 def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":

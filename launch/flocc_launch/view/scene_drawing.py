@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.reports import CorrectionApplied, Fact, KeyframeTaken
+from flocc_agent.extras import to_install
 from flocc_agent.geometry import pose_from_tq, tq_from_pose
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied
@@ -61,7 +62,7 @@ def foxglove_module() -> Any:
         import foxglove.channels
         import foxglove.messages
     except ImportError as error:
-        raise FoxgloveMissing("MCAP and Foxglove need foxglove-sdk: pip install 'flocc[mcap]'") from error
+        raise FoxgloveMissing(f"MCAP and Foxglove need foxglove-sdk: {to_install('mcap')}") from error
     return foxglove
 
 

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
+from flocc_agent.extras import to_install
 from flocc_protocol.errors import FloccError
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -49,7 +50,7 @@ class MessageTypes:
             from rosbags.serde import SerdeError
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise Ros2Error("the ROS 2 side needs rosbags and xxhash: pip install 'flocc[ros2]'") from error
+            raise Ros2Error(f"the ROS 2 side needs rosbags and xxhash: {to_install('ros2')}") from error
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._broken = (SerdeError, struct.error, ValueError, IndexError, AssertionError, OverflowError, MemoryError)
 
