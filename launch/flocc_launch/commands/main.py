@@ -142,6 +142,8 @@ def launch(
     dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
     secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
+    mcap: Annotated[Path | None, typer.Option(help="The run as MCAP; run.mcap in --out where not given.")] = None,
+    foxglove: Annotated[str | None, typer.Option(help="Serve the run to Foxglove at [HOST:]PORT.")] = None,
     json_out: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -150,8 +152,12 @@ def launch(
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     changes |= {} if rate is None else {"rate": rate}
     changes |= _parsed(sets)
+    if mcap is not None or foxglove is not None:
+        from flocc_launch.view.scene_drawing import foxglove_module
+
+        foxglove_module()  # a missing package is said before the run, not after it
     speech = Speech(json_out, quiet, verbose)
-    _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics)
+    _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics, mcap, foxglove)
 
 
 @app.command(short_help="Run the same on virtual time: one process, repeatable.")
@@ -292,6 +298,8 @@ def _launch(
     secure: bool = False,
     dashboard: str | None = None,
     metrics: str | None = None,
+    mcap: Path | None = None,
+    foxglove: str | None = None,
 ) -> None:
     from rich.console import Console
 
@@ -302,9 +310,42 @@ def _launch(
     with progress_bar("preparing data") as progress:
         recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)
-    with LiveTable(console) as table, _dashboard(out, dashboard, table.show, speech) as show:
+    with (
+        LiveTable(console) as table,
+        _dashboard(out, dashboard, table.show, speech) as show,
+        _foxglove(out, foxglove, speech),
+    ):
         report = run(scenario, out, show, secure=secure, metrics=metrics)
+    _record(out, mcap)
     show_report(report, out, speech)
+
+
+def _record(out: Path, mcap: Path | None) -> None:
+    """Write the run as MCAP; without the package only where somebody asked for it."""
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+    from flocc_launch.view.scene_drawing import FoxgloveMissing
+
+    try:
+        write_mcap(RunFolder.open(out), mcap or out / MCAP_NAME)
+    except FoxgloveMissing:
+        if mcap is not None:
+            raise
+
+
+@contextmanager
+def _foxglove(out: Path, where: str | None, speech: Speech) -> "Iterator[None]":
+    """Serve the run to Foxglove, where somebody wants it."""
+    if where is None:
+        yield
+        return
+    from flocc_launch.dashboard import address
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import foxglove_server
+
+    with foxglove_server(RunFolder(out), *address(where)) as url:
+        speech.tell(f"foxglove: {url}")
+        yield
 
 
 @contextmanager

@@ -23,7 +23,7 @@ CLOCK_YEAR_MIN = 2025
 REQUIRED = {"zenoh": "eclipse-zenoh", "gtsam": "gtsam", "cv2": "opencv-python-headless", "scipy": "scipy"}
 OPTIONAL = {
     "rosbags": "bags", "cryptography": "secure", "rerun": "view", "torch": "mast3r", "prometheus_client": "metrics",
-    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval",
+    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval", "foxglove": "mcap",
 }  # fmt: skip
 
 
