@@ -71,6 +71,7 @@ def launch(
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
     metrics: str | None = None,
+    paths: dict[str, Path] | None = None,
 ) -> RunReport:
     """Run a scenario and write its run folder.
 
@@ -80,6 +81,7 @@ def launch(
         on_watch: Called four times a second.
         progress: Called while data is generated, with (done, all).
         secure: Make keys for this run, and let agents trust those who have them only.
+        paths: Recordings by robot, where they were made already.
         metrics: [HOST:]PORT of the first robot's metrics, by name; each further robot has the next port.
 
     Raises:
@@ -89,7 +91,7 @@ def launch(
     check_perception(scenario.perception)
     names = scenario.names()
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
-    paths = recordings(scenario, progress)
+    paths = recordings(scenario, progress) if paths is None else paths
     check_measurable(scenario, paths)
     folder = fresh_folder(out)
     return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure, served).run())
