@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +38,19 @@ STATUS_PERIOD_S = 0.5
 RETRY_S = 5.0
 """A disk that took no event is tried again so often."""
 EXIT_BAD_INPUT = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """How an agent begins.
+
+    Attributes:
+        map_fixed: The map that it opens does not move.
+        new_journey: Its odometry began anew since it ran last.
+    """
+
+    map_fixed: bool = False
+    new_journey: bool = False
 
 
 class Lines:
@@ -97,6 +111,7 @@ async def run_agent(
     on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
+    beginning: Beginning | None = None,
 ) -> None:
     """Run one agent until it is told to stop, by a signal or an order.
 
@@ -106,13 +121,14 @@ async def run_agent(
         on_status: Takes a state, twice a second.
         orders: JSON lines from the launcher.
         dashboard: [HOST:]PORT of a page that shows this agent's own view of its swarm.
+        beginning: How it begins; None: as always.
 
     Raises:
         FloccError: The configuration, the recording or the network cannot be used.
     """
     lines = Lines(config.folder / "events.jsonl" if config.folder else None)
     with _page(config, dashboard, lambda: time.monotonic() - epoch_s) as source:
-        await _run(config, epoch_s, on_status, orders, lines, source)
+        await _run(config, epoch_s, on_status, orders, lines, source, beginning or Beginning())
 
 
 async def _run(
@@ -122,12 +138,13 @@ async def _run(
     orders: asyncio.StreamReader | None,
     lines: Lines,
     source: "AgentSource | None",
+    beginning: Beginning,
 ) -> None:
     """Live; where the robot's own log turns out to be lost, live once more, with another log.
 
     Once at most, since without keys anybody can end a log; and not under a launcher, which expects one life.
     """
-    life = _Life(config, epoch_s, lines, source)
+    life = _Life(config, epoch_s, lines, source, beginning)
     try:
         await life.live(on_status, orders)
         if life.log_ended and not life.stopped and orders is None:
@@ -152,12 +169,20 @@ class _Life:
         stopped: A signal ended it.
     """
 
-    def __init__(self, config: AgentConfig, epoch_s: float, lines: Lines, source: "AgentSource | None") -> None:
+    def __init__(
+        self,
+        config: AgentConfig,
+        epoch_s: float,
+        lines: Lines,
+        source: "AgentSource | None",
+        beginning: Beginning,
+    ) -> None:
         self.log_ended = self.stopped = False
         self._config = config
         self._epoch_s = epoch_s
         self._lines = lines
         self._source = source
+        self._beginning = beginning
         self._agent: Agent | None = None
 
     async def live(self, on_status: Callable[[AgentStatus], None], orders: asyncio.StreamReader | None) -> None:
@@ -166,7 +191,13 @@ class _Life:
 
         may_renew = orders is None and not self.log_ended
         on_report = self._ends_with_its_log if may_renew else self._report
-        agent = Agent(self._config, on_report=on_report, clock_s=lambda: time.monotonic() - self._epoch_s)
+        agent = Agent(
+            self._config,
+            on_report=on_report,
+            clock_s=lambda: time.monotonic() - self._epoch_s,
+            map_fixed=self._beginning.map_fixed,
+            new_journey=self._beginning.new_journey,
+        )
         self._agent = agent
         for number in ending_signals():
             asyncio.get_running_loop().add_signal_handler(number, self._stop)
@@ -276,8 +307,8 @@ def _print_status(status: AgentStatus) -> None:
     sys.stdout.flush()
 
 
-async def _run_launched(config: AgentConfig, epoch_s: float) -> None:
-    await run_agent(config, epoch_s, _print_status, await _standard_input())
+async def _run_launched(config: AgentConfig, epoch_s: float, beginning: Beginning) -> None:
+    await run_agent(config, epoch_s, _print_status, await _standard_input(), beginning=beginning)
 
 
 def main() -> None:
@@ -285,11 +316,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("config", type=Path)
     parser.add_argument("--epoch-s", type=float, required=True)
+    parser.add_argument("--map-fixed", action="store_true")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     try:
         config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
-        asyncio.run(_run_launched(config, arguments.epoch_s))
+        asyncio.run(_run_launched(config, arguments.epoch_s, Beginning(map_fixed=arguments.map_fixed)))
     except Exception as error:
         sentence = sentence_of(error)
         if sentence is None:
