@@ -39,13 +39,18 @@ types:
 contracts:
 	$(BIN)/lint-imports
 
-# Two workers share two cores; tests of a live swarm measure time, so they get the machine to themselves.
+# Two workers share two cores; tests of a live swarm measure time, so they get the machine to themselves. What fails
+# there is tried once more, since the machine itself may stall; both results are printed.
 tests:
 	@mkdir -p build; set -o pipefail; status=0; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -m "not swarm" | tee build/pytest.txt || status=1; \
-	$(BIN)/python -m pytest -q -m "swarm and not scenarios" | tee build/pytest-swarm.txt || status=1; \
+	rm -f build/pytest-swarm-again.txt; \
+	$(BIN)/python -m pytest -q -m "swarm and not scenarios" | tee build/pytest-swarm.txt \
+		|| $(BIN)/python -m pytest -q -m "swarm and not scenarios" --lf --lfnf none | tee build/pytest-swarm-again.txt \
+		|| status=1; \
 	echo "pytest:              $$(tail -n 1 build/pytest.txt)"; \
 	echo "pytest, live swarms: $$(tail -n 1 build/pytest-swarm.txt)"; \
+	[ ! -e build/pytest-swarm-again.txt ] || echo "second try of what failed: $$(tail -n 1 build/pytest-swarm-again.txt)"; \
 	exit $$status
 
 swarm-test: $(VENV)/.test

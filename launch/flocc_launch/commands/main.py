@@ -54,6 +54,7 @@ def options(
 
 FIXED_WHAT = "--map-fixed says of --map that it does not move; give --map FOLDER"
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
+ROS_ARGS = "All that follows goes to ROS 2: -p KEY:=VALUE, -r FROM:=TO, --params-file FILE."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
@@ -71,7 +72,7 @@ def main() -> None:
     """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
     speak_utf8()
     try:
-        app()
+        app(with_ros_args(sys.argv[1:]))
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -79,6 +80,17 @@ def main() -> None:
         if sentence is None:
             raise
         fail(sentence)
+
+
+def with_ros_args(words: list[str]) -> list[str]:
+    """Words of a command line with each one between `--ros-args` and its end (or `--`) as that option's value."""
+    if "--ros-args" not in words:
+        return words
+    at = words.index("--ros-args")
+    given, rest = words[at + 1 :], list[str]()
+    if "--" in given:
+        given, rest = given[: given.index("--")], given[given.index("--") + 1 :]
+    return [*words[:at], *rest, *(f"--ros-args={word}" for word in given)]
 
 
 def fail(sentence: str, code: int = EXIT_BAD_INPUT) -> NoReturn:
@@ -185,6 +197,7 @@ def agent(
         bool, typer.Option("--new-journey", help="The odometry began anew: another log of the same robot.")
     ] = False,
     verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
+    ros_args: Annotated[list[str] | None, typer.Option("--ros-args", help=ROS_ARGS)] = None,
 ) -> None:
     """Run one robot's agent until it is stopped."""
     import asyncio
@@ -205,7 +218,16 @@ def agent(
         fail(FIXED_WHAT)
     beginning = Beginning(map_fixed, new_journey)
     try:
-        asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard, beginning=beginning))
+        asyncio.run(
+            run_agent(
+                read,
+                time.monotonic(),
+                lambda _: None,
+                dashboard=dashboard,
+                beginning=beginning,
+                ros_args=ros_args or (),
+            )
+        )
     except Exception as error:
         if not may_pass(error):
             raise
@@ -217,11 +239,17 @@ def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
     json_out: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Write trajectories and errors as PNG and SVG.")] = False,
+    pictures: Annotated[
+        int | None, typer.Option(min=0, max=200, help="Pairs of keyframes that the report shows as pictures; else 24.")
+    ] = None,
 ) -> None:
     """Evaluate a run folder anew: ATE and RPE against ground truth, closures, bytes, leaders."""
     from flocc_launch.report.evaluate import evaluate as run_evaluation
 
-    typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
+    with progress_bar("matching pictures") as progress:
+        said = run_evaluation(run, evo, json_out, plot, pictures, progress)
+    typer.echo(said)
 
 
 def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
