@@ -19,6 +19,7 @@ from flocc_agent.runtime.measurement_file import rows_of
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.stages import counts_of
+from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
 from flocc_launch.runs.ground_truth import truth_path, write_truth
@@ -82,9 +83,11 @@ def swarm_of(scenario: Scenario, playbacks: Mapping[str, Playback], seed: int, c
     return swarm
 
 
-def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str, Playback]:
-    """What each robot of a scenario sees."""
-    drawn = walks(scenario.tracks) if scenario.tracks else []
+def playbacks_of(
+    scenario: Scenario, recordings: Mapping[str, Path], drift: DriftSpec | None = None
+) -> dict[str, Playback]:
+    """What each robot of a scenario sees; walks drift as given, or as usual."""
+    drawn = walks(scenario.tracks, drift) if scenario.tracks else []
     walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
     measured = sense(scenario.sensors, {name: walk.truth for name, walk in walked.items()}) if scenario.sensors else {}
     playbacks = {}
