@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.extras import to_install
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.robot_result import ClosureKnown
@@ -67,7 +68,7 @@ def rerun_module() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise ViewError("flocc view needs rerun: pip install 'flocc[view]'") from error
+        raise ViewError(f"flocc view needs rerun: {to_install('view')}") from error
     return rerun
 
 
