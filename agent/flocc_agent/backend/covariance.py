@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flocc_agent.backend.descent import Objective, Solved
-from flocc_agent.backend.edges import jacobians, residuals
+from flocc_agent.backend.edges import residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import Trajectory
@@ -52,8 +52,7 @@ def covariances_of(
 def keyframe_covariances(objective: Objective, solved: Solved, indices: Sequence[int]) -> list[Float]:
     """Marginal covariance (6, 6) of poses in their own tangent spaces; zero for the pose that does not move."""
     at = residuals(objective.edges, solved.state)
-    jac = jacobians(objective.edges, at)
-    return objective.linear.marginals(objective.edges, solved.state, at, jac, solved.weights, list(indices))
+    return objective.linear.marginals(objective.edges, solved.state, at, solved.weights, list(indices))
 
 
 def _usable(S: Float) -> Float | None:

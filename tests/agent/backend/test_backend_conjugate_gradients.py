@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from flocc_agent.backend import conjugate_gradients
+from flocc_agent.backend import conjugate_gradients, linear
 from flocc_agent.backend.conjugate_gradients import SEGMENT_POSES, segments_of
-from flocc_agent.backend.edges import Edges, State, jacobians, residuals, state_of
+from flocc_agent.backend.edges import Edges, State, residuals, state_of
 from flocc_agent.backend.initial import initial_poses
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
@@ -34,15 +34,14 @@ def problem_of(graph: GeneratedGraph, formulation: Formulation) -> tuple[Problem
 
 def steps(problem: Problem, state: State, weights: np.ndarray, hold: bool, damping: float) -> list[np.ndarray]:
     at = residuals(problem.edges, state, hold)
-    jac = jacobians(problem.edges, at)
     solvers = (LinearSolver(0, 20.0, iterative_loops_min=least) for least in (1, 10**9))
-    return [solver.step(problem.edges, state, at, jac, weights, damping) for solver in solvers]
+    return [solver.step(problem.edges, state, at, weights, damping) for solver in solvers]
 
 
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Iterate until nothing is left."""
-    monkeypatch.setattr(conjugate_gradients, "TOLERANCE_RATIO", 1e-9)
+    monkeypatch.setattr(linear, "TOLERANCE_RATIO", 1e-9)
     monkeypatch.setattr(conjugate_gradients, "ITERATIONS_LEAST", 400)
 
 
