@@ -125,7 +125,10 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Jacobians:
-    """Whitened derivatives of the residuals: `A_i`, `A_j` (E, 6, 6) and `a_scale` (E, 6) by the cluster's scale."""
+    """Whitened derivatives of the residuals: `A_i`, `A_j` (E, 6, 6) and `a_scale` (E, 6) by the cluster's scale.
+
+    Each matrix is column-major.
+    """
 
     A_i: Float
     A_j: Float
@@ -192,7 +195,7 @@ def jacobians(edges: Edges, at: Residuals) -> Jacobians:
     J[:, 3:, 3:6] = -R_hat_inverse
     J[:, :3, 6:9] = J_r
     J[:, 3:, 9:] = R_error
-    A = at.L @ J
+    A = np.swapaxes(np.swapaxes(J, 1, 2) @ np.swapaxes(at.L, 1, 2), 1, 2)
     return Jacobians(A[:, :, :6], A[:, :, 6:], scale_slopes(edges, at))
 
 

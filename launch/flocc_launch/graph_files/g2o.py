@@ -172,8 +172,8 @@ def _se2(words: list[str], isotropic: bool, planar: bool) -> Measurement:
     first, second, v = _numbers(words, SE2_NUMBERS)
     T = pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
     covariance = np.eye(6)
-    planar = np.ix_([3, 4, 2], [3, 4, 2])
-    covariance[planar] = _covariance(_symmetric(v[3:], 3))
+    in_plane = np.ix_([3, 4, 2], [3, 4, 2])
+    covariance[in_plane] = _covariance(_symmetric(v[3:], 3))
     return Measurement(first, second, T, isotropic_noise(covariance, planar) if isotropic else covariance)
 
 
