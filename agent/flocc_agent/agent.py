@@ -10,7 +10,7 @@ import os
 import signal
 import time
 import zlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +29,7 @@ from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
-from flocc_agent.runtime.facts import KilledByOrder
+from flocc_agent.runtime.facts import JourneyEnded, KilledByOrder
 from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
 from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.keyframes import KeyframeSelector
@@ -41,7 +41,7 @@ from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
-from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.robot_result import RobotResult, write_result
 from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
@@ -80,6 +80,7 @@ class Agent:
         on_report: Callable[[Reported[Fact]], None] | None = None,
         clock_s: Callable[[], float] | None = None,
         perception: Perception | None = None,
+        ros_args: Sequence[str] = (),
     ) -> None:
         """Prepare an agent; `async with` starts it.
 
@@ -90,6 +91,7 @@ class Agent:
             on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
             clock_s: Seconds since the start of the run; None counts from now.
             perception: What it sees with; None builds what `config.perception` names.
+            ros_args: What ROS 2 is started with: what stands behind `--ros-args` elsewhere.
 
         Raises:
             BadKeyframe: `T_body_camera` is no pose.
@@ -100,6 +102,7 @@ class Agent:
         self._on_report = on_report or (lambda _: None)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._perception = perception
+        self._ros_args = tuple(ros_args)
         self._recording = _recording(config)
         self._camera = self._recording.camera if self._recording else camera
         given = np.eye(4) if T_body_camera is None else _mounting(T_body_camera, config.name)
@@ -404,8 +407,27 @@ class Agent:
             lambda: self._started.corrected_bodies(),
             lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
             report,
+            self._save_result,
+            self._begin_anew,
         )
-        return Ros2Adapter(config, self.config.name, self._selector, host)
+        return Ros2Adapter(config, self.config.name, self._selector, host, self._ros_args)
+
+    def _save_result(self) -> str:
+        """Write what the robot knows now, and say where.
+
+        Raises:
+            OSError: There is no folder, or its disk does not take it.
+        """
+        if self.config.folder is None:
+            raise FileNotFoundError("the agent has no folder (the key 'folder'), so nothing was written")
+        return str(write_result(self.config.folder, self._started.result()).resolve())
+
+    def _begin_anew(self) -> None:
+        """End this journey: who runs the agent starts it again, and it begins another log."""
+        assert self._store is not None
+        self._store.end_log()
+        self._on_report(Reported(self._clock_s(), self.config.name, JourneyEnded()))
+        self.stop()
 
     def _on_position(self, position_m: Float) -> None:
         if self._radio is not None:

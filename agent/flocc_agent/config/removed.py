@@ -105,6 +105,8 @@ REMOVED: dict[str, str] = {
     "ros2.image_type": "a topic whose name ends with 'compressed' has CompressedImage messages, any other has Image",
     "ros2.tf_static_topic": "ros2.tf_topic and '_static'",
     "ros2.map_frame_topic": "always flocc/map_frame, in ros2.namespace",
+    "ros2.path_topic": "always flocc/path, in ros2.namespace; with rclpy, --ros-args -r flocc/path:=NAME",
+    "ros2.pose_topic": "always flocc/pose, in ros2.namespace; with rclpy, --ros-args -r flocc/pose:=NAME",
     "ros2.tf_period_s": "always 0.05",
     "ros2.path_period_s": "always 1.0",
     "ros2.odometry_gap_max_s": "always 0.5",

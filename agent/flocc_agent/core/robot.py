@@ -10,9 +10,10 @@ from typing import assert_never
 
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
+from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, DistributedOptimisation
-from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
+from flocc_agent.core.effects import Broadcast, Effect, Encode, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
     LATENT_UNKNOWN,
@@ -71,12 +72,14 @@ from flocc_protocol.messages import (
     Coordinator,
     CorrectionBatch,
     CorrectionRequest,
-    CorrectionVersion,
+    DigestRequest,
+    Digests,
     Election,
     Envelope,
     Handover,
     Heartbeat,
     LogCorrection,
+    LogDigest,
     RecordRequest,
     Records,
     Separators,
@@ -156,11 +159,15 @@ class Robot:
         self._waiting: dict[int, list[Measurement]] = {}
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
-        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.__contains__)
+        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
+        self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
         self.assembly = GraphAssembly()
         self.recognition = PlaceRecognition(log, parameters.place_recognition)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
-        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
+        listens_until_s = now + parameters.election.startup_s if restored.records else float("-inf")
+        self.closing = LoopClosing(
+            log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral, listens_until_s
+        )
         self.corrections = Corrections(log, parameters.gossip, sealer)
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
@@ -203,6 +210,7 @@ class Robot:
             "neighbours": neighbours,
             "measurements": (sum(map(len, self._waiting.values())), WAITING_MAX * max(len(self._pending), 1)),
             **self.gossip.sizes(),
+            **self.comparisons.sizes(),
             **self.closing.sizes(),
             **self.corrections.sizes(),
             **self.election.sizes(),
@@ -253,6 +261,10 @@ class Robot:
         match message:
             case Heartbeat():
                 return self._on_heartbeat(sender, message, now)
+            case Digests():
+                return self._on_digests(sender, message, now)
+            case DigestRequest():
+                return self._on_digest_request(sender, message, now)
             case Election():
                 return self.election.on_election(sender, now)
             case Answer():
@@ -286,8 +298,7 @@ class Robot:
         if not known:
             self._greet(heartbeat, now)
         effects += self.election.on_heartbeat(sender, heartbeat, now)
-        effects += self.gossip.on_digests(sender, heartbeat.digests, now)
-        effects += self._on_versions(sender, heartbeat.corrections, now)
+        effects += self._compare(sender, heartbeat, now)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else heartbeat.compute_class
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
         self.closing.on_wants(heartbeat.wants, now)
@@ -302,10 +313,28 @@ class Robot:
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
         return refused or self.corrections.take(message)
 
-    def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
-        """What others say they apply: whoever has something older asks for it, and a leader then outbids it."""
-        news = self.corrections.news(versions)
-        return self.corrections.on_versions(sender.robot, news, now) if news else []
+    def _compare(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
+        """Ask a neighbour for what it has more of, and for what changed in its tables where they are others."""
+        peer, digests, versions = sender.robot, self.gossip.state(), self.corrections.state()
+        own = (LogDigest(sender, heartbeat.records, heartbeat.checksum),) if heartbeat.records else ()
+        effects = self.gossip.on_digests(sender, own, now)
+        if heartbeat.versions.hash != versions.hash:
+            effects += self.corrections.ask(peer, now)
+        return effects + self.comparisons.on_heartbeat(peer, heartbeat, digests, versions, now)
+
+    def _on_digests(self, sender: LogId, message: Digests, now: float) -> list[Effect]:
+        """What others hold: whoever has less of a log or an older correction asks for it."""
+        helped = self.gossip.has_news(message.digests) or self.corrections.has_news(message.versions)
+        self.comparisons.on_digests(sender.robot, message, helped, now)
+        effects = self.gossip.on_digests(sender, message.digests, now, at_once=True)
+        return effects + self.corrections.on_versions(sender.robot, message.versions, now)
+
+    def _on_digest_request(self, sender: LogId, request: DigestRequest, now: float) -> list[Effect]:
+        if sender.robot not in self.neighbours or not self.comparisons.may_answer(sender.robot, now):
+            return []
+        digests = self.gossip.digests_since(request.digests_since)
+        versions = self.corrections.versions_since(request.versions_since)
+        return [Unicast(sender.robot, Digests(self._boot, *digests, *versions))]
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""
@@ -457,6 +486,7 @@ class Robot:
             self._heartbeat_due_s = now + period
         self._heartbeat_s = now
         self._sequence += 1
+        own = self.gossip.logs[self.log]
         return [
             Broadcast(
                 Heartbeat(
@@ -466,8 +496,10 @@ class Robot:
                     leader=self.election.advert(),
                     term_counter_max=self.election.counter_max,
                     load=self.closing.load,
-                    digests=self.gossip.announced(),
-                    corrections=self.corrections.announced(),
+                    records=len(own),
+                    checksum=own.checksums[-1],
+                    digests=self.gossip.state(),
+                    versions=self.corrections.state(),
                     wants=self.closing.wants(now),
                     holds=self.closing.holds(),
                     lost=self.closing.lost(now),
@@ -476,9 +508,7 @@ class Robot:
         ]
 
     def _greet(self, heartbeat: Heartbeat, now: float) -> None:
-        """Tell a new neighbour everything at once; where groups meet, a leader expects news."""
-        self.gossip.on_neighbour()
-        self.corrections.on_neighbour()
+        """Greet a new neighbour at once; where groups meet, a leader expects news."""
         term = self.election.term
         if term is None or heartbeat.leader is None or heartbeat.leader.term.leader != term.leader:
             self.rounds.hurry(now)
@@ -490,6 +520,7 @@ class Robot:
         for name in gone:
             self.election.on_lost(name)
             self.gossip.on_lost(name)
+            self.comparisons.on_lost(name)
             self.closing.on_lost(name, now)
         return [Report(NeighbourDown(peer=name)) for name in gone]
 

@@ -135,6 +135,7 @@ def write(
             recordings={name: str(path.resolve()) for name, path in given.items() if path is not None},
             radio=scenario.links().model_dump(mode="json", exclude_defaults=True),
             settings=scenario.settings(),
+            perception=scenario.perception.model_dump(mode="json"),
             expectations=scenario.expectations.limits(),
             duration_s=end_s,
         )

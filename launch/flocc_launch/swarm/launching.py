@@ -313,6 +313,7 @@ class _Launch:
             recordings={name: str(path.resolve()) for name, path in self._paths.items()},
             radio=json.loads(scenario.links().model_dump_json(), parse_constant=lambda _: None),
             settings=scenario.settings(),
+            perception=scenario.perception.model_dump(mode="json"),
             expectations=scenario.expectations.limits(),
             duration_s=wall_s,
             wall_s=wall_s,
