@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.context import Context
@@ -23,6 +24,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
 
 from flocc_agent.geometry import Float, pose_from_tq, tq_from_pose
 from flocc_agent.runtime.recording import Frame, Recording
@@ -156,6 +158,8 @@ class Listener:
             self._hear(Path, f"/{name}/flocc/path", LATCHED)
             self._hear(PoseWithCovarianceStamped, f"/{name}/flocc/pose", 10)
             self._hear(String, f"/{name}/flocc/map_frame", LATCHED)
+            self._hear(MarkerArray, f"/{name}/flocc/graph", LATCHED)
+        self._hear(DiagnosticArray, "/diagnostics", 10)
 
     def _hear(self, kind: Any, topic: str, qos: Any) -> None:
         self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
@@ -175,6 +179,16 @@ class Listener:
         """The swarm's name of its map, as it came last."""
         told = self.heard[f"/{name}/flocc/map_frame"]
         return told[-1].data if told else None
+
+    def markers(self, name: str) -> dict[tuple[str, int], Marker]:
+        """What an agent last drew, by namespace and number."""
+        return {(marker.ns, marker.id): marker for marker in self.heard[f"/{name}/flocc/graph"][-1].markers}
+
+    def status(self, name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
+        """What an agent last said of itself, and its values by key."""
+        told = [each for array in list(self.heard["/diagnostics"]) for each in array.status]
+        one = [each for each in told if each.hardware_id == name][-1]
+        return one, {value.key: value.value for value in one.values}
 
     def call(self, service: str, timeout_s: float = 10.0) -> Trigger.Response:
         """Call a Trigger service and wait for its answer."""
