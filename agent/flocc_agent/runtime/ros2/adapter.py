@@ -22,7 +22,7 @@ from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.given_keyframes import BadKeyframe
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.ros2.hearing import Hearing
+from flocc_agent.runtime.ros2.hearing import KINDS, Hearing
 from flocc_agent.runtime.ros2.markers import KnownClosure
 from flocc_agent.runtime.ros2.node import RosNode, open_node
 from flocc_agent.runtime.ros2.problems import Problems
@@ -123,7 +123,8 @@ class Ros2Adapter:
             Ros2Error: ROS does not start.
         """
         loop = asyncio.get_running_loop()
-        inbox = Inbox(loop, self._arrived, self._counter, INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
+        limits = (INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
+        inbox = Inbox(loop, self._arrived, self._counter, *limits, urgent_first=KINDS)
         try:
             node, hearing, teller = await asyncio.to_thread(self._open, inbox, loop)
             for note in node.notes:

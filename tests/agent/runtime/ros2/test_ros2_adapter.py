@@ -276,7 +276,7 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
         ("MP", "%r1%flocc%map_frame", ":1:,1:,:,:,,"),
         ("MP", "%r1%flocc%graph", ":1:,1:,:,:,,"),
         ("MP", "%diagnostics", "::,10:,:,:,,"),
-        ("MS", "%r1%odom", "::,50:,:,:,,"),
+        ("MS", "%r1%odom", "::,200:,:,:,,"),
         ("MS", "%r1%camera%image_raw", "2::,5:,:,:,,"),
         ("MS", "%r1%camera%camera_info", "2::,5:,:,:,,"),
         ("MS", "%tf_static", ":1:,100:,:,:,,"),
