@@ -125,6 +125,7 @@ def team(tmp_path: Path, domain_id: int) -> Iterator[Team]:
             ros2 = Ros2Config(
                 namespace=f"/{name}",
                 image_topic="camera/image_raw" if name == "r1" else "camera/image_raw/compressed",
+                grid_topic="local_map",
                 odom_frame=f"{name}/odom",
                 base_frame=f"{name}/base_link",
             )
@@ -148,6 +149,7 @@ def test_two_robots_get_one_map_through_a_pause_and_a_reset(team: Team, tmp_path
     check_paths(team)
     check_markers(team)
     check_diagnostics(team)
+    check_merged_map(team)
     check_pause(team)
     check_services_after_a_reset(team, tmp_path)
     for name in NAMES:
@@ -228,6 +230,26 @@ def check_diagnostics(team: Team) -> None:
         assert not any("refused" in key for key in values), values
     stamps_ns = [ns_of(array.header.stamp) for array in team.listener.heard["/diagnostics"]]
     assert all(0 <= t_ns - START_NS <= team.since_ns + 1e9 for t_ns in stamps_ns if t_ns)
+
+
+def check_merged_map(team: Team) -> None:
+    """Each agent merges both robots' grids, where /tf puts them; a grid in another frame is refused, and said."""
+    marks = {"r1": ((4.5, 0.5), 100), "r2": ((4.5, -1.5), 77)}
+    team.robots[0].publish_grid("r1/odom", {marks["r1"][0]: 100})
+    team.robots[1].publish_grid("r2/odom", {marks["r2"][0]: 77}, resolution_m=0.2)
+
+    def place(name: str) -> Any:
+        T = team.listener.T_map_odom(name)
+        return None if T is None else (T @ np.array([*marks[name][0], 0.0, 1.0]) + [0.05, 0.05, 0.0, 0.0])[:3]
+
+    def is_there(by: str, name: str) -> bool:
+        told = team.listener.merged_at(by, place(name))
+        return told is not None and told == marks[name][1]
+
+    for by in NAMES:
+        for name in NAMES:
+            team.until(partial(is_there, by, name))
+        assert team.listener.heard[f"/{by}/flocc_{by}/merged_map"][-1].header.frame_id == "map"
 
 
 def check_pause(team: Team) -> None:

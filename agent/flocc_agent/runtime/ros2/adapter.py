@@ -24,6 +24,7 @@ from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.hearing import KINDS, Hearing
 from flocc_agent.runtime.ros2.markers import KnownClosure
+from flocc_agent.runtime.ros2.merged_maps import MergedMaps
 from flocc_agent.runtime.ros2.node import RosNode, open_node
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes
@@ -147,7 +148,8 @@ class Ros2Adapter:
         node = self._node = open_node(self._config, name, self._ros_args, self._types)
         config = self._config = node.config
         hearing = self._hearing = self._heard(config)
-        teller = self._teller = Teller(config, self._types, node, self._bodies, self._host.closures)
+        grids = MergedMaps(config, self._robot, self._types, node, self._problems)
+        teller = self._teller = Teller(config, self._types, node, self._bodies, self._host.closures, grids)
         for kind, (topic, type_name, qos) in hearing.wanted().items():
             hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind))
         node.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))

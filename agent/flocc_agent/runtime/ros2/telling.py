@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.corrected import Correction
+from flocc_agent.core.corrected import CorrectedLog, Correction
 from flocc_agent.runtime.ros2.diagnostics import diagnostics
 from flocc_agent.runtime.ros2.markers import KnownClosure, Markers
+from flocc_agent.runtime.ros2.merged_maps import MergedMaps
 from flocc_agent.runtime.ros2.node import RosNode, RosPublisher
 from flocc_agent.runtime.ros2.outgoing import Outgoing
 from flocc_agent.runtime.ros2.topics import Qos
@@ -46,6 +47,7 @@ class Teller:
         node: RosNode,
         trajectory: Trajectory,
         closures: Callable[[], Sequence[KnownClosure]],
+        grids: MergedMaps,
     ) -> None:
         """Declare the publishers.
 
@@ -55,6 +57,7 @@ class Teller:
             node: Where to publish.
             trajectory: The corrected path; called off the loop's thread.
             closures: Those of all logs; called off the loop's thread.
+            grids: Occupancy grids of all robots.
         """
         self._config = config
         self._outgoing = Outgoing(types, config.map_frame, config.odom_frame)
@@ -63,6 +66,7 @@ class Teller:
         self._node = node
         self._trajectory = trajectory
         self._closures = closures
+        self._grids = grids
         self._tf = node.publisher(config.tf_topic, TF, TF_QOS)
         self._path = node.publisher(config.path_topic, PATH, LATCHED)
         self._pose = node.publisher(config.pose_topic, POSE, RELIABLE)
@@ -103,12 +107,14 @@ class Teller:
         pause_s = self._config.path_period_s
         while True:
             await asyncio.sleep(pause_s)
-            if not self.path_changed:
+            if not self.path_changed and not self._grids.changed:
                 continue
-            self.path_changed = False
-            began_s = time.monotonic()
-            await asyncio.to_thread(_put_one, self._path, self._drawn)
-            await asyncio.to_thread(_put_one, self._graph, self._swarm)
+            began_s, path_changed, self.path_changed = time.monotonic(), self.path_changed, False
+            if path_changed:
+                await asyncio.to_thread(_put_one, self._path, self._drawn)
+                await asyncio.to_thread(_put_one, self._graph, self._swarm)
+            await asyncio.to_thread(self._merge)
+            self._grids.complain()
             pause_s = max(self._config.path_period_s, PATH_PAUSE_RATIO * (time.monotonic() - began_s))
 
     async def diagnose(self, state: Callable[[], State]) -> None:
@@ -124,8 +130,15 @@ class Teller:
         correction = self._correction
         if correction is None:
             return None
-        logs = {correction.own.log.robot: correction.own, **correction.others}
+        logs = logs_of(correction)
         return self._markers.array(logs, self._closures(), correction.term.leader.robot, self._node.now_ns())
+
+    def _merge(self) -> None:
+        """Publish the merged occupancy, and hear the grids of robots that have come into the map."""
+        if self._correction is not None:
+            logs = logs_of(self._correction)
+            self._grids.follow(logs)
+            self._grids.publish(logs, self._node.now_ns())
 
     def _drawn(self) -> Any:
         """The corrected path, thinned evenly, with the last keyframe; None where it is not known yet."""
@@ -141,6 +154,11 @@ class Teller:
     def _put_transform(self, correction: Correction, stamp_ns: int) -> None:
         ahead_ns = round(self._config.tf_tolerance_s * 1e9)
         self._tf.put(self._outgoing.transform(correction.T_map_odom, stamp_ns + ahead_ns))
+
+
+def logs_of(correction: Correction) -> dict[str, CorrectedLog]:
+    """All robots in a correction's map."""
+    return {correction.own.log.robot: correction.own, **correction.others}
 
 
 def _put_one(publisher: RosPublisher, make: Callable[[], Any]) -> None:
