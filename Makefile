@@ -2,6 +2,8 @@
 # make test    installs what tests need and runs all of them: ruff, mypy, import contracts, pytest
 # make swarm-test   shipped scenarios over real zenoh, a worse variant of each that must fail, observers: six minutes
 # make check   the same without installing anything
+# make docs    the pages as a searchable site: build/site/index.html
+# make release-check   builds what would be published, checks its metadata, installs it in a fresh environment, runs flocc demo --small
 # make campaign     the back end and others on 300 drawn graphs (DRAWS=60 for a sweep), at most an hour (LIMIT_S)
 # make clean   removes .venv and everything that was generated
 
@@ -18,7 +20,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 DESCRIPTION := pyproject.toml constraints.txt
 
-.PHONY: demo test swarm-test check lint types contracts tests campaign constraints clean
+.PHONY: demo test swarm-test check lint types contracts tests campaign docs install release-check constraints clean
 .DEFAULT_GOAL := check
 
 demo: $(VENV)/.demo
@@ -61,6 +63,16 @@ campaign: $(VENV)/.test
 	@mkdir -p build
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/python -m flocc_lab.graph_family --draws $(DRAWS) --methods "" \
 		--rows build/graph_family.jsonl --limit-s $(LIMIT_S) | tee build/graph_family.md
+
+docs: $(VENV)/.test
+	$(BIN)/python -m flocc_lab.reference.site_pages build/pages
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "site: $(CURDIR)/build/site/index.html"
+
+install: $(VENV)/.test
+
+release-check: $(VENV)/.test
+	$(BIN)/python .ci/release_check.py
 
 constraints: $(VENV)/.test
 	$(BIN)/python .ci/constraints.py > constraints.new

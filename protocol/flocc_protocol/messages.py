@@ -10,9 +10,10 @@ from typing import Any
 
 import msgspec
 
-from flocc_protocol import candidate_pairs, elections, heartbeats, log_corrections, record_batches, separators
+from flocc_protocol import candidate_pairs, digests, elections, heartbeats, log_corrections, record_batches, separators
 from flocc_protocol.candidate_pairs import OFFERS_MAX, CandidateOffer, CandidatePair
 from flocc_protocol.codec import LOG_ID, LOGS_MAX, MESSAGE_BYTES_MAX, Codec, Reader, listed, packed
+from flocc_protocol.digests import DigestRequest, Digests, LogDigest, TableState
 from flocc_protocol.elections import (
     COMPUTE_CLASS_MAX,
     COUNTER_MAX,
@@ -24,7 +25,7 @@ from flocc_protocol.elections import (
     LeaderAdvert,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.heartbeats import WANTS_MAX, Heartbeat, LogDigest
+from flocc_protocol.heartbeats import WANTS_MAX, Heartbeat
 from flocc_protocol.ids import LogId
 from flocc_protocol.log_corrections import (
     CORRECTION_KEYFRAMES_MAX,
@@ -63,6 +64,8 @@ __all__ = [
     "CorrectionBatch",
     "CorrectionRequest",
     "CorrectionVersion",
+    "DigestRequest",
+    "Digests",
     "Election",
     "Envelope",
     "HOPS_MAX",
@@ -87,6 +90,7 @@ __all__ = [
     "Records",
     "SEPARATORS_MAX",
     "Separators",
+    "TableState",
     "UnknownVersion",
     "WANTS_MAX",
     "decode",
@@ -96,7 +100,7 @@ __all__ = [
     "version_of",
 ]
 
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 VERSION_MAX = 127
 
 
@@ -106,6 +110,8 @@ class UnknownVersion(DecodeError):
 
 Message = (
     Heartbeat
+    | Digests
+    | DigestRequest
     | Election
     | Answer
     | Coordinator
@@ -129,6 +135,7 @@ class Envelope:
 
 _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     **heartbeats.CODECS,
+    **digests.CODECS,
     **elections.CODECS,
     **record_batches.CODECS,
     **log_corrections.CODECS,
