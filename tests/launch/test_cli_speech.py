@@ -27,6 +27,10 @@ NO_FACTS = {
     "weights synthesize": "writes files",
     "experiment": "writes tables and findings",
     "export": "writes a file",
+    "map save": "writes a map",
+    "map merge": "writes a map",
+    "map prune": "writes a map",
+    "map export": "writes files",
 }
 
 
