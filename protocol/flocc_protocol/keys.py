@@ -37,6 +37,8 @@ class Kind(StrEnum):
     HANDOVER = "handover"
     CORRECTION = "correction"
     CORRECTION_REQUEST = "want-correction"
+    DIGESTS = "digests"
+    DIGEST_REQUEST = "want-digests"
     RECORDS = "records"
     RECORD_REQUEST = "want-records"
     CANDIDATES = "candidates"

@@ -23,12 +23,12 @@ from flocc_protocol.codec import (
     Codec,
     Kinds,
     Pose7,
-    from_bytes,
+    Reader,
     integer,
     optional,
+    packed,
     sequence,
     struct,
-    to_bytes,
 )
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INDEX_MAX, LogId, Term
@@ -103,7 +103,7 @@ class CorrectionBatch:
             raise ValueError(f"{len(self.corrections)} corrections of {keyframes} keyframes do not fit one message")
 
     @classmethod
-    def packed(cls, corrections: Iterable[LogCorrection]) -> "list[CorrectionBatch]":
+    def batched(cls, corrections: Iterable[LogCorrection]) -> "list[CorrectionBatch]":
         """Put any number of corrections, in their order, into messages."""
         batches: list[list[LogCorrection]] = [[]]
         room = CORRECTION_KEYFRAMES_MAX
@@ -134,17 +134,10 @@ def _check_poses(poses: NDArray[np.float64]) -> None:
 _ANY_VERSION = struct(CorrectionVersion, log=LOG_ID, term=TERM, round=COUNT)
 
 
-@lru_cache(maxsize=REPEATED_MAX, typed=True)
-def _version(robot: Any, incarnation: Any, counter: Any, leader: Any, life: Any, number: Any) -> CorrectionVersion:
-    return _ANY_VERSION.unpack([[robot, incarnation], [counter, [leader, life]], number])
-
-
-def _unpack_version(value: Any) -> CorrectionVersion:
-    try:
-        (robot, incarnation), (counter, (leader, life)), number = value
-        return _version(robot, incarnation, counter, leader, life, number)
-    except (TypeError, ValueError) as error:
-        raise DecodeError("expected the version of a correction") from error
+@lru_cache(maxsize=REPEATED_MAX)
+def _version(raw: Any) -> CorrectionVersion:
+    assert _ANY_VERSION.build is not None
+    return _ANY_VERSION.build(raw)
 
 
 def _pack_version(value: CorrectionVersion) -> CorrectionVersion:
@@ -153,7 +146,7 @@ def _pack_version(value: CorrectionVersion) -> CorrectionVersion:
     return value
 
 
-VERSION = Codec(_pack_version, _unpack_version)
+VERSION = Codec(_pack_version, _ANY_VERSION.wire, _version)
 
 
 def _unsigned(
@@ -184,28 +177,33 @@ _UNSIGNED = struct(
 )
 
 
+_read_unsigned = Reader(_UNSIGNED, MESSAGE_BYTES_MAX)
+
+
 @lru_cache(maxsize=CORRECTIONS_KEPT_MAX)
 def encode_correction(correction: LogCorrection) -> bytes:
     """A correction without its signature, as it is on the wire; every relay passes on the same bytes."""
-    return to_bytes(_UNSIGNED.pack(correction))
+    return packed(_UNSIGNED.pack(correction))
 
 
 @lru_cache(maxsize=CORRECTIONS_KEPT_MAX)
 def _read_correction(data: bytes, signature: bytes) -> LogCorrection:
-    unsigned = _UNSIGNED.unpack(from_bytes(data, MESSAGE_BYTES_MAX))
+    unsigned = _read_unsigned(data)
     return replace(unsigned, signature=signature) if signature else unsigned
 
 
-def _unpack_correction(value: Any) -> LogCorrection:
-    if type(value) is not list or len(value) != 2 or type(value[0]) is not bytes or type(value[1]) is not bytes:
-        raise DecodeError("expected a correction and its signature")
+def _build_correction(raw: tuple[bytes, bytes]) -> LogCorrection:
     try:
-        return _read_correction(*value)
+        return _read_correction(*raw)
     except ValueError as error:
         raise DecodeError(str(error)) from error
 
 
-_CORRECTION = Codec(lambda correction: [encode_correction(correction), correction.signature], _unpack_correction)
+_CORRECTION = Codec(
+    lambda correction: [encode_correction(correction), correction.signature],
+    tuple[bytes, bytes],
+    _build_correction,
+)
 
 
 CODECS: Kinds = {

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,6 +25,7 @@ from tests.protocol.wire_examples import (
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import from_bytes, to_bytes
+from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INDEX_MAX, TERM_COUNTER_MAX, LogId
 from flocc_protocol.keys import Kind, broadcast_key, checked_kind
@@ -38,6 +40,7 @@ from flocc_protocol.messages import (
     RECORDS_BATCH_MAX,
     CorrectionBatch,
     CorrectionVersion,
+    Digests,
     Election,
     Envelope,
     Heartbeat,
@@ -48,6 +51,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
+    TableState,
     UnknownVersion,
     decode,
     encode,
@@ -70,6 +74,14 @@ def test_any_message_reads_back(sender: LogId, message: Message) -> None:
 @pytest.mark.parametrize("message", MESSAGES, ids=kind_of)
 def test_every_example_reads_back(message: Message) -> None:
     assert decode(encode(Envelope(BOB, message))) == Envelope(BOB, message)
+
+
+@pytest.mark.parametrize("envelope", ENVELOPES, ids=lambda envelope: kind_of(envelope.message))
+def test_plain_messagepack_reads_and_writes_the_same_bytes(envelope: Envelope) -> None:
+    data = encode(envelope)
+    read = msgpack.unpackb(data)
+    assert read[:3] == [PROTOCOL_VERSION, kind_of(envelope.message), list(envelope.sender)]
+    assert msgpack.packb(read) == data
 
 
 def test_there_is_an_example_of_every_kind() -> None:
@@ -138,9 +150,10 @@ def test_what_does_not_fit_cannot_be_built(build: Any) -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        Heartbeat(0, 0, 0, None, 0, 0, (LogDigest(ALICE, 0, 0),) * (LOGS_MAX + 1)),
-        Heartbeat(0, 0, 10, None, 0, 0, ()),
-        Heartbeat(0, 0, 0, None, TERM_COUNTER_MAX + 1, 0, ()),
+        Digests(0, 0, (LogDigest(ALICE, 0, 0),) * (LOGS_MAX + 1), 0, ()),
+        Heartbeat(0, 0, 0, None, 0, 0, digests=TableState(HASH_MAX + 1, 0)),
+        Heartbeat(0, 0, 10, None, 0, 0),
+        Heartbeat(0, 0, 0, None, TERM_COUNTER_MAX + 1, 0),
         Election(TERM_COUNTER_MAX + 1),
         Election(-1),
         Records((RecordBatch(ALICE, 0, 2**32, ()),)),
@@ -234,12 +247,17 @@ def test_a_message_larger_than_its_limit_is_a_decode_error() -> None:
 # --- sizes -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_heartbeat_of_50_logs_fits_two_datagrams_of_ethernet() -> None:
+def test_a_heartbeat_of_however_many_logs_is_small() -> None:
+    everything = TableState(HASH_MAX, INDEX_MAX)
+    heartbeat = Heartbeat(10_000, 2**40, 5, None, 7, 3, 1000, 2**32 - 1, everything, everything)
+    assert len(encode(Envelope(LogId("robot-01"), heartbeat))) < 90
+
+
+def test_what_50_logs_hold_fits_two_datagrams_of_ethernet() -> None:
     logs = [LogId(f"robot-{k:02d}") for k in range(50)]
     digests = tuple(LogDigest(log, 1000, 2**32 - 1) for log in logs)
     versions = tuple(CorrectionVersion(log, TERM, 200) for log in logs)
-    heartbeat = Heartbeat(10_000, 2**40, 5, None, 7, 3, digests, versions)
-    assert len(encode(Envelope(logs[0], heartbeat))) < 2 * 1400
+    assert len(encode(Envelope(logs[0], Digests(2**40, 50_000, digests, 10_000, versions)))) < 2 * 1400
 
 
 def test_a_keyframe_costs_less_than_700_bytes_in_a_batch() -> None:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX, Pose7
+from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
 from flocc_protocol.messages import (
     BATCHES_MAX,
@@ -28,6 +29,8 @@ from flocc_protocol.messages import (
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    DigestRequest,
+    Digests,
     Election,
     Envelope,
     Handover,
@@ -41,6 +44,7 @@ from flocc_protocol.messages import (
     RecordRequest,
     Records,
     Separators,
+    TableState,
 )
 from flocc_protocol.records import (
     REASON_LENGTH_MAX,
@@ -129,13 +133,23 @@ MESSAGES: tuple[Message, ...] = (
         ADVERT,
         7,
         2,
-        (LogDigest(ALICE, 13, 0xDEADBEEF), LogDigest(BOB, 40, 17)),
-        (CorrectionVersion(ALICE, TERM, 4), CorrectionVersion(BOB, TERM, 4)),
+        40,
+        17,
+        TableState(2**56 - 1, 53),
+        TableState(0, 2),
         (KeyframeId(BOB, 8),),
         (KeyframeId(ALICE, 3),),
         (KeyframeId(BOB, 7),),
     ),
-    Heartbeat(0, 0, 0, None, 0, 0, ()),
+    Heartbeat(0, 0, 0, None, 0, 0),
+    Digests(
+        0xBEEF,
+        53,
+        (LogDigest(ALICE, 13, 0xDEADBEEF), LogDigest(BOB, 40, 17)),
+        2,
+        (CorrectionVersion(ALICE, TERM, 4), CorrectionVersion(BOB, TERM, 4)),
+    ),
+    DigestRequest(12, 0),
     Election(8),
     Answer(8),
     Coordinator(ADVERT),
@@ -193,12 +207,22 @@ def largest_messages() -> list[Message]:
             advert,
             TERM_COUNTER_MAX,
             INDEX_MAX,
-            tuple(LogDigest(_long(k), INDEX_MAX, 2**32 - 1) for k in range(LOGS_MAX)),
-            tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(LOGS_MAX)),
+            INDEX_MAX,
+            2**32 - 1,
+            TableState(HASH_MAX, INDEX_MAX),
+            TableState(HASH_MAX, INDEX_MAX),
             (keyframe,) * WANTS_MAX,
             (keyframe,) * WANTS_MAX,
             (keyframe,) * WANTS_MAX,
         ),
+        Digests(
+            INCARNATION_MAX,
+            INDEX_MAX,
+            tuple(LogDigest(_long(k), INDEX_MAX, 2**32 - 1) for k in range(LOGS_MAX)),
+            INDEX_MAX,
+            tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(LOGS_MAX)),
+        ),
+        DigestRequest(INDEX_MAX, INDEX_MAX),
         Election(TERM_COUNTER_MAX),
         Answer(TERM_COUNTER_MAX),
         Coordinator(advert),
@@ -323,6 +347,7 @@ def _tuples(items: st.SearchStrategy[object], longest: int) -> st.SearchStrategy
 
 
 _starts = st.integers(0, 2**30)
+_states = st.builds(TableState, st.integers(0, HASH_MAX), _counts)
 batches = st.builds(
     RecordBatch, log_ids, _starts, st.integers(0, 2**32 - 1), _tuples(st.binary(max_size=64), RECORDS_BATCH_MAX)
 )
@@ -348,12 +373,23 @@ messages: st.SearchStrategy[Message] = st.one_of(
         st.none() | adverts,
         _term_counters,
         _counts,
-        _tuples(st.builds(LogDigest, log_ids, _counts, st.integers(0, 2**32 - 1)), LOGS_MAX),
-        _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), LOGS_MAX),
+        _counts,
+        st.integers(0, 2**32 - 1),
+        _states,
+        _states,
         _tuples(keyframe_ids, WANTS_MAX),
         _tuples(keyframe_ids, WANTS_MAX),
         _tuples(keyframe_ids, WANTS_MAX),
     ),
+    st.builds(
+        Digests,
+        st.integers(0, INCARNATION_MAX),
+        _counts,
+        _tuples(st.builds(LogDigest, log_ids, _counts, st.integers(0, 2**32 - 1)), LOGS_MAX),
+        _counts,
+        _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), LOGS_MAX),
+    ),
+    st.builds(DigestRequest, _counts, _counts),
     st.builds(Election, _term_counters),
     st.builds(Answer, _term_counters),
     st.builds(Coordinator, adverts),

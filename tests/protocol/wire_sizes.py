@@ -8,6 +8,7 @@ import numpy as np
 from tests.protocol.wire_examples import IDENTITY, descriptor, largest_messages, poses_array
 
 from flocc_protocol.arrays import Array
+from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import (
     Answer,
@@ -17,6 +18,8 @@ from flocc_protocol.messages import (
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    DigestRequest,
+    Digests,
     Election,
     Envelope,
     Handover,
@@ -29,6 +32,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
+    TableState,
     encode,
     kind_of,
 )
@@ -46,10 +50,15 @@ CHECKSUM = 2**32 - 1
 
 def heartbeat(logs: int) -> Heartbeat:
     """A heartbeat of a robot that holds that many logs of 1,000 records and a correction of each."""
-    digests = tuple(LogDigest(log, 1000, CHECKSUM) for log in LOGS[:logs])
-    return Heartbeat(
-        10_000, 2**52, 5, ADVERT, 7, 3, digests, tuple(CorrectionVersion(log, TERM, 200) for log in LOGS[:logs])
-    )
+    digests, versions = TableState(HASH_MAX, 1000 * logs), TableState(HASH_MAX, 200 * logs)
+    return Heartbeat(10_000, 2**52, 5, ADVERT, 7, 3, 1000, CHECKSUM, digests, versions)
+
+
+def digests(logs: int) -> Digests:
+    """All that such a robot holds, as it tells a new neighbour."""
+    held = tuple(LogDigest(log, 1000, CHECKSUM) for log in LOGS[:logs])
+    versions = tuple(CorrectionVersion(log, TERM, 200) for log in LOGS[:logs])
+    return Digests(2**52, 1000 * logs, held, 200 * logs, versions)
 
 
 def keyframe(place: Array | None) -> KeyframeRecord:
@@ -81,8 +90,10 @@ def messages() -> Iterator[tuple[str, Message]]:
     """Messages, by what the table calls them."""
     data = encode_record(keyframe(descriptor(512)))
     yield "heartbeat, 3 logs", heartbeat(3)
-    yield "heartbeat, 10 logs", heartbeat(10)
     yield "heartbeat, 50 logs", heartbeat(50)
+    yield "digests, 3 logs", digests(3)
+    yield "digests, 50 logs", digests(50)
+    yield "want-digests", DigestRequest(40_000, 10_000)
     yield "election", Election(7)
     yield "answer", Answer(7)
     yield "coordinator", Coordinator(ADVERT)

@@ -5,7 +5,7 @@ nothing, and a robot that was away gets the newest from whoever it meets.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,12 @@ from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import (
+    LOGS_MAX,
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
     LogCorrection,
+    TableState,
     encode_correction,
 )
 
@@ -34,6 +36,8 @@ Float = NDArray[np.float64]
 
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
+ASKED_MAX = 8
+"""Times that a correction is asked for; what somebody says to hold and nobody sends is given up."""
 LISTED_MAX = 400
 """Keyframes listed in a correction; a longer trajectory is thinned and interpolated, so that messages stay small."""
 KNOTS_MAX = 16
@@ -41,6 +45,20 @@ KNOTS_MAX = 16
 TRANSLATION_TOLERANCE_M = 1e-3
 ROTATION_TOLERANCE_RAD = 1e-4
 """A correction that moves no keyframe further is not sent again in one term: nobody would see the difference."""
+
+
+@dataclass(slots=True)
+class _Wanted:
+    """A newer correction that a peer holds: how often it was asked for, and until when that may be answered."""
+
+    version: CorrectionVersion
+    peer: str
+    asked: int = 0
+    until_s: float = float("-inf")
+
+    def may_ask(self, peer: str, now: float) -> bool:
+        """Whether it is time to ask: the one that holds it, or anybody when that one was not heard for a while."""
+        return self.until_s + (0.0 if peer == self.peer else REQUEST_TIMEOUT_S) <= now
 
 
 class Corrections:
@@ -52,8 +70,7 @@ class Corrections:
         self._sealer = sealer
         self._newest: dict[LogId, LogCorrection] = {}
         self._frame_unknown = False
-        self._asked_until_s: dict[LogId, float] = {}
-        self._agreed: dict[LogId, CorrectionVersion] = {}
+        self._wanted: dict[LogId, _Wanted] = {}
         self._announcer: Announcer[CorrectionVersion] = Announcer()
 
     @property
@@ -69,8 +86,7 @@ class Corrections:
         """Tables with their maximum."""
         return {
             "corrections": (len(self._newest), self._gossip.logs_max),
-            "asked_corrections": (len(self._asked_until_s), REMEMBERED_MAX),
-            "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
+            "wanted_corrections": (len(self._wanted), REMEMBERED_MAX),
         }
 
     def restore(self, message: LogCorrection | None, frame_changed: bool) -> None:
@@ -79,36 +95,45 @@ class Corrections:
             self._keep(message)
         self._frame_unknown = frame_changed
 
-    def announced(self) -> tuple[CorrectionVersion, ...]:
-        """What one heartbeat says of the corrections that this robot holds."""
-        return self._announcer.next()
+    def state(self) -> TableState:
+        """Which corrections this robot holds, as a heartbeat says it."""
+        return self._announcer.state()
 
-    def on_neighbour(self) -> None:
-        """Somebody came into range: the next heartbeat says everything."""
-        self._announcer.say_all()
+    def versions_since(self, changes: int) -> tuple[int, tuple[CorrectionVersion, ...]]:
+        """What of that changed after so many changes, as far as one message tells, and up to which change that is."""
+        return self._announcer.since(changes, LOGS_MAX)
 
-    def news(self, versions: tuple[CorrectionVersion, ...]) -> tuple[CorrectionVersion, ...]:
-        """Those versions that were not yet found to be no newer than this robot's own."""
-        agreed = self._agreed
-        return tuple([version for version in versions if version is not agreed.get(version.log)])
+    def has_news(self, versions: tuple[CorrectionVersion, ...]) -> bool:
+        """Whether somebody holds newer ones than this robot."""
+        return any(self._is_newer(version) for version in versions)
 
     def on_versions(self, peer: str, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """Ask a peer for corrections that are newer than this robot's."""
-        wanted: list[LogId] = []
         for version in versions:
-            held = self._newest.get(version.log)
-            newer = held is None or (version.term, version.round) > (held.term, held.round)
-            if newer and self._asked_until_s.get(version.log, now) <= now:
-                remember(self._asked_until_s, version.log, now + REQUEST_TIMEOUT_S)
-                wanted.append(version.log)
-            elif not newer:
-                remember(self._agreed, version.log, version)
-        return [Unicast(peer, CorrectionRequest(tuple(wanted)))] if wanted else []
+            wanted = self._wanted.get(version.log)
+            if self._is_newer(version) and (wanted is None or wanted.version < version):
+                remember(self._wanted, version.log, _Wanted(version, peer))
+        return self.ask(peer, now)
+
+    def ask(self, peer: str, now: float) -> list[Effect]:
+        """Ask a peer for what is wanted and was not asked of anybody just now; what nobody sends is given up."""
+        asked: list[LogId] = []
+        for log, wanted in list(self._wanted.items()):
+            if not self._is_newer(wanted.version) or (wanted.asked == ASKED_MAX and wanted.until_s <= now):
+                del self._wanted[log]
+            elif wanted.may_ask(peer, now) and len(asked) < LOGS_MAX:
+                wanted.asked, wanted.until_s = wanted.asked + 1, now + REQUEST_TIMEOUT_S
+                asked.append(log)
+        return [Unicast(peer, CorrectionRequest(tuple(asked)))] if asked else []
+
+    def _is_newer(self, version: CorrectionVersion) -> bool:
+        held = self._newest.get(version.log)
+        return held is None or (version.term, version.round) > (held.term, held.round)
 
     def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
         """Pass corrections on, so many that a request cannot call forth a flood."""
         held = [self._newest[log] for log in request.logs if log in self._newest]
-        return [Unicast(peer, batch) for batch in CorrectionBatch.packed(held)[:ANSWERS_MAX]]
+        return [Unicast(peer, batch) for batch in CorrectionBatch.batched(held)[:ANSWERS_MAX]]
 
     def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Keep a newer correction that its leader made; apply it when it is this robot's."""
@@ -121,6 +146,8 @@ class Corrections:
 
     def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Refuse a newer correction for which there is no room, or which its leader did not make."""
+        if message.log in self._wanted:
+            self._wanted[message.log].asked = 0  # somebody does send it: a counter may rise in steps until it is taken
         if message.log not in self._newest and not self._is_room(message.log):
             return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
@@ -134,7 +161,6 @@ class Corrections:
         """Keep a newer correction that was not refused; apply it when it is this robot's."""
         held = self._newest.get(message.log)
         self._keep(message)
-        self._asked_until_s.pop(message.log, None)
         return self._apply(message, held) if message.log == self._own else []
 
     def _is_signed(self, message: LogCorrection) -> bool:
@@ -178,7 +204,7 @@ class Corrections:
                 message = self._signed(message)
                 published.append(message)
                 effects += self.on_message(self._own.robot, message)
-        return [*(Broadcast(batch) for batch in CorrectionBatch.packed(published)), *effects]
+        return [*(Broadcast(batch) for batch in CorrectionBatch.batched(published)), *effects]
 
     def _signed(self, message: LogCorrection) -> LogCorrection:
         if self._sealer is None:

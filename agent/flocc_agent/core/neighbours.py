@@ -11,14 +11,18 @@ from flocc_protocol.messages import Heartbeat
 LOSS_WEIGHT = 0.05
 """How much one heartbeat weighs in the running share of lost ones: about the last twenty count."""
 
+SETTLED_S = 1.0
+"""A robot that came into range less than this ago wrote most of what it has before it could be heard."""
+
 
 @dataclass(slots=True)
 class Neighbour:
-    """A robot in range: its log, its last heartbeat and when it came, and the running share of heartbeats lost."""
+    """A robot in range: its log, its last heartbeat and when it came, since when, and the share of heartbeats lost."""
 
     log: LogId
     heartbeat: Heartbeat
     heard_s: float
+    since_s: float
     previous_boot: int | None = None
     loss_ratio: float = 0.0
 
@@ -48,6 +52,11 @@ class Neighbours:
         """The neighbour of that name, or None where it is not in range."""
         return self._by_name.get(name)
 
+    def was_near(self, name: str, now: float) -> bool:
+        """Whether a robot was in range already before what it broadcasts now can have been lost on the way."""
+        known = self._by_name.get(name)
+        return known is not None and known.since_s + SETTLED_S <= now
+
     def is_double(self, name: str) -> bool:
         """Whether two robots were heard under this name."""
         return name in self._duplicates
@@ -68,7 +77,7 @@ class Neighbours:
         if known is None:
             if len(self._by_name) >= self._parameters.neighbours_max:
                 return [Report(PeerRefused(peer=sender.robot, reason="too many neighbours"))]
-            self._by_name[sender.robot] = Neighbour(sender, heartbeat, now)
+            self._by_name[sender.robot] = Neighbour(sender, heartbeat, now, now)
             self._due_s = min(self._due_s, self._expires_s(sender.robot))
             return [Report(NeighbourUp(peer=sender.robot, log=sender))]
         effects = self._restarted(known, sender, heartbeat)

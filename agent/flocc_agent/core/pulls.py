@@ -44,12 +44,14 @@ class _Asked:
 class Pulls:
     """What others hold beyond this robot's copies, and what was asked of them."""
 
-    def __init__(self, held: Callable[[LogId], int], near: Callable[[str], bool], parameters: GossipParameters) -> None:
+    def __init__(
+        self, held: Callable[[LogId], int], near: Callable[[str, float], bool], parameters: GossipParameters
+    ) -> None:
         """Start with nothing to ask for.
 
         Args:
             held: How many records of a log this robot holds.
-            near: Whether a robot of this name is in range.
+            near: Whether a robot of this name was in range when it wrote what it broadcasts at that time.
             parameters: Limits and times.
         """
         self._held = held
@@ -100,9 +102,9 @@ class Pulls:
             self._pauses_s.pop((log, peer), None)
             self._not_before_s.pop((log, peer), None)
 
-    def ask(self, now: float) -> list[Effect]:
-        """Ask whoever is ahead, those with the most first, unless that was done just now."""
-        if not self._ahead or now < self._next_s:
+    def ask(self, now: float, at_once: bool = False) -> list[Effect]:
+        """Ask whoever is ahead, those with the most first, unless that was done just now or it is to be at once."""
+        if not self._ahead or (now < self._next_s and not at_once):
             return []
         effects: list[Effect] = []
         for peer in sorted(self._ahead, key=lambda peer: (-len(self._ahead[peer]), peer)):
@@ -130,7 +132,7 @@ class Pulls:
 
     def _is_on_its_way(self, log: LogId, held: int, count: int, now: float) -> bool:
         """Whether the records may still come from their writer, who broadcasts them."""
-        if count - held > BROADCAST_RECORDS or not self._near(log.robot):
+        if count - held > BROADCAST_RECORDS or not self._near(log.robot, now):
             return False
         noticed = self._noticed.get(log)
         if noticed is None or noticed[0] != held:

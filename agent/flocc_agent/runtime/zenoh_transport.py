@@ -58,6 +58,8 @@ PRIORITY = {
     keys.Kind.HANDOVER.value: zenoh.Priority.INTERACTIVE_HIGH,
     keys.Kind.CORRECTION.value: zenoh.Priority.INTERACTIVE_LOW,
     keys.Kind.CORRECTION_REQUEST.value: zenoh.Priority.INTERACTIVE_LOW,
+    keys.Kind.DIGESTS.value: zenoh.Priority.INTERACTIVE_LOW,
+    keys.Kind.DIGEST_REQUEST.value: zenoh.Priority.INTERACTIVE_LOW,
     keys.Kind.RECORDS.value: zenoh.Priority.DATA_HIGH,
     keys.Kind.RECORD_REQUEST.value: zenoh.Priority.DATA_HIGH,
     keys.Kind.CANDIDATES.value: zenoh.Priority.DATA,

@@ -14,6 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from flocc_agent.extras import to_install
 from flocc_lab.experiments.experiment import Experiment, ExperimentError, Row, S, Settings, Summary
 from flocc_lab.experiments.folder import ExperimentFolder
 from flocc_launch.runs.run_folder import write_json
@@ -41,7 +42,7 @@ def require_matplotlib() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise ExperimentError("experiments draw figures with matplotlib: pip install 'flocc[figures]'") from error
+        raise ExperimentError(f"experiments draw figures with matplotlib: {to_install('figures')}") from error
 
 
 def write_outputs(

@@ -14,13 +14,15 @@ CAUSES = {
     "overlay": "overlay",
     "frozen": "frozen-pictures",
 }
+OTHER_CAUSE = "camera"
+"""Of a doubt that this version does not know."""
 
 
 def doubted_cameras(loaded: LoadedRun) -> list[Finding]:
     """One finding for each robot and doubt; what a robot took care of itself is worth knowing only."""
     return [
         Finding(
-            CAUSES.get(doubt.doubt, "camera"),
+            CAUSES.get(doubt.doubt, OTHER_CAUSE),
             Severity.HINDERS if doubt.matters else Severity.NOTE,
             doubt.sentence,
             doubt.advice,

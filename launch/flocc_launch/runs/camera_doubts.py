@@ -92,4 +92,4 @@ def _guess(fact: CameraDoubted) -> str:
 def _advice(fact: CameraDoubted) -> str:
     if fact.doubt == "mounting" and fact.amount >= AXES_TURN_MIN_DEG:
         return AXES
-    return ADVICE.get(fact.doubt, "")
+    return ADVICE.get(fact.doubt, "Update flocc here: what this robot tells is newer.")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tests.agent.core.virtual_time import Robots
 
-from flocc_agent.core.corrections import KNOTS_MAX, LISTED_MAX, Corrections
+from flocc_agent.core.corrections import ASKED_MAX, KNOTS_MAX, LISTED_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
@@ -23,8 +23,8 @@ from flocc_protocol.messages import (
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    Digests,
     Envelope,
-    Heartbeat,
     LogCorrection,
 )
 from flocc_protocol.records import SIGNATURE_BYTES
@@ -98,15 +98,31 @@ def test_another_robots_correction_is_kept_and_passed_on() -> None:
 def test_a_newer_version_elsewhere_is_asked_for_once_per_timeout() -> None:
     machine, versions = corrections(), (CorrectionVersion(R1, Term(1, R2), 1),)
     assert machine.on_versions("r2", versions, 0.0) == [Unicast("r2", CorrectionRequest((R1,)))]
-    assert machine.on_versions("r3", versions, 0.5) == []
-    assert machine.on_versions("r3", versions, 1.0) == [Unicast("r3", CorrectionRequest((R1,)))]
+    assert machine.on_versions("r2", versions, 0.5) == []
+    assert machine.on_versions("r2", versions, 1.0) == [Unicast("r2", CorrectionRequest((R1,)))]
+
+
+def test_another_peer_is_asked_for_it_when_the_first_was_not_heard_again() -> None:
+    machine, versions = corrections(), (CorrectionVersion(R1, Term(1, R2), 1),)
+    machine.on_versions("r2", versions, 0.0)
+    assert machine.on_versions("r3", versions, 1.0) == []
+    assert machine.ask("r3", 2.0) == [Unicast("r3", CorrectionRequest((R1,)))]
+
+
+def test_what_somebody_says_to_hold_and_nobody_sends_is_given_up() -> None:
+    machine, questions = corrections(), 0
+    machine.on_versions("r2", (CorrectionVersion(R1, Term(1, R2), 1),), 0.0)
+    for second in range(1, 60):
+        questions += len(machine.ask("r2", float(second)))
+    assert questions == ASKED_MAX - 1
+    assert machine.sizes()["wanted_corrections"][0] == 0
 
 
 def test_versions_of_strangers_do_not_fill_the_memory() -> None:
     machine = corrections()
     for t in range(2000):
-        machine.on_versions("r2", (CorrectionVersion(LogId("r9", t), Term(1, R2), 1),), float(t))
-    assert machine.sizes()["asked_corrections"] == (REMEMBERED_MAX, REMEMBERED_MAX)
+        machine.on_versions("r2", (CorrectionVersion(LogId("r9", t), Term(1, R2), 1),), 0.0)
+    assert machine.sizes()["wanted_corrections"] == (REMEMBERED_MAX, REMEMBERED_MAX)
 
 
 def test_what_did_not_move_is_not_sent_again_in_one_term() -> None:
@@ -205,7 +221,7 @@ def test_a_forged_correction_raises_no_counter() -> None:
 
 def test_versions_that_nobody_holds_raise_no_counter() -> None:
     robot = Robot(R1, 0, 1, CoreParameters(), 0.0)
-    lie = Heartbeat(1, 7, 0, None, 0, 0, (), (CorrectionVersion(R2, Term(900, R2), 1),))
+    lie = Digests(7, 0, (), 1, (CorrectionVersion(R2, Term(900, R2), 1),))
     robot.handle(MessageReceived(Envelope(R2, lie)), 0.1)
     assert robot.election.counter_max == 0
 

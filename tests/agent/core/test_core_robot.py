@@ -21,7 +21,7 @@ R1, R2 = LogId("r1"), LogId("r2")
 
 
 def heartbeat(boot: int, sequence: int = 1) -> Heartbeat:
-    return Heartbeat(sequence, boot, 0, None, 0, 0, ())
+    return Heartbeat(sequence, boot, 0, None, 0, 0)
 
 
 def disk_of(robots: Robots, name: str) -> Restored:
@@ -223,7 +223,7 @@ def test_no_pair_is_handed_to_a_name_under_which_two_robots_run() -> None:
     robots = Robots()
     robot = robots.add("r1")
     for boot in (7, 8, 7):
-        message = Heartbeat(boot, boot, 9, None, 0, 0, ())
+        message = Heartbeat(boot, boot, 9, None, 0, 0)
         robots.put("r1", MessageReceived(Envelope(LogId("server", boot), message)))
     found = Candidate(CandidatePair.of(keyframe("r3/1"), keyframe("r4/1")), 0.9)
     robots.carry_out("r1", robot.closing.on_candidates([found], robots.now_s))

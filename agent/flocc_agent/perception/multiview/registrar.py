@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.interfaces import OdometryPair, SeenMatches
 from flocc_agent.core.registration import (
     Registration,
     RegistrationFailed,
@@ -123,6 +123,21 @@ class PairRegistrar(Generic[F]):
         features_before, features_now = self._read(before), self._read(now)
         matched = self._match(features_now, features_before)
         return flow_of(features_before, features_now, matched, T_odom_before, T_odom_now)
+
+    def matches(self, query: bytes, match: bytes) -> SeenMatches:
+        """Tell which points of two images look alike, and which of those agree with one relative pose.
+
+        Raises:
+            BadLatent: A latent is damaged or of another model.
+        """
+        query_features, match_features = self._read(query), self._read(match)
+        matched = self._match(query_features, match_features)
+        pair = two_view(query_features, match_features, matched, self._geometry)
+        agree = (
+            np.zeros(len(matched[0]), np.bool_) if isinstance(pair, int) else np.isin(matched[0], pair.query_indices)
+        )
+        points = query_features.points[matched[0]], match_features.points[matched[1]]
+        return SeenMatches(points[0].astype(np.float64), points[1].astype(np.float64), agree)
 
     def _pair(self, first: F, second: F, prior: DirectionPrior | None = None) -> TwoView | int:
         matched = self._match(first, second)
