@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from flocc_agent.backend import build_iterator, build_optimiser
 from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
-from flocc_agent.core.interfaces import Camera, Image, Perception
+from flocc_agent.core.interfaces import Camera, Image, ImageWatch, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
@@ -362,6 +362,7 @@ class Agent:
             transport.serve_admin(Admin.CHAOS, self._disturb)
         tools = Tools(
             perception,
+            self._camera_watch(),
             build_optimiser(config.backend),
             build_iterator(config.backend),
             self._workers,
@@ -372,6 +373,12 @@ class Agent:
         return Driver(
             core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
         )
+
+    def _camera_watch(self) -> ImageWatch:
+        """What looks at this robot's images."""
+        from flocc_agent.perception.watch.camera_watch import CameraWatch
+
+        return CameraWatch(None if self._recording is None else self._recording.hidden)
 
     @property
     def _method(self) -> str | None:

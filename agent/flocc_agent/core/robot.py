@@ -246,12 +246,12 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor):
+            case KeyframeEncoded(keyframe, descriptor, doubts):
                 self.closing.on_held(keyframe)
-                return self._on_encoded(keyframe, descriptor, now)
-            case KeyframeEncodingFailed(keyframe, reason):
-                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
-                return [report, *self._on_encoded(keyframe, None, now)]
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
+                return [*reports, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
@@ -377,7 +377,7 @@ class Robot:
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
-        return [Encode(KeyframeId(self.log, index), event.image)]
+        return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
