@@ -10,7 +10,7 @@ import os
 import signal
 import time
 import zlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,10 +29,12 @@ from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
-from flocc_agent.runtime.facts import KilledByOrder
+from flocc_agent.runtime.facts import JourneyEnded, KilledByOrder
 from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
 from flocc_agent.runtime.jobs import Tools
+from flocc_agent.runtime.kept_for_maps import keep_camera, keep_front_end, keep_map, lens_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
+from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_faults import network_faults
@@ -41,7 +43,7 @@ from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import Reporter, result_of
-from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.robot_result import RobotResult, write_result
 from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
@@ -80,6 +82,9 @@ class Agent:
         on_report: Callable[[Reported[Fact]], None] | None = None,
         clock_s: Callable[[], float] | None = None,
         perception: Perception | None = None,
+        map_fixed: bool = False,
+        new_journey: bool = False,
+        ros_args: Sequence[str] = (),
     ) -> None:
         """Prepare an agent; `async with` starts it.
 
@@ -90,6 +95,10 @@ class Agent:
             on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
             clock_s: Seconds since the start of the run; None counts from now.
             perception: What it sees with; None builds what `config.perception` names.
+            map_fixed: The map of `config.map` does not move, whatever is measured in it.
+            new_journey: The odometry began anew since the last start: write another log, joined to the earlier ones by
+                closures.
+            ros_args: What ROS 2 is started with: what stands behind `--ros-args` elsewhere.
 
         Raises:
             BadKeyframe: `T_body_camera` is no pose.
@@ -100,6 +109,9 @@ class Agent:
         self._on_report = on_report or (lambda _: None)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._perception = perception
+        self._map_fixed = map_fixed
+        self._new_journey = new_journey
+        self._ros_args = tuple(ros_args)
         self._recording = _recording(config)
         self._camera = self._recording.camera if self._recording else camera
         given = np.eye(4) if T_body_camera is None else _mounting(T_body_camera, config.name)
@@ -323,7 +335,16 @@ class Agent:
     def _compose(self) -> Driver:
         """Name every concrete class."""
         config = self.config
+        opened = None if config.map is None else MapFolder.open(config.map)
+        perception = self._perception or build_perception(config.perception, config.seed)
         self._store = _open_store(config)
+        if self._new_journey:
+            self._store.begin_journey()
+        keep_front_end(self._store, self._method, config.perception, perception)
+        if self._camera is not None:
+            keep_camera(self._store, self._camera, self._T_body_camera)
+        if opened is not None:
+            self._use_map(opened, perception)
         self._workers = Workers()
         self._radio = Radio(
             config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())])
@@ -331,7 +352,7 @@ class Agent:
         if config.ros2 is not None:
             self._ros2 = self._adapter(config.ros2)
         sealer = _sealer(config)
-        restored = restore(self._store, sealer)
+        restored = restore(self._store, sealer, opened, self._map_fixed)
         log = self._store.identity.log
         boot = int.from_bytes(os.urandom(6))
         distributed = config.backend.mode is BackendMode.DISTRIBUTED
@@ -344,7 +365,7 @@ class Agent:
         if config.transport.chaos:
             transport.serve_admin(Admin.CHAOS, self._disturb)
         tools = Tools(
-            self._perception or build_perception(config.perception, config.seed),
+            perception,
             build_optimiser(config.backend),
             build_iterator(config.backend),
             self._workers,
@@ -355,6 +376,22 @@ class Agent:
         return Driver(
             core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
         )
+
+    @property
+    def _method(self) -> str | None:
+        """What the front end is called; a program's own has no name."""
+        return self.config.perception.method if self._perception is None else None
+
+    def _use_map(self, opened: MapFolder, perception: Perception) -> None:
+        """Serve a map's latents, if this robot's own can be compared with them."""
+        assert self._store is not None
+        opened.check_front_end(self._method, perception.encoder.model)
+        if self._camera is not None:
+            warning = opened.other_lens(lens_of(self._camera))
+            if warning is not None:
+                logger.warning("robot %s: %s", self.config.name, warning)
+        self._store.open_map(opened)
+        keep_map(self._store, opened, self._map_fixed)
 
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
@@ -408,8 +445,27 @@ class Agent:
             lambda: self._started.corrected_bodies(),
             lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
             report,
+            self._save_result,
+            self._begin_anew,
         )
-        return Ros2Adapter(config, self.config.name, self._selector, host)
+        return Ros2Adapter(config, self.config.name, self._selector, host, self._ros_args)
+
+    def _save_result(self) -> str:
+        """Write what the robot knows now, and say where.
+
+        Raises:
+            OSError: There is no folder, or its disk does not take it.
+        """
+        if self.config.folder is None:
+            raise FileNotFoundError("the agent has no folder (the key 'folder'), so nothing was written")
+        return str(write_result(self.config.folder, self._started.result()).resolve())
+
+    def _begin_anew(self) -> None:
+        """End this journey: who runs the agent starts it again, and it begins another log."""
+        assert self._store is not None
+        self._store.end_log()
+        self._on_report(Reported(self._clock_s(), self.config.name, JourneyEnded()))
+        self.stop()
 
     def _on_position(self, position_m: Float) -> None:
         if self._radio is not None:
@@ -443,7 +499,8 @@ def stored_result(config: AgentConfig) -> RobotResult:
     store = _open_store(config)
     try:
         sealer = _sealer(config)
-        restored = restore(store, sealer)
+        opened = None if config.map is None else MapFolder.open(config.map)
+        restored = restore(store, sealer, opened)
         robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restored, sealer)
     finally:
         store.close()

@@ -232,3 +232,32 @@ def test_a_browser_shows_maps_that_are_apart(tmp_path: Path) -> None:
         html = browse(dashboard.url, tmp_path / "profile")
     assert ">3 maps<" in html
     assert html.count("<svg") == 3
+
+
+@pytest.mark.slow
+def test_robots_without_a_map_are_drawn_apart_and_stale_leaders_have_no_star(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run", start_s=None)
+    for robot in ("r1", "r2", "r3"):
+        add(folder, 1.0, robot, "keyframe", keyframe=f"{robot}/0", stamp_s=0.0, T_odom_body=IDENTITY)
+        add(folder, 1.0, robot, "leader", term=1, leader=robot)
+        for peer in {"r1", "r2", "r3"} - {robot}:
+            add(folder, 1.5, robot, "neighbour_up", peer=peer)
+    for robot in ("r1", "r3"):
+        add(folder, 2.0, robot, "leader", term=2, leader="r1")
+    with Dashboard(folder, port=0) as dashboard:
+        html = browse(dashboard.url, tmp_path / "profile")
+    assert ">0 maps, 3 robots without<" in html
+    assert len(re.findall(r"<b>odometry alone</b>: r\d<", html)) == html.count("<svg") == 3
+    assert re.findall(r">(r\d ★)<", html) == ["r1 ★"], "r2 leads itself, and hears a newer leader"
+    assert ">leader r1 (term 2)<" in html
+
+
+def test_rejected_candidates_are_counted_and_not_listed(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run")
+    for k in range(100):
+        add(folder, 5.0 + k, "r1", "closure_rejected", query="r1/0", match=f"r2/{k}", ratio=0.1, reason="few")
+    add(folder, 200.0, "r1", "closure_accepted", query="r1/0", match="r2/0", ratio=1.0, probability=0.9,
+        correspondences=99, odometry_correspondences=99, scale_initial=None, by="r1")  # fmt: skip
+    snapshot = RunSource(folder).snapshot()
+    assert robot_of(snapshot, "r1").rejected == 100
+    assert [said.text for said in snapshot.recent] == ["closure r1/0 – r2/0, match ratio 1.00"]

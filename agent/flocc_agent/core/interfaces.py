@@ -114,6 +114,21 @@ class PictureEncoder(Encoder, Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenMatches:
+    """Points that look alike in two images, for people to look at.
+
+    Attributes:
+        query: (K, 2) x/z and y/z of each point in the query's camera, free of distortion.
+        match: (K, 2) the same points in the match's camera.
+        agree: (K,) which of them fit one relative pose.
+    """
+
+    query: Float
+    match: Float
+    agree: NDArray[np.bool_]
+
+
 class Registrar(Protocol):
     """Two latents to correspondences and a relative pose up to scale."""
 
@@ -127,6 +142,19 @@ class Registrar(Protocol):
 
         Returns:
             The relative pose up to scale, or why there is none. Raises nothing for bad latents of a peer.
+        """
+        ...
+
+
+@runtime_checkable
+class MatchTelling(Registrar, Protocol):
+    """A registrar that can tell which points it matched."""
+
+    def matches(self, query: bytes, match: bytes, /) -> SeenMatches:
+        """Match two latents of its own.
+
+        Raises:
+            BadLatent: A latent is damaged or of another model.
         """
         ...
 
@@ -171,6 +199,10 @@ class Perception:
         if not isinstance(result, Registration | RegistrationFailed):
             raise TypeError(f"a registration is a Registration or RegistrationFailed, not {type(result).__name__}")
         return result
+
+    def matches(self, query: bytes, match: bytes) -> SeenMatches | None:
+        """Give what the registrar matched in two latents; None where it cannot tell."""
+        return self.registrar.matches(query, match) if isinstance(self.registrar, MatchTelling) else None
 
     def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
         """Give what is sent of a stored latent; see `PictureEncoder.part`."""

@@ -308,6 +308,34 @@ class RoundTimedOut:
     round: int
 
 
+@fact("map_opened")
+class MapOpened:
+    """A robot began with a saved map: its frame and logs, how many keyframes it has, and whether it is fixed."""
+
+    map_frame: str
+    logs: tuple[LogId, ...]
+    keyframes: int
+    is_fixed: bool
+
+
+@fact("found_in_map")
+class FoundInMap:
+    """A robot's first correction in the frame of the map that it opened: so long after its start and first keyframe."""
+
+    map_frame: str
+    keyframes: int
+    after_start_s: float
+    after_keyframe_s: float
+
+
+@fact("map_log_written")
+class MapLogWritten:
+    """A robot in range writes a log of the opened map, which nobody should write any more."""
+
+    peer: str
+    log: LogId
+
+
 @fact("stale_solution")
 class SolutionIgnored:
     """A solution came after its round was given up."""

@@ -34,6 +34,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
+from flocc_agent.core.in_map import InMap
 from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
@@ -61,6 +62,7 @@ from flocc_agent.core.reports import (
     SolutionIgnored,
 )
 from flocc_agent.core.rounds import Rounds, solution_report
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
@@ -110,6 +112,8 @@ class Restored:
         term_counter: Highest term counter the robot claimed.
         correction: The correction it applied last.
         frame_changed: That correction changed the map frame, and nobody knows whether consumers heard of it.
+        saved: The map that it opens; its logs are among the records, its latents among the latents.
+        journeys: Earlier logs of its own that it goes on from.
     """
 
     records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
@@ -117,6 +121,12 @@ class Restored:
     term_counter: int = 0
     correction: LogCorrection | None = None
     frame_changed: bool = False
+    saved: SavedMap | None = None
+    journeys: frozenset[LogId] = frozenset()
+
+    def closed(self) -> frozenset[LogId]:
+        """Logs that nobody writes any more, and whose latents are on this robot's disk."""
+        return self.journeys if self.saved is None else self.journeys | self.saved.closed
 
     def counter_max(self) -> int:
         """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
@@ -158,14 +168,22 @@ class Robot:
         self._heartbeat_s = float("-inf")
         self._pending: list[_Pending] = []
         self._waiting: dict[int, list[Measurement]] = {}
+        self._served = frozenset(restored.latents if restored.saved is not None else ())
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
-        self.assembly = GraphAssembly()
-        self.recognition = PlaceRecognition(log, parameters.place_recognition)
+        self.assembly = GraphAssembly(restored.saved)
+        closed = restored.closed()
+        self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
-        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
+        comes_back = any(each not in closed for each, _ in restored.records)
+        listens_until_s = now + parameters.election.startup_s if comes_back else float("-inf")
+        pair_of = self.assembly.odometry_pair
+        self.closing = LoopClosing(
+            log, compute_class, pair_of, parameters.loop_closing, spectral, closed, listens_until_s
+        )
+        self.in_map = None if restored.saved is None else InMap(restored.saved, now)
         self.corrections = Corrections(
             log,
             parameters.gossip,
@@ -184,7 +202,7 @@ class Robot:
     def handle(self, event: Event, now: float) -> list[Effect]:
         """Something happened."""
         effects = self._dispatch(event, now)
-        return effects + self._settle(now)
+        return self._placed(effects + self._settle(now), now)
 
     def tick(self, now: float) -> list[Effect]:
         """Time passed."""
@@ -192,7 +210,13 @@ class Robot:
         effects += self.election.tick(now)
         if self._heartbeat_due_s <= now:
             effects += self._heartbeat(now)
-        return effects + self._settle(now)
+        return self._placed(effects + self._settle(now), now)
+
+    def _placed(self, effects: list[Effect], now: float) -> list[Effect]:
+        """Tell of the opened map, and when this robot finds itself in it."""
+        if self.in_map is None:
+            return effects
+        return effects + self.in_map.told(effects, self.gossip.logs[self.log].keyframes, now)
 
     def deadline(self) -> float:
         """When `tick` is due next, in seconds of the driver's clock."""
@@ -305,6 +329,8 @@ class Robot:
             return effects
         if not known:
             self._greet(heartbeat, now)
+        if self.in_map is not None:
+            effects += self.in_map.on_heartbeat(sender)
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self._compare(sender, heartbeat, now)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else heartbeat.compute_class
@@ -440,7 +466,7 @@ class Robot:
             match record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
-                    if descriptor is not None:
+                    if descriptor is not None and self._may_match(KeyframeId(new.log, index)):
                         described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match))
@@ -449,6 +475,11 @@ class Robot:
                 case _:
                     assert_never(record)
         return self._recognise(described, now) if described else []
+
+    def _may_match(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe can be registered; of a pruned map not all have a latent."""
+        saved = None if self.in_map is None else self.in_map.saved
+        return saved is None or keyframe.log not in saved.closed or keyframe in self._served
 
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
         """Look for keyframes' candidates; after a restart not between a keyframe and a log where it had a partner."""

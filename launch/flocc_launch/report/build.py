@@ -83,6 +83,7 @@ def build(loaded: LoadedRun) -> RunReport:
         iate_moments=0 if during is None else during.moments,
         if1=mean_f1(moments, judged_closures(loaded)),
         odometry_scale=dict.fromkeys(loaded.robots),
+        maps_used=[str(run.settings["map"])] if "map" in run.settings else [],
         bytes=total_bytes(by_robot),
         bytes_by_robot=by_robot,
         links=links_of(loaded.events),

@@ -14,6 +14,7 @@ from flocc_agent.core.reports import Fact
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied, AgentStopped
+from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.reporting import Reporter
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.agenda import Agenda
@@ -35,11 +36,27 @@ LINKS, WORK, BOOTS, AIR = 1, 2, 3, 4
 
 @dataclass(frozen=True, slots=True)
 class Equipment:
-    """What all robots of a swarm carry."""
+    """What all robots of a swarm carry.
+
+    Attributes:
+        eyes: Perception.
+        optimiser: Of pose graphs.
+        times: How long workers take.
+        opened: A saved map; None: there is none.
+        map_fixed: It does not move.
+        lives: Robot -> the incarnation with which it begins, where that is not the first.
+    """
 
     eyes: Eyes
     optimiser: Optimiser
     times: WorkTimes = field(default_factory=WorkTimes)
+    opened: MapFolder | None = None
+    map_fixed: bool = False
+    lives: Mapping[str, int] = field(default_factory=dict)
+
+    def disk(self, latent_bytes_max: int) -> Disk:
+        """A new disk, and the map beside it."""
+        return Disk(latent_bytes_max, opened=self.opened, map_fixed=self.map_fixed)
 
 
 class Swarm:
@@ -114,7 +131,7 @@ class Swarm:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
         station = self.stations[name]
         assert not station.running
-        station.disk = Disk(self.scenario.store.latent_bytes_max)
+        station.disk = self._equipment.disk(self.scenario.store.latent_bytes_max)
         station.log = LogId(station.log.robot, station.log.incarnation + 1)
 
     def report(self, name: str, fact: Fact) -> None:
@@ -130,7 +147,7 @@ class Swarm:
         rng = np.random.default_rng([self._seed, WORK, number])
         self.stations[name] = Station(
             name,
-            LogId(name),
+            LogId(name, self._equipment.lives.get(name, 0)),
             robot.compute_class,
             playback,
             VirtualWorkers(
@@ -140,7 +157,7 @@ class Swarm:
                 self._equipment.times,
                 rng,
             ),
-            Disk(self.scenario.store.latent_bytes_max),
+            self._equipment.disk(self.scenario.store.latent_bytes_max),
             Clock(robot.clock_offset_s, robot.clock_drift_ratio),
             self.agenda,
             self._around,

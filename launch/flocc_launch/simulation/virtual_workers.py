@@ -120,7 +120,7 @@ class VirtualWorkers:
         """Register a pair, or say which latent is missing."""
         latents: list[bytes] = []
         for keyframe in (job.query, job.match, job.neighbour):
-            latent = disk.latents.get(keyframe)
+            latent = disk.latent(keyframe)
             if latent is None:
                 return LatentMissing(job.pair, keyframe)
             latents.append(latent)

@@ -38,11 +38,14 @@ def pairs_of(registrar: LogId, count: int) -> list[CandidatePair]:
     return [pair for pair in pairs if registrar_of(pair) == registrar][:count]
 
 
-def closing(compute_class: int = 0, own: LogId = R1, **changes: Any) -> LoopClosing:
+def closing(
+    compute_class: int = 0, own: LogId = R1, listens_until_s: float = float("-inf"), **changes: Any
+) -> LoopClosing:
     def odometry_pair(k: KeyframeId) -> tuple[KeyframeId, Any]:
         return KeyframeId(k.log, k.index - 1), ONE
 
-    return LoopClosing(own, compute_class, odometry_pair, LoopClosingParameters(**changes))
+    parameters = LoopClosingParameters(**changes)
+    return LoopClosing(own, compute_class, odometry_pair, parameters, listens_until_s=listens_until_s)
 
 
 def found(machine: LoopClosing, pair: CandidatePair, similarity: float = 0.9, now: float = 0.0) -> None:
@@ -183,6 +186,17 @@ def test_an_offer_of_a_pair_that_is_neither_transferred_nor_own_is_ignored() -> 
     machine, pair = closing(), pair_of(R2)
     machine.on_offer(CandidateOffer((pair,)), 0.0)
     assert machine.open_pairs() == []
+
+
+def test_a_robot_that_comes_back_listens_before_it_decides_about_a_pair() -> None:
+    machine = closing(listens_until_s=1.5)
+    pair = pair_of(R1)
+    hold_all(machine, pair)
+    found(machine, pair)
+    assert machine.tick(0.0) == []
+    assert machine.deadline() == 1.5
+    machine.on_peer("r9", Peer(9))
+    assert offers(machine.tick(1.5)) == [("r9", True)]
 
 
 def test_a_resolved_pair_is_never_taken_up_again() -> None:

@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.interfaces import OdometryPair, SeenMatches
 from flocc_agent.core.registration import (
     Registration,
     RegistrationFailed,
@@ -107,6 +107,21 @@ class PairRegistrar(Generic[F]):
                 neighbour_pair = self._pair(self._read(odometry.latent), match_features)
             evidence = evidence_of_neighbour(evidence, neighbour_pair, result, odometry.T_neighbour_query)
         return (result if rule is None else rule.judged(result, evidence)), evidence
+
+    def matches(self, query: bytes, match: bytes) -> SeenMatches:
+        """Tell which points of two images look alike, and which of those agree with one relative pose.
+
+        Raises:
+            BadLatent: A latent is damaged or of another model.
+        """
+        query_features, match_features = self._read(query), self._read(match)
+        matched = self._match(query_features, match_features)
+        pair = two_view(query_features, match_features, matched, self._geometry)
+        agree = (
+            np.zeros(len(matched[0]), np.bool_) if isinstance(pair, int) else np.isin(matched[0], pair.query_indices)
+        )
+        points = query_features.points[matched[0]], match_features.points[matched[1]]
+        return SeenMatches(points[0].astype(np.float64), points[1].astype(np.float64), agree)
 
     def _pair(self, first: F, second: F, prior: DirectionPrior | None = None) -> TwoView | int:
         return two_view(first, second, self._match(first, second), self._geometry, prior)

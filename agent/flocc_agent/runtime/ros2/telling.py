@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.corrected import Correction
+from flocc_agent.runtime.ros2.node import RosNode, RosPublisher
 from flocc_agent.runtime.ros2.outgoing import Outgoing
-from flocc_agent.runtime.ros2.session import Publisher, Ros2Session
 from flocc_agent.runtime.ros2.topics import Qos
 from flocc_agent.runtime.ros2.types import PATH, POSE, TEXT, TF, MessageTypes
 
@@ -31,22 +31,22 @@ Trajectory = Callable[[], tuple[list[float], Float] | None]
 class Teller:
     """Publishes what corrections say."""
 
-    def __init__(self, config: Ros2Config, types: MessageTypes, session: Ros2Session, trajectory: Trajectory) -> None:
+    def __init__(self, config: Ros2Config, types: MessageTypes, node: RosNode, trajectory: Trajectory) -> None:
         """Declare the publishers.
 
         Args:
             config: Topics, frames, periods.
             types: Writes messages.
-            session: Where to publish.
+            node: Where to publish.
             trajectory: The corrected path; called off the loop's thread.
         """
         self._config = config
         self._outgoing = Outgoing(types, config.map_frame, config.odom_frame)
         self._trajectory = trajectory
-        self._tf = session.publisher(config.tf_topic, TF, TF_QOS)
-        self._path = session.publisher(config.path_topic, PATH, LATCHED)
-        self._pose = session.publisher(config.pose_topic, POSE, RELIABLE)
-        self._map_frame = session.publisher(MAP_FRAME_TOPIC, TEXT, LATCHED)
+        self._tf = node.publisher(config.tf_topic, TF, TF_QOS)
+        self._path = node.publisher(config.path_topic, PATH, LATCHED)
+        self._pose = node.publisher(config.pose_topic, POSE, RELIABLE)
+        self._map_frame = node.publisher(MAP_FRAME_TOPIC, TEXT, LATCHED)
         self._correction: Correction | None = None
         self._tf_last_ns: int | None = None
         self.path_changed = False
@@ -69,12 +69,12 @@ class Teller:
         self._put_transform(correction, stamp_ns)
         self._pose.put(self._outgoing.pose(correction.T_map_odom, correction.covariance, T_odom_body, stamp_ns))
 
-    async def beat(self) -> None:
+    async def beat(self, node: RosNode) -> None:
         """Publish map to odom by the clock where no odometry comes by ROS."""
         while not self._config.odometry_topic:
             await asyncio.sleep(self._config.tf_period_s)
             if self._correction is not None:
-                self._put_transform(self._correction, time.time_ns())
+                self._put_transform(self._correction, node.now_ns())
 
     async def draw(self) -> None:
         """Publish the path when it changed, for at most a tenth of the time: it grows with the run."""
@@ -104,7 +104,7 @@ class Teller:
         self._tf.put(self._outgoing.transform(correction.T_map_odom, stamp_ns + ahead_ns))
 
 
-def _put_one(publisher: Publisher, make: Callable[[], Any]) -> None:
+def _put_one(publisher: RosPublisher, make: Callable[[], Any]) -> None:
     message = make()
     if message is not None:
         publisher.put(message)

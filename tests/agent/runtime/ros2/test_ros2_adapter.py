@@ -88,6 +88,7 @@ class Agent:
         self.mounted: list[Float] = []
         self.measured: list[tuple[Measurement, float]] = []
         self.facts: list[Fact] = []
+        self.resets: list[None] = []
         self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
         self.poses = [(EPOCH_S + 0.25, np.eye(4)), (EPOCH_S + 1.0, T_MAP_ODOM)]
 
@@ -104,6 +105,8 @@ class Agent:
             self.trajectory,
             lambda measurement, stamp_s: self.measured.append((measurement, stamp_s)),
             self.facts.append,
+            lambda: "r1/result.json",
+            lambda: self.resets.append(None),
         )
 
     def problems(self) -> list[str]:
@@ -131,7 +134,8 @@ def ros(port: int, domain_id: int = 0) -> Iterator[Robot]:
 @asynccontextmanager
 async def adapted(port: int, **options: Any) -> AsyncIterator[tuple[Agent, Ros2Adapter]]:
     """An adapter that runs; it must end when its corrections end."""
-    config = Ros2Config(router=f"tcp/127.0.0.1:{port}", namespace="/r1", path_period_s=0.1, **options)
+    where = {"middleware": "rmw_zenoh", "router": f"tcp/127.0.0.1:{port}", "namespace": "/r1"}
+    config = Ros2Config.model_validate({**where, "path_period_s": 0.1, **options})
     agent = Agent()
     adapter = Ros2Adapter(config, "r-1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
     running = asyncio.create_task(adapter.run(agent.corrections))
@@ -256,7 +260,7 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
     (port,) = free_ports(1)
     with ros(port) as robot:
         async with adapted(port):
-            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 9)
+            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 11)
             ours = [token.split("/") for token in robot.node.tokens if "flocc_r_1" in token]
     assert {chunks[2] for chunks in ours} != {str(robot.node.session.zid())}
     assert {tuple(chunks[6:9]) for chunks in ours} == {("%", "%r1", "flocc_r_1")}
@@ -269,8 +273,10 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
         ("MS", "%r1%camera%image_raw", "2::,5:,:,:,,"),
         ("MS", "%r1%camera%camera_info", "2::,5:,:,:,,"),
         ("MS", "%tf_static", ":1:,100:,:,:,,"),
+        ("SS", "%r1%flocc_r_1%save_map", "::,10:,:,:,,"),
+        ("SS", "%r1%flocc_r_1%reset_odometry", "::,10:,:,:,,"),
     }
-    assert len({chunks[4] for chunks in ours}) == 9
+    assert len({chunks[4] for chunks in ours}) == 11
 
 
 async def test_a_topic_of_another_type_is_said() -> None:
@@ -380,7 +386,7 @@ def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], said
 @pytest.mark.parametrize("package", ["rosbags.typesys", "xxhash"])
 def test_a_missing_extra_is_said(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(Ros2Error, match=r"needs rosbags and xxhash: pip install 'flocc\[ros2\]'"):
+    with pytest.raises(Ros2Error, match=r"needs rosbags and xxhash: pip install '\.\[ros2\]'"):
         Ros2Adapter(Ros2Config(), "r1", KeyframeSelector(KeyframeConfig()), Agent().host())
 
 
@@ -401,8 +407,9 @@ def mutated(payload: bytes, rng: np.random.Generator) -> bytes:
 async def test_no_payload_of_any_kind_stops_the_adapter() -> None:
     rng, agent = np.random.default_rng(11), Agent()
     selector = KeyframeSelector(KeyframeConfig(distance_m=0.0))
-    adapter = Ros2Adapter(Ros2Config(camera_mounting=MOUNTING), "r1", selector, agent.host())
-    adapter._mount(T_BODY_CAMERA)
+    config = Ros2Config(camera_mounting=MOUNTING)
+    adapter = Ros2Adapter(config, "r1", selector, agent.host())
+    hearing = adapter._hearing = adapter._heard(config)
     K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
     info = cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.1, 0.0, 0.0, 0.0, 0.1], P)
     placed = cdr_by_hand.transforms([Stamped((0, 0), "base_link", "optical", MOUNTING[:3], MOUNTING[3:])])
@@ -412,9 +419,9 @@ async def test_no_payload_of_any_kind_stops_the_adapter() -> None:
         sent = {"odometry": cdr_by_hand.odometry(sample), "image": picture, "camera_info": info, "tf_static": placed}
         for kind, payload in sent.items():
             adapter._arrived(Incoming("", kind, mutated(payload, rng)))
-        while (posed := adapter._synchroniser.next()) is not None:
+        while (posed := hearing.synchroniser.next()) is not None:
             with suppress(BadMessage):
-                await adapter._consider(posed)
+                await adapter._consider(hearing, posed)
     assert len(agent.problems()) <= 64
     assert sum(adapter.counters().values()) > 300
     assert all(np.all(np.isfinite(T)) for _, T, _ in agent.keyframes)
