@@ -272,6 +272,10 @@ class Agent:
         while (correction := await queue.get()) is not None:
             yield correction
 
+    def follow_others(self) -> None:
+        """Learn from now on how all robots' earlier poses were corrected (`Correction.others`), not only the last."""
+        self._started.robot.corrections.follow_all()
+
     @property
     def robot(self) -> Robot:
         """The running core, for those who watch: to be read on the event loop's thread only, and never changed."""

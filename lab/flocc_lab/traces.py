@@ -190,7 +190,8 @@ class _Trace:
         if isinstance(event, MessageReceived) and isinstance(event.envelope.message, CorrectionBatch):
             for correction in event.envelope.message.corrections:
                 sender = self._swarm.stations[correction.term.leader.robot]
-                self._corrections.setdefault(correction.log.robot, (sender, correction))
+                if correction.knots is not None:
+                    self._corrections.setdefault(correction.log.robot, (sender, correction))
         for effect in effects:
             text = _told(effect)
             if text is not None:
