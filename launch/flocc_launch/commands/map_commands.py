@@ -90,3 +90,34 @@ def prune(
     sizes = f"{before.latent_file.bytes / 1e6:.1f} to {after.latent_file.bytes / 1e6:.1f} MB"
     typer.echo(f"{before.latents} to {after.latents} latents, {sizes}")
     typer.echo(f"map: {out.resolve()}")
+
+
+@maps.command()
+def sessions(
+    recordings_of: Annotated[
+        str, typer.Argument(metavar="DATA", help="Folder of one recording per session, or a scenario.")
+    ],
+    out: MapOut,
+    runs: Annotated[Path, typer.Option(help="Folder for the run and the map of each session.")] = Path("runs/sessions"),
+    begin: Annotated[Path | None, typer.Option("--map", help="A map to begin with.")] = None,
+    sets: Annotated[list[str] | None, typer.Option("--set", help="Another value for a key.")] = None,
+) -> None:
+    """Make one map of recordings of different times, one after the other, in the order of their names."""
+    from flocc_agent.config import parsed_change
+    from flocc_launch.commands.common import progress_bar
+    from flocc_launch.scenarios.recordings import recordings
+    from flocc_launch.scenarios.shipped import read_scenario
+    from flocc_launch.setup.cache import cache_folder
+    from flocc_launch.simulation.sessions import Session, map_of_sessions
+
+    def tell(session: Session) -> None:
+        closures = session.report.closures.accepted
+        typer.echo(f"{session.name}: {session.left_out or f'in {session.report.map_frames[0]}, {closures} closures'}")
+
+    changes = dict(parsed_change(text) for text in sets or ())
+    scenario = read_scenario(recordings_of, changes, None, typer.echo)
+    with progress_bar("preparing data") as progress:
+        paths = recordings(scenario, progress)
+    manifest = map_of_sessions(scenario, paths, out, runs, begin, cache_folder() / "perception", tell)
+    typer.echo(f"{manifest.frame}: edition {manifest.edition}, {manifest.poses} logs, {manifest.closures} closures")
+    typer.echo(f"map: {out.resolve()}")

@@ -13,7 +13,7 @@ from flocc_launch.maps.gathering import Gathered, Logs, Optics, gathered
 from flocc_launch.maps.map_page import map_page
 from flocc_launch.maps.solving import NotSolved, SolvedMap, solved_map
 from flocc_launch.maps.thumbnails import thumbnails
-from flocc_launch.maps.writing import MapContent, check_target, write_map
+from flocc_launch.maps.writing import PAGE, MapContent, check_target, write_map
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -49,6 +49,29 @@ def save_map(where: Path, out: Path, name: str | None = None, frame: str | None 
         swarm=_swarm(where),
         pruned=earlier is not None and earlier.manifest.pruned,
         page=lambda manifest: map_page(manifest, solved, thumbnails(found.recordings, logs)),
+    )
+    return write_map(out, content)
+
+
+def copy_map(opened: MapFolder, out: Path) -> MapManifest:
+    """Write a map once more elsewhere, in one step; its page and thumbnails are those that it has.
+
+    Raises:
+        BadMap: It is damaged, or `out` cannot be written.
+    """
+    manifest = opened.manifest
+    page = opened.path / PAGE
+    content = MapContent(
+        name=manifest.name,
+        logs=opened.records,
+        solved=SolvedMap(opened.saved(), opened.covariances(), {}),
+        front_end=manifest.front_end,
+        optics=optics_of(opened),
+        latents=latents_of(opened),
+        edition=manifest.edition,
+        swarm=manifest.swarm,
+        pruned=manifest.pruned,
+        page=(lambda _: page.read_text(encoding="utf-8")) if page.is_file() else None,
     )
     return write_map(out, content)
 
