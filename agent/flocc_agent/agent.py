@@ -52,7 +52,7 @@ from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.errors import FloccError
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.keys import Admin
 
 if TYPE_CHECKING:
@@ -355,6 +355,10 @@ class Agent:
                 for task in done:
                     task.result()
             await self._while_journey_begins()
+
+    async def fetch_latent(self, keyframe: KeyframeId, deadline_s: float) -> bool:
+        """Bring another robot's latent into this one's store, where that robot is in range; whether it came."""
+        return await self._started.fetch_latent(keyframe, deadline_s)
 
     def result(self) -> RobotResult | None:
         """What this robot knows (`result.json`), None before it started."""
