@@ -496,6 +496,7 @@ class Agent:
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
+        from flocc_agent.runtime.ros2.markers import known_closures
 
         def report(fact: Fact) -> None:
             self._on_report(Reported(self._clock_s(), self.config.name, fact))
@@ -508,6 +509,8 @@ class Agent:
             report,
             self._save_result,
             self._begin_anew,
+            lambda: known_closures(self._started.robot, self.config.backend.steepness),
+            self._state,
         )
         return Ros2Adapter(config, self.config.name, self._selector, host, self._ros_args)
 
@@ -529,6 +532,11 @@ class Agent:
         if self.config.folder is None:
             raise FileNotFoundError("the agent has no folder (the key 'folder'), so nothing was written")
         return str(write_result(self.config.folder, self._started.result()).resolve())
+
+    def _state(self) -> tuple[AgentStatus, tuple[str, ...]]:
+        """What a robot monitor is told: the status, and what the last own solution warned of."""
+        solution = self._started.last_solution
+        return self.status(), () if solution is None else solution.warnings
 
     def _begin_anew(self) -> None:
         """End this journey: who runs the agent starts it again, and it begins another log."""

@@ -1,8 +1,13 @@
 """Configuration files: paths are relative to their file, wherever they stand in it."""
 
+import contextlib
+import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import BaseModel, ValidationError
 
 from flocc_agent.config import AgentConfig, TransportConfig
 from flocc_launch.scenarios.scenario import Scenario
@@ -54,3 +59,26 @@ def test_bulk_sessions_are_found_at_the_port_after_that_of_control() -> None:
 def test_a_multicast_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(ValueError, match="is no multicast address"):
         TransportConfig(multicast_address=address)
+
+
+def leaves(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every key of a section and of those within it."""
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            yield from leaves(inner, (*path, name))
+        else:
+            yield (*path, name)
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_no_key_takes_a_number_that_is_not_finite(value: float) -> None:
+    taken = []
+    for path in leaves(AgentConfig):
+        given: Any = value
+        for name in reversed(path):
+            given = {name: given}
+        with contextlib.suppress(ValidationError):
+            AgentConfig.model_validate({"name": "r1", **given})
+            taken.append(path)
+    assert taken == []

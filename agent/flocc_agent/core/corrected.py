@@ -72,6 +72,16 @@ class CorrectedLog:
     def __len__(self) -> int:
         return len(self._odometry.poses())
 
+    @property
+    def log(self) -> LogId:
+        """Which log it is."""
+        return self._correction.log
+
+    @property
+    def T_map_odom(self) -> Float:
+        """(4, 4) of the odom frame that the newest keyframes are in."""
+        return pose_from_tq(np.array(self._correction.T_map_odom))
+
     def pose_of(self, index: int) -> Float | None:
         """Corrected pose (4, 4) at a keyframe, by its number; None where no such keyframe is known."""
         poses = self._odometry.poses()

@@ -470,11 +470,15 @@ class Robot:
         return saved is None or keyframe.log not in saved.closed or keyframe in self._served
 
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
-        """Look for keyframes' candidates; after a restart not between a keyframe and a log where it had a partner."""
+        """Look for keyframes' candidates; after a restart not where both already had a partner in the other's log."""
         found = self.recognition.on_keyframes(keyframes)
         if self._partnered:
-            found = [(k, c) for k, c in found if (k, c.pair.other(k).log) not in self._partnered]
+            found = [(k, c) for k, c in found if not self._had_partners(k, c.pair.other(k))]
         return self.closing.on_candidates([candidate for _, candidate in found], now) if found else []
+
+    def _had_partners(self, one: KeyframeId, other: KeyframeId) -> bool:
+        """Whether each of two keyframes was registered with one of the other's log; else their pair waits still."""
+        return (one, other.log) in self._partnered and (other, one.log) in self._partnered
 
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
@@ -554,10 +558,13 @@ class Robot:
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
+        effects = self.closing.tick(now)
+        for keyframe in self.closing.own_lost():
+            effects += self._reject_lost(self.closing.on_latent_lost(keyframe, now), keyframe, now)
         if self.distributed is not None:
-            return [*self.closing.tick(now), *self._optimise_together(self.distributed, now)]
+            return [*effects, *self._optimise_together(self.distributed, now)]
         self.rounds.on_term(self.election.term if self.election.leading else None)
-        return [*self.closing.tick(now), *self.rounds.tick(now)]
+        return [*effects, *self.rounds.tick(now)]
 
     def _optimise_together(self, distributed: DistributedOptimisation, now: float) -> list[Effect]:
         """Iterate on the own block, and correct itself."""

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from flocc_launch.commands.common import EXIT_BAD_INPUT, EXIT_TRY_AGAIN, progress_bar, show_report
+from flocc_launch.commands.common import (
+    EXIT_BAD_INPUT,
+    EXIT_TRY_AGAIN,
+    Json,
+    Quiet,
+    Speech,
+    Verbose,
+    progress_bar,
+    show_report,
+)
 from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
 from flocc_launch.commands.map_commands import add_maps
@@ -72,7 +81,7 @@ def main() -> None:
     """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
     speak_utf8()
     try:
-        app(with_ros_args(sys.argv[1:]))
+        app(with_ros_args(sys.argv[1:]), prog_name="flocc")
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -104,14 +113,22 @@ def demo(
     out: Out = Path("runs/demo"),
     robots: Annotated[int, typer.Option(min=2, max=8, help="Robots in the generated world.")] = 3,
     seed: Annotated[int, typer.Option(help="Another seed is another world.")] = 7,
+    small: Annotated[bool, typer.Option("--small", help="Shorter routes, smaller pictures: within a minute.")] = False,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run the main job: robots in a generated world, real images, real zenoh, one report."""
-    from flocc_launch.scenarios.scenario import Scenario
     from flocc_launch.scenarios.shipped import read_shipped
+    from flocc_launch.scenarios.small_demo import small_demo
 
-    scenario = read_shipped("demo", {"world.robots": robots, "world.seed": seed})
-    assert isinstance(scenario, Scenario)
-    _launch(scenario, out)
+    speech = Speech(json_out, quiet, verbose)
+    if not small:
+        _launch(read_shipped("demo", {"world.robots": robots, "world.seed": seed}), out, speech)
+        return
+    with progress_bar("preparing data") as progress:
+        scenario = small_demo(robots, seed, progress)
+    _launch(scenario, out, speech)
 
 
 @app.command(short_help="Run a scenario or your own data, a process per robot.")
@@ -130,6 +147,11 @@ def launch(
     dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
     secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
+    mcap: Annotated[Path | None, typer.Option(help="The run as MCAP; run.mcap in --out where not given.")] = None,
+    foxglove: Annotated[str | None, typer.Option(help="Serve the run to Foxglove at [HOST:]PORT.")] = None,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     map_folder: Map = None,
     map_fixed: MapFixed = False,
 ) -> None:
@@ -137,8 +159,13 @@ def launch(
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     changes |= {} if rate is None else {"rate": rate}
     changes |= _parsed(sets)
+    if mcap is not None or foxglove is not None:
+        from flocc_launch.view.scene_drawing import foxglove_module
+
+        foxglove_module()  # a missing package is said before the run, not after it
     use = _map_use(map_folder, map_fixed)
-    _launch(_read(scenario, changes, agents), out, secure, dashboard, metrics, use)
+    speech = Speech(json_out, quiet, verbose)
+    _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics, mcap, foxglove, use)
 
 
 @app.command(short_help="Run the same on virtual time: one process, repeatable.")
@@ -155,14 +182,18 @@ def simulate(
     sets: Set = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
     shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     map_folder: Map = None,
     map_fixed: MapFixed = False,
 ) -> None:
     """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
+    speech = Speech(json_out, quiet, verbose)
     if seeds is not None and sets:
         fail("a campaign draws its scenarios; --set changes one, without --seeds")
     if seeds is not None:
-        run_campaign(seeds, seed or 0, shrink, out)
+        run_campaign(seeds, seed or 0, shrink, out, speech)
         return
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
@@ -174,12 +205,12 @@ def simulate(
     from flocc_launch.swarm.launching import fresh_folder
 
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
-    read = _read(scenario, changes | _parsed(sets), agents)
+    read = _read(scenario, changes | _parsed(sets), agents, speech)
     with progress_bar("preparing data") as progress:
         paths = recordings(read, progress)
     check_measurable(read, paths)
     fresh_folder(out)
-    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out)
+    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 
 
 @app.command()
@@ -238,7 +269,9 @@ def agent(
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
-    json_out: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     plot: Annotated[bool, typer.Option("--plot", help="Write trajectories and errors as PNG and SVG.")] = False,
     pictures: Annotated[
         int | None, typer.Option(min=0, max=200, help="Pairs of keyframes that the report shows as pictures; else 24.")
@@ -247,15 +280,16 @@ def evaluate(
     """Evaluate a run folder anew: ATE and RPE against ground truth, closures, bytes, leaders."""
     from flocc_launch.report.evaluate import evaluate as run_evaluation
 
+    speech = Speech(json_out, quiet, verbose)
     with progress_bar("matching pictures") as progress:
-        said = run_evaluation(run, evo, json_out, plot, pictures, progress)
+        said = run_evaluation(run, evo, json_out, plot, pictures, progress, quiet=speech.quiet, verbose=speech.verbose)
     typer.echo(said)
 
 
-def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
+def _read(scenario: str, changes: dict[str, Any], agents: int | None, speech: Speech) -> "Scenario":
     from flocc_launch.scenarios.shipped import read_scenario
 
-    return read_scenario(scenario, changes, agents, typer.echo)
+    return read_scenario(scenario, changes, agents, speech.tell)
 
 
 def _changes(
@@ -298,9 +332,12 @@ def _map_use(folder: Path | None, fixed: bool) -> "MapUse | None":
 def _launch(
     scenario: "Scenario",
     out: Path,
+    speech: Speech,
     secure: bool = False,
     dashboard: str | None = None,
     metrics: str | None = None,
+    mcap: Path | None = None,
+    foxglove: str | None = None,
     use: "MapUse | None" = None,
 ) -> None:
     from rich.console import Console
@@ -311,13 +348,47 @@ def _launch(
 
     with progress_bar("preparing data") as progress:
         recordings(scenario, progress)
-    with LiveTable(Console()) as table, _dashboard(out, dashboard, table.show) as show:
+    console = Console(stderr=speech.as_json, quiet=speech.quiet)
+    with (
+        LiveTable(console) as table,
+        _dashboard(out, dashboard, table.show, speech) as show,
+        _foxglove(out, foxglove, speech),
+    ):
         report = run(scenario, out, show, secure=secure, metrics=metrics, use=use)
-    show_report(report, out)
+    _record(out, mcap)
+    show_report(report, out, speech)
+
+
+def _record(out: Path, mcap: Path | None) -> None:
+    """Write the run as MCAP; without the package only where somebody asked for it."""
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+    from flocc_launch.view.scene_drawing import FoxgloveMissing
+
+    try:
+        write_mcap(RunFolder.open(out), mcap or out / MCAP_NAME)
+    except FoxgloveMissing:
+        if mcap is not None:
+            raise
 
 
 @contextmanager
-def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWatch]":
+def _foxglove(out: Path, where: str | None, speech: Speech) -> "Iterator[None]":
+    """Serve the run to Foxglove, where somebody wants it."""
+    if where is None:
+        yield
+        return
+    from flocc_launch.dashboard import address
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import foxglove_server
+
+    with foxglove_server(RunFolder(out), *address(where)) as url:
+        speech.tell(f"foxglove: {url}")
+        yield
+
+
+@contextmanager
+def _dashboard(out: Path, where: str | None, show: "OnWatch", speech: Speech) -> "Iterator[OnWatch]":
     """Serve the dashboard beside the table, where somebody wants one."""
     if where is None:
         yield show
@@ -327,7 +398,7 @@ def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWat
 
     host, port = address(where)
     with live_dashboard(RunFolder(out), port, show, host) as both:
-        typer.echo(f"dashboard: http://{host}:{port}/")
+        speech.tell(f"dashboard: http://{host}:{port}/")
         yield both
 
 
