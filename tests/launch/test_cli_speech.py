@@ -30,6 +30,7 @@ NO_FACTS = {
     "map save": "writes a map",
     "map merge": "writes a map",
     "map prune": "writes a map",
+    "map sessions": "writes maps",
     "map export": "writes files",
 }
 
