@@ -1,5 +1,7 @@
 """Claims on questions for knots: a robot's own need is asked for until it is met, others' only so often."""
 
+import itertools
+
 import pytest
 
 from flocc_agent.core.knot_requests import ASKED_MAX, PAUSE_MAX_S, KnotRequests
@@ -17,10 +19,10 @@ def asked_at_s(requests: KnotRequests, until_s: int) -> list[float]:
 
 
 def test_what_a_robot_needs_itself_is_asked_for_until_it_comes_with_growing_pauses() -> None:
-    requests = KnotRequests(lambda term: ["r2"])  # noqa: ARG005
+    requests = KnotRequests(lambda term: ["r2"])
     requests.want(WANTED, 0.0)
     times_s = asked_at_s(requests, HOUR_S)
-    pauses_s = [b - a for a, b in zip(times_s, times_s[1:], strict=False)]
+    pauses_s = [b - a for a, b in itertools.pairwise(times_s)]
     assert pauses_s == sorted(pauses_s)
     assert pauses_s[-1] == PAUSE_MAX_S
     assert times_s[-1] > HOUR_S - 2 * PAUSE_MAX_S
@@ -30,7 +32,7 @@ def test_what_a_robot_needs_itself_is_asked_for_until_it_comes_with_growing_paus
 
 @pytest.mark.parametrize("needs_it_later", [False, True])
 def test_what_others_need_is_given_up_unless_the_robot_needs_it_too(needs_it_later: bool) -> None:
-    requests = KnotRequests(lambda term: ["r2", "r3"])  # noqa: ARG005
+    requests = KnotRequests(lambda term: ["r2", "r3"])
     requests.on_interest("r3", WANTED, 0.0)
     if needs_it_later:
         requests.want(WANTED, 0.0)
@@ -38,7 +40,7 @@ def test_what_others_need_is_given_up_unless_the_robot_needs_it_too(needs_it_lat
 
 
 def test_an_own_need_outlives_a_newer_version_that_another_robot_asks_for() -> None:
-    requests = KnotRequests(lambda term: ["r2"])  # noqa: ARG005
+    requests = KnotRequests(lambda term: ["r2"])
     requests.want(WANTED, 0.0)
     requests.on_interest("r3", WANTED._replace(round=2), 1.0)
     assert len(asked_at_s(requests, HOUR_S)) > ASKED_MAX
