@@ -19,6 +19,7 @@ from flocc_agent.backend.edges import State, state_of
 from flocc_agent.backend.filtering import Filtered, filtered
 from flocc_agent.backend.initial import Aligned, component_with, initial_poses, trusted_closures
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
+from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import Problem, build
@@ -35,6 +36,7 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
     components_of,
 )
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
@@ -57,9 +59,26 @@ def optimise(
     Returns:
         The solution, with one result per closure and a sentence for whatever was left out; or why there is none.
     """
+    if graph.saved is not None:
+        return _optimise_in_map(graph, graph.saved, config, initial, covariance_of)
     expanded = with_factors(graph, config, initial)
     solution = _optimise(expanded.graph, config, expanded.initial, covariance_of)
     return solution if isinstance(solution, OptimisationFailed) else without_factors(solution, graph, expanded)
+
+
+def _optimise_in_map(
+    graph: PoseGraph,
+    saved: SavedMap,
+    config: BackendConfig,
+    initial: GraphSolution | None,
+    covariance_of: Sequence[KeyframeId],
+) -> GraphSolution | OptimisationFailed:
+    """Optimise what a team adds to an opened map, in the map's frame."""
+    mapped = with_map(graph, saved, config, initial)
+    if mapped.graph is None:
+        return without_map(None, mapped)
+    solution = optimise(mapped.graph, config, mapped.initial, solver_keyframes(covariance_of, mapped))
+    return solution if isinstance(solution, OptimisationFailed) else without_map(solution, mapped)
 
 
 def _optimise(
