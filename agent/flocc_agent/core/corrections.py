@@ -62,9 +62,14 @@ class _Wanted:
 
 
 class Corrections:
-    """The newest correction of every log, as one robot knows them."""
+    """The newest correction of every log, as one robot knows them.
+
+    Attributes:
+        failed_signers: Leaders who did not sign what stands under their names, until somebody clears it.
+    """
 
     def __init__(self, own: LogId, gossip: GossipParameters, sealer: Sealer | None = None) -> None:
+        self.failed_signers: set[str] = set()
         self._own = own
         self._gossip = gossip
         self._sealer = sealer
@@ -170,6 +175,7 @@ class Corrections:
         try:
             self._sealer.check_correction(message.term.leader, encode_correction(message), message.signature)
         except DecodeError:
+            self.failed_signers.add(message.term.leader.robot)
             return False
         return True
 
