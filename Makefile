@@ -88,7 +88,7 @@ $(VENV)/bin/python:
 		|| { rm -rf $(VENV); echo "$(PYTHON) -m venv failed; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 
 $(VENV)/.demo: $(DESCRIPTION) | $(VENV)/bin/python
-	$(PIP) -e .
+	$(PIP) -e '.[mcap]'
 	@touch $@
 
 $(VENV)/.test: $(DESCRIPTION) | $(VENV)/bin/python

@@ -14,17 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import votes
-from flocc_agent.backend.descent import Objective
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, state_of
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import Aligned, initial_poses, trusted_closures
+from flocc_agent.backend.initial import Aligned, component_with, initial_poses, trusted_closures
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
+from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import solve
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     ClosureState,
@@ -35,6 +36,7 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
     components_of,
 )
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
@@ -57,9 +59,26 @@ def optimise(
     Returns:
         The solution, with one result per closure and a sentence for whatever was left out; or why there is none.
     """
+    if graph.saved is not None:
+        return _optimise_in_map(graph, graph.saved, config, initial, covariance_of)
     expanded = with_factors(graph, config, initial)
     solution = _optimise(expanded.graph, config, expanded.initial, covariance_of)
     return solution if isinstance(solution, OptimisationFailed) else without_factors(solution, graph, expanded)
+
+
+def _optimise_in_map(
+    graph: PoseGraph,
+    saved: SavedMap,
+    config: BackendConfig,
+    initial: GraphSolution | None,
+    covariance_of: Sequence[KeyframeId],
+) -> GraphSolution | OptimisationFailed:
+    """Optimise what a team adds to an opened map, in the map's frame."""
+    mapped = with_map(graph, saved, config, initial)
+    if mapped.graph is None:
+        return without_map(None, mapped)
+    solution = optimise(mapped.graph, config, mapped.initial, solver_keyframes(covariance_of, mapped))
+    return solution if isinstance(solution, OptimisationFailed) else without_map(solution, mapped)
 
 
 def _optimise(
@@ -176,7 +195,8 @@ def _solve_connected(
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())
-    solution = Solution(posed.problem, posed.objective, posed.start, solved, kept.trajectories, kept.left)
+    earlier = component_with(kept.trajectories, initial) if is_confirmed(posed, solved) else None
+    solution = Solution(posed.problem, posed.objective, posed.start, solved, kept.trajectories, kept.left, earlier)
     outcome = collect(solution, wanted)
     times.append(time.perf_counter())
     spans_s = np.diff(times).tolist()
@@ -200,6 +220,12 @@ class Posed:
     start: State
     trusted: NDArray[np.bool_] | None
     places: Places
+
+
+def is_confirmed(posed: Posed, solved: Solved) -> bool:
+    """Whether a solution rests on the closures that the one before it trusted."""
+    chosen = solved.weights[posed.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
+    return posed.trusted is not None and np.array_equal(chosen, posed.trusted)
 
 
 def _posed(kept: Filtered, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None) -> Posed:

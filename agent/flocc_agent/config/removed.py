@@ -38,6 +38,7 @@ REMOVED: dict[str, str] = {
     "perception.classical.odometry_rotation_sigma_rad": "always 0.03",
     "perception.classical.odometry_direction_sigma_rad": "always 0.2",
     "perception.classical.odometry_pairs_max": "always 256",
+    "perception.synthetic.latent_bytes": "latents are as large as they are; radio.bandwidth_bytes_s loads links",
     "perception.synthetic.place_distance_m": "always 3.0",
     "perception.synthetic.place_angle_rad": "always 0.7",
     "perception.synthetic.descriptor_noise_ratio": "always 0.2",
@@ -51,6 +52,7 @@ REMOVED: dict[str, str] = {
     "perception.synthetic.translation_sigma_ratio": "always 0.05",
     "perception.synthetic.outlier_distance_m": "always 10.0",
     "perception.mast3r.warm_up": "perception.mast3r.compile also runs everything once at start",
+    "perception.mast3r.batch_max": "always 1; an agent encodes and decodes one at a time",
     "perception.mast3r.memory_check": "memory is always checked; encode_only and dtype need less of it",
     "perception.mast3r.jpeg_quality": "always 90",
     "perception.mast3r.border_px": "always 3",
@@ -110,6 +112,6 @@ REMOVED: dict[str, str] = {
     "ros2.tf_period_s": "always 0.05",
     "ros2.path_period_s": "always 1.0",
     "ros2.odometry_gap_max_s": "always 0.5",
-    "ros2.images_max": "always 8",
+    "ros2.images_max": "always 64, and 64 MiB",
     "ros2.path_poses_max": "always 1000",
 }

@@ -6,6 +6,9 @@ found a pair that is another's to register tells it so until the record shows. W
 `TAKEOVER_S`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
 exists no more is rejected, by a record like any other. A robot that comes back does not know what it handed over
 before: it listens who is there before it decides about any pair.
+
+Robots of closed logs (an opened map's, and this robot's own earlier journeys) register nothing: the other owner does.
+Nor are their keyframes queries, so that of their latents only the matching one is needed.
 """
 
 import zlib
@@ -42,6 +45,7 @@ class LoopClosing:
         odometry_pair: OdometryPairOf,
         parameters: LoopClosingParameters,
         spectral: SpectralOrder | None = None,
+        closed: frozenset[LogId] = frozenset(),
         listens_until_s: float = float("-inf"),
     ) -> None:
         """Start without pairs.
@@ -52,15 +56,17 @@ class LoopClosing:
             odometry_pair: Gives the neighbour of a keyframe.
             parameters: Limits and times.
             spectral: Orders pairs by what they add to the pose graph; None: by similarity.
+            closed: Logs that nobody writes any more, and whose latents are here.
             listens_until_s: Pairs wait undecided until then.
         """
         self.latents = Latents(own, parameters)
         self.dropped = 0
         self._own = own
+        self._closed = closed
         self._compute_class = compute_class
         self._parameters = parameters
         self._reach = Reach()
-        self._work = WorkTable(own, self.latents, odometry_pair)
+        self._work = WorkTable(own, self.latents, lambda k: None if k.log in closed else odometry_pair(k))
         self._offers = Offers(self.latents)
         self._spectral = spectral
         self._chosen: list[CandidatePair] | None = None
@@ -112,7 +118,7 @@ class LoopClosing:
                 self._offers.remove(pair)
                 self._undecided.pop(pair, None)
                 self._add(Candidate(pair, 0.0))
-            elif registrar_of(pair) == self._own and not self._knows(pair):
+            elif self._owner(pair) == self._own and not self._knows(pair):
                 self._assign(Candidate(pair, 0.0), now)
 
     def roles(self, pair: CandidatePair) -> tuple[KeyframeId, KeyframeId] | None:
@@ -155,7 +161,8 @@ class LoopClosing:
         self._work.on_evicted(keyframe)
         self._work.stop(pair)
         self._changed = True
-        return self._using(keyframe) if keyframe.log == self._own else []
+        is_lost = keyframe.log == self._own or keyframe.log in self._closed
+        return self._using(keyframe) if is_lost else []
 
     def on_latent_lost(self, keyframe: KeyframeId, now: float) -> list[CandidatePair]:
         """A latent exists no more: the pairs that need it, which are to be rejected; relays pass it on."""
@@ -256,7 +263,7 @@ class LoopClosing:
             remember(self._undecided, candidate.pair, candidate, self._parameters.candidates_max)
             self._changed = True
             return
-        owner = registrar_of(candidate.pair)
+        owner = self._owner(candidate.pair)
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
             self._offer(candidate, Recipient(owner.robot, owner), now)
             return
@@ -269,6 +276,12 @@ class LoopClosing:
             self._offer(candidate, Recipient(stronger, None), now)
             return
         self._add(candidate)
+
+    def _owner(self, pair: CandidatePair) -> LogId:
+        """Which of its owners registers a pair: one that is there."""
+        if pair.low.log in self._closed:
+            return pair.high.log
+        return pair.low.log if pair.high.log in self._closed else registrar_of(pair)
 
     def _offer(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
         self._offers.add(candidate, recipient, now)

@@ -34,6 +34,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
+from flocc_agent.core.in_map import InMap
 from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
@@ -62,6 +63,7 @@ from flocc_agent.core.reports import (
     SolutionIgnored,
 )
 from flocc_agent.core.rounds import Rounds, solution_report
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
@@ -79,6 +81,7 @@ from flocc_protocol.messages import (
     Envelope,
     Handover,
     Heartbeat,
+    KnotRequest,
     LogCorrection,
     LogDigest,
     RecordRequest,
@@ -110,6 +113,8 @@ class Restored:
         term_counter: Highest term counter the robot claimed.
         correction: The correction it applied last.
         frame_changed: That correction changed the map frame, and nobody knows whether consumers heard of it.
+        saved: The map that it opens; its logs are among the records, its latents among the latents.
+        journeys: Earlier logs of its own that it goes on from.
     """
 
     records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
@@ -117,6 +122,12 @@ class Restored:
     term_counter: int = 0
     correction: LogCorrection | None = None
     frame_changed: bool = False
+    saved: SavedMap | None = None
+    journeys: frozenset[LogId] = frozenset()
+
+    def closed(self) -> frozenset[LogId]:
+        """Logs that nobody writes any more, and whose latents are on this robot's disk."""
+        return self.journeys if self.saved is None else self.journeys | self.saved.closed
 
     def counter_max(self) -> int:
         """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
@@ -158,20 +169,32 @@ class Robot:
         self._heartbeat_s = float("-inf")
         self._pending: list[_Pending] = []
         self._waiting: dict[int, list[Measurement]] = {}
+        self._served = frozenset(restored.latents if restored.saved is not None else ())
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
         self._answers = AnswerBudget()
         self._muted = Muted()
-        self.assembly = GraphAssembly()
-        self.recognition = PlaceRecognition(log, parameters.place_recognition)
+        self.assembly = GraphAssembly(restored.saved)
+        closed = restored.closed()
+        self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
-        listens_until_s = now + parameters.election.startup_s if restored.records else float("-inf")
+        comes_back = any(each not in closed for each, _ in restored.records)
+        listens_until_s = now + parameters.election.startup_s if comes_back else float("-inf")
+        pair_of = self.assembly.odometry_pair
         self.closing = LoopClosing(
-            log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral, listens_until_s
+            log, compute_class, pair_of, parameters.loop_closing, spectral, closed, listens_until_s
         )
-        self.corrections = Corrections(log, parameters.gossip, sealer)
+        self.in_map = None if restored.saved is None else InMap(restored.saved, now)
+        self.corrections = Corrections(
+            log,
+            parameters.gossip,
+            sealer,
+            odometry=self.assembly.odometry,
+            near=self.neighbours.__contains__,
+            towards=self.neighbours.towards,
+        )
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -182,7 +205,7 @@ class Robot:
     def handle(self, event: Event, now: float) -> list[Effect]:
         """Something happened."""
         effects = self._dispatch(event, now)
-        return effects + self._settle(now)
+        return self._placed(effects + self._settle(now), now)
 
     def tick(self, now: float) -> list[Effect]:
         """Time passed."""
@@ -190,7 +213,13 @@ class Robot:
         effects += self.election.tick(now)
         if self._heartbeat_due_s <= now:
             effects += self._heartbeat(now)
-        return effects + self._settle(now)
+        return self._placed(effects + self._settle(now), now)
+
+    def _placed(self, effects: list[Effect], now: float) -> list[Effect]:
+        """Tell of the opened map, and when this robot finds itself in it."""
+        if self.in_map is None:
+            return effects
+        return effects + self.in_map.told(effects, self.gossip.logs[self.log].keyframes, now)
 
     def deadline(self) -> float:
         """When `tick` is due next, in seconds of the driver's clock."""
@@ -230,12 +259,12 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor):
+            case KeyframeEncoded(keyframe, descriptor, doubts):
                 self.closing.on_held(keyframe)
-                return self._on_encoded(keyframe, descriptor, now)
-            case KeyframeEncodingFailed(keyframe, reason):
-                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
-                return [report, *self._on_encoded(keyframe, None, now)]
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
+                return [*reports, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
@@ -284,6 +313,10 @@ class Robot:
                 return self._answers.within(sender.robot, self.gossip.on_request(sender, message), now)
             case CorrectionRequest():
                 return self._answers.within(sender.robot, self.corrections.on_request(sender.robot, message), now)
+            case KnotRequest():
+                near = sender.robot in self.neighbours
+                answers = self.corrections.on_knot_request(sender.robot, message, now) if near else []
+                return self._answers.within(sender.robot, answers, now)
             case CandidateOffer():
                 self.closing.on_offer(message, now)
                 return []
@@ -301,7 +334,7 @@ class Robot:
             effects += self._take(new, now)
         else:
             heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
-            effects = [effect for correction in heard for effect in self._on_correction(sender, correction)]
+            effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
         for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
             for signer in failed:
                 muted.on_failed(peer, signer, now)
@@ -315,6 +348,8 @@ class Robot:
             return effects
         if not known:
             self._greet(heartbeat, now)
+        if self.in_map is not None:
+            effects += self.in_map.on_heartbeat(sender)
         effects += self.election.on_heartbeat(sender, heartbeat, now)
         effects += self._compare(sender, heartbeat, now)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else heartbeat.compute_class
@@ -324,12 +359,12 @@ class Robot:
             effects += self._reject_lost([pair], keyframe, now)
         return effects
 
-    def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
+    def _on_correction(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
         """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
-        if not self.corrections.is_news(message):
+        if not self.corrections.is_news(message, now):
             return []
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
-        return refused or self.corrections.take(message)
+        return refused or self.corrections.take(message, now)
 
     def _compare(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Ask a neighbour for what it has more of, and for what changed in its tables where they are others."""
@@ -338,6 +373,7 @@ class Robot:
         effects = self.gossip.on_digests(sender, own, now)
         if heartbeat.versions.hash != versions.hash:
             effects += self.corrections.ask(peer, now)
+        effects += self.corrections.ask_knots(now)
         return effects + self.comparisons.on_heartbeat(peer, heartbeat, digests, versions, now)
 
     def _on_digests(self, sender: LogId, message: Digests, now: float) -> list[Effect]:
@@ -372,7 +408,7 @@ class Robot:
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
-        return [Encode(KeyframeId(self.log, index), event.image)]
+        return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
@@ -449,7 +485,7 @@ class Robot:
             match record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
-                    if descriptor is not None:
+                    if descriptor is not None and self._may_match(KeyframeId(new.log, index)):
                         described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match))
@@ -458,6 +494,11 @@ class Robot:
                 case _:
                     assert_never(record)
         return self._recognise(described, now) if described else []
+
+    def _may_match(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe can be registered; of a pruned map not all have a latent."""
+        saved = None if self.in_map is None else self.in_map.saved
+        return saved is None or keyframe.log not in saved.closed or keyframe in self._served
 
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
         """Look for keyframes' candidates; after a restart not where both already had a partner in the other's log."""

@@ -41,6 +41,9 @@ Pose7 = Annotated[list[float], Field(min_length=7, max_length=7), AfterValidator
 """Seven finite numbers: translation x y z in metres, quaternion w x y z."""
 
 
+POSE_ORDER = "x y z qw qx qy qz"
+
+
 class Record(BaseModel):
     """Base of what stands in a run folder: frozen; unknown keys are ignored; numbers are finite."""
 
@@ -76,6 +79,8 @@ class RobotResult(Record):
 
     robot: str
     incarnation: int = 0
+    pose_order: str = POSE_ORDER
+    """What the seven numbers of each pose `T_*` are."""
     map_frame: str | None = None
     T_map_odom: Pose7 | None = None
     T_body_camera: Pose7 | None = None

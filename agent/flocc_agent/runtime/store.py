@@ -35,6 +35,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 
 if TYPE_CHECKING:
     from flocc_agent.config import StoreConfig
+    from flocc_agent.runtime.map_folder import MapFolder
 
 logger = logging.getLogger(__name__)
 
@@ -96,6 +97,11 @@ class Store:
             on_recovered=self._measure,
         )
         self._others_bytes = self._latent_bytes = 0
+        self._map: MapFolder | None = None
+
+    def open_map(self, opened: "MapFolder") -> None:
+        """Give latents of a saved map as if they were the store's; the map is closed with it, and never written to."""
+        self._map = opened
 
     @classmethod
     def open(
@@ -142,6 +148,12 @@ class Store:
             self._intact.remove()
             self._move_aside(self.identity.log)
 
+    def begin_journey(self) -> None:
+        """Write another log from now on, unless nothing was written yet; the earlier one stays, and its latents."""
+        if self.records(self.identity.log):
+            self._be(StoreIdentity(LogId(self.identity.log.robot, self._incarnation_after_loss), 1))
+            self._measure()
+
     def set_aside(self, log: LogId) -> None:
         """Keep a log's records for a person only; where it is the robot's own, begin another one."""
         self._move_aside(log)
@@ -161,6 +173,8 @@ class Store:
         self._latents.close()
         if self._lock_file is not None:
             self._lock_file.close()
+        if self._map is not None:
+            self._map.close()
 
     # --- records
 
@@ -226,7 +240,7 @@ class Store:
         for sha256, data in self._latents.read("SELECT sha256, data FROM latents WHERE keyframe = ?", (str(keyframe),)):
             if hashlib.sha256(data).digest() == sha256:
                 return bytes(data)
-        return None
+        return None if self._map is None else self._map.latent(keyframe)
 
     def has_latent(self, keyframe: KeyframeId) -> bool:
         """Tell whether a latent is kept, without reading it."""

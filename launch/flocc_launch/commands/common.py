@@ -80,9 +80,11 @@ class ProgressLines:
         now_s = self._clock()
         if now_s - self._said_s < PROGRESS_LINE_PERIOD_S or done == 0:
             return
+        from flocc_launch.runs.plain_numbers import duration
+
         self._said_s = now_s
         left_s = (now_s - self._begin_s) / done * (total - done)
-        typer.echo(f"{self._what}: {self._unit} {done} of {total}, about {left_s:.0f} s left", err=True)
+        typer.echo(f"{self._what}: {self._unit} {done} of {total}, about {duration(left_s)} left", err=True)
 
 
 def show_report(report: "RunReport", out: Path, speech: Speech | None = None) -> None:

@@ -19,6 +19,7 @@ from flocc_launch.commands.common import (
 )
 from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
+from flocc_launch.commands.map_commands import add_maps
 from flocc_launch.commands.offline import add_offline, run_campaign
 from flocc_launch.commands.tools import add_tools
 from flocc_launch.setup.world_faults import may_pass, sentence_of, speak_utf8
@@ -26,6 +27,7 @@ from flocc_launch.setup.world_faults import may_pass, sentence_of, speak_utf8
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from flocc_launch.maps.opening import MapUse
     from flocc_launch.scenarios.scenario import Scenario
     from flocc_launch.swarm.launching import OnWatch
 
@@ -59,6 +61,7 @@ def options(
     """Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots."""
 
 
+FIXED_WHAT = "--map-fixed says of --map that it does not move; give --map FOLDER"
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
 ROS_ARGS = "All that follows goes to ROS 2: -p KEY:=VALUE, -r FROM:=TO, --params-file FILE."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
@@ -69,6 +72,8 @@ Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a 
 Range = Annotated[float | None, typer.Option("--range", min=0.0, help="Communication range by true position, metres.")]
 Duration = Annotated[float | None, typer.Option(min=0.0, help="End after so many seconds, not when all is settled.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
+Map = Annotated[Path | None, typer.Option("--map", help="A saved map in which the robots find themselves.")]
+MapFixed = Annotated[bool, typer.Option("--map-fixed", help="The map does not move, whatever is measured in it.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Another value for a key, such as radio.loss_ratio=0.3.")]
 
 
@@ -142,16 +147,25 @@ def launch(
     dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
     secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
+    mcap: Annotated[Path | None, typer.Option(help="The run as MCAP; run.mcap in --out where not given.")] = None,
+    foxglove: Annotated[str | None, typer.Option(help="Serve the run to Foxglove at [HOST:]PORT.")] = None,
     json_out: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    map_folder: Map = None,
+    map_fixed: MapFixed = False,
 ) -> None:
     """Run a scenario with one process per robot on this machine, over real zenoh."""
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     changes |= {} if rate is None else {"rate": rate}
     changes |= _parsed(sets)
+    if mcap is not None or foxglove is not None:
+        from flocc_launch.view.scene_drawing import foxglove_module
+
+        foxglove_module()  # a missing package is said before the run, not after it
+    use = _map_use(map_folder, map_fixed)
     speech = Speech(json_out, quiet, verbose)
-    _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics)
+    _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics, mcap, foxglove, use)
 
 
 @app.command(short_help="Run the same on virtual time: one process, repeatable.")
@@ -171,6 +185,8 @@ def simulate(
     json_out: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    map_folder: Map = None,
+    map_fixed: MapFixed = False,
 ) -> None:
     """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
     speech = Speech(json_out, quiet, verbose)
@@ -181,6 +197,7 @@ def simulate(
         return
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
+    use = _map_use(map_folder, map_fixed)
     from flocc_launch.scenarios.expectations import check_measurable
     from flocc_launch.scenarios.recordings import recordings
     from flocc_launch.setup.cache import cache_folder
@@ -193,7 +210,7 @@ def simulate(
         paths = recordings(read, progress)
     check_measurable(read, paths)
     fresh_folder(out)
-    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out, speech)
+    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 
 
 @app.command()
@@ -205,6 +222,11 @@ def agent(
     bandwidth: Annotated[
         float | None, typer.Option(min=0.001, help="Budget of this robot, kilobytes per second.")
     ] = None,
+    map_folder: Map = None,
+    map_fixed: MapFixed = False,
+    new_journey: Annotated[
+        bool, typer.Option("--new-journey", help="The odometry began anew: another log of the same robot.")
+    ] = False,
     verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
     ros_args: Annotated[list[str] | None, typer.Option("--ros-args", help=ROS_ARGS)] = None,
 ) -> None:
@@ -214,7 +236,7 @@ def agent(
     import time
 
     from flocc_agent.config import AgentConfig, MetricsConfig
-    from flocc_launch.swarm.agent_process import run_agent
+    from flocc_launch.swarm.agent_process import Beginning, run_agent
 
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
@@ -222,8 +244,21 @@ def agent(
     if bandwidth is not None:
         given["bandwidth_bytes_s"] = 1000.0 * bandwidth
     read = AgentConfig.read(config, changes or ()).model_copy(update=given)
+    read = read.with_map(map_folder)
+    if map_fixed and read.map is None:
+        fail(FIXED_WHAT)
+    beginning = Beginning(map_fixed, new_journey)
     try:
-        asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard, ros_args=ros_args or ()))
+        asyncio.run(
+            run_agent(
+                read,
+                time.monotonic(),
+                lambda _: None,
+                dashboard=dashboard,
+                beginning=beginning,
+                ros_args=ros_args or (),
+            )
+        )
     except Exception as error:
         if not may_pass(error):
             raise
@@ -285,6 +320,15 @@ def _parsed(sets: list[str] | None) -> dict[str, Any]:
     return dict(parsed_change(text) for text in sets or ())
 
 
+def _map_use(folder: Path | None, fixed: bool) -> "MapUse | None":
+    """The map in which a team is to work."""
+    from flocc_launch.maps.opening import MapUse
+
+    if folder is None and fixed:
+        fail(FIXED_WHAT)
+    return None if folder is None else MapUse(folder, fixed)
+
+
 def _launch(
     scenario: "Scenario",
     out: Path,
@@ -292,6 +336,9 @@ def _launch(
     secure: bool = False,
     dashboard: str | None = None,
     metrics: str | None = None,
+    mcap: Path | None = None,
+    foxglove: str | None = None,
+    use: "MapUse | None" = None,
 ) -> None:
     from rich.console import Console
 
@@ -302,9 +349,42 @@ def _launch(
     with progress_bar("preparing data") as progress:
         recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)
-    with LiveTable(console) as table, _dashboard(out, dashboard, table.show, speech) as show:
-        report = run(scenario, out, show, secure=secure, metrics=metrics)
+    with (
+        LiveTable(console) as table,
+        _dashboard(out, dashboard, table.show, speech) as show,
+        _foxglove(out, foxglove, speech),
+    ):
+        report = run(scenario, out, show, secure=secure, metrics=metrics, use=use)
+    _record(out, mcap)
     show_report(report, out, speech)
+
+
+def _record(out: Path, mcap: Path | None) -> None:
+    """Write the run as MCAP; without the package only where somebody asked for it."""
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+    from flocc_launch.view.scene_drawing import FoxgloveMissing
+
+    try:
+        write_mcap(RunFolder.open(out), mcap or out / MCAP_NAME)
+    except FoxgloveMissing:
+        if mcap is not None:
+            raise
+
+
+@contextmanager
+def _foxglove(out: Path, where: str | None, speech: Speech) -> "Iterator[None]":
+    """Serve the run to Foxglove, where somebody wants it."""
+    if where is None:
+        yield
+        return
+    from flocc_launch.dashboard import address
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import foxglove_server
+
+    with foxglove_server(RunFolder(out), *address(where)) as url:
+        speech.tell(f"foxglove: {url}")
+        yield
 
 
 @contextmanager
@@ -324,6 +404,7 @@ def _dashboard(out: Path, where: str | None, show: "OnWatch", speech: Speech) ->
 
 add_tools(app)
 add_data(app)
+add_maps(app)
 add_offline(app)
 add_lab(app)
 

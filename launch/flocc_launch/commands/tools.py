@@ -32,6 +32,7 @@ def add_tools(app: typer.Typer) -> None:
     app.command(short_help="Show all robots of a swarm or of a run in one table.")(status)
     app.command(short_help="Serve one page that shows a run while it goes on.")(dashboard)
     app.command(short_help="Show a run or a running swarm in rerun.")(view)
+    app.command(short_help="Write a run as one MCAP file, for Foxglove, rerun and others.")(export)
     app.command(short_help="Cause a fault in a running swarm, or take it back.")(chaos)
 
 
@@ -105,6 +106,18 @@ def dashboard(
         typer.echo(f"dashboard: {page.url}")
         while True:
             time.sleep(3600)
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    mcap: Annotated[Path | None, typer.Option(help="The file; run.mcap in the run folder where not given.")] = None,
+) -> None:
+    """Write a run as MCAP with Foxglove's schemas, and a layout beside it."""
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+
+    path = write_mcap(RunFolder.open(run), run / MCAP_NAME if mcap is None else mcap)
+    typer.echo(f"{path} ({path.stat().st_size / 1e6:.1f} MB), layout {path.with_suffix('.layout.json')}")
 
 
 def view(

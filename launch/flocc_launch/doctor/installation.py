@@ -23,7 +23,7 @@ CLOCK_YEAR_MIN = 2025
 REQUIRED = {"zenoh": "eclipse-zenoh", "gtsam": "gtsam", "cv2": "opencv-python-headless", "scipy": "scipy"}
 OPTIONAL = {
     "rosbags": "bags", "cryptography": "secure", "rerun": "view", "torch": "mast3r", "prometheus_client": "metrics",
-    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval",
+    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval", "foxglove": "mcap",
 }  # fmt: skip
 
 
@@ -66,10 +66,11 @@ def packages() -> list[Finding]:
         else:
             advice = f"Install it again: pip install --force-reinstall {package}."
             found.append(Finding("package", Severity.BLOCKS, f"{package} cannot be imported: {problem}.", advice))
-    for module, extra in OPTIONAL.items():
-        if importlib.util.find_spec(module) is None:
-            sentence = f"{module} is not installed; it is needed for the extra {extra!r} only."
-            found.append(Finding("extra", Severity.NOTE, sentence, f"{to_install(extra)} brings it."))
+    lacking = {extra: module for module, extra in OPTIONAL.items() if importlib.util.find_spec(module) is None}
+    if lacking:
+        named_ = ", ".join(f"{extra} ({module})" for extra, module in lacking.items())
+        sentence = f"Extras that are not installed, and needed for what they are named after only: {named_}."
+        found.append(Finding("extra", Severity.NOTE, sentence, f"{to_install(','.join(lacking))} brings them."))
     return found
 
 

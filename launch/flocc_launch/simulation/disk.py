@@ -10,7 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from flocc_agent.core.robot import Restored
-from flocc_agent.runtime.persistence import COPIES_PERIOD_S
+from flocc_agent.runtime.map_folder import MapFolder
+from flocc_agent.runtime.persistence import COPIES_PERIOD_S, joined_logs
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import LogCorrection
 
@@ -34,6 +35,8 @@ class Disk:
     Attributes:
         own: The log that the robot writes.
         latent_bytes_max: Beyond this the oldest latents go first.
+        opened: A saved map beside it, which is only read.
+        map_fixed: The map does not move.
         slow_s: How long each write of the robot's own takes.
         whole: Nothing of the own log is missing; else the robot begins another one when it starts.
         went_back: The power went, or an older copy took its place: the robot may not know what it said last.
@@ -47,6 +50,8 @@ class Disk:
     correction: LogCorrection | None = None
     frame_changed: bool = False
     latent_bytes: int = 0
+    opened: MapFolder | None = None
+    map_fixed: bool = False
     slow_s: float = 0.0
     whole: bool = True
     went_back: bool = False
@@ -73,10 +78,26 @@ class Disk:
             oldest = next(iter(self.latents))
             self.latent_bytes -= len(self.latents.pop(oldest))
 
+    def latent(self, keyframe: KeyframeId) -> bytes | None:
+        """A latent of its own, or of the map."""
+        data = self.latents.get(keyframe)
+        return self.opened.latent(keyframe) if data is None and self.opened is not None else data
+
     def restored(self) -> Restored:
         """What a robot finds when it starts again."""
-        records = tuple((log, tuple(data)) for log, data in sorted(self.records.items()))
-        return Restored(records, tuple(sorted(self.latents)), self.term_counter, self.correction, self.frame_changed)
+        held = {log: tuple(data) for log, data in self.records.items()}
+        latents = set(self.latents)
+        if self.opened is not None:
+            held |= joined_logs(self.opened, held, None, None)
+            latents |= set(self.opened.latent_keyframes())
+        return Restored(
+            tuple(sorted(held.items())),
+            tuple(sorted(latents)),
+            self.term_counter,
+            self.correction,
+            self.frame_changed,
+            None if self.opened is None else self.opened.saved(self.map_fixed),
+        )
 
     def begin(self, log: LogId) -> None:
         """Let another log be the robot's own; what was applied to the earlier one is of no use to it."""

@@ -14,6 +14,7 @@ from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied, AgentStopped
+from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.reporting import Reporter
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.agenda import Agenda
@@ -35,11 +36,27 @@ LINKS, WORK, BOOTS, AIR = 1, 2, 3, 4
 
 @dataclass(frozen=True, slots=True)
 class Equipment:
-    """What all robots of a swarm carry."""
+    """What all robots of a swarm carry.
+
+    Attributes:
+        eyes: Perception.
+        optimiser: Of pose graphs.
+        times: How long workers take.
+        opened: A saved map; None: there is none.
+        map_fixed: It does not move.
+        lives: Robot -> the incarnation with which it begins, where that is not the first.
+    """
 
     eyes: Eyes
     optimiser: Optimiser
     times: WorkTimes = field(default_factory=WorkTimes)
+    opened: MapFolder | None = None
+    map_fixed: bool = False
+    lives: Mapping[str, int] = field(default_factory=dict)
+
+    def disk(self, own: LogId, latent_bytes_max: int) -> Disk:
+        """A new disk, and the map beside it."""
+        return Disk(own, latent_bytes_max, opened=self.opened, map_fixed=self.map_fixed)
 
 
 class Swarm:
@@ -68,7 +85,7 @@ class Swarm:
         self._fetcher = LatentFetcher(self.agenda, self.network, self._running, scenario.bandwidth_bytes_s)
         self._reporters: dict[str, Reporter] = {}
         self.forked: set[LogId] = set()
-        self._lives: dict[str, int] = {}
+        self._lives = dict(equipment.lives)
         self._near: dict[tuple[str, float | None], list[str]] = {}
         self._around = Surroundings(
             self._broadcast, self._unicast, self._fetcher.fetch, self._observe, lambda station: self.kill(station.name)
@@ -121,7 +138,7 @@ class Swarm:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
         station = self.stations[name]
         assert not station.running
-        station.disk = Disk(station.log, self.scenario.store.latent_bytes_max)
+        station.disk = self._equipment.disk(station.log, self.scenario.store.latent_bytes_max)
         self._begin_log(station)
 
     def copy_disk(self, name: str, until_s: float) -> None:
@@ -175,9 +192,10 @@ class Swarm:
     def _add(self, name: str, number: int, playback: Playback) -> None:
         robot = self.scenario.robot(name)
         rng = np.random.default_rng([self._seed, WORK, number])
+        log = LogId(name, self._equipment.lives.get(name, 0))
         self.stations[name] = Station(
             name,
-            LogId(name),
+            log,
             robot.compute_class,
             playback,
             VirtualWorkers(
@@ -186,8 +204,9 @@ class Swarm:
                 build_iterator(self.scenario.backend),
                 self._equipment.times,
                 rng,
+                playback.hidden,
             ),
-            Disk(LogId(name), self.scenario.store.latent_bytes_max),
+            self._equipment.disk(log, self.scenario.store.latent_bytes_max),
             Clock(robot.clock_offset_s, robot.clock_drift_ratio),
             self.agenda,
             self._around,

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +38,19 @@ STATUS_PERIOD_S = 0.5
 RETRY_S = 5.0
 """A disk that took no event is tried again so often."""
 EXIT_BAD_INPUT = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """How an agent begins.
+
+    Attributes:
+        map_fixed: The map that it opens does not move.
+        new_journey: Its odometry began anew since it ran last.
+    """
+
+    map_fixed: bool = False
+    new_journey: bool = False
 
 
 class Lines:
@@ -97,6 +111,7 @@ async def run_agent(
     on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
+    beginning: Beginning | None = None,
     ros_args: Sequence[str] = (),
 ) -> None:
     """Run one agent until it is told to stop, by a signal or an order.
@@ -107,6 +122,7 @@ async def run_agent(
         on_status: Takes a state, twice a second.
         orders: JSON lines from the launcher.
         dashboard: [HOST:]PORT of a page that shows this agent's own view of its swarm.
+        beginning: How it begins; None: as always.
         ros_args: What ROS 2 is started with.
 
     Raises:
@@ -114,7 +130,8 @@ async def run_agent(
     """
     lines = Lines(config.folder / "events.jsonl" if config.folder else None)
     with _page(config, dashboard, lambda: time.monotonic() - epoch_s) as source:
-        await _run(_Life(config, epoch_s, lines, source, ros_args), config, epoch_s, on_status, orders, lines)
+        life = _Life(config, epoch_s, lines, source, beginning or Beginning(), ros_args)
+        await _run(life, config, epoch_s, on_status, orders, lines)
 
 
 async def _run(
@@ -160,6 +177,7 @@ class _Life:
         epoch_s: float,
         lines: Lines,
         source: "AgentSource | None",
+        beginning: Beginning,
         ros_args: Sequence[str] = (),
     ) -> None:
         self.log_ended = self.stopped = False
@@ -169,6 +187,7 @@ class _Life:
         self._epoch_s = epoch_s
         self._lines = lines
         self._source = source
+        self._beginning = beginning
         self._agent: Agent | None = None
 
     async def live(self, on_status: Callable[[AgentStatus], None], orders: asyncio.StreamReader | None) -> None:
@@ -181,6 +200,8 @@ class _Life:
             self._config,
             on_report=on_report,
             clock_s=lambda: time.monotonic() - self._epoch_s,
+            map_fixed=self._beginning.map_fixed,
+            new_journey=self._beginning.new_journey,
             ros_args=self._ros_args,
         )
         self._agent = agent
@@ -295,8 +316,8 @@ def _print_status(status: AgentStatus) -> None:
     sys.stdout.flush()
 
 
-async def _run_launched(config: AgentConfig, epoch_s: float) -> None:
-    await run_agent(config, epoch_s, _print_status, await _standard_input())
+async def _run_launched(config: AgentConfig, epoch_s: float, beginning: Beginning) -> None:
+    await run_agent(config, epoch_s, _print_status, await _standard_input(), beginning=beginning)
 
 
 def main() -> None:
@@ -304,11 +325,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("config", type=Path)
     parser.add_argument("--epoch-s", type=float, required=True)
+    parser.add_argument("--map-fixed", action="store_true")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     try:
         config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
-        asyncio.run(_run_launched(config, arguments.epoch_s))
+        asyncio.run(_run_launched(config, arguments.epoch_s, Beginning(map_fixed=arguments.map_fixed)))
     except Exception as error:
         sentence = sentence_of(error)
         if sentence is None:

@@ -22,7 +22,9 @@ from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.given_keyframes import BadKeyframe
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.ros2.hearing import Hearing
+from flocc_agent.runtime.ros2.hearing import KINDS, Hearing
+from flocc_agent.runtime.ros2.markers import KnownClosure
+from flocc_agent.runtime.ros2.merged_maps import MergedMaps
 from flocc_agent.runtime.ros2.node import RosNode, open_node
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes
@@ -30,6 +32,7 @@ from flocc_agent.runtime.ros2.synchroniser import PosedImage
 from flocc_agent.runtime.ros2.telling import Teller
 from flocc_agent.runtime.ros2.topics import Offer
 from flocc_agent.runtime.ros2.types import BadMessage, MessageTypes
+from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.transport import TrafficCounter
 
 logger = logging.getLogger(__name__)
@@ -55,6 +58,8 @@ class Host:
         report: Takes facts for people.
         save_map: Writes what the robot knows, and says where; raises OSError.
         begin_anew: Ends this journey and begins another one, of odometry that has nothing to do with this one's.
+        closures: Accepted closures of all logs; called off the loop's thread.
+        state: Status of the robot, and what its last own solution warned of.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
@@ -64,6 +69,8 @@ class Host:
     report: Callable[[Fact], None]
     save_map: Callable[[], str]
     begin_anew: Callable[[], None]
+    closures: Callable[[], Sequence[KnownClosure]]
+    state: Callable[[], tuple[AgentStatus, Sequence[str]]]
 
 
 class Ros2Adapter:
@@ -117,13 +124,15 @@ class Ros2Adapter:
             Ros2Error: ROS does not start.
         """
         loop = asyncio.get_running_loop()
-        inbox = Inbox(loop, self._arrived, self._counter, INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
+        limits = (INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
+        inbox = Inbox(loop, self._arrived, self._counter, *limits, urgent_first=KINDS)
         try:
             node, hearing, teller = await asyncio.to_thread(self._open, inbox, loop)
             for note in node.notes:
                 hearing.complain("node", note)
             async with asyncio.TaskGroup() as tasks:
-                works = (self._feed(hearing), self._watch(node, hearing), teller.draw(), teller.beat(node))
+                telling = (teller.draw(), teller.beat(), teller.diagnose(lambda: (*self._host.state(), hearing.heard)))
+                works = (self._feed(hearing), self._watch(node, hearing), *telling)
                 others = [tasks.create_task(work) for work in works]
                 await teller.listen(corrections)
                 for other in others:
@@ -139,7 +148,8 @@ class Ros2Adapter:
         node = self._node = open_node(self._config, name, self._ros_args, self._types)
         config = self._config = node.config
         hearing = self._hearing = self._heard(config)
-        teller = self._teller = Teller(config, self._types, node, self._bodies)
+        grids = MergedMaps(config, self._robot, self._types, node, self._problems)
+        teller = self._teller = Teller(config, self._types, node, self._bodies, self._host.closures, grids)
         for kind, (topic, type_name, qos) in hearing.wanted().items():
             hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind))
         node.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))

@@ -32,7 +32,10 @@ from flocc_agent.runtime.ros2.types import (
 
 Float = NDArray[np.float64]
 
-IMAGES_MAX = 8
+KINDS = ("tf_static", "camera_info", "odometry", "fix", "image")
+"""What is taken in first where much has come at once: images last, since they need all the others."""
+IMAGES_MAX = 64
+IMAGES_BYTES_MAX = 64 * 1024 * 1024
 """Images that wait for odometry or for the encoder; the oldest gives way."""
 ODOMETRY_GAP_MAX_S = 0.5
 """Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
@@ -71,7 +74,7 @@ class Hearing:
         self._fixes = fixes
         self._mount_camera = mount_camera
         self._static = StaticFrames()
-        self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S)
+        self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
         self.eye: Eye | None = None
@@ -84,7 +87,7 @@ class Hearing:
         config = self._config
         wanted: dict[str, tuple[str, str, Qos]] = {}
         if config.odometry_topic:
-            wanted["odometry"] = (config.odometry_topic, ODOMETRY, Qos(50))
+            wanted["odometry"] = (config.odometry_topic, ODOMETRY, Qos(200))
         if config.image_topic:
             wanted["image"] = (config.image_topic, self.image_type(), SENSOR)
             wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)

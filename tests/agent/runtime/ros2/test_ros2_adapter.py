@@ -26,7 +26,7 @@ from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 from flocc_agent.runtime.ros2.types import BadMessage, Ros2Error
-from flocc_protocol.arrays import Array
+from flocc_agent.runtime.status import AgentStatus
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import LogCorrection
 
@@ -108,6 +108,8 @@ class Agent:
             self.facts.append,
             lambda: "r1/result.json",
             lambda: self.resets.append(None),
+            lambda: [],
+            lambda: (AgentStatus(robot="r-1"), ()),
         )
 
     def problems(self) -> list[str]:
@@ -116,8 +118,7 @@ class Agent:
 
 def correction(covariance: Float | None = None) -> Correction:
     term = Term(1, LogId("r1", 0))
-    nowhere = Array.of(np.zeros((0, 7)), "f4")
-    message = LogCorrection(term.leader, term, 1, term.leader, pose7(T_MAP_ODOM), None, 0, 1, nowhere)
+    message = LogCorrection(term.leader, term, 1, term.leader, pose7(T_MAP_ODOM))
     own = CorrectedLog(message, RecordedOdometry(LogCopy()))
     return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, own, {})
 
@@ -262,7 +263,7 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
     (port,) = free_ports(1)
     with ros(port) as robot:
         async with adapted(port):
-            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 11)
+            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 13)
             ours = [token.split("/") for token in robot.node.tokens if "flocc_r_1" in token]
     assert {chunks[2] for chunks in ours} != {str(robot.node.session.zid())}
     assert {tuple(chunks[6:9]) for chunks in ours} == {("%", "%r1", "flocc_r_1")}
@@ -271,14 +272,16 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
         ("MP", "%r1%flocc%path", ":1:,1:,:,:,,"),
         ("MP", "%r1%flocc%pose", "::,10:,:,:,,"),
         ("MP", "%r1%flocc%map_frame", ":1:,1:,:,:,,"),
-        ("MS", "%r1%odom", "::,50:,:,:,,"),
+        ("MP", "%r1%flocc%graph", ":1:,1:,:,:,,"),
+        ("MP", "%diagnostics", "::,10:,:,:,,"),
+        ("MS", "%r1%odom", "::,200:,:,:,,"),
         ("MS", "%r1%camera%image_raw", "2::,5:,:,:,,"),
         ("MS", "%r1%camera%camera_info", "2::,5:,:,:,,"),
         ("MS", "%tf_static", ":1:,100:,:,:,,"),
         ("SS", "%r1%flocc_r_1%save_map", "::,10:,:,:,,"),
         ("SS", "%r1%flocc_r_1%reset_odometry", "::,10:,:,:,,"),
     }
-    assert len({chunks[4] for chunks in ours}) == 11
+    assert len({chunks[4] for chunks in ours}) == 13
 
 
 async def test_a_topic_of_another_type_is_said() -> None:
@@ -388,7 +391,7 @@ def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], said
 @pytest.mark.parametrize("package", ["rosbags.typesys", "xxhash"])
 def test_a_missing_extra_is_said(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(Ros2Error, match=r"needs rosbags and xxhash: pip install 'flocc\[ros2\]'"):
+    with pytest.raises(Ros2Error, match=r"needs rosbags and xxhash: pip install '\.\[ros2\]'"):
         Ros2Adapter(Ros2Config(), "r1", KeyframeSelector(KeyframeConfig()), Agent().host())
 
 
