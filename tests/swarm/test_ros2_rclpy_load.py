@@ -138,7 +138,8 @@ def team(domain_id: int, tmp_path: Path) -> Iterator[tuple[list[Camera], Ears]]:
             )
             config = AgentConfig(name=name, swarm="load", folder=tmp_path / name, transport=transports[name], ros2=ros2)
             topics = [f"/{name}/camera/{topic}" for topic in ("image_raw", "camera_info")]
-            reliable = [f"qos_overrides.{topic}.subscription.reliability:=reliable" for topic in topics]
+            policies = ("reliability:=reliable", "depth:=20")
+            reliable = [f"qos_overrides.{topic}.subscription.{policy}" for topic in topics for policy in policies]
             stack.enter_context(agent(config, tmp_path, *(word for each in reliable for word in ("-p", each))))
         end_s = time.monotonic() + 30.0
         while not all(camera.ready() for camera in cameras) and time.monotonic() < end_s:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Image
-from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.measurements import BadMeasurement, Measurement
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.given_keyframes import BadKeyframe
@@ -194,7 +194,7 @@ class Ros2Adapter:
             while (posed := hearing.synchroniser.next()) is not None:
                 try:
                     await self._consider(hearing, posed)
-                except (BadMessage, BadKeyframe) as error:
+                except (BadMessage, BadKeyframe, BadMeasurement) as error:
                     hearing.refuse("image", str(error))
 
     async def _consider(self, hearing: Hearing, posed: PosedImage) -> None:
@@ -212,6 +212,9 @@ class Ros2Adapter:
         image = await asyncio.to_thread(eye.image, message)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
+        step = hearing.covariances.of_keyframe(posed.stamp_ns, posed.T_odom_body)
+        if step is not None:
+            self._host.add_measurement(step.in_camera(T_body_camera), posed.stamp_ns * 1e-9)
         if self._config.fix_topic:
             self._fixes.add_keyframe(posed.stamp_ns * 1e-9)
         if self._teller is not None:

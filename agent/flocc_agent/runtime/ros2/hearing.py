@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, step_fault
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
+from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
@@ -75,6 +76,7 @@ class Hearing:
         self._mount_camera = mount_camera
         self._static = StaticFrames()
         self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
+        self.covariances = StepCovariances()
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
         self.eye: Eye | None = None
@@ -128,11 +130,13 @@ class Hearing:
 
     def _take_odometry(self, payload: bytes) -> bool:
         config = self._config
-        sample = odometry_of(self._types.read(payload, ODOMETRY), config.odom_frame, config.base_frame)
+        message = self._types.read(payload, ODOMETRY)
+        sample = odometry_of(message, config.odom_frame, config.base_frame)
         self._check_step(*sample)
         if not self.synchroniser.add_odometry(*sample):
             self.complain("odometry", BACK_IN_TIME)
             return False
+        self.covariances.add(sample[0], np.reshape(message.pose.covariance, (6, 6)))
         return True
 
     def _check_step(self, stamp_ns: int, T_odom_body: Float) -> None:
