@@ -30,6 +30,8 @@ from flocc_launch.maps.opening import MapUse
 from flocc_launch.maps.solving import NotSolved, solved_map
 from flocc_launch.maps.writing import MapContent, write_map
 from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.simulation.sessions import map_of_sessions
 from flocc_launch.simulation.simulate import simulate
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
@@ -430,3 +432,24 @@ def test_commands_say_what_they_did(
     assert (code, "editions of one map" in text) == (2, True)
     code, text = said(capsys, monkeypatch, "simulate", "meeting", "--map-fixed")
     assert (code, text) == (2, "error: --map-fixed says of --map that it does not move; give --map FOLDER")
+
+
+# Sessions
+
+
+def test_sessions_one_after_the_other_make_one_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    given = scenario({**BLOCK, "r3": FAR["r1"]})
+    paths = recordings(given)
+    told: list[tuple[str, bool]] = []
+    manifest = map_of_sessions(
+        given, paths, tmp_path / "map", tmp_path / "runs", tell=lambda s: told.append((s.name, s.left_out is None))
+    )
+    assert told == [("r1", True), ("r2", True), ("r3", False)], "the third was never near"
+    assert (manifest.frame, manifest.edition, manifest.name) == ("map/r1", 2, "map")
+    assert [entry.log for entry in manifest.logs] == ["r1", "r2"]
+    assert MapFolder.open(tmp_path / "map").records == MapFolder.open(tmp_path / "runs" / "02-r2" / "map").records
+    with pytest.raises(BadMap, match="is not empty; choose another --runs"):
+        map_of_sessions(given, paths, tmp_path / "map", tmp_path / "runs")
+    later = map_of_sessions(given, {"r1": paths["r1"]}, tmp_path / "next", tmp_path / "more", begin=tmp_path / "map")
+    assert [entry.log for entry in later.logs] == ["r1", "r2", "r1~1"]

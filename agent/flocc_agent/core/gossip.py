@@ -261,8 +261,9 @@ class Gossip:
             new += news
             effects += more
         gap = any(batch.first > self._held(batch.log) for batch in message.batches)
-        if gap or (new and _is_full(message)):
-            effects += self._pulls.ask_on(sender.robot, now)
+        left_out = bool(new) and _is_full(message)
+        if gap or left_out:
+            effects += self._pulls.ask_on(sender.robot, now, left_out)
         return new, effects
 
     def _on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:

@@ -169,6 +169,11 @@ class LoopClosing:
         self.latents.on_gone(keyframe, now)
         return self._using(keyframe)
 
+    def own_lost(self) -> list[KeyframeId]:
+        """Own latents that a pair needs and that the disk did not bring back; nobody else has them."""
+        of_own = self._work.lacking.get(self._own.robot)
+        return sorted(k for k in of_own if k.log == self._own) if of_own else []
+
     def on_lost_elsewhere(self, lost: Iterable[KeyframeId], now: float) -> list[tuple[KeyframeId, CandidatePair]]:
         """A neighbour knows of latents that exist no more; believed where nobody in range has them. Pairs to reject."""
         gone = [k for k in lost if self.latents.is_out_of_reach(k, self._reach)]
@@ -227,9 +232,9 @@ class LoopClosing:
         self._give_up(now)
         if self._undecided and self._listens_until_s <= now:
             self._decide(now)
-        effects = self._offers.tell(self._reach, now)
         for candidate in self._offers.taken_over(self._reach, now):
-            self._add(candidate)
+            self._hand_on_or_add(candidate, now)
+        effects = self._offers.tell(self._reach, now)
         if self.latents.free() > 0:
             effects += self.latents.fetch(self._fetchable(), self._reach, now)
         effects += self._register(now)
@@ -262,6 +267,10 @@ class LoopClosing:
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
             self._offer(candidate, Recipient(owner.robot, owner), now)
             return
+        self._hand_on_or_add(candidate, now)
+
+    def _hand_on_or_add(self, candidate: Candidate, now: float) -> None:
+        """A pair that is this robot's goes to a stronger one, where one is in range."""
         stronger = self._reach.stronger(self._compute_class)
         if stronger is not None:
             self._offer(candidate, Recipient(stronger, None), now)

@@ -29,7 +29,15 @@ from flocc_agent.core.effects import (
     Report,
     Unicast,
 )
-from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Leaving, Measured, MessageReceived
+from flocc_agent.core.events import (
+    Event,
+    GraphOptimised,
+    KeyframeCaptured,
+    LatentFetched,
+    Leaving,
+    Measured,
+    MessageReceived,
+)
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement, belongs_to, record_of
 from flocc_agent.core.pose_graph import GraphSolution
@@ -43,7 +51,7 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.admission import Refusal, admitted
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes, checked_keyframe
-from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, job_of
+from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, fetch, job_of
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import DiskQueue, Persist
 from flocc_agent.runtime.punctuality import LongestGap
@@ -135,6 +143,12 @@ class Driver:
             BadMeasurement: There is none.
         """
         return KeyframeId(self.robot.log, self._given.at("closure", stamp_s))
+
+    async def fetch_latent(self, keyframe: KeyframeId, deadline_s: float) -> bool:
+        """Bring a latent from its owner into the store; whether it came."""
+        event = await fetch(FetchLatent(keyframe, keyframe.log.robot, deadline_s), self._tools)
+        self.put(event)
+        return isinstance(event, LatentFetched)
 
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""
