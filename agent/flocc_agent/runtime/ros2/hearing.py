@@ -76,6 +76,7 @@ class Hearing:
         self._mount_camera = mount_camera
         self._static = StaticFrames()
         self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
+        self._compared_ns: int | None = None
         self.covariances = StepCovariances()
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
@@ -198,14 +199,15 @@ class Hearing:
             self.complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
 
     def compare_clocks(self, now_ns: int) -> None:
-        """Say when odometry is stamped by another clock than the node's: tf2 finds no transform then.
+        """Say when odometry that still comes is stamped by another clock than the node's: tf2 finds nothing then.
 
         Args:
             now_ns: The node's time; 0 while simulated time has not begun.
         """
         if now_ns == 0:
             self.complain("clock", "use_sim_time is set, but no /clock has come")
-        elif self.synchroniser.latest is not None:
+        elif self.synchroniser.latest is not None and self.synchroniser.latest[0] != self._compared_ns:
+            self._compared_ns = self.synchroniser.latest[0]
             behind_s = (now_ns - self.synchroniser.latest[0]) * 1e-9
             if abs(behind_s) > CLOCKS_APART_MAX_S:
                 aside = "behind" if behind_s > 0 else "ahead of"

@@ -110,6 +110,7 @@ class Agent:
             lambda: self.resets.append(None),
             lambda: [],
             lambda: (AgentStatus(robot="r-1"), ()),
+            dict,
         )
 
     def problems(self) -> list[str]:
