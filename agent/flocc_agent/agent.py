@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from flocc_agent.backend import build_iterator, build_optimiser
 from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
-from flocc_agent.core.interfaces import Camera, Image, Perception
+from flocc_agent.core.interfaces import Camera, Image, ImageWatch, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
@@ -330,6 +330,10 @@ class Agent:
         async with self._renewal:
             return
 
+    def follow_others(self) -> None:
+        """Learn from now on how all robots' earlier poses were corrected (`Correction.others`), not only the last."""
+        self._started.robot.corrections.follow_all()
+
     @property
     def robot(self) -> Robot:
         """The running core, for those who watch: to be read on the event loop's thread only, and never changed."""
@@ -427,6 +431,7 @@ class Agent:
             transport.serve_admin(Admin.CHAOS, self._disturb)
         tools = Tools(
             perception,
+            self._camera_watch(),
             build_optimiser(config.backend),
             build_iterator(config.backend),
             self._workers,
@@ -437,6 +442,12 @@ class Agent:
         return Driver(
             core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
         )
+
+    def _camera_watch(self) -> ImageWatch:
+        """What looks at this robot's images."""
+        from flocc_agent.perception.watch.camera_watch import CameraWatch
+
+        return CameraWatch(None if self._recording is None else self._recording.hidden)
 
     @property
     def _method(self) -> str | None:

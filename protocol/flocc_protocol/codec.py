@@ -31,6 +31,7 @@ Pose7 = tuple[float, float, float, float, float, float, float]
 
 QUATERNION_NORM_TOLERANCE = 1e-3
 COORDINATE_MAX = 1e7
+ORIGIN_MAX = 4e7
 MESSAGE_BYTES_MAX = 64 * 1024
 LOGS_MAX = 256
 """Logs that one message may speak of."""
@@ -224,11 +225,9 @@ def _build_pose(raw: bytes) -> Pose7:
     return _checked_pose(_POSE.unpack(raw))
 
 
-def _checked_pose(numbers: Pose7) -> Pose7:
+def _checked_pose(numbers: Pose7, coordinate_max: float = COORDINATE_MAX) -> Pose7:
     x, y, z, qw, qx, qy, qz = numbers
-    if not (-COORDINATE_MAX <= x <= COORDINATE_MAX and -COORDINATE_MAX <= y <= COORDINATE_MAX):
-        raise DecodeError("a pose must be finite and within the map")
-    if not -COORDINATE_MAX <= z <= COORDINATE_MAX:
+    if not (abs(x) <= coordinate_max and abs(y) <= coordinate_max and abs(z) <= coordinate_max):
         raise DecodeError("a pose must be finite and within the map")
     if not abs(math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz) - 1.0) <= QUATERNION_NORM_TOLERANCE:
         raise DecodeError("a pose must have a unit quaternion")
@@ -248,6 +247,12 @@ def _build_array(raw: tuple[str, list[int], bytes, float]) -> Array:
 _SHAPE = Annotated[list[int], Meta(max_length=DIMENSIONS_MAX)]
 _POSE_BYTES = Annotated[bytes, Meta(min_length=_POSE.size, max_length=_POSE.size)]
 POSE: Codec[Pose7] = Codec(_pack_pose, _POSE_BYTES, _build_pose)
+FRAME: Codec[Pose7] = Codec(
+    lambda value: _POSE.pack(*_checked_pose(value, ORIGIN_MAX)),
+    _POSE_BYTES,
+    lambda raw: _checked_pose(_POSE.unpack(raw), ORIGIN_MAX),
+)
+"""Where the origin of a frame is: two frames within the map may have theirs as far apart as both are wide."""
 ARRAY: Codec[Array] = Codec(
     lambda a: [a.dtype, list(a.shape), a.data, float(a.scale)], tuple[str, _SHAPE, bytes, int | float], _build_array
 )

@@ -37,6 +37,7 @@ class Kind(StrEnum):
     HANDOVER = "handover"
     CORRECTION = "correction"
     CORRECTION_REQUEST = "want-correction"
+    KNOT_REQUEST = "want-knots"
     DIGESTS = "digests"
     DIGEST_REQUEST = "want-digests"
     RECORDS = "records"

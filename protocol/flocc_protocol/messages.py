@@ -28,12 +28,14 @@ from flocc_protocol.errors import DecodeError
 from flocc_protocol.heartbeats import WANTS_MAX, Heartbeat
 from flocc_protocol.ids import LogId
 from flocc_protocol.log_corrections import (
-    CORRECTION_KEYFRAMES_MAX,
     CORRECTIONS_KEPT_MAX,
     CORRECTIONS_MAX,
+    KNOTS_MAX,
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    KnotRequest,
+    Knots,
     LogCorrection,
     encode_correction,
 )
@@ -56,7 +58,6 @@ __all__ = [
     "COMPUTE_CLASS_MAX",
     "CORRECTIONS_KEPT_MAX",
     "CORRECTIONS_MAX",
-    "CORRECTION_KEYFRAMES_MAX",
     "COUNTER_MAX",
     "CandidateOffer",
     "CandidatePair",
@@ -71,6 +72,9 @@ __all__ = [
     "HOPS_MAX",
     "Handover",
     "Heartbeat",
+    "KNOTS_MAX",
+    "KnotRequest",
+    "Knots",
     "LOGS_MAX",
     "LeaderAdvert",
     "LogCorrection",
@@ -120,6 +124,7 @@ Message = (
     | RecordRequest
     | CorrectionBatch
     | CorrectionRequest
+    | KnotRequest
     | CandidateOffer
     | Separators
 )

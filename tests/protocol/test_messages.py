@@ -17,10 +17,10 @@ from tests.protocol.wire_examples import (
     MESSAGES,
     TERM,
     descriptor,
+    knots,
     largest_messages,
     log_ids,
     messages,
-    poses_array,
 )
 
 from flocc_protocol.arrays import Array
@@ -29,9 +29,11 @@ from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INDEX_MAX, TERM_COUNTER_MAX, LogId
 from flocc_protocol.keys import Kind, broadcast_key, checked_kind
+from flocc_protocol.log_corrections import KNOT_REQUESTS_MAX
 from flocc_protocol.messages import (
     BATCHES_MAX,
-    CORRECTION_KEYFRAMES_MAX,
+    CORRECTIONS_MAX,
+    KNOTS_MAX,
     LOGS_MAX,
     MESSAGE_BYTES_MAX,
     MESSAGE_KINDS,
@@ -44,6 +46,7 @@ from flocc_protocol.messages import (
     Election,
     Envelope,
     Heartbeat,
+    KnotRequest,
     LogCorrection,
     LogDigest,
     LogPosition,
@@ -60,7 +63,8 @@ from flocc_protocol.messages import (
 )
 from flocc_protocol.records import RECORD_BYTES_MAX, KeyframeRecord, encode_record
 
-CORRECTION = LogCorrection(ALICE, TERM, 5, ALICE, IDENTITY, None, 0, 1, poses_array(6))
+KNOTS = knots(6)
+CORRECTION = LogCorrection(ALICE, TERM, 5, ALICE, IDENTITY, KNOTS)
 KEYFRAME_BYTES = encode_record(KeyframeRecord(9, 1_700_000_000.0, IDENTITY, descriptor(512)))
 
 
@@ -128,18 +132,23 @@ def test_a_batch_keeps_the_order_and_leaves_no_gap_for_a_small_record() -> None:
         lambda: RecordBatch(ALICE, INDEX_MAX, 0, (b"x",)),
         lambda: Records((RecordBatch(ALICE, 0, 0, (bytes(RECORD_BYTES_MAX),) * 3),) * 2),
         lambda: Records((RecordBatch(ALICE, 0, 0, ()),) * (BATCHES_MAX + 1)),
-        lambda: CorrectionBatch((CORRECTION,) * 17),
-        lambda: CorrectionBatch((replace(CORRECTION, T_map_camera=poses_array(800)),) * 2),
+        lambda: CorrectionBatch((CORRECTION,) * (CORRECTIONS_MAX + 1)),
+        lambda: CorrectionBatch((replace(CORRECTION, knots=knots(800)),) * 2),
         lambda: replace(CORRECTION, signature=b"short"),
-        lambda: replace(CORRECTION, T_map_camera=poses_array(CORRECTION_KEYFRAMES_MAX + 1)),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.zeros((3, 7)))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.full((1, 7), 2.0))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.array([[1e8, 0, 0, 1, 0, 0, 0]]))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.array([[0, 0, 0, 1, 0, 0, 0]]), "f8")),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.zeros(7))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.zeros((7, 6)))),
-        lambda: replace(CORRECTION, first=INDEX_MAX, step=1),
-        lambda: replace(CORRECTION, covariance=Array.of(np.zeros(20))),
+        lambda: knots(KNOTS_MAX + 1),
+        lambda: knots(0),
+        lambda: replace(KNOTS, twists=Array.of(np.zeros((5, 6)), "f4")),
+        lambda: replace(KNOTS, twists=Array.of(np.zeros((6, 7)), "f4")),
+        lambda: replace(KNOTS, twists=Array.of(np.zeros((6, 6)), "f8")),
+        lambda: replace(KNOTS, twists=Array.of(np.full((6, 6), 5.0), "f4")),
+        lambda: replace(KNOTS, twists=Array.of(np.tile([0, 0, 0, 2e8, 0, 0], (6, 1)), "f4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.array([1, 2, 3, 3, 4, 5]), "u4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.array([1, 2, 4, 3, 5, 6]), "u4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.array([1, 2, 3, 4, 5, 2**32 - 1]), "u4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.arange(6), "u1")),
+        lambda: replace(KNOTS, about_odom_m=Array.of(np.zeros(3), "f4")),
+        lambda: replace(KNOTS, about_odom_m=Array.of(np.full(3, 1e8), "f8")),
+        lambda: replace(KNOTS, covariance=Array.of(np.zeros(20))),
     ],
 )
 def test_what_does_not_fit_cannot_be_built(build: Any) -> None:
@@ -158,7 +167,7 @@ def test_what_does_not_fit_cannot_be_built(build: Any) -> None:
         Election(-1),
         Records((RecordBatch(ALICE, 0, 2**32, ()),)),
         RecordRequest((LogPosition(ALICE, 0),) * (BATCHES_MAX + 1)),
-        CorrectionBatch((replace(CORRECTION, step=0),)),
+        KnotRequest((CorrectionVersion(ALICE, TERM, 1),) * (KNOT_REQUESTS_MAX + 1)),
         CorrectionBatch((replace(CORRECTION, T_map_odom=(math.nan, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),)),
     ],
     ids=lambda message: kind_of(message),
@@ -168,15 +177,20 @@ def test_a_message_that_others_would_refuse_is_a_value_error_here(message: Messa
         encode(Envelope(ALICE, message))
 
 
-def test_a_correction_on_the_wire_has_unit_quaternions() -> None:
+def test_knots_on_the_wire_are_in_order_and_finite() -> None:
     version, kind, sender, fields = from_bytes(
         encode(Envelope(ALICE, CorrectionBatch((CORRECTION,)))), MESSAGE_BYTES_MAX
     )
     correction = from_bytes(fields[0][0][0], MESSAGE_BYTES_MAX)
-    correction[-1] = ["f4", [1, 7], bytes(28), 1.0]
-    fields[0][0][0] = to_bytes(correction)
-    with pytest.raises(DecodeError, match="unit quaternions"):
-        decode(to_bytes([version, kind, sender, fields]))
+    for field, bad, told in (
+        (2, ["u4", [6], np.array([1, 2, 3, 2, 5, 6], "<u4").tobytes(), 1.0], "order"),
+        (3, ["f4", [6, 6], np.full(36, np.nan, "<f4").tobytes(), 1.0], "finite"),
+    ):
+        damaged = list(correction)
+        damaged[-1] = [*correction[-1][:field], bad, *correction[-1][field + 1 :]]
+        fields[0][0][0] = to_bytes(damaged)
+        with pytest.raises(DecodeError, match=told):
+            decode(to_bytes([version, kind, sender, fields]))
 
 
 # --- versions and malformed messages ---------------------------------------------------------------------------------
@@ -267,8 +281,8 @@ def test_a_keyframe_costs_less_than_700_bytes_in_a_batch() -> None:
     assert len(encode(Envelope(ALICE, Records((batch,))))) / len(batch.records) < 650
 
 
-def test_a_correction_of_1500_keyframes_fits_one_message() -> None:
-    correction = replace(CORRECTION, T_map_camera=poses_array(1500), covariance=Array.of(np.ones(21)))
+def test_a_correction_of_as_many_knots_as_may_be_fits_one_message() -> None:
+    correction = replace(CORRECTION, knots=knots(KNOTS_MAX, Array.of(np.ones(21))))
     assert len(encode(Envelope(ALICE, CorrectionBatch((correction,))))) < 43_000
 
 

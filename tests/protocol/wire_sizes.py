@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from tests.protocol.wire_examples import IDENTITY, descriptor, largest_messages, poses_array
+from tests.protocol.wire_examples import IDENTITY, descriptor, knots, largest_messages
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.digests import HASH_MAX
@@ -24,6 +24,7 @@ from flocc_protocol.messages import (
     Envelope,
     Handover,
     Heartbeat,
+    KnotRequest,
     LeaderAdvert,
     LogCorrection,
     LogDigest,
@@ -79,11 +80,10 @@ def records() -> Iterator[tuple[str, Record]]:
     yield "fix", FixRecord(1000, Array.of(np.ones(3), "f8"), Array.of(np.ones(9), "f8"))
 
 
-def correction(keyframes: int) -> CorrectionBatch:
-    """A correction of a log."""
-    return CorrectionBatch(
-        (LogCorrection(LOGS[1], TERM, 200, LOGS[0], IDENTITY, COVARIANCE, 0, 1, poses_array(keyframes)),)
-    )
+def correction(count: int) -> CorrectionBatch:
+    """A correction of a log, with so many knots; in short with none."""
+    told = knots(count, Array.of(np.ones(21), "f2")) if count else None
+    return CorrectionBatch((LogCorrection(LOGS[1], TERM, 200, LOGS[0], IDENTITY, told),))
 
 
 def messages() -> Iterator[tuple[str, Message]]:
@@ -102,10 +102,11 @@ def messages() -> Iterator[tuple[str, Message]]:
     yield "records, as many such keyframes as fit", Records((RecordBatch.of(LOGS[1], 1000, CHECKSUM, [data] * 100),))
     yield "want-records, 1 log", RecordRequest((LogPosition(LOGS[1], 1000),))
     yield "want-records, 50 logs", RecordRequest(tuple(LogPosition(log, 1000) for log in LOGS))
-    yield "correction, 100 keyframes", correction(100)
-    yield "correction, 400 keyframes", correction(400)
-    yield "correction, 1500 keyframes", correction(1500)
+    yield "correction, in short", correction(0)
+    yield "correction, 30 knots", correction(30)
+    yield "correction, 1500 knots", correction(1500)
     yield "want-correction", CorrectionRequest(LOGS[1:2])
+    yield "want-knots", KnotRequest((CorrectionVersion(LOGS[1], TERM, 200),))
     yield "candidates, 1 pair", CandidateOffer((CandidatePair(QUERY, MATCH),))
 
 

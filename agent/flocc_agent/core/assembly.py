@@ -133,6 +133,11 @@ class GraphAssembly:
             found = self._odometry_pairs[keyframe] = (KeyframeId(keyframe.log, index), T_neighbour_query)
         return found
 
+    def odometry(self, log: LogId) -> Float:
+        """T_odom_camera (N, 4, 4) of the known keyframes of a log."""
+        odometry = self._odometry.get(log)
+        return np.empty((0, 4, 4)) if odometry is None else odometry.matrices()
+
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
         trajectories = {log: self._trajectory(log) for log in sorted(self._odometry)}

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.parameters import NeighbourParameters
 from flocc_agent.core.reports import NameTaken, NeighbourRestarted, NeighbourUp, PeerRefused
-from flocc_protocol.ids import LogId
-from flocc_protocol.messages import Heartbeat
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import HOPS_MAX, Heartbeat
 
 LOSS_WEIGHT = 0.05
 """How much one heartbeat weighs in the running share of lost ones: about the last twenty count."""
@@ -34,6 +34,14 @@ class Neighbour:
             self.loss_ratio = (1.0 - LOSS_WEIGHT) * (1.0 - kept * (1.0 - self.loss_ratio))
 
 
+def _hops(neighbour: Neighbour, term: Term) -> int:
+    """Robots between a neighbour and the leader of a term; more than there may be where it follows another one."""
+    if neighbour.log == term.leader:
+        return -1
+    advert = neighbour.heartbeat.leader
+    return advert.hops if advert is not None and advert.term == term else HOPS_MAX + 1
+
+
 class Neighbours:
     """The table of robots in range, by name."""
 
@@ -44,6 +52,9 @@ class Neighbours:
         self._by_name: dict[str, Neighbour] = {}
         self._duplicates: set[str] = set()
         self._due_s = float("inf")
+
+    def __len__(self) -> int:
+        return len(self._by_name)
 
     def __contains__(self, name: str) -> bool:
         return name in self._by_name
@@ -56,6 +67,11 @@ class Neighbours:
         """Whether a robot was in range already before what it broadcasts now can have been lost on the way."""
         known = self._by_name.get(name)
         return known is not None and known.since_s + SETTLED_S <= now
+
+    def towards(self, term: Term) -> list[str]:
+        """Robots in range: the leader of a term, those that follow it over ever more robots, then all others."""
+        away = {name: _hops(neighbour, term) for name, neighbour in self._by_name.items()}
+        return sorted(away, key=lambda name: (away[name], name))
 
     def is_double(self, name: str) -> bool:
         """Whether two robots were heard under this name."""

@@ -80,6 +80,7 @@ from flocc_protocol.messages import (
     Envelope,
     Handover,
     Heartbeat,
+    KnotRequest,
     LogCorrection,
     LogDigest,
     RecordRequest,
@@ -183,7 +184,14 @@ class Robot:
             log, compute_class, pair_of, parameters.loop_closing, spectral, closed, listens_until_s
         )
         self.in_map = None if restored.saved is None else InMap(restored.saved, now)
-        self.corrections = Corrections(log, parameters.gossip, sealer)
+        self.corrections = Corrections(
+            log,
+            parameters.gossip,
+            sealer,
+            odometry=self.assembly.odometry,
+            near=self.neighbours.__contains__,
+            towards=self.neighbours.towards,
+        )
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -246,12 +254,12 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor):
+            case KeyframeEncoded(keyframe, descriptor, doubts):
                 self.closing.on_held(keyframe)
-                return self._on_encoded(keyframe, descriptor, now)
-            case KeyframeEncodingFailed(keyframe, reason):
-                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
-                return [report, *self._on_encoded(keyframe, None, now)]
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
+                return [*reports, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
@@ -300,9 +308,12 @@ class Robot:
             case RecordRequest():
                 return self.gossip.on_request(sender, message)
             case CorrectionBatch(corrections):
-                return [effect for correction in corrections for effect in self._on_correction(sender, correction)]
+                return [effect for correction in corrections for effect in self._on_correction(sender, correction, now)]
             case CorrectionRequest():
                 return self.corrections.on_request(sender.robot, message)
+            case KnotRequest():
+                near = sender.robot in self.neighbours
+                return self.corrections.on_knot_request(sender.robot, message, now) if near else []
             case CandidateOffer():
                 self.closing.on_offer(message, now)
                 return []
@@ -329,12 +340,12 @@ class Robot:
             effects += self._reject_lost([pair], keyframe, now)
         return effects
 
-    def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
+    def _on_correction(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
         """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
-        if not self.corrections.is_news(message):
+        if not self.corrections.is_news(message, now):
             return []
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
-        return refused or self.corrections.take(message)
+        return refused or self.corrections.take(message, now)
 
     def _compare(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Ask a neighbour for what it has more of, and for what changed in its tables where they are others."""
@@ -343,6 +354,7 @@ class Robot:
         effects = self.gossip.on_digests(sender, own, now)
         if heartbeat.versions.hash != versions.hash:
             effects += self.corrections.ask(peer, now)
+        effects += self.corrections.ask_knots(now)
         return effects + self.comparisons.on_heartbeat(peer, heartbeat, digests, versions, now)
 
     def _on_digests(self, sender: LogId, message: Digests, now: float) -> list[Effect]:
@@ -377,7 +389,7 @@ class Robot:
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
-        return [Encode(KeyframeId(self.log, index), event.image)]
+        return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
@@ -512,7 +524,7 @@ class Robot:
 
     def _heartbeat(self, now: float) -> list[Effect]:
         """Say who is here; a late tick does not make up for heartbeats it missed."""
-        period = self._parameters.neighbours.heartbeat_period_s
+        period = self._parameters.neighbours.period_s(len(self.neighbours))
         self._heartbeat_due_s += period
         if self._heartbeat_due_s <= now:
             self._heartbeat_due_s = now + period

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.reports import (
+    CameraDoubted,
     ClosureAccepted,
     CorrectionApplied,
     Fact,
@@ -206,7 +207,7 @@ class Telemetry:
         return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = (PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_WARNINGS = (CameraDoubted, PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
 _INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 

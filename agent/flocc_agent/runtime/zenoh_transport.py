@@ -58,6 +58,7 @@ PRIORITY = {
     keys.Kind.HANDOVER.value: zenoh.Priority.INTERACTIVE_HIGH,
     keys.Kind.CORRECTION.value: zenoh.Priority.INTERACTIVE_LOW,
     keys.Kind.CORRECTION_REQUEST.value: zenoh.Priority.INTERACTIVE_LOW,
+    keys.Kind.KNOT_REQUEST.value: zenoh.Priority.INTERACTIVE_LOW,
     keys.Kind.DIGESTS.value: zenoh.Priority.INTERACTIVE_LOW,
     keys.Kind.DIGEST_REQUEST.value: zenoh.Priority.INTERACTIVE_LOW,
     keys.Kind.RECORDS.value: zenoh.Priority.DATA_HIGH,

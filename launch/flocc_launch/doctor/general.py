@@ -8,6 +8,7 @@ from statistics import median
 from flocc_agent.core.reports import EncodingFailed, NameTaken, RoundSolved
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.doctor.cameras import doubted_cameras
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
@@ -183,6 +184,7 @@ GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     deaths,
     shared_names,
     weak_links,
+    doubted_cameras,
     solver_warnings,
     solver_refusals,
     encoding_failures,

@@ -202,6 +202,7 @@ class Swarm:
                 build_iterator(self.scenario.backend),
                 self._equipment.times,
                 rng,
+                playback.hidden,
             ),
             self._equipment.disk(log, self.scenario.store.latent_bytes_max),
             Clock(robot.clock_offset_s, robot.clock_drift_ratio),

@@ -287,10 +287,10 @@ class Station:
                 self._around.broadcast(self, message)
             case Unicast(to, message):
                 self._around.unicast(self, to, message)
-            case Encode(keyframe, image):
+            case Encode(keyframe, image, T_odom_camera):
                 capture = self._images.pop(image)
                 done_s = self.workers.encoded_at_s(now_s)
-                self.later(done_s, lambda: self.workers.encode(keyframe, capture, self.disk))
+                self.later(done_s, lambda: self.workers.encode(keyframe, capture, T_odom_camera, self.disk))
             case FetchLatent():
                 self._around.fetch(self, effect)
             case Register():

@@ -27,7 +27,6 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 from flocc_agent.runtime.ros2.types import BadMessage, Ros2Error
 from flocc_agent.runtime.status import AgentStatus
-from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import LogCorrection
 
@@ -119,8 +118,7 @@ class Agent:
 
 def correction(covariance: Float | None = None) -> Correction:
     term = Term(1, LogId("r1", 0))
-    nowhere = Array.of(np.zeros((0, 7)), "f4")
-    message = LogCorrection(term.leader, term, 1, term.leader, pose7(T_MAP_ODOM), None, 0, 1, nowhere)
+    message = LogCorrection(term.leader, term, 1, term.leader, pose7(T_MAP_ODOM))
     own = CorrectedLog(message, RecordedOdometry(LogCopy()))
     return Correction(term, 1, "map/r1", False, T_MAP_ODOM, covariance, own, {})
 
