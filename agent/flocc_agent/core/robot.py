@@ -543,7 +543,7 @@ class Robot:
 
     def _heartbeat(self, now: float) -> list[Effect]:
         """Say who is here; a late tick does not make up for heartbeats it missed."""
-        period = self._parameters.neighbours.heartbeat_period_s
+        period = self._parameters.neighbours.period_s(len(self.neighbours))
         self._heartbeat_due_s += period
         if self._heartbeat_due_s <= now:
             self._heartbeat_due_s = now + period

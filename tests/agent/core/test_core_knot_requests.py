@@ -24,3 +24,10 @@ def test_knots_that_another_robot_needed_are_given_up() -> None:
     requests = KnotRequests(lambda _: ["r2"])
     requests.on_interest("r3", VERSION, 0.0)
     assert len(asked_at_s(requests, 60)) == ASKED_MAX
+
+
+def test_an_own_need_outlives_a_newer_version_that_another_robot_asks_for() -> None:
+    requests = KnotRequests(lambda _: ["r2"])
+    requests.want(VERSION, 0.0)
+    requests.on_interest("r3", VERSION._replace(round=11), 1.0)
+    assert len(asked_at_s(requests, 600)) > 2 * ASKED_MAX

@@ -13,7 +13,6 @@ from flocc_agent.runtime.ros2.diagnostics import ERROR, OK, WARN, diagnostics, j
 from flocc_agent.runtime.ros2.markers import ABOVE_M, KEYFRAMES_MAX, KnownClosure, Markers
 from flocc_agent.runtime.ros2.types import MessageTypes
 from flocc_agent.runtime.status import AgentStatus
-from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import LogCorrection
 from flocc_protocol.records import KeyframeRecord
@@ -33,8 +32,7 @@ def corrected_log(robot: str, keyframes: int, incarnation: int = 0) -> Corrected
         T = pose7(pose(np.eye(3), np.array([float(k), 0.0, 0.0])))
         copy.records.append(KeyframeRecord(k, float(k), T, None))
     term = Term(1, LogId("r2"))
-    nothing = Array.of(np.zeros((0, 7)), "f4")
-    correction = LogCorrection(log, term, 1, term.leader, pose7(T_MAP_ODOM[robot]), None, 0, 1, nothing)
+    correction = LogCorrection(log, term, 1, term.leader, pose7(T_MAP_ODOM[robot]))
     return CorrectedLog(correction, RecordedOdometry(copy))
 
 
