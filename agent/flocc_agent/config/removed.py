@@ -2,8 +2,9 @@
 
 REMOVED: dict[str, str] = {
     "source.hold_s": "an agent runs until it is stopped",
-    "core.neighbours.heartbeat_period_s": "always 0.5; core.neighbours.timeout_s is the key for robots out of range",
-    "core.neighbours.neighbours_max": "always 64",
+    "core.neighbours.heartbeat_period_s": "0.5 with up to 32 robots in range; for robots out of range there is "
+    "core.neighbours.timeout_s",
+    "core.neighbours.neighbours_max": "always 512",
     "core.election.startup_s": "always 1.5",
     "core.election.answer_timeout_s": "always 0.6",
     "core.election.coordinator_timeout_s": "always 2.0",
@@ -22,9 +23,9 @@ REMOVED: dict[str, str] = {
     "core.rounds.period_per_keyframe_s": "always 0.001; core.rounds.period_s is the key for slower rounds",
     "core.rounds.timeout_s": "always 60.0",
     "core.rounds.keyframes_per_round": "always 20",
-    "core.rounds.correction_keyframes_max": "always 400",
-    "core.rounds.translation_tolerance_m": "always 0.001",
-    "core.rounds.rotation_tolerance_rad": "always 0.0001",
+    "core.rounds.correction_keyframes_max": "a correction has as many knots as it takes",
+    "core.rounds.translation_tolerance_m": "always 0.01",
+    "core.rounds.rotation_tolerance_rad": "always 0.1 degrees",
     "transport.bulk_send_buffer_bytes": "always 65536",
     "core.distributed": "distributed mode has no keys beside backend.mode",
     "perception.classical.contrast_threshold": "always 0.02",

@@ -53,6 +53,9 @@ class Neighbours:
         self._duplicates: set[str] = set()
         self._due_s = float("inf")
 
+    def __len__(self) -> int:
+        return len(self._by_name)
+
     def __contains__(self, name: str) -> bool:
         return name in self._by_name
 

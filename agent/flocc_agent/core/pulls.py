@@ -20,7 +20,7 @@ Entry = TypeVar("Entry")
 
 REMEMBERED_MAX = 1024
 """Open requests and pauses that are remembered; beyond this the oldest are forgotten."""
-PEERS_MAX = 64
+PEERS_MAX = 128
 BROADCAST_RECORDS = 3
 BROADCAST_S = 0.2
 """A robot in range sends its last few records itself; others who heard them sooner are asked only after this time."""

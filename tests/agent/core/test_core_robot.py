@@ -233,6 +233,19 @@ def test_no_pair_is_handed_to_a_name_under_which_two_robots_run() -> None:
     assert robot.closing.roles(found.pair) is not None
 
 
+def test_the_heartbeat_is_slower_in_a_crowd_and_never_too_slow_for_the_timeout() -> None:
+    parameters = NeighbourParameters()
+    assert [parameters.period_s(count) for count in (0, 8, 32, 48, 64, 512)] == [0.5, 0.5, 0.5, 0.75, 1.0, 1.0]
+    assert 3 * parameters.period_s(512) <= parameters.timeout_s
+    robots = Robots()
+    robots.add("r1")
+    for k in range(64):
+        robots.put("r1", MessageReceived(Envelope(LogId(f"s{k:02d}"), heartbeat(1, k))))
+    before = len(robots.effects("r1", Broadcast))
+    robots.run(2.5)
+    assert len(robots.effects("r1", Broadcast)) - before <= 4
+
+
 def test_neighbours_beyond_the_maximum_are_refused() -> None:
     robots = Robots(CoreParameters(neighbours=NeighbourParameters(neighbours_max=2)))
     robots.add("r1")
