@@ -118,7 +118,12 @@ class Telemetry:
             stages={name: StageBrief.model_validate(brief) for name, brief in stages.items()},
             refused=self.refused(),
             busy=busy,
+            in_map=self._in_map(),
         )
+
+    def _in_map(self) -> str | None:
+        recognition, in_map = self._robot.recognition, self._robot.in_map
+        return None if in_map is None else in_map.state(recognition.best_similarities, recognition.similarity_threshold)
 
     def look(self) -> Look:
         """What a scrape of the metrics sees."""

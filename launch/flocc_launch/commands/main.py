@@ -236,7 +236,7 @@ def agent(
     import time
 
     from flocc_agent.config import AgentConfig, MetricsConfig
-    from flocc_launch.swarm.agent_process import Beginning, run_agent
+    from flocc_launch.swarm.agent_process import Beginning, ToldOfMap, run_agent
 
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
@@ -253,7 +253,7 @@ def agent(
             run_agent(
                 read,
                 time.monotonic(),
-                lambda _: None,
+                ToldOfMap(read.name).tell,
                 dashboard=dashboard,
                 beginning=beginning,
                 ros_args=ros_args or (),

@@ -11,12 +11,16 @@ from tests.agent.runtime.test_agent_api import CONFIG, camera
 from flocc_agent import Agent
 from flocc_agent.agent import JourneyError
 from flocc_agent.core.corrected import Correction
-from flocc_agent.core.reports import Fact, FoundInMap
+from flocc_agent.core.effects import Report
+from flocc_agent.core.in_map import InMap
+from flocc_agent.core.reports import Fact, FoundInMap, MapLogWritten
+from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import Float, between, pose, so3_exp
 from flocc_agent.perception.synthetic import pose_image
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.journeys import began_anew
 from flocc_launch.maps.map_saving import save_map
+from flocc_protocol.ids import LogId
 
 STEP_M = 0.7
 WITHIN_S = 60.0
@@ -134,3 +138,28 @@ async def test_a_robot_alone_finds_itself_in_an_old_map(tmp_path: Path) -> None:
         assert set(found.others) == {"r1"}
     (fact,) = [each for each in told if isinstance(each, FoundInMap)]
     assert fact.keyframes <= 8
+
+
+def test_what_a_robot_says_before_it_is_found() -> None:
+    saved = SavedMap((LogId("r1"),), frozenset({LogId("r1"), LogId("r2")}), {LogId("r1"): np.eye(4)[None]})
+    in_map = InMap(saved, 0.0)
+    assert in_map.state({}, 0.1) == "not in map/r1 yet: nothing compared so far"
+    assert in_map.state({"r7": 0.9}, 0.1) == "not in map/r1 yet: nothing compared so far"
+    assert in_map.state({"r1": 0.01, "r2": 0.052}, 0.1) == (
+        "not in map/r1 yet: best similarity 0.052, with r2; 0.1 is needed"
+    )
+    assert in_map.state({"r2": 0.213}, 0.1) == (
+        "not in map/r1 yet: looks like r2 (0.213); waits for closures that agree"
+    )
+    in_map.found = True
+    assert in_map.state({}, 0.1) == "in map/r1"
+
+
+def test_a_robot_that_writes_a_log_of_the_map_is_named_once() -> None:
+    saved = SavedMap((LogId("r1"),), frozenset({LogId("r1")}), {LogId("r1"): np.eye(4)[None]})
+    in_map = InMap(saved, 0.0)
+    assert in_map.on_heartbeat(LogId("r2")) == []
+    assert in_map.on_heartbeat(LogId("r1", 3)) == [], "another journey of that name"
+    (told,) = in_map.on_heartbeat(LogId("r1"))
+    assert told == Report(MapLogWritten(peer="r1", log=LogId("r1")))
+    assert in_map.on_heartbeat(LogId("r1")) == []
