@@ -523,6 +523,7 @@ class Agent:
             self._begin_anew,
             lambda: known_closures(self._started.robot, self.config.backend.steepness),
             self._state,
+            lambda: self._started.corrected_logs(),
         )
         return Ros2Adapter(config, self.config.name, self._selector, host, self._ros_args)
 

@@ -8,7 +8,7 @@ from flocc_lab.commands.bench import bench
 
 
 def test_a_round_ends_where_a_whole_solve_ends() -> None:
-    answer = CliRunner().invoke(bench, ["solver", "--keyframes", "600", "--closures", "60", "--robots", "2", "--json"])
+    answer = CliRunner().invoke(bench, ["solver", "--keyframes", "600", "--closures", "60", "--json"])
     assert answer.exit_code == 0, answer.output
     result = json.loads(answer.output)
     assert (result["keyframes"], result["closures"]) == (600, 60)
@@ -18,7 +18,7 @@ def test_a_round_ends_where_a_whole_solve_ends() -> None:
 
 
 def test_the_result_is_told_in_lines() -> None:
-    answer = CliRunner().invoke(bench, ["solver", "--keyframes", "400", "--closures", "30", "--formulation", "base"])
+    answer = CliRunner().invoke(bench, ["solver", "--keyframes", "400", "--closures", "30", "--lm"])
     assert answer.exit_code == 0, answer.output
-    assert "400 keyframes, 30 closures, base, gnc-tls" in answer.output
+    assert "400 keyframes, 30 closures, base, lm" in answer.output
     assert "ten closures more" in answer.output

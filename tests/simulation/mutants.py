@@ -13,7 +13,6 @@ from unittest.mock import patch
 import numpy as np
 
 from flocc_agent.core import assembly, election, judgement, loop_closing, robot
-from flocc_agent.core import corrections as corrections_module
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, PersistCorrection, PersistTerm, Report
@@ -94,6 +93,8 @@ def without_reports(*kinds: type) -> Wrap:
 
 
 def _off_by_50_m(message: Any) -> Any:
+    if message is None:
+        return None
     x, *rest = message.T_map_odom
     return replace(message, T_map_odom=(x + 50.0, *rest))
 
@@ -102,8 +103,8 @@ def _component(change: Callable[[Any, Any], dict[str, Any]]) -> Wrap:
     """Let a correction be made of another part of the solution."""
 
     def wrap(original: Callable[..., Any]) -> Callable[..., Any]:
-        def broken(component: Any, log: Any, *rest: Any) -> Any:
-            return original(replace(component, **change(component, log)), log, *rest)
+        def broken(self: Corrections, component: Any, log: Any, *rest: Any) -> Any:
+            return original(self, replace(component, **change(component, log)), log, *rest)
 
         return broken
 
@@ -281,13 +282,13 @@ def _follows_whoever_came_first(original: Callable[..., Any]) -> Callable[..., A
 
 MUTANTS = (
     # corrections
-    Mutant("T_map_odom is 50 m off", corrections_module, "correction_of", afterwards(_off_by_50_m)),
-    Mutant("corrections are zero poses", corrections_module, "correction_of", _component(_zero_poses)),
-    Mutant("the previous keyframe's pose", corrections_module, "correction_of", _component(_previous_poses)),
-    Mutant("the last keyframe stays uncorrected", corrections_module, "correction_of", _component(_last_one_stays)),
-    Mutant("a covariance of zero", corrections_module, "correction_of", _component(_covariance(0.0))),
-    Mutant("a covariance of NaN", corrections_module, "correction_of", _component(_covariance(float("nan")))),
-    Mutant("an inflated covariance", corrections_module, "correction_of", _component(_covariance(4.0))),
+    Mutant("T_map_odom is 50 m off", Corrections, "_made", afterwards(_off_by_50_m)),
+    Mutant("corrections are zero poses", Corrections, "_made", _component(_zero_poses)),
+    Mutant("the previous keyframe's pose", Corrections, "_made", _component(_previous_poses)),
+    Mutant("the last keyframe stays uncorrected", Corrections, "_made", _component(_last_one_stays)),
+    Mutant("a covariance of zero", Corrections, "_made", _component(_covariance(0.0))),
+    Mutant("a covariance of NaN", Corrections, "_made", _component(_covariance(float("nan")))),
+    Mutant("an inflated covariance", Corrections, "_made", _component(_covariance(4.0))),
     Mutant("a correction is not persisted", Corrections, "_apply", without(PersistCorrection)),
     Mutant("a correction is delivered twice", Corrections, "_apply", afterwards(_delivers_twice)),
     Mutant("a correction is never delivered", Corrections, "_apply", always([])),

@@ -40,7 +40,7 @@ RIDGE_RATIO = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Layout:
+class BlockLayout:
     """Where the blocks of a symmetric matrix's upper triangle are in the whole of it.
 
     Attributes:
@@ -58,7 +58,7 @@ class Layout:
     starts: Int
 
     @classmethod
-    def of(cls, rows: Int, cols: Int, nodes: int) -> "Layout":
+    def of(cls, rows: Int, cols: Int, nodes: int) -> "BlockLayout":
         """Lay out blocks of the upper triangle, at block rows and columns (K,)."""
         above = rows < cols
         all_rows, all_cols = np.concatenate([rows, cols[above]]), np.concatenate([cols, rows[above]])
@@ -115,7 +115,7 @@ class Structure:
         steps: Indices of the edges from a pose to the next one, each pair of poses once.
         others: Indices of all other edges.
         poses: Blocks between poses of those others.
-        far: Layout of those of the blocks that are in no band.
+        far: BlockLayout of those of the blocks that are in no band.
         is_far: (K,) which they are.
         segments: Blocks between segments.
         coarse: Their layout.
@@ -126,10 +126,10 @@ class Structure:
     steps: Int
     others: Int
     poses: Pattern
-    far: Layout
+    far: BlockLayout
     is_far: Bool
     segments: Pattern
-    coarse: Layout
+    coarse: BlockLayout
     segment: Int
     between: Int
 
@@ -141,12 +141,12 @@ class Structure:
         others = np.setdiff1d(np.arange(len(edges)), steps)
         pattern = Pattern.of(edges.i[others], edges.j[others], poses)
         is_far = pattern.cols > pattern.rows + 1
-        far = Layout.of(pattern.rows[is_far], pattern.cols[is_far], poses)
+        far = BlockLayout.of(pattern.rows[is_far], pattern.cols[is_far], poses)
         segment = segments_of(edges, poses, fixed)
         i, j = segment[edges.i], segment[edges.j]
         between = np.flatnonzero(i != j)
         segments = Pattern.of(i[between], j[between], int(segment[-1]) + 1)
-        coarse = Layout.of(segments.rows, segments.cols, segments.nodes)
+        coarse = BlockLayout.of(segments.rows, segments.cols, segments.nodes)
         return cls(steps, others, pattern, far, is_far, segments, coarse, segment, between)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from flocc_agent.backend.edges import Edges, Residuals, State, residuals
+from flocc_agent.backend.edges import Edges, Residuals, State, residuals, taken
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.config import BackendConfig
 
@@ -70,7 +70,7 @@ class Objective:
 
     def closure_residuals(self, state: State) -> Float:
         """Squared residuals (L,) of the closures."""
-        return residuals(self.edges, state, hold=False).squared()[self.closures]
+        return residuals(taken(self.edges, self.closures), state, hold=False).squared()
 
     def weights(self, of_closures: Float | float = 1.0) -> Float:
         """Weights (E,) of all edges, given those of the closures."""

@@ -210,6 +210,6 @@ def scale_slopes(edges: Edges, at: Residuals) -> Float:
 Record = TypeVar("Record", Edges, Residuals)
 
 
-def taken(record: Record, rows: Int) -> Record:
+def taken(record: Record, rows: Int | slice) -> Record:
     """Some of the edges, or what they say."""
     return type(record)(*(getattr(record, field.name)[rows] for field in fields(record)))

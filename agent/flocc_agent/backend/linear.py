@@ -6,7 +6,7 @@ instead of 122 ms for 8,000 factors).
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import repeat
 
@@ -179,6 +179,7 @@ class LinearSolver:
     def factors(self, edges: Edges, state: State, at: Residuals, weights: Float) -> gtsam.GaussianFactorGraph:
         """Jacobian factors of all edges and of the cluster scales' priors, noise whitened."""
         graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(6)
+        add: Callable[..., None] = graph.add
         jac = jacobians(edges, at)
         w = np.sqrt(weights)[:, None]
         whole = bool(np.all(weights == 1.0))
@@ -188,14 +189,14 @@ class LinearSolver:
         others = np.flatnonzero((weights > 0.0) & ~plain).tolist()
         of_plain = (x[plain] for x in (edges.i, A_i, edges.j, A_j, b))
         keys_i, rows_i, keys_j, rows_j, right = of_plain
-        both = map(graph.add, keys_i.tolist(), rows_i, keys_j.tolist(), rows_j, right, repeat(unit))
+        both = map(add, keys_i.tolist(), rows_i, keys_j.tolist(), rows_j, right, repeat(unit))
         deque(both, maxlen=0)
         for k in others:
             ends = ((int(edges.i[k]), A_i[k]), (int(edges.j[k]), A_j[k]))
             terms = [term for end in ends if end[0] != self.fixed for term in end]
             if edges.cluster[k] >= 0:
                 terms += [SCALE_KEYS_FROM + int(edges.cluster[k]), a_scale[k]]
-            graph.add(*terms, b[k], unit)
+            add(*terms, b[k], unit)
         self._add_scale_rows(graph, edges, state, at, w[:, 0])
         return graph
 

@@ -177,6 +177,17 @@ class Corrector:
             others=self._others(applied),
         )
 
+    def now(self, T_body_camera: Float) -> dict[str, CorrectedLog]:
+        """All robots in this robot's map, itself among them, by the newest corrections; none before its first.
+
+        They share nothing with what programs were given, so another thread may read them.
+        """
+        own = self._robot.corrections.of(self._robot.log)
+        if own is None:
+            return {}
+        fresh = Corrector(self._robot)
+        return {own.log.robot: fresh._corrected(own, inverse(T_body_camera)), **fresh._others(own)}
+
     def _others(self, applied: LogCorrection) -> dict[str, CorrectedLog]:
         """The newest life of every other robot that has a correction in this frame."""
         found: dict[str, CorrectedLog] = {}

@@ -2,8 +2,7 @@
 
 Rules: who is asked for knots that it does not hold remembers the asker for a few seconds and asks the robot next on the
 way to the leader; what comes is passed on and kept. One log is asked for once at a time, so no question runs in
-circles; a question that nobody answers is asked of another robot after a pause. What a robot needs for itself it asks
-for until it comes: its correction may be the last one for hours.
+circles; a question that nobody answers is asked of another robot after a pause.
 """
 
 from collections.abc import Callable
@@ -21,9 +20,8 @@ INTEREST_S = 5.0
 """Knots that come later than this are not passed on to who asked for them."""
 PEERS_MAX = 16
 ASKED_MAX = 6
-"""Times that one version is asked for on behalf of others; they ask again."""
-PAUSE_MAX_S = 30.0
-"""What a robot needs itself is asked for until it comes, with pauses that double up to this."""
+"""Times that one version is asked for quickly; a robot that needs it goes on every `RARELY_S`: no other may come."""
+RARELY_S = 8.0
 
 
 @dataclass(slots=True)
@@ -32,19 +30,9 @@ class _Question:
 
     version: CorrectionVersion
     next_s: float
-    for_itself: bool
+    own: bool = False
     asked: int = 0
     peers: dict[str, float] = field(default_factory=dict)
-
-    def was_asked(self, now: float) -> None:
-        """Count a question; the next one is due after a pause."""
-        self.asked += 1
-        doublings = min(max(0, self.asked - ASKED_MAX), 16)
-        self.next_s = now + min(REQUEST_TIMEOUT_S * 2**doublings, PAUSE_MAX_S)
-
-    def is_due(self, now: float) -> bool:
-        """Whether it is time to ask; on behalf of others only so often."""
-        return self.next_s <= now and (self.for_itself or self.asked < ASKED_MAX)
 
 
 class KnotRequests:
@@ -69,16 +57,16 @@ class KnotRequests:
         question = self._open.get(version.log)
         if question is None or question.version < version:
             peers = {} if question is None else question.peers
-            remember(self._open, version.log, _Question(version, not_before_s, True, peers=peers))
+            remember(self._open, version.log, _Question(version, not_before_s, own=True, peers=peers))
         else:
-            question.for_itself = True
+            question.own = True
 
     def on_interest(self, peer: str, version: CorrectionVersion, now: float) -> None:
         """Another robot needs them."""
         question = self._open.get(version.log)
         if question is None or question.version < version:
-            peers, for_itself = ({}, False) if question is None else (question.peers, question.for_itself)
-            question = _Question(version, now, for_itself, peers=peers)
+            peers = {} if question is None else question.peers
+            question = _Question(version, now, own=question is not None and question.own, peers=peers)
             remember(self._open, version.log, question)
         if question.asked >= ASKED_MAX and question.next_s <= now:
             question.asked = 0
@@ -102,7 +90,7 @@ class KnotRequests:
         """Ask for what is due, each of one robot in range; other robots in turn."""
         questions: dict[str, list[CorrectionVersion]] = {}
         for question in self._open.values():
-            if not question.is_due(now):
+            if question.next_s > now or (question.asked >= ASKED_MAX and not question.own):
                 continue
             on_the_way = [peer for peer in self._towards(question.version.term) if peer not in question.peers]
             if not on_the_way:
@@ -110,5 +98,6 @@ class KnotRequests:
             asked = questions.setdefault(on_the_way[question.asked % len(on_the_way)], [])
             if len(asked) < KNOT_REQUESTS_MAX:
                 asked.append(question.version)
-                question.was_asked(now)
+                question.asked += 1
+                question.next_s = now + (REQUEST_TIMEOUT_S if question.asked < ASKED_MAX else RARELY_S)
         return [Unicast(peer, KnotRequest(tuple(versions))) for peer, versions in questions.items()]

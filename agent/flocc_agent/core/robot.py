@@ -49,6 +49,7 @@ from flocc_agent.core.measurements import (
 )
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.peer_budgets import AnswerBudget, Muted
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
@@ -173,6 +174,8 @@ class Robot:
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
+        self._answers = AnswerBudget()
+        self._muted = Muted()
         self.assembly = GraphAssembly(restored.saved)
         closed = restored.closed()
         self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
@@ -243,6 +246,8 @@ class Robot:
             **self.closing.sizes(),
             **self.corrections.sizes(),
             **self.election.sizes(),
+            **self._answers.sizes(),
+            **self._muted.sizes(),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
 
@@ -302,18 +307,16 @@ class Robot:
                 return self.election.on_coordinator(sender, message, now)
             case Handover():
                 return self.election.on_handover(sender, message, now)
-            case Records():
-                new, effects = self.gossip.on_records(sender, message, now)
-                return effects + self._take(new, now)
+            case Records() | CorrectionBatch():
+                return self._on_signed(sender, message, now)
             case RecordRequest():
-                return self.gossip.on_request(sender, message)
-            case CorrectionBatch(corrections):
-                return [effect for correction in corrections for effect in self._on_correction(sender, correction, now)]
+                return self._answers.within(sender.robot, self.gossip.on_request(sender, message), now)
             case CorrectionRequest():
-                return self.corrections.on_request(sender.robot, message)
+                return self._answers.within(sender.robot, self.corrections.on_request(sender.robot, message), now)
             case KnotRequest():
                 near = sender.robot in self.neighbours
-                return self.corrections.on_knot_request(sender.robot, message, now) if near else []
+                answers = self.corrections.on_knot_request(sender.robot, message, now) if near else []
+                return self._answers.within(sender.robot, answers, now)
             case CandidateOffer():
                 self.closing.on_offer(message, now)
                 return []
@@ -321,6 +324,22 @@ class Robot:
                 if self.distributed is not None:
                     self.distributed.on_separators(sender, message)
                 return []
+
+    def _on_signed(self, sender: LogId, message: Records | CorrectionBatch, now: float) -> list[Effect]:
+        """Take in what is signed, but for what of this sender failed lately."""
+        peer, muted = sender.robot, self._muted
+        if isinstance(message, Records):
+            batches = tuple(b for b in message.batches if not muted.is_muted(peer, b.log.robot, now))
+            new, effects = self.gossip.on_records(sender, Records(batches), now)
+            effects += self._take(new, now)
+        else:
+            heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
+            effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
+        for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
+            for signer in failed:
+                muted.on_failed(peer, signer, now)
+            failed.clear()
+        return effects
 
     def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         known = sender.robot in self.neighbours

@@ -13,7 +13,7 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrected import Correction, Corrector
+from flocc_agent.core.corrected import CorrectedLog, Correction, Corrector
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -175,6 +175,10 @@ class Driver:
     def corrected_bodies(self) -> tuple[list[float], Float]:
         """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes; may be called off the loop's thread."""
         return corrected_bodies(self.robot, self._T_body_camera)
+
+    def corrected_logs(self) -> dict[str, CorrectedLog]:
+        """All robots in this robot's map as of now; what it gives may be read off the loop's thread."""
+        return self._corrector.now(self._T_body_camera)
 
     @property
     def _T_body_camera(self) -> Float:

@@ -20,18 +20,24 @@ from flocc_lab.bench.generated_graph import generate
 NEW_CLOSURES = 10
 
 
-def run(
-    robots: int, keyframes: int, closures: int, formulation: Formulation | None, solver: Solver | None, seed: int = 1
-) -> dict[str, Any]:
+def run(robots: int, keyframes: int, closures: int, lm: bool = False, seed: int = 1) -> dict[str, Any]:
     """Solve a graph of so many keyframes and closures in all, without ten closures, whole, and whole from the former.
+
+    Args:
+        robots: That share the keyframes.
+        keyframes: Of all robots.
+        closures: Wanted; the robots may meet less often.
+        lm: The base formulation with LM in place of the default.
+        seed: Of the graph.
 
     Returns:
         `full`, `round` and `ratio` of CPU seconds, how far the round's solution lies from the full one, peak memory.
     """
     generated = generate(np.random.default_rng(seed), robots, keyframes // robots, closures)
     graph = generated.graph
-    asked = {"formulation": formulation, "solver": solver}
-    config = BackendConfig(weight_by_probability=False, **{k: v for k, v in asked.items() if v is not None})
+    config = BackendConfig(weight_by_probability=False)
+    if lm:
+        config = config.model_copy(update={"formulation": Formulation.BASE, "solver": Solver.LM})
     before_mb = peak_mb()
     full, full_s = timed(lambda: optimise(graph, config))
     full_mb = peak_mb()

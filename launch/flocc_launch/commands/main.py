@@ -347,14 +347,14 @@ def _launch(
     from flocc_launch.swarm.launching import launch as run
 
     with progress_bar("preparing data") as progress:
-        recordings(scenario, progress)
+        paths = recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)
     with (
         LiveTable(console) as table,
         _dashboard(out, dashboard, table.show, speech) as show,
         _foxglove(out, foxglove, speech),
     ):
-        report = run(scenario, out, show, secure=secure, metrics=metrics, use=use)
+        report = run(scenario, out, show, secure=secure, metrics=metrics, paths=paths, use=use)
     _record(out, mcap)
     show_report(report, out, speech)
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flocc_launch.commands.common import Json, facts
+
 if TYPE_CHECKING:
     from flocc_agent.runtime.map_folder import MapManifest
 
@@ -62,12 +64,16 @@ def _saved_swarm(
 
 
 @maps.command()
-def info(folder: MapArgument) -> None:
+def info(folder: MapArgument, json_out: Json = False) -> None:
     """Say what a map holds, and check that it is whole."""
     from flocc_agent.runtime.map_folder import MapFolder
     from flocc_launch.maps.map_info import map_lines
 
-    for name, value in map_lines(MapFolder.open(folder)):
+    lines = list(map_lines(MapFolder.open(folder)))
+    if json_out:
+        facts(dict(lines))
+        return
+    for name, value in lines:
         typer.echo(f"{name:14} {value}")
 
 

@@ -64,7 +64,9 @@ class Complete:
         writers = {station.log for station in group}
         robots = {log.robot for log in writers}
         logs = core(group[0]).gossip.logs
-        known = {log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots}
+        known = {
+            log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
+        }
         resolved = resolved_pairs(logs)
         for one, other in combinations(known, 2):
             apart = one.robot != other.robot and (one in writers or other in writers)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from flocc_agent.core.effects import Broadcast, Effect, FetchLatent, Register, Report, Unicast
 from flocc_agent.core.events import LatentFetched, LatentFetchFailed
-from flocc_agent.core.reports import CandidateFound, NeighbourDown, NeighbourUp
+from flocc_agent.core.reports import CandidateFound, NameTaken, NeighbourDown, NeighbourUp
 from flocc_launch.simulation.invariants import Step
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import KeyframeId, LogId
@@ -105,13 +105,16 @@ class Balanced:
     _shared: Counter[bool] = field(default_factory=Counter)
 
     def step(self, step: Step) -> Iterator[str]:
-        """A registration that a stronger robot in range should do, or one owner that does most of the work."""
+        """A registration that a stronger robot in range should do, or one owner that does most of the work.
+
+        A name under which two robots seem to run is handed nothing.
+        """
         life = step.station.name, step.station.life
         for effect in step.effects:
             match effect:
                 case Report(NeighbourUp(peer=peer)):
                     self._near_since_s[life][peer] = step.at_s
-                case Report(NeighbourDown(peer=peer)):
+                case Report(NeighbourDown(peer=peer) | NameTaken(peer=peer)):
                     self._near_since_s[life].pop(peer, None)
                 case Report(CandidateFound(query=query, match=match)):
                     self._known_since_s.setdefault((*life, CandidatePair.of(query, match)), step.at_s)

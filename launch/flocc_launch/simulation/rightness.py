@@ -82,9 +82,13 @@ class Right:
         if _apart(T_map_odom, component.T_map_odom[correction.log], APPLIED_M, APPLIED_RAD):
             yield f"{name} with another T_map_odom than was solved"
         yield from (f"{name}, {what}" for what in _other_poses(correction, odometry, component))
-        solved = component.covariance_map_odom.get(correction.log)
-        told = None if correction.knots is None else correction.knots.covariance
-        if solved is not None and (told is None or not _same_covariance(symmetric(told.numpy()), solved)):
+        knots = correction.knots
+        solved, told = component.covariance_map_odom.get(correction.log), None if knots is None else knots.covariance
+        if (
+            solved is not None
+            and knots is not None
+            and (told is None or not _same_covariance(symmetric(told.numpy()), solved))
+        ):
             yield f"{name} with another covariance than was solved"
 
 

@@ -68,6 +68,7 @@ class Swarm:
         stations: By name.
         told: What was reported, in the order in which it happened.
         observers: Told of every step of every station.
+        forked: Logs of which two versions were seen; everybody keeps the one that he heard first.
     """
 
     def __init__(self, scenario: Scenario, playbacks: Mapping[str, Playback], equipment: Equipment, seed: int) -> None:
@@ -83,6 +84,7 @@ class Swarm:
         self._seed = seed
         self._fetcher = LatentFetcher(self.agenda, self.network, self._running, scenario.bandwidth_bytes_s)
         self._reporters: dict[str, Reporter] = {}
+        self.forked: set[LogId] = set()
         self._lives = dict(equipment.lives)
         self._near: dict[tuple[str, float | None], list[str]] = {}
         self._around = Surroundings(
@@ -268,8 +270,10 @@ class Swarm:
     def _observe(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, Report):
-                if isinstance(effect.fact, LogForked) and effect.fact.log == station.log:
-                    self.agenda.after(0.0, lambda: self._end_log(station))
+                if isinstance(effect.fact, LogForked):
+                    self.forked.add(effect.fact.log)
+                    if effect.fact.log == station.log:
+                        self.agenda.after(0.0, lambda: self._end_log(station))
                 self.told.append(self._reporters[station.name].reported(effect.fact, self.agenda.now_s))
         for observer in self.observers:
             observer(station, event, effects)

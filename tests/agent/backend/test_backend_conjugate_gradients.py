@@ -147,10 +147,12 @@ def test_a_large_graph_s_covariances_stand_for_five_rounds(monkeypatch: pytest.M
     large = partial(LinearSolver, iterative_loops_min=1)
     monkeypatch.setattr("flocc_agent.backend.optimiser.LinearSolver", large)
     graph, config = generated().graph, BackendConfig(weight_by_probability=False)
-    solution, ages = None, []
+    earlier: GraphSolution | None = None
+    ages = []
     for _ in range(7):
-        solution = optimise(graph, config, solution)
+        solution = optimise(graph, config, earlier)
         assert isinstance(solution, GraphSolution)
         ages.append(solution.components[0].covariance_rounds)
         assert len(covariances(solution)) == 3
+        earlier = solution
     assert ages == [0, 1, 2, 3, 4, 0, 1]

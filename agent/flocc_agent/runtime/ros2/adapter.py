@@ -6,7 +6,7 @@ once and counted; the agent goes on.
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.corrected import Correction
+from flocc_agent.core.corrected import CorrectedLog, Correction
 from flocc_agent.core.interfaces import Image
-from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.measurements import BadMeasurement, Measurement
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.given_keyframes import BadKeyframe
@@ -60,6 +60,7 @@ class Host:
         begin_anew: Ends this journey and begins another one, of odometry that has nothing to do with this one's.
         closures: Accepted closures of all logs; called off the loop's thread.
         state: Status of the robot, and what its last own solution warned of.
+        logs: All robots in this robot's map as of now; read off the loop's thread.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
@@ -71,6 +72,7 @@ class Host:
     begin_anew: Callable[[], None]
     closures: Callable[[], Sequence[KnownClosure]]
     state: Callable[[], tuple[AgentStatus, Sequence[str]]]
+    logs: Callable[[], Mapping[str, CorrectedLog]]
 
 
 class Ros2Adapter:
@@ -149,7 +151,7 @@ class Ros2Adapter:
         config = self._config = node.config
         hearing = self._hearing = self._heard(config)
         grids = MergedMaps(config, self._robot, self._types, node, self._problems)
-        teller = self._teller = Teller(config, self._types, node, self._bodies, self._host.closures, grids)
+        teller = self._teller = Teller(config, self._types, node, self._bodies, self._host, grids)
         for kind, (topic, type_name, qos) in hearing.wanted().items():
             hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind))
         node.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))
@@ -194,7 +196,7 @@ class Ros2Adapter:
             while (posed := hearing.synchroniser.next()) is not None:
                 try:
                     await self._consider(hearing, posed)
-                except (BadMessage, BadKeyframe) as error:
+                except (BadMessage, BadKeyframe, BadMeasurement) as error:
                     hearing.refuse("image", str(error))
 
     async def _consider(self, hearing: Hearing, posed: PosedImage) -> None:
@@ -212,6 +214,9 @@ class Ros2Adapter:
         image = await asyncio.to_thread(eye.image, message)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
+        step = hearing.covariances.of_keyframe(posed.stamp_ns, posed.T_odom_body)
+        if step is not None:
+            self._host.add_measurement(step.in_camera(T_body_camera), posed.stamp_ns * 1e-9)
         if self._config.fix_topic:
             self._fixes.add_keyframe(posed.stamp_ns * 1e-9)
         if self._teller is not None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, step_fault
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
+from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
@@ -75,6 +76,8 @@ class Hearing:
         self._mount_camera = mount_camera
         self._static = StaticFrames()
         self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
+        self._compared_ns: int | None = None
+        self.covariances = StepCovariances()
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
         self.eye: Eye | None = None
@@ -128,11 +131,13 @@ class Hearing:
 
     def _take_odometry(self, payload: bytes) -> bool:
         config = self._config
-        sample = odometry_of(self._types.read(payload, ODOMETRY), config.odom_frame, config.base_frame)
+        message = self._types.read(payload, ODOMETRY)
+        sample = odometry_of(message, config.odom_frame, config.base_frame)
         self._check_step(*sample)
         if not self.synchroniser.add_odometry(*sample):
             self.complain("odometry", BACK_IN_TIME)
             return False
+        self.covariances.add(sample[0], np.reshape(message.pose.covariance, (6, 6)))
         return True
 
     def _check_step(self, stamp_ns: int, T_odom_body: Float) -> None:
@@ -194,14 +199,15 @@ class Hearing:
             self.complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
 
     def compare_clocks(self, now_ns: int) -> None:
-        """Say when odometry is stamped by another clock than the node's: tf2 finds no transform then.
+        """Say when odometry that still comes is stamped by another clock than the node's: tf2 finds nothing then.
 
         Args:
             now_ns: The node's time; 0 while simulated time has not begun.
         """
         if now_ns == 0:
             self.complain("clock", "use_sim_time is set, but no /clock has come")
-        elif self.synchroniser.latest is not None:
+        elif self.synchroniser.latest is not None and self.synchroniser.latest[0] != self._compared_ns:
+            self._compared_ns = self.synchroniser.latest[0]
             behind_s = (now_ns - self.synchroniser.latest[0]) * 1e-9
             if abs(behind_s) > CLOCKS_APART_MAX_S:
                 aside = "behind" if behind_s > 0 else "ahead of"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.corrected import CorrectedLog
@@ -18,6 +19,8 @@ from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.static_frames import pose_of_numbers
 from flocc_agent.runtime.ros2.topics import Qos
 from flocc_agent.runtime.ros2.types import GRID, BadMessage, MessageTypes
+
+Float = NDArray[np.float64]
 
 ROBOTS_MAX = 16
 LATCHED = Qos(1, transient_local=True)
@@ -48,6 +51,7 @@ class MergedMaps:
         self._topics: dict[str, str] = {}
         self._grids: dict[str, tuple[bytes, Grid]] = {}
         self._complaints: list[tuple[str, str]] = []
+        self._poses: dict[str, Float] = {}
         self.changed = False
         self._publisher = node.publisher(MERGED_TOPIC, GRID, LATCHED) if config.grid_topic else None
         self.follow({robot: None})
@@ -60,6 +64,15 @@ class MergedMaps:
             topic = self._config.grid_topic
             named = topic if robot == self._robot else f"/{robot.replace('-', '_')}/{topic}"
             self._topics[robot] = self._node.subscribe(named, GRID, LATCHED, self._keep(robot)).name
+
+    def is_due(self, logs: Mapping[str, CorrectedLog]) -> bool:
+        """Whether a grid, a robot or a correction has come since the last time."""
+        if self._publisher is None:
+            return False
+        poses = {robot: log.T_map_odom for robot, log in logs.items()}
+        same = poses.keys() == self._poses.keys() and all(np.array_equal(T, self._poses[r]) for r, T in poses.items())
+        due, self._poses = self.changed or not same, poses
+        return due
 
     def publish(self, logs: Mapping[str, CorrectedLog], stamp_ns: int) -> None:
         """Publish the merged map of the robots in this frame; nothing before the first grid.

@@ -3,7 +3,8 @@
 import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,23 @@ Trajectory = Callable[[], tuple[list[float], Float] | None]
 """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes, None while the body is not known."""
 
 
+class SwarmKnown(Protocol):
+    """What a robot knows of all.
+
+    Attributes:
+        closures: Accepted closures of all logs; called off the loop's thread.
+        logs: All robots in this robot's map as of now; called on the loop's thread, read off it.
+    """
+
+    @property
+    def closures(self) -> Callable[[], Sequence[KnownClosure]]:
+        """See above."""
+
+    @property
+    def logs(self) -> Callable[[], Mapping[str, CorrectedLog]]:
+        """See above."""
+
+
 class Teller:
     """Publishes what corrections say."""
 
@@ -46,7 +64,7 @@ class Teller:
         types: MessageTypes,
         node: RosNode,
         trajectory: Trajectory,
-        closures: Callable[[], Sequence[KnownClosure]],
+        swarm: SwarmKnown,
         grids: MergedMaps,
     ) -> None:
         """Declare the publishers.
@@ -56,7 +74,7 @@ class Teller:
             types: Writes messages.
             node: Where to publish.
             trajectory: The corrected path; called off the loop's thread.
-            closures: Those of all logs; called off the loop's thread.
+            swarm: What this robot knows of all.
             grids: Occupancy grids of all robots.
         """
         self._config = config
@@ -65,7 +83,7 @@ class Teller:
         self._types = types
         self._node = node
         self._trajectory = trajectory
-        self._closures = closures
+        self._known = swarm
         self._grids = grids
         self._tf = node.publisher(config.tf_topic, TF, TF_QOS)
         self._path = node.publisher(config.path_topic, PATH, LATCHED)
@@ -107,14 +125,14 @@ class Teller:
         pause_s = self._config.path_period_s
         while True:
             await asyncio.sleep(pause_s)
-            if not self.path_changed and not self._grids.changed:
-                continue
             began_s, path_changed, self.path_changed = time.monotonic(), self.path_changed, False
+            logs = self._known.logs()
             if path_changed:
                 await asyncio.to_thread(_put_one, self._path, self._drawn)
-                await asyncio.to_thread(_put_one, self._graph, self._swarm)
-            await asyncio.to_thread(self._merge)
-            self._grids.complain()
+                await asyncio.to_thread(_put_one, self._graph, partial(self._swarm, logs))
+            if self._grids.is_due(logs):
+                await asyncio.to_thread(self._merge, logs)
+                self._grids.complain()
             pause_s = max(self._config.path_period_s, PATH_PAUSE_RATIO * (time.monotonic() - began_s))
 
     async def diagnose(self, state: Callable[[], State]) -> None:
@@ -125,20 +143,17 @@ class Teller:
             self._diagnostics.put(diagnostics(self._types, status, warnings, heard, connected, now_ns))
             await asyncio.sleep(DIAGNOSTICS_PERIOD_S)
 
-    def _swarm(self) -> Any:
+    def _swarm(self, logs: Mapping[str, CorrectedLog]) -> Any:
         """All robots of the map with their closures; None before the first correction."""
-        correction = self._correction
-        if correction is None:
+        if self._correction is None or not logs:
             return None
-        logs = logs_of(correction)
-        return self._markers.array(logs, self._closures(), correction.term.leader.robot, self._node.now_ns())
+        leader = self._correction.term.leader.robot
+        return self._markers.array(logs, self._known.closures(), leader, self._node.now_ns())
 
-    def _merge(self) -> None:
+    def _merge(self, logs: Mapping[str, CorrectedLog]) -> None:
         """Publish the merged occupancy, and hear the grids of robots that have come into the map."""
-        if self._correction is not None:
-            logs = logs_of(self._correction)
-            self._grids.follow(logs)
-            self._grids.publish(logs, self._node.now_ns())
+        self._grids.follow(logs)
+        self._grids.publish(logs, self._node.now_ns())
 
     def _drawn(self) -> Any:
         """The corrected path, thinned evenly, with the last keyframe; None where it is not known yet."""
@@ -154,11 +169,6 @@ class Teller:
     def _put_transform(self, correction: Correction, stamp_ns: int) -> None:
         ahead_ns = round(self._config.tf_tolerance_s * 1e9)
         self._tf.put(self._outgoing.transform(correction.T_map_odom, stamp_ns + ahead_ns))
-
-
-def logs_of(correction: Correction) -> dict[str, CorrectedLog]:
-    """All robots in a correction's map."""
-    return {correction.own.log.robot: correction.own, **correction.others}
 
 
 def _put_one(publisher: RosPublisher, make: Callable[[], Any]) -> None:

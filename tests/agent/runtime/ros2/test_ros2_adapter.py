@@ -18,7 +18,7 @@ from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.corrected import CorrectedLog, Correction, RecordedOdometry
 from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.interfaces import Image
-from flocc_agent.core.measurements import GeodeticFix, Measurement
+from flocc_agent.core.measurements import GeodeticFix, Measurement, OdometryCovariance
 from flocc_agent.core.reports import Fact
 from flocc_agent.geometry import Float, pose, pose7, so3_exp, tq_from_pose
 from flocc_agent.runtime.facts import RosProblem, RouterConnected
@@ -110,6 +110,7 @@ class Agent:
             lambda: self.resets.append(None),
             lambda: [],
             lambda: (AgentStatus(robot="r-1"), ()),
+            dict,
         )
 
     def problems(self) -> list[str]:
@@ -205,6 +206,27 @@ async def test_fixes_are_interpolated_to_the_stamps_of_keyframes() -> None:
         assert fix.latitude_deg == pytest.approx(48.0 + 1e-5 * (stamp_s - EPOCH_S), abs=1e-9)
         assert np.asarray(fix.covariance_m2)[2, 2] == 9.0
     assert agent.problems() == []
+
+
+async def test_what_the_covariance_of_odometry_grew_by_becomes_that_of_the_steps() -> None:
+    agent = Agent()
+    config = Ros2Config(camera_mounting=MOUNTING)
+    adapter = Ros2Adapter(config, "r1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
+    hearing = adapter._hearing = adapter._heard(config)
+    K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
+    hearing.take("camera_info", cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P))
+    for t_ms in range(0, 400, 100):
+        sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        hearing.take("odometry", cdr_by_hand.odometry(sample, variance=1e-6 * t_ms))
+        hearing.take("image", cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "mono8", bytes(24), 6))
+        while (posed := hearing.synchroniser.next()) is not None:
+            await adapter._consider(hearing, posed)
+    assert len(agent.keyframes) == 4
+    assert [round(1000 * (stamp_s - EPOCH_S)) for _, stamp_s in agent.measured] == [100, 200, 300]
+    for measured, _ in agent.measured:
+        assert isinstance(measured, OdometryCovariance)
+        seen = OdometryCovariance(1e-4 * np.eye(6)).in_camera(T_BODY_CAMERA).covariance
+        np.testing.assert_allclose(measured.covariance, seen, atol=3e-5)
 
 
 async def test_a_correction_goes_out_as_transform_pose_path_and_frame() -> None:

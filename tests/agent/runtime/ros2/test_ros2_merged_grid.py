@@ -154,8 +154,11 @@ def test_grids_of_all_robots_of_the_map_are_heard_and_drawn_where_corrections_sa
     node.subscribed["local_map"](TYPES.written(message("r1/odom", CELLS)))
     node.subscribed["/r2/local_map"](TYPES.written(message("r2/odom", CELLS)))
     assert [maps.changed] == [True]
+    assert [maps.is_due(logs), maps.is_due(logs)] == [True, True]
     maps.publish(logs, 5 * 10**9)
     assert [maps.changed] == [False]
+    assert not maps.is_due(logs)
+    assert maps.is_due({"r1": logs["r1"]}), "a robot has left the map"
     (told,) = node.put
     parts = [(log.T_map_odom, Grid(CELLS, 0.5, np.eye(4))) for log in logs.values()]
     np.testing.assert_array_equal(told.data.reshape(told.info.height, told.info.width), merged(parts, 0.5).cells)
