@@ -33,13 +33,13 @@ from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.facts import JourneyEnded, KilledByOrder
 from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
 from flocc_agent.runtime.jobs import Tools
-from flocc_agent.runtime.journeys import began_anew, last_body
-from flocc_agent.runtime.kept_for_maps import keep_camera, keep_front_end, keep_map, lens_of
+from flocc_agent.runtime.kept_for_maps import keep_back_end, keep_camera, keep_front_end, keep_map, lens_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.new_journeys import began_anew, last_body
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
@@ -406,6 +406,7 @@ class Agent:
         if self._new_journey:
             self._store.begin_journey()
         keep_front_end(self._store, self._method, config.perception, perception)
+        keep_back_end(self._store, config.backend)
         if self._camera is not None:
             keep_camera(self._store, self._camera, self._T_body_camera)
         if opened is not None:

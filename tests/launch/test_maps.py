@@ -19,6 +19,7 @@ from tests.launch.map_missions import AGAIN, BLOCK, FAR, mission, scenario
 
 from flocc_agent.config import TlsConfig
 from flocc_agent.core.reports import FoundInMap, MapOpened
+from flocc_agent.geometry import symmetric
 from flocc_agent.runtime.map_folder import BadMap, LensModel, MapFolder, read_manifest
 from flocc_agent.runtime.persistence import joined_logs
 from flocc_agent.runtime.record_tables import PUT_RECORD, row
@@ -111,6 +112,15 @@ def test_poses_of_a_map_are_near_the_truth(first: Path, block: Path) -> None:
     poses = MapFolder.open(block).poses()[LogId("r2")]
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps.sum() == pytest.approx(truth.length_m(), rel=0.1)
+
+
+def test_a_map_is_solved_as_its_robots_solved(block: Path, tmp_path: Path) -> None:
+    simulate(scenario(BLOCK, backend={"odometry_translation_sigma_m": 0.5}), tmp_path / "run")
+    save_map(tmp_path / "run", tmp_path / "map")
+    assert read_manifest(tmp_path / "map").back_end["odometry_translation_sigma_m"] == 0.5
+    folders = (block, tmp_path / "map")
+    usual, loose = (symmetric(MapFolder.open(folder).covariances()[LogId("r1")][1])[3, 3] for folder in folders)
+    assert loose > 10 * usual
 
 
 def test_saving_reads_stores_that_are_in_use_and_changes_nothing(first: Path, tmp_path: Path) -> None:

@@ -24,10 +24,10 @@ def test_a_launched_team_comes_back_to_its_map_also_after_a_kill(
     launch(scenario(BLOCK, "monday", rate=3.0, settle_s=3.0), tmp_path / "monday")
     save_map(tmp_path / "monday", tmp_path / "map")
     faults = (
-        Fault(at_s=3.0, kind=FaultKind.KILL, robots=("r1",)),
-        Fault(at_s=4.0, kind=FaultKind.RESTART, robots=("r1",)),
+        Fault(at_s=12.0, kind=FaultKind.KILL, robots=("r1",)),
+        Fault(at_s=13.0, kind=FaultKind.RESTART, robots=("r1",)),
     )
-    again = scenario(AGAIN, "tuesday", rate=3.0, settle_s=3.0, faults=faults)
+    again = scenario(AGAIN, "tuesday", settle_s=3.0, faults=faults)
     report = launch(again, tmp_path / "tuesday", use=MapUse(tmp_path / "map", fixed=True))
     assert (report.map_frames, report.maps_used) == (["map/r1"], [str(tmp_path / "map")])
     told = [each.fact for each in RunFolder.open(tmp_path / "tuesday").events()]

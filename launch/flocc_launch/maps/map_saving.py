@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.config import BackendConfig, validated
 from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapFrontEnd, MapManifest
 from flocc_launch.maps.gathering import Gathered, Logs, Optics, gathered
 from flocc_launch.maps.map_page import map_page
@@ -39,7 +40,8 @@ def save_map(
     earlier = None if found.used is None else _earlier(found, out)
     logs = found.logs if earlier is None else _with(earlier, found.logs)
     saved = None if earlier is None or found.used is None else earlier.saved(found.used.is_fixed)
-    solved = solved_map(str(where), logs, saved, frame)
+    back_end = found.back_end if earlier is None else back_end_of(earlier)
+    solved = solved_map(str(where), logs, saved, frame, back_end)
     if earlier is not None:
         solved = _kept_covariances(_checked_news(solved, earlier, where), earlier)
     content = MapContent(
@@ -49,6 +51,7 @@ def save_map(
         front_end=found.front_end if earlier is None else earlier.manifest.front_end,
         optics={**({} if earlier is None else optics_of(earlier)), **found.optics},
         latents=chain(() if earlier is None else latents_of(earlier), found.latents()),
+        back_end=back_end,
         edition=1 if earlier is None else earlier.manifest.edition + 1,
         swarm=_swarm(where),
         pruned=earlier is not None and earlier.manifest.pruned,
@@ -72,12 +75,22 @@ def copy_map(opened: MapFolder, out: Path) -> MapManifest:
         front_end=manifest.front_end,
         optics=optics_of(opened),
         latents=latents_of(opened),
+        back_end=back_end_of(opened),
         edition=manifest.edition,
         swarm=manifest.swarm,
         pruned=manifest.pruned,
         page=(lambda _: page.read_text(encoding="utf-8")) if page.is_file() else None,
     )
     return write_map(out, content)
+
+
+def back_end_of(opened: MapFolder) -> BackendConfig:
+    """How a map was solved.
+
+    Raises:
+        ConfigError: This version does not know one of its settings.
+    """
+    return validated(BackendConfig, opened.manifest.back_end, f"{opened.path}: back end")
 
 
 def optics_of(opened: MapFolder) -> dict[LogId, Optics]:

@@ -18,7 +18,7 @@ from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import Float, between, pose, so3_exp
 from flocc_agent.perception.synthetic import pose_image
 from flocc_agent.runtime.event_lines import Reported
-from flocc_agent.runtime.journeys import began_anew
+from flocc_agent.runtime.new_journeys import began_anew
 from flocc_launch.maps.map_saving import save_map
 from flocc_protocol.ids import LogId
 
