@@ -9,10 +9,12 @@ from flocc_agent.backend.descent import Solved
 from flocc_agent.backend.edges import GAMMA_MIN, scales_at
 from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
-from flocc_agent.core.pose_graph import LoopClosure
+from flocc_agent.core.pose_graph import LoopClosure, OdometryScale
+from flocc_protocol.ids import LogId
 
 NAMED_MAX = 5
 COLLAPSED_RATIO = 2.0
+TOLD_SIGMAS = 3.0
 
 
 def scale_warnings(problem: Problem, solved: Solved, closures: Mapping[int, LoopClosure]) -> tuple[str, ...]:
@@ -29,6 +31,22 @@ def scale_warnings(problem: Problem, solved: Solved, closures: Mapping[int, Loop
     if len(lonely):
         sentences.append(f"the scale is not observable and stays at its prior: {_names(lonely, problem, closures)}")
     return tuple(sentences)
+
+
+def odometry_warnings(scales: Mapping[LogId, OdometryScale]) -> tuple[str, ...]:
+    """Name the robots whose odometry measures lengths too short or too long."""
+    sentences = [
+        f"odometry of robot {log} measures lengths {100 * abs(scale.ratio - 1):.1f} % too "
+        f"{'long' if scale.ratio > 1 else 'short'} (give or take {100 * scale.sigma_ratio:.1f} %)"
+        f"{_against(scale)}; {'its poses are corrected' if scale.is_applied else 'its poses are as measured'}"
+        for log, scale in sorted(scales.items())
+        if abs(scale.ratio - 1) > TOLD_SIGMAS * scale.sigma_ratio
+    ]
+    return tuple(sentences)
+
+
+def _against(scale: OdometryScale) -> str:
+    return "" if scale.is_metric else ", compared with the mean of all robots, because nothing was measured in metres"
 
 
 def unobservable(problem: Problem, free: NDArray[np.bool_], used: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ one `map` frame that is named after the component's anchor, its lowest log.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -150,6 +150,24 @@ class FactorResult:
     reason: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class OdometryScale:
+    """How long a robot's odometry measures one metre.
+
+    Attributes:
+        ratio: Measured over true length, 1 where it is true.
+        sigma_ratio: Standard deviation of `ratio`.
+        is_applied: The solution holds the robot's way to be shorter or longer than measured.
+        is_metric: Something in the component was measured in metres besides odometry; else ratios are relative to the
+            mean of its robots.
+    """
+
+    ratio: float
+    sigma_ratio: float
+    is_applied: bool
+    is_metric: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Component:
     """One connected part of the graph, solved in one map frame.
@@ -164,6 +182,7 @@ class Component:
         covariance_keyframe: (6, 6) marginal covariance of keyframes that were asked for, in their own tangent spaces.
         T_map_world: (4, 4) pose of the fixes' world frame, or None without fixes.
         T_map_landmark: (4, 4) pose of each landmark, by name: `tag/NAME`, `world`, `earth` (east, north, up).
+        odometry_scales: Of each log whose odometry could be compared with something.
     """
 
     logs: tuple[LogId, ...]
@@ -175,6 +194,7 @@ class Component:
     covariance_keyframe: Mapping[KeyframeId, Float] = field(default_factory=dict)
     T_map_world: Float | None = None
     T_map_landmark: Mapping[str, Float] = field(default_factory=dict)
+    odometry_scales: Mapping[LogId, OdometryScale] = field(default_factory=dict)
 
     @property
     def anchor(self) -> LogId:
@@ -234,6 +254,13 @@ def landmark(name: str) -> KeyframeId:
 def is_landmark(log: LogId) -> bool:
     """Whether this is no robot's log."""
     return log.robot.startswith(LANDMARK)
+
+
+def stretched(trajectory: Trajectory, ratio: float) -> Trajectory:
+    """A way of the same shape that is `ratio` times as long."""
+    T = np.array(trajectory.T_odom_keyframe, dtype=float)
+    T[:, :3, 3] = T[0, :3, 3] + ratio * (T[:, :3, 3] - T[0, :3, 3])
+    return replace(trajectory, T_odom_keyframe=T)
 
 
 def map_frame(anchor: LogId) -> str:

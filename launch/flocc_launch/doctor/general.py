@@ -17,6 +17,12 @@ LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3
 
 
+SOLVER_ADVICE = {
+    "odometry of robot": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
+}
+"""What to do about warnings that begin so."""
+
+
 def deaths(loaded: LoadedRun) -> list[Finding]:
     """Agents that died; one that the scenario or an operator killed needs no advice."""
     unasked = Counter(deaths_unasked(loaded.events))
@@ -40,9 +46,18 @@ def _asked_death(event: Reported[AgentDied]) -> Finding:
 def solver_warnings(loaded: LoadedRun) -> list[Finding]:
     """What the solver warned of last."""
     rounds = of_kind(loaded.events, RoundSolved)
-    advice = "See docs/report.md on the pose graph; more closures from other view points make scales observable."
     warnings = rounds[-1].fact.warnings if rounds else ()
-    return [Finding("solver-warning", Severity.HINDERS, f"The solver warns: {text}.", advice) for text in warnings]
+    return [
+        Finding("solver-warning", Severity.HINDERS, f"The solver warns: {text}.", _advice(text)) for text in warnings
+    ]
+
+
+def _advice(warning: str) -> str:
+    """What to do about a warning of the solver."""
+    for begins, advice in SOLVER_ADVICE.items():
+        if warning.startswith(begins):
+            return advice
+    return "See docs/report.md on the pose graph; more closures from other view points make scales observable."
 
 
 def encoding_failures(loaded: LoadedRun) -> list[Finding]:
