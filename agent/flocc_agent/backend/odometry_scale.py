@@ -27,6 +27,8 @@ Float = NDArray[np.float64]
 PosedAnew = Callable[[Mapping[LogId, float]], Posed]
 
 DEMANDED_SIGMAS = 3.0
+OTHERS_SIGMAS = 2.0
+"""How far from 1 the other robots' scales are demanded where one robot's is: these robots' odometry is not all true."""
 BIAS_RATIO = 0.005
 """Standard deviation of an estimate beyond what noise explains: drift that keeps its direction looks like scale."""
 ASKED_CLOSURES_MAX = 2500
@@ -55,7 +57,8 @@ class Estimates:
 
     def demanded(self) -> dict[LogId, float]:
         """Scales of logs whose odometry is not true; all scales where only ratios are known and one is not 1."""
-        off = np.abs(self.scale - 1.0) > DEMANDED_SIGMAS * np.hypot(self.sigma, BIAS_RATIO)
+        sigmas = np.abs(self.scale - 1.0) / np.hypot(self.sigma, BIAS_RATIO)
+        off = sigmas > (OTHERS_SIGMAS if np.any(sigmas > DEMANDED_SIGMAS) else DEMANDED_SIGMAS)
         if not self.is_metric:
             off[:] = np.any(off)
         return {log: float(self.scale[k]) for k, log in enumerate(self.logs) if off[k]}

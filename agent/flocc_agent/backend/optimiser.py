@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.filtering import Filtered, filtered
 from flocc_agent.backend.initial import initial_poses
 from flocc_agent.backend.linear import SingularSystem
@@ -65,6 +66,9 @@ def _optimise(
     """Optimise a graph of odometry and closures."""
     began = time.perf_counter()
     screened = screen(graph)
+    left = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    held = held_closures(screened.trajectories, left, config)
+    screened = replace(screened, excluded={**screened.excluded, **held})
     if not screened.trajectories:
         return OptimisationFailed("; ".join(screened.warnings) or "the pose graph has no odometry")
     usable = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}

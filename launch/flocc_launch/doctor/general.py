@@ -18,9 +18,11 @@ CLOSURES_FEW = 3
 
 
 SOLVER_ADVICE = {
-    "odometry of robot": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
+    "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
+    "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
+    "the distance between robots": "Let them meet side by side as well as ahead, or measure a length: fix, tag, range.",
 }
-"""What to do about warnings that begin so."""
+"""What to do about warnings that say so."""
 
 
 def deaths(loaded: LoadedRun) -> list[Finding]:
@@ -54,8 +56,8 @@ def solver_warnings(loaded: LoadedRun) -> list[Finding]:
 
 def _advice(warning: str) -> str:
     """What to do about a warning of the solver."""
-    for begins, advice in SOLVER_ADVICE.items():
-        if warning.startswith(begins):
+    for said, advice in SOLVER_ADVICE.items():
+        if said in warning:
             return advice
     return "See docs/report.md on the pose graph; more closures from other view points make scales observable."
 
