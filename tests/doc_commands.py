@@ -19,7 +19,7 @@ from typing import Any
 import typer
 import typer.main
 
-from flocc_launch.commands.main import app
+from flocc_launch.commands.main import app, with_ros_args
 from flocc_protocol.errors import FloccError
 
 ROOT = Path(__file__).parents[1]
@@ -35,6 +35,7 @@ OTHER_PROGRAMS = {
     "apt", "apt-get", "cd", "cp", "curl", "docker", "evo_ape", "export", "git", "ip", "journalctl", "mkdir", "pip",
     "python3", "ros2", "scp", "ssh", "sudo", "sysctl", "systemctl", "tc", "useradd", "install", "source", "openssl",
     "iperf3", "nmcli", "iw", "chown", "chmod", "echo", "cat", "ls", "hadolint", "ping", "tee", "rosdep", "colcon",
+    "ros2_environment",
 }  # fmt: skip
 
 
@@ -129,6 +130,7 @@ def complaint(command: str) -> str | None:
 def _flocc_complaint(words: list[str]) -> str | None:
     """What the command line itself says; values may be placeholders, names of commands and options may not."""
     command: Any = typer.main.get_command(app)
+    words = with_ros_args(words)
     typed = not any(PLACEHOLDER.search(word) for word in words)
     path = ["flocc"]
     while getattr(command, "commands", None) and words and not words[0].startswith("-"):

@@ -13,6 +13,7 @@ from flocc_protocol.codec import Pose7
 Float = NDArray[np.float64]
 
 SMALL_ANGLE_RAD = 1e-9
+SMALL_TWIST_RAD = 1e-5
 RIGID_TOLERANCE = 1e-3
 _UPPER = np.triu_indices(6)
 
@@ -104,6 +105,45 @@ def se3_log(T: Float) -> Float:
         half = theta / 2.0
         V_inverse = np.eye(3) - 0.5 * W + (1 / theta**2) * (1 - half * np.cos(half) / np.sin(half)) * (W @ W)
     return np.concatenate([omega, V_inverse @ T[:3, 3]])
+
+
+def poses_of_twists(xi: Float) -> Float:
+    """Poses (N, 4, 4) of tangent vectors (N, 6), rotation first."""
+    omega = xi[:, :3]
+    theta = np.linalg.norm(omega, axis=1)[:, None, None]
+    small = theta < SMALL_TWIST_RAD
+    safe = np.where(small, 1.0, theta)
+    W = hats(omega)
+    WW = W @ W
+    T = np.zeros((len(xi), 4, 4))
+    second = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    T[:, :3, :3] = np.eye(3) + np.where(small, 1.0, np.sin(safe) / safe) * W + second * WW
+    V = np.eye(3) + second * W + np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3) * WW
+    T[:, :3, 3] = (V @ xi[:, 3:, None])[..., 0]
+    T[:, 3, 3] = 1.0
+    return T
+
+
+def twists_of_poses(T: Float) -> Float:
+    """Tangent vectors (N, 6) of poses (N, 4, 4), rotation first, its norm in [0, pi]."""
+    q = quaternions(T[:, :3, :3])
+    norm = np.linalg.norm(q[:, 1:], axis=1)
+    theta = 2.0 * np.arctan2(norm, q[:, 0])
+    omega = (
+        np.where(norm < SMALL_ANGLE_RAD, 2.0, theta / np.where(norm < SMALL_ANGLE_RAD, 1.0, norm))[:, None] * q[:, 1:]
+    )
+    half = np.where(theta < SMALL_TWIST_RAD, 1.0, theta / 2.0)
+    last = np.where(theta < SMALL_TWIST_RAD, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
+    W = hats(omega)
+    V_inverse = np.eye(3) - 0.5 * W + last[:, None, None] * (W @ W)
+    return np.concatenate([omega, (V_inverse @ T[:, :3, 3:4])[..., 0]], axis=1)
+
+
+def hats(v: Float) -> Float:
+    """Skew-symmetric matrices (N, 3, 3) of (N, 3)."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 2, 1], out[:, 0, 2], out[:, 1, 0] = v.T
+    return out - np.swapaxes(out, 1, 2)
 
 
 def adjoint(T: Float) -> Float:

@@ -5,13 +5,15 @@
     python -m flocc_lab.measure scale --robots 50 --minutes 10
     python -m flocc_lab.measure twice --seeds 200
 
-Each prints one JSON object. Everything but `cpu_s` is the same wherever it runs.
+Each prints one JSON object. Everything but `cpu_s` and `memory_mb` is the same wherever it runs.
 """
 
 import argparse
 import json
+import resource
 import sys
 import time
+from collections import Counter
 from typing import Any
 
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
@@ -47,7 +49,7 @@ def gossip(dimension: int = 512) -> dict[str, Any]:
 
 
 def scale(robots: int, minutes: float) -> dict[str, Any]:
-    """A large swarm in a town, radio range 25 m: CPU time of the simulation on one core."""
+    """A large swarm in a town, radio range 25 m: CPU time of the simulation on one core, bytes by kind, memory."""
     scenario = _scenario(robots=robots, area_m=120.0, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
     began_s = time.process_time()
     playbacks = playbacks_of(scenario, {})
@@ -55,6 +57,7 @@ def scale(robots: int, minutes: float) -> dict[str, Any]:
     swarm = swarm_of(scenario, playbacks, scenario.seed)
     swarm.run_until(60.0 * minutes)
     done_s = time.process_time()
+    received = sum((traffic.received for traffic in swarm.network.traffic.values()), Counter[str]())
     held = [len(station.core.gossip.logs) for station in swarm.running() if station.core]
     return {
         "robots": robots,
@@ -62,7 +65,9 @@ def scale(robots: int, minutes: float) -> dict[str, Any]:
         "keyframes": sum(len(playback.captures) for playback in playbacks.values()),
         "logs_held_least": min(held),
         "closures": max(station.core.assembly.closures for station in swarm.running() if station.core),
-        "messages_received_bytes": sum(sum(traffic.received.values()) for traffic in swarm.network.traffic.values()),
+        "messages_received_bytes": sum(received.values()),
+        "received_bytes": dict(received.most_common()),
+        "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
         "cpu_walks_s": round(drawn_s - began_s, 1),
         "cpu_s": round(done_s - drawn_s, 1),
     }

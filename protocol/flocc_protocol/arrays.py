@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 ARRAY_BYTES_MAX = 48 * 1024
 DIMENSIONS_MAX = 3
 SCALE_MAX = 1e30
-_NUMPY = {"f8": "<f8", "f4": "<f4", "f2": "<f2", "i1": "|i1", "u1": "|u1"}
+_NUMPY = {"f8": "<f8", "f4": "<f4", "f2": "<f2", "i1": "|i1", "u1": "|u1", "u4": "<u4"}
 _ITEM_BYTES = {dtype: np.dtype(name).itemsize for dtype, name in _NUMPY.items()}
-_ALWAYS_FINITE = frozenset({"i1", "u1"})
+_ALWAYS_FINITE = frozenset({"i1", "u1", "u4"})
 
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """A dense array: dtype code (f8, f4, f2, i1, u1), shape, bytes, and the value of one int8 step."""
+    """A dense array: dtype code (f8, f4, f2, i1, u1, u4), shape, bytes, and the value of one int8 step."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -43,7 +43,7 @@ class Array:
 
     @classmethod
     def of(cls, values: NDArray[np.generic], dtype: str = "f4") -> "Array":
-        """Store values as floats of the given width (or u1), without a scale.
+        """Store values as floats of the given width (or u1, u4), without a scale.
 
         Raises:
             ValueError: A value is not finite in that width, or the array is too large.

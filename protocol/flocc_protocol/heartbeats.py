@@ -1,37 +1,15 @@
 """Heartbeats: who is there, what it holds, whom it follows. They repeat, and what they say repairs the rest."""
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, NamedTuple
 
-from flocc_protocol.codec import (
-    COUNT,
-    KEYFRAME_ID,
-    LOG_ID,
-    LOGS_MAX,
-    REPEATED_MAX,
-    Codec,
-    Kinds,
-    integer,
-    optional,
-    sequence,
-    struct,
-)
+from flocc_protocol.codec import COUNT, KEYFRAME_ID, Kinds, integer, optional, sequence, struct
+from flocc_protocol.digests import TABLE_STATE, TableState
 from flocc_protocol.elections import ADVERT, BEAT, COMPUTE_CLASS, TERM_COUNTER, LeaderAdvert
-from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, KeyframeId, LogId
-from flocc_protocol.log_corrections import VERSION, CorrectionVersion
-from flocc_protocol.record_batches import CHECKSUM, CHECKSUM_MAX
+from flocc_protocol.ids import INCARNATION_MAX, KeyframeId
+from flocc_protocol.record_batches import CHECKSUM
 
 WANTS_MAX = 16
-
-
-class LogDigest(NamedTuple):
-    """How much of one log the sender holds, with the chained checksum of those records."""
-
-    log: LogId
-    count: int  # type: ignore[assignment]  # tuples have a method of this name, which nobody needs here
-    checksum: int
+NOTHING_HELD = TableState(0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +23,10 @@ class Heartbeat:
         leader: The followed leader, None while there is none.
         term_counter_max: Highest term counter the sender knows of; hearsay, which nobody acts on.
         load: Registrations waiting at the sender.
-        digests: What the sender holds of some logs: those that grew lately, and the others in turn.
-        corrections: Which corrections the sender holds, of some logs in the same way.
+        records: How many records the sender's own log has.
+        checksum: Their chained checksum.
+        digests: All that the sender holds of logs, as one hash.
+        versions: All corrections that it holds, as one hash.
         wants: Latents the sender needs and cannot reach, for relays.
         holds: Latents the sender holds for a neighbour that wanted them.
         lost: Latents that a neighbour wanted, and that exist no more as the sender knows from their owner.
@@ -58,39 +38,13 @@ class Heartbeat:
     leader: LeaderAdvert | None
     term_counter_max: int
     load: int
-    digests: tuple[LogDigest, ...]
-    corrections: tuple[CorrectionVersion, ...] = ()
+    records: int = 0
+    checksum: int = 0
+    digests: TableState = NOTHING_HELD
+    versions: TableState = NOTHING_HELD
     wants: tuple[KeyframeId, ...] = ()
     holds: tuple[KeyframeId, ...] = ()
     lost: tuple[KeyframeId, ...] = ()
-
-
-_ANY_DIGEST = struct(LogDigest, log=LOG_ID, count=COUNT, checksum=CHECKSUM)
-
-
-@lru_cache(maxsize=REPEATED_MAX, typed=True)
-def _digest(robot: Any, incarnation: Any, count: Any, checksum: Any) -> LogDigest:
-    """Heartbeats repeat most of what they say: the same digest comes back as the same object, checked once."""
-    return _ANY_DIGEST.unpack([[robot, incarnation], count, checksum])
-
-
-def _unpack_digest(value: Any) -> LogDigest:
-    try:
-        (robot, incarnation), count, checksum = value
-        return _digest(robot, incarnation, count, checksum)
-    except (TypeError, ValueError) as error:
-        raise DecodeError("expected a digest") from error
-
-
-def _pack_digest(value: LogDigest) -> LogDigest:
-    """A digest is a tuple as it is on the wire."""
-    log, count, checksum = value
-    if not 0 <= count <= INDEX_MAX or not 0 <= checksum <= CHECKSUM_MAX:
-        raise DecodeError(f"digest of {log} is out of range")
-    return value
-
-
-_DIGEST = Codec(_pack_digest, _unpack_digest)
 
 
 CODECS: Kinds = {
@@ -104,8 +58,10 @@ CODECS: Kinds = {
             leader=optional(ADVERT),
             term_counter_max=TERM_COUNTER,
             load=COUNT,
-            digests=sequence(_DIGEST, LOGS_MAX),
-            corrections=sequence(VERSION, LOGS_MAX),
+            records=COUNT,
+            checksum=CHECKSUM,
+            digests=TABLE_STATE,
+            versions=TABLE_STATE,
             wants=sequence(KEYFRAME_ID, WANTS_MAX),
             holds=sequence(KEYFRAME_ID, WANTS_MAX),
             lost=sequence(KEYFRAME_ID, WANTS_MAX),

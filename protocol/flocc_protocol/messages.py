@@ -8,9 +8,12 @@ module that is named after what it says; a new one is listed in `Message`, and i
 from dataclasses import dataclass
 from typing import Any
 
-from flocc_protocol import candidate_pairs, elections, heartbeats, log_corrections, record_batches, separators
+import msgspec
+
+from flocc_protocol import candidate_pairs, digests, elections, heartbeats, log_corrections, record_batches, separators
 from flocc_protocol.candidate_pairs import OFFERS_MAX, CandidateOffer, CandidatePair
-from flocc_protocol.codec import LOG_ID, LOGS_MAX, MESSAGE_BYTES_MAX, Codec, from_bytes, to_bytes
+from flocc_protocol.codec import LOG_ID, LOGS_MAX, MESSAGE_BYTES_MAX, Codec, Reader, listed, packed
+from flocc_protocol.digests import DigestRequest, Digests, LogDigest, TableState
 from flocc_protocol.elections import (
     COMPUTE_CLASS_MAX,
     COUNTER_MAX,
@@ -22,15 +25,17 @@ from flocc_protocol.elections import (
     LeaderAdvert,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.heartbeats import WANTS_MAX, Heartbeat, LogDigest
+from flocc_protocol.heartbeats import WANTS_MAX, Heartbeat
 from flocc_protocol.ids import LogId
 from flocc_protocol.log_corrections import (
-    CORRECTION_KEYFRAMES_MAX,
     CORRECTIONS_KEPT_MAX,
     CORRECTIONS_MAX,
+    KNOTS_MAX,
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    KnotRequest,
+    Knots,
     LogCorrection,
     encode_correction,
 )
@@ -53,7 +58,6 @@ __all__ = [
     "COMPUTE_CLASS_MAX",
     "CORRECTIONS_KEPT_MAX",
     "CORRECTIONS_MAX",
-    "CORRECTION_KEYFRAMES_MAX",
     "COUNTER_MAX",
     "CandidateOffer",
     "CandidatePair",
@@ -61,11 +65,16 @@ __all__ = [
     "CorrectionBatch",
     "CorrectionRequest",
     "CorrectionVersion",
+    "DigestRequest",
+    "Digests",
     "Election",
     "Envelope",
     "HOPS_MAX",
     "Handover",
     "Heartbeat",
+    "KNOTS_MAX",
+    "KnotRequest",
+    "Knots",
     "LOGS_MAX",
     "LeaderAdvert",
     "LogCorrection",
@@ -85,6 +94,7 @@ __all__ = [
     "Records",
     "SEPARATORS_MAX",
     "Separators",
+    "TableState",
     "UnknownVersion",
     "WANTS_MAX",
     "decode",
@@ -94,7 +104,7 @@ __all__ = [
     "version_of",
 ]
 
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 VERSION_MAX = 127
 
 
@@ -104,6 +114,8 @@ class UnknownVersion(DecodeError):
 
 Message = (
     Heartbeat
+    | Digests
+    | DigestRequest
     | Election
     | Answer
     | Coordinator
@@ -112,6 +124,7 @@ Message = (
     | RecordRequest
     | CorrectionBatch
     | CorrectionRequest
+    | KnotRequest
     | CandidateOffer
     | Separators
 )
@@ -127,6 +140,7 @@ class Envelope:
 
 _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     **heartbeats.CODECS,
+    **digests.CODECS,
     **elections.CODECS,
     **record_batches.CODECS,
     **log_corrections.CODECS,
@@ -134,7 +148,21 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     **separators.CODECS,
 }
 _KINDS: dict[type[Message], str] = {cls: kind for kind, (cls, _) in _CODECS.items()}
+_READERS = {kind: Reader(codec, MESSAGE_BYTES_MAX) for kind, (_, codec) in _CODECS.items()}
 MESSAGE_KINDS: tuple[str, ...] = tuple(_CODECS)
+
+
+def _envelope(raw: tuple[int, str, tuple[str, int], msgspec.Raw]) -> Envelope:
+    _, kind, sender, fields = raw
+    read = _READERS.get(kind)
+    if read is None or LOG_ID.build is None:
+        raise DecodeError("a message is of a known kind")
+    return Envelope(LOG_ID.build(sender), read(fields))
+
+
+_read: Reader[Envelope] = Reader(
+    Codec(packed, listed(int, str, LOG_ID.wire, msgspec.Raw), _envelope), MESSAGE_BYTES_MAX
+)
 
 
 def kind_of(message: Message) -> str:
@@ -153,7 +181,7 @@ def encode(envelope: Envelope) -> bytes:
         body = _CODECS[kind][1].pack(envelope.message)
     except DecodeError as error:
         raise ValueError(f"{kind}: {error}") from error
-    data = to_bytes([PROTOCOL_VERSION, kind, LOG_ID.pack(envelope.sender), body])
+    data = packed([PROTOCOL_VERSION, kind, LOG_ID.pack(envelope.sender), body])
     assert len(data) <= MESSAGE_BYTES_MAX, f"{kind} of {len(data)} bytes is larger than a message may be"
     return data
 
@@ -179,7 +207,4 @@ def decode(data: bytes) -> Envelope:
     version = version_of(data)
     if version != PROTOCOL_VERSION:
         raise UnknownVersion(f"protocol version {version}, this robot speaks {PROTOCOL_VERSION}")
-    value = from_bytes(data, MESSAGE_BYTES_MAX)
-    if type(value) is not list or len(value) != 4 or type(value[1]) is not str or value[1] not in _CODECS:
-        raise DecodeError("a message is version, kind, sender and fields")
-    return Envelope(LOG_ID.unpack(value[2]), _CODECS[value[1]][1].unpack(value[3]))
+    return _read(data)

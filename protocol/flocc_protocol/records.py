@@ -22,12 +22,14 @@ from flocc_protocol.codec import (
     POSE,
     Codec,
     Pose7,
+    Reader,
     from_bytes,
+    listed,
     optional,
+    packed,
     real,
     struct,
     text,
-    to_bytes,
 )
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import KeyframeId, checked_name
@@ -259,6 +261,8 @@ CODE_MAX = 127
 """A code is one byte of msgpack, the second one of a record."""
 PAIR_HEADER = 0x92
 """First byte of every record: a msgpack array of two, its code and its fields."""
+_SHORT_LIST = 0x90
+_LIST_SIZE_BYTES = {0xDC: 2, 0xDD: 4}
 
 
 _STAMP = real(-1e12, 1e12)
@@ -315,6 +319,15 @@ _CODES: dict[type[Record], int] = {
 _FIELDS = {_CODES[kind]: len(fields(kind)) for kind in _CODES}
 
 
+def _reader(codec: Codec[Any]) -> Reader[Record]:
+    build = codec.build
+    assert build is not None
+    return Reader(Codec(packed, listed(int, codec.wire), lambda raw: build(raw[1])), RECORD_BYTES_MAX)
+
+
+_READERS = {code: _reader(codec) for code, codec in _BY_CODE.items()}
+
+
 def _check_covariance(covariance: Array, size: int) -> None:
     if covariance.shape != (size,):
         raise ValueError(f"a covariance has {size} numbers here, not {covariance.shape}")
@@ -335,7 +348,7 @@ def encode_record(record: Record) -> bytes:
         return record.data
     code = _CODES[type(record)]
     try:
-        data = to_bytes([code, _BY_CODE[code].pack(record)])
+        data = packed([code, _BY_CODE[code].pack(record)])
     except DecodeError as error:
         raise ValueError(f"{type(record).__name__}: {error}") from error
     if len(data) > RECORD_BYTES_MAX:
@@ -352,13 +365,18 @@ def decode_record(data: bytes) -> Record:
     code = code_of(data)
     if code not in _BY_CODE:
         return UnknownRecord(code, data)
-    value = from_bytes(data, RECORD_BYTES_MAX)
-    if type(value) is not list or len(value) != 2:
-        raise DecodeError("a record is a code and its fields")
-    if type(value[1]) is list and len(value[1]) > _FIELDS[code]:
+    if _is_longer(data, _FIELDS[code]):
+        from_bytes(data, RECORD_BYTES_MAX)
         return UnknownRecord(code, data)
-    record: Record = _BY_CODE[code].unpack(value[1])
-    return record
+    return _READERS[code](data)
+
+
+def _is_longer(data: bytes, fields_known: int) -> bool:
+    """Whether a record announces more fields than this version knows."""
+    size_bytes = _LIST_SIZE_BYTES.get(data[2])
+    if size_bytes is not None:
+        return int.from_bytes(data[3 : 3 + size_bytes], "big") > fields_known
+    return data[2] & 0xF0 == _SHORT_LIST and data[2] & 0x0F > fields_known
 
 
 def code_of(data: bytes) -> int:

@@ -1,10 +1,15 @@
 """Configuration files: paths are relative to their file, wherever they stand in it."""
 
+import contextlib
+import math
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import BaseModel, ValidationError
 
-from flocc_agent.config import AgentConfig, TransportConfig
+from flocc_agent.config import AgentConfig, ConfigError, TransportConfig
 from flocc_launch.scenarios.scenario import Scenario
 
 AGENT = """
@@ -54,3 +59,37 @@ def test_bulk_sessions_are_found_at_the_port_after_that_of_control() -> None:
 def test_a_multicast_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(ValueError, match="is no multicast address"):
         TransportConfig(multicast_address=address)
+
+
+def leaves(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every key of a section and of those within it."""
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            yield from leaves(inner, (*path, name))
+        else:
+            yield (*path, name)
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_no_key_takes_a_number_that_is_not_finite(value: float) -> None:
+    taken = []
+    for path in leaves(AgentConfig):
+        given: Any = value
+        for name in reversed(path):
+            given = {name: given}
+        with contextlib.suppress(ValidationError):
+            AgentConfig.model_validate({"name": "r1", **given})
+            taken.append(path)
+    assert taken == []
+
+
+def test_a_swarm_with_keys_listens_with_tls_without_being_told(tmp_path: Path) -> None:
+    path = tmp_path / "agent.toml"
+    path.write_text('name = "r1"\n[transport.tls]\nfolder = "keys"\n')
+    read = AgentConfig.read(path).transport
+    assert (read.control_listen, read.bulk_listen) == (("tls/0.0.0.0:0",), ("tls/0.0.0.0:0",))
+    assert TransportConfig().control_listen == ("tcp/0.0.0.0:0",)
+    path.write_text('name = "r1"\n[transport]\ncontrol_listen = ["tcp/0.0.0.0:7"]\n[transport.tls]\nfolder = "keys"\n')
+    with pytest.raises(ConfigError, match="with tls every endpoint begins with tls/, but there is 'tcp/0"):
+        AgentConfig.read(path)

@@ -5,6 +5,7 @@ import re
 import shutil
 import socket
 import subprocess
+import threading
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
-from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard
+from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard, server
 from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.snapshot import LinkView, MapGroup, RobotView, Said, Snapshot
 from flocc_launch.dashboard.state import SwarmState
@@ -170,6 +171,20 @@ def test_the_server_answers_two_paths_and_nothing_else(tmp_path: Path) -> None:
             urllib.request.urlopen(dashboard.url + "../run.json")
 
 
+def test_idle_connections_are_few_and_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "IDLE_S", 0.5)
+    threads = threading.active_count()
+    with Dashboard(synthetic_run.write(tmp_path / "run", Synthetic()), port=0) as dashboard:
+        host, port = dashboard.url.removeprefix("http://").strip("/").split(":")
+        idle = [socket.create_connection((host, int(port)), timeout=10.0) for _ in range(3 * server.CONNECTIONS_MAX)]
+        assert idle[-1].recv(1) == b""
+        assert threading.active_count() <= threads + 1 + server.CONNECTIONS_MAX
+        assert [connection.recv(1) for connection in idle] == [b""] * len(idle)
+        assert urllib.request.urlopen(dashboard.url, timeout=10.0).status == 200
+    for connection in idle:
+        connection.close()
+
+
 def test_a_port_in_use_is_one_sentence(tmp_path: Path) -> None:
     folder = synthetic_run.write(tmp_path / "run")
     with Dashboard(folder, port=0) as dashboard:
@@ -232,3 +247,32 @@ def test_a_browser_shows_maps_that_are_apart(tmp_path: Path) -> None:
         html = browse(dashboard.url, tmp_path / "profile")
     assert ">3 maps<" in html
     assert html.count("<svg") == 3
+
+
+@pytest.mark.slow
+def test_robots_without_a_map_are_drawn_apart_and_stale_leaders_have_no_star(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run", start_s=None)
+    for robot in ("r1", "r2", "r3"):
+        add(folder, 1.0, robot, "keyframe", keyframe=f"{robot}/0", stamp_s=0.0, T_odom_body=IDENTITY)
+        add(folder, 1.0, robot, "leader", term=1, leader=robot)
+        for peer in {"r1", "r2", "r3"} - {robot}:
+            add(folder, 1.5, robot, "neighbour_up", peer=peer)
+    for robot in ("r1", "r3"):
+        add(folder, 2.0, robot, "leader", term=2, leader="r1")
+    with Dashboard(folder, port=0) as dashboard:
+        html = browse(dashboard.url, tmp_path / "profile")
+    assert ">0 maps, 3 robots without<" in html
+    assert len(re.findall(r"<b>odometry alone</b>: r\d<", html)) == html.count("<svg") == 3
+    assert re.findall(r">(r\d ★)<", html) == ["r1 ★"], "r2 leads itself, and hears a newer leader"
+    assert ">leader r1 (term 2)<" in html
+
+
+def test_rejected_candidates_are_counted_and_not_listed(tmp_path: Path) -> None:
+    folder = growing(tmp_path / "run")
+    for k in range(100):
+        add(folder, 5.0 + k, "r1", "closure_rejected", query="r1/0", match=f"r2/{k}", ratio=0.1, reason="few")
+    add(folder, 200.0, "r1", "closure_accepted", query="r1/0", match="r2/0", ratio=1.0, probability=0.9,
+        correspondences=99, odometry_correspondences=99, scale_initial=None, by="r1")  # fmt: skip
+    snapshot = RunSource(folder).snapshot()
+    assert robot_of(snapshot, "r1").rejected == 100
+    assert [said.text for said in snapshot.recent] == ["closure r1/0 – r2/0, match ratio 1.00"]

@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import inverse, pose, so3_exp
 from flocc_agent.lenses import CameraModel
+from flocc_agent.runtime.decoder_noise import quiet_decoders
+from flocc_agent.runtime.picture_heads import PictureError
+from flocc_agent.runtime.pictures import read_picture
 from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.commands import convert, info, split
+from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.datasets.intrinsics import read_lens
@@ -430,3 +433,88 @@ def test_two_poses_of_one_image_are_refused(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(json.dumps(table))
     with pytest.raises(DatasetError, match=r"gives a.png two poses"):
         read_source(tmp_path)
+
+
+def write_colmap(path: Path, last: str = "4 1 0 0 0 0 0 3 1 3.png\n\n", count: int = 4) -> Path:
+    for k in range(4):
+        write_image(path / "images" / f"{k}.png")
+    (path / "cameras.txt").write_text("1 PINHOLE 32 24 7 8 16 12\n")
+    rows = [f"{k + 1} 1 0 0 0 0 0 {k} 1 {k}.png\n{k}.5 2.5 -1 7.5 3.5 {k}\n" for k in range(3)]
+    (path / "images.txt").write_text(f"# Number of images: {count}, mean observations: 2\n{''.join(rows)}{last}")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("last", "said"),
+    [
+        ("4 1 0 0 0 0 0 3 1", "images.txt:8: is no whole row of an image"),
+        ("4 1 0 0 0 0 0", "images.txt:8: is no whole row of an image"),
+        ("4 1 0 0 0 0", "images.txt:8: is no whole row of an image"),
+        ("", "says that it has 4 images, but has 3: it may be cut off"),
+    ],
+)
+def test_a_row_of_colmap_that_was_cut_is_said(tmp_path: Path, last: str, said: str) -> None:
+    source = read_source(write_colmap(tmp_path, last))
+    assert [note for note in source.notes if said in note]
+    assert len(source.images) == 3
+    assert not [note for note in read_source(write_colmap(tmp_path)).notes if "images.txt" in note]
+
+
+def test_a_camera_of_colmap_that_is_no_number_is_refused_with_its_line(tmp_path: Path) -> None:
+    path = write_colmap(tmp_path, "4 1 0 0 0 0 0 3 1.5 3.png\n")
+    with pytest.raises(DatasetError, match=r"images\.txt:8: CAMERA_ID must be a whole number, not '1\.5'"):
+        read_source(path)
+
+
+@pytest.mark.parametrize("poses", [0, 4, 7])
+def test_numbers_of_kitti_with_gaps_are_times_where_nothing_else_is(tmp_path: Path, poses: int) -> None:
+    """Numbers 0, 1, 4, 6: with as many poses as images, or one for every number."""
+    path = write_kitti(tmp_path / "00", 7, 7)
+    (path / "times.txt").unlink()
+    for number in (2, 3, 5):
+        (path / "image_0" / f"{number:06d}.png").unlink()
+    (path / "poses.txt").unlink()
+    if poses:
+        np.savetxt(path / "poses.txt", moving(7)[:poses, :3].reshape(poses, 12))
+    source = read_source(path)
+    assert [stamp_s for stamp_s, _ in source.images] == pytest.approx([0.0, 0.1, 0.4, 0.6])
+    assert any("number N was taken at N/10 s" in note for note in source.notes)
+    if poses:
+        assert source.truth is not None
+        wanted = [0.0, 0.1, 0.4, 0.6] if poses == 4 else [0.1 * k for k in range(7)]
+        assert source.truth.stamps_s == pytest.approx(wanted)
+
+
+def test_a_trajectory_or_a_graph_alone_is_named(tmp_path: Path) -> None:
+    (tmp_path / "tracks").mkdir()
+    write_tum(tmp_path / "tracks" / "robot.txt", Trajectory(np.linspace(0, 1, 9), moving(9)))
+    (tmp_path / "graphs").mkdir()
+    (tmp_path / "graphs" / "r1.g2o").write_text("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n")
+    said = {
+        "tracks": r"tracks: holds trajectories only \(robot\.txt\); flocc needs the images, too",
+        "tracks/robot.txt": r"robot\.txt: is a trajectory; flocc needs the images, too",
+        "graphs": r"graphs: holds r1\.g2o: a pose graph, which has no images: flocc optimise",
+        "graphs/r1.g2o": r"r1\.g2o: is a pose graph, which has no images: flocc optimise",
+    }
+    for name, sentence in said.items():
+        with pytest.raises(DatasetError, match=sentence):
+            read_source(tmp_path / name)
+
+
+def test_info_names_the_file_of_each_trajectory(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "mine")
+    write_tum(path / "vio.txt", Trajectory(np.linspace(100, 102.5, 6), moving(6)))
+    lines = dict(info_lines(info(path)))
+    assert (lines["odometry"], lines["ground truth"]) == ("6 poses, vio.txt", "6 poses, groundtruth.tum")
+
+
+def test_decoders_do_not_speak_for_themselves(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A damaged PNG: libpng writes to stderr, past Python."""
+    _, encoded = cv2.imencode(".png", np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8))
+    damaged = encoded.tobytes()[:2000] + b"\0" + encoded.tobytes()[2001:]
+    with pytest.raises(PictureError, match="damaged PNG"):
+        read_picture(damaged)
+    assert capfd.readouterr().err == ""
+    with quiet_decoders():
+        os.write(2, b"somebody else\nlibpng error: x\n")
+    assert capfd.readouterr().err == "somebody else\n"

@@ -12,6 +12,7 @@ from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
 from flocc_agent.core.reports import Fact
+from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.event_lines import Reported, UnknownFact
 from flocc_agent.runtime.facts import AgentDied, KilledByOrder
 from flocc_agent.runtime.trajectory_text import read_tum
@@ -288,3 +289,11 @@ def test_an_order_to_kill_explains_one_death_of_its_robot_and_no_later_one() -> 
         (9.0, AgentDied(signal=9, exit_code=None, scripted=True)),
     ]
     assert deaths_unasked([Reported(t, "r1", each) for t, each in told]) == ["r1"]
+
+
+def test_a_result_names_the_order_of_its_poses(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run")
+    fields = json.loads((folder.path / "robots/r1/result.json").read_text())
+    assert fields["pose_order"] == "x y z qw qx qy qz"
+    result = folder.results()["r1"]
+    assert np.allclose(result.T_odom_body()[3], pose_from_tq(np.array(fields["keyframes"][3]["T_odom_body"])))

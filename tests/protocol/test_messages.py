@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,20 +17,23 @@ from tests.protocol.wire_examples import (
     MESSAGES,
     TERM,
     descriptor,
+    knots,
     largest_messages,
     log_ids,
     messages,
-    poses_array,
 )
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import from_bytes, to_bytes
+from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import INDEX_MAX, TERM_COUNTER_MAX, LogId
 from flocc_protocol.keys import Kind, broadcast_key, checked_kind
+from flocc_protocol.log_corrections import KNOT_REQUESTS_MAX
 from flocc_protocol.messages import (
     BATCHES_MAX,
-    CORRECTION_KEYFRAMES_MAX,
+    CORRECTIONS_MAX,
+    KNOTS_MAX,
     LOGS_MAX,
     MESSAGE_BYTES_MAX,
     MESSAGE_KINDS,
@@ -38,9 +42,11 @@ from flocc_protocol.messages import (
     RECORDS_BATCH_MAX,
     CorrectionBatch,
     CorrectionVersion,
+    Digests,
     Election,
     Envelope,
     Heartbeat,
+    KnotRequest,
     LogCorrection,
     LogDigest,
     LogPosition,
@@ -48,6 +54,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
+    TableState,
     UnknownVersion,
     decode,
     encode,
@@ -56,7 +63,8 @@ from flocc_protocol.messages import (
 )
 from flocc_protocol.records import RECORD_BYTES_MAX, KeyframeRecord, encode_record
 
-CORRECTION = LogCorrection(ALICE, TERM, 5, ALICE, IDENTITY, None, 0, 1, poses_array(6))
+KNOTS = knots(6)
+CORRECTION = LogCorrection(ALICE, TERM, 5, ALICE, IDENTITY, KNOTS)
 KEYFRAME_BYTES = encode_record(KeyframeRecord(9, 1_700_000_000.0, IDENTITY, descriptor(512)))
 
 
@@ -70,6 +78,14 @@ def test_any_message_reads_back(sender: LogId, message: Message) -> None:
 @pytest.mark.parametrize("message", MESSAGES, ids=kind_of)
 def test_every_example_reads_back(message: Message) -> None:
     assert decode(encode(Envelope(BOB, message))) == Envelope(BOB, message)
+
+
+@pytest.mark.parametrize("envelope", ENVELOPES, ids=lambda envelope: kind_of(envelope.message))
+def test_plain_messagepack_reads_and_writes_the_same_bytes(envelope: Envelope) -> None:
+    data = encode(envelope)
+    read = msgpack.unpackb(data)
+    assert read[:3] == [PROTOCOL_VERSION, kind_of(envelope.message), list(envelope.sender)]
+    assert msgpack.packb(read) == data
 
 
 def test_there_is_an_example_of_every_kind() -> None:
@@ -116,18 +132,23 @@ def test_a_batch_keeps_the_order_and_leaves_no_gap_for_a_small_record() -> None:
         lambda: RecordBatch(ALICE, INDEX_MAX, 0, (b"x",)),
         lambda: Records((RecordBatch(ALICE, 0, 0, (bytes(RECORD_BYTES_MAX),) * 3),) * 2),
         lambda: Records((RecordBatch(ALICE, 0, 0, ()),) * (BATCHES_MAX + 1)),
-        lambda: CorrectionBatch((CORRECTION,) * 17),
-        lambda: CorrectionBatch((replace(CORRECTION, T_map_camera=poses_array(800)),) * 2),
+        lambda: CorrectionBatch((CORRECTION,) * (CORRECTIONS_MAX + 1)),
+        lambda: CorrectionBatch((replace(CORRECTION, knots=knots(800)),) * 2),
         lambda: replace(CORRECTION, signature=b"short"),
-        lambda: replace(CORRECTION, T_map_camera=poses_array(CORRECTION_KEYFRAMES_MAX + 1)),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.zeros((3, 7)))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.full((1, 7), 2.0))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.array([[1e8, 0, 0, 1, 0, 0, 0]]))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.array([[0, 0, 0, 1, 0, 0, 0]]), "f8")),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.zeros(7))),
-        lambda: replace(CORRECTION, T_map_camera=Array.of(np.zeros((7, 6)))),
-        lambda: replace(CORRECTION, first=INDEX_MAX, step=1),
-        lambda: replace(CORRECTION, covariance=Array.of(np.zeros(20))),
+        lambda: knots(KNOTS_MAX + 1),
+        lambda: knots(0),
+        lambda: replace(KNOTS, twists=Array.of(np.zeros((5, 6)), "f4")),
+        lambda: replace(KNOTS, twists=Array.of(np.zeros((6, 7)), "f4")),
+        lambda: replace(KNOTS, twists=Array.of(np.zeros((6, 6)), "f8")),
+        lambda: replace(KNOTS, twists=Array.of(np.full((6, 6), 5.0), "f4")),
+        lambda: replace(KNOTS, twists=Array.of(np.tile([0, 0, 0, 2e8, 0, 0], (6, 1)), "f4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.array([1, 2, 3, 3, 4, 5]), "u4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.array([1, 2, 4, 3, 5, 6]), "u4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.array([1, 2, 3, 4, 5, 2**32 - 1]), "u4")),
+        lambda: replace(KNOTS, keyframes=Array.of(np.arange(6), "u1")),
+        lambda: replace(KNOTS, about_odom_m=Array.of(np.zeros(3), "f4")),
+        lambda: replace(KNOTS, about_odom_m=Array.of(np.full(3, 1e8), "f8")),
+        lambda: replace(KNOTS, covariance=Array.of(np.zeros(20))),
     ],
 )
 def test_what_does_not_fit_cannot_be_built(build: Any) -> None:
@@ -138,14 +159,15 @@ def test_what_does_not_fit_cannot_be_built(build: Any) -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        Heartbeat(0, 0, 0, None, 0, 0, (LogDigest(ALICE, 0, 0),) * (LOGS_MAX + 1)),
-        Heartbeat(0, 0, 10, None, 0, 0, ()),
-        Heartbeat(0, 0, 0, None, TERM_COUNTER_MAX + 1, 0, ()),
+        Digests(0, 0, (LogDigest(ALICE, 0, 0),) * (LOGS_MAX + 1), 0, ()),
+        Heartbeat(0, 0, 0, None, 0, 0, digests=TableState(HASH_MAX + 1, 0)),
+        Heartbeat(0, 0, 10, None, 0, 0),
+        Heartbeat(0, 0, 0, None, TERM_COUNTER_MAX + 1, 0),
         Election(TERM_COUNTER_MAX + 1),
         Election(-1),
         Records((RecordBatch(ALICE, 0, 2**32, ()),)),
         RecordRequest((LogPosition(ALICE, 0),) * (BATCHES_MAX + 1)),
-        CorrectionBatch((replace(CORRECTION, step=0),)),
+        KnotRequest((CorrectionVersion(ALICE, TERM, 1),) * (KNOT_REQUESTS_MAX + 1)),
         CorrectionBatch((replace(CORRECTION, T_map_odom=(math.nan, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)),)),
     ],
     ids=lambda message: kind_of(message),
@@ -155,15 +177,20 @@ def test_a_message_that_others_would_refuse_is_a_value_error_here(message: Messa
         encode(Envelope(ALICE, message))
 
 
-def test_a_correction_on_the_wire_has_unit_quaternions() -> None:
+def test_knots_on_the_wire_are_in_order_and_finite() -> None:
     version, kind, sender, fields = from_bytes(
         encode(Envelope(ALICE, CorrectionBatch((CORRECTION,)))), MESSAGE_BYTES_MAX
     )
     correction = from_bytes(fields[0][0][0], MESSAGE_BYTES_MAX)
-    correction[-1] = ["f4", [1, 7], bytes(28), 1.0]
-    fields[0][0][0] = to_bytes(correction)
-    with pytest.raises(DecodeError, match="unit quaternions"):
-        decode(to_bytes([version, kind, sender, fields]))
+    for field, bad, told in (
+        (2, ["u4", [6], np.array([1, 2, 3, 2, 5, 6], "<u4").tobytes(), 1.0], "order"),
+        (3, ["f4", [6, 6], np.full(36, np.nan, "<f4").tobytes(), 1.0], "finite"),
+    ):
+        damaged = list(correction)
+        damaged[-1] = [*correction[-1][:field], bad, *correction[-1][field + 1 :]]
+        fields[0][0][0] = to_bytes(damaged)
+        with pytest.raises(DecodeError, match=told):
+            decode(to_bytes([version, kind, sender, fields]))
 
 
 # --- versions and malformed messages ---------------------------------------------------------------------------------
@@ -234,12 +261,17 @@ def test_a_message_larger_than_its_limit_is_a_decode_error() -> None:
 # --- sizes -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_heartbeat_of_50_logs_fits_two_datagrams_of_ethernet() -> None:
+def test_a_heartbeat_of_however_many_logs_is_small() -> None:
+    everything = TableState(HASH_MAX, INDEX_MAX)
+    heartbeat = Heartbeat(10_000, 2**40, 5, None, 7, 3, 1000, 2**32 - 1, everything, everything)
+    assert len(encode(Envelope(LogId("robot-01"), heartbeat))) < 90
+
+
+def test_what_50_logs_hold_fits_two_datagrams_of_ethernet() -> None:
     logs = [LogId(f"robot-{k:02d}") for k in range(50)]
     digests = tuple(LogDigest(log, 1000, 2**32 - 1) for log in logs)
     versions = tuple(CorrectionVersion(log, TERM, 200) for log in logs)
-    heartbeat = Heartbeat(10_000, 2**40, 5, None, 7, 3, digests, versions)
-    assert len(encode(Envelope(logs[0], heartbeat))) < 2 * 1400
+    assert len(encode(Envelope(logs[0], Digests(2**40, 50_000, digests, 10_000, versions)))) < 2 * 1400
 
 
 def test_a_keyframe_costs_less_than_700_bytes_in_a_batch() -> None:
@@ -249,8 +281,8 @@ def test_a_keyframe_costs_less_than_700_bytes_in_a_batch() -> None:
     assert len(encode(Envelope(ALICE, Records((batch,))))) / len(batch.records) < 650
 
 
-def test_a_correction_of_1500_keyframes_fits_one_message() -> None:
-    correction = replace(CORRECTION, T_map_camera=poses_array(1500), covariance=Array.of(np.ones(21)))
+def test_a_correction_of_as_many_knots_as_may_be_fits_one_message() -> None:
+    correction = replace(CORRECTION, knots=knots(KNOTS_MAX, Array.of(np.ones(21))))
     assert len(encode(Envelope(ALICE, CorrectionBatch((correction,))))) < 43_000
 
 

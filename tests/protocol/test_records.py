@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -165,7 +166,26 @@ def test_a_record_with_more_fields_than_known_is_kept_byte_for_byte(data: bytes)
     assert encode_record(decode_record(longer)) == longer
 
 
+@pytest.mark.parametrize("data", ENCODED)
+def test_plain_messagepack_reads_and_writes_the_same_bytes(data: bytes) -> None:
+    assert msgpack.packb(msgpack.unpackb(data)) == data
+
+
+def test_a_record_whose_fields_have_a_long_header_is_read_all_the_same() -> None:
+    data = ENCODED[0]
+    for header in (b"\xdc\x00\x04", b"\xdd\x00\x00\x00\x04"):
+        assert data[2] == 0x94
+        assert decode_record(data[:2] + header + data[3:]) == decode_record(data)
+
+
+def test_an_integer_is_no_float_and_nan_is_no_number() -> None:
+    code, fields = from_bytes(ENCODED[0], RECORD_BYTES_MAX)
+    for stamp in (1, math.nan, math.inf):
+        with pytest.raises(DecodeError, match="finite number"):
+            decode_record(to_bytes([code, [fields[0], stamp, *fields[2:]]]))
+
+
 def test_a_record_with_fewer_fields_than_known_is_a_decode_error() -> None:
     code, fields = from_bytes(ENCODED[0], RECORD_BYTES_MAX)
-    with pytest.raises(DecodeError, match="fields"):
+    with pytest.raises(DecodeError, match="of length 4, got 3"):
         decode_record(to_bytes([code, fields[:-1]]))

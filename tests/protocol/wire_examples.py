@@ -5,14 +5,16 @@ from hypothesis import strategies as st
 
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import COORDINATE_MAX, Pose7
+from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.ids import INCARNATION_MAX, INDEX_MAX, TERM_COUNTER_MAX, KeyframeId, LogId, Term
+from flocc_protocol.log_corrections import KNOT_REQUESTS_MAX, SHORT_WEIGHT
 from flocc_protocol.messages import (
     BATCHES_MAX,
     COMPUTE_CLASS_MAX,
-    CORRECTION_KEYFRAMES_MAX,
     CORRECTIONS_MAX,
     COUNTER_MAX,
     HOPS_MAX,
+    KNOTS_MAX,
     LOGS_MAX,
     OFFERS_MAX,
     RANK_MAX,
@@ -28,10 +30,14 @@ from flocc_protocol.messages import (
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    DigestRequest,
+    Digests,
     Election,
     Envelope,
     Handover,
     Heartbeat,
+    KnotRequest,
+    Knots,
     LeaderAdvert,
     LogCorrection,
     LogDigest,
@@ -41,6 +47,7 @@ from flocc_protocol.messages import (
     RecordRequest,
     Records,
     Separators,
+    TableState,
 )
 from flocc_protocol.records import (
     REASON_LENGTH_MAX,
@@ -65,11 +72,11 @@ from flocc_protocol.records import (
 IDENTITY: Pose7 = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
-def poses_array(count: int, seed: int = 0) -> Array:
-    """(count, 7) float32 poses with unit quaternions."""
-    poses = np.random.default_rng(seed).normal(size=(count, 7))
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    return Array.of(poses, "f4")
+def knots(count: int, covariance: Array | None = None, seed: int = 0) -> Knots:
+    """That many knots, two keyframes apart."""
+    twists = np.random.default_rng(seed).integers(-8, 8, size=(count, 6)) / 8.0
+    about = Array.of(np.array([1.0, -2.0, 0.5]), "f8")
+    return Knots(covariance, about, Array.of(np.arange(1, 2 * count, 2), "u4"), Array.of(twists, "f4"))
 
 
 def lifted_array(count: int, rank: int = 3) -> Array:
@@ -92,7 +99,6 @@ def descriptor(dimension: int = 512, seed: int = 0) -> Array:
 
 
 EXACT_DESCRIPTOR = Array("i1", (512,), bytes(k * 37 % 256 for k in range(512)), 0.0078125)
-EXACT_POSES = Array.of(np.array([[k, 0.5 * k, -k, 0.5, 0.5, -0.5, 0.5] for k in range(6)]), "f4")
 ALICE, BOB = LogId("alice"), LogId("bob-2", 0x18F0A1B2C3D)
 TERM = Term(7, ALICE)
 ADVERT = LeaderAdvert(TERM, 5, 123_456, 2)
@@ -117,8 +123,8 @@ RECORDS: tuple[Record, ...] = (
 ENCODED = tuple(encode_record(record) for record in RECORDS)
 
 CORRECTIONS = (
-    LogCorrection(ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), Array.of(np.ones(21)), 3, 2, EXACT_POSES),
-    LogCorrection(BOB, TERM, 0, ALICE, IDENTITY, None, 0, 1, poses_array(0), bytes(range(SIGNATURE_BYTES))),
+    LogCorrection(ALICE, TERM, 5, ALICE, (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0), knots(3, Array.of(np.ones(21), "f2"))),
+    LogCorrection(BOB, TERM, 0, ALICE, IDENTITY, None, bytes(range(SIGNATURE_BYTES))),
 )
 
 MESSAGES: tuple[Message, ...] = (
@@ -129,13 +135,23 @@ MESSAGES: tuple[Message, ...] = (
         ADVERT,
         7,
         2,
-        (LogDigest(ALICE, 13, 0xDEADBEEF), LogDigest(BOB, 40, 17)),
-        (CorrectionVersion(ALICE, TERM, 4), CorrectionVersion(BOB, TERM, 4)),
+        40,
+        17,
+        TableState(2**56 - 1, 53),
+        TableState(0, 2),
         (KeyframeId(BOB, 8),),
         (KeyframeId(ALICE, 3),),
         (KeyframeId(BOB, 7),),
     ),
-    Heartbeat(0, 0, 0, None, 0, 0, ()),
+    Heartbeat(0, 0, 0, None, 0, 0),
+    Digests(
+        0xBEEF,
+        53,
+        (LogDigest(ALICE, 13, 0xDEADBEEF), LogDigest(BOB, 40, 17)),
+        2,
+        (CorrectionVersion(ALICE, TERM, 4), CorrectionVersion(BOB, TERM, 4)),
+    ),
+    DigestRequest(12, 0),
     Election(8),
     Answer(8),
     Coordinator(ADVERT),
@@ -144,6 +160,7 @@ MESSAGES: tuple[Message, ...] = (
     RecordRequest((LogPosition(ALICE, 12), LogPosition(BOB, 41))),
     CorrectionBatch(CORRECTIONS),
     CorrectionRequest((ALICE, BOB)),
+    KnotRequest((CorrectionVersion(ALICE, TERM, 4),)),
     CandidateOffer((CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),), True),
     Separators(
         ALICE,
@@ -171,19 +188,9 @@ def largest_messages() -> list[Message]:
     keyframe = KeyframeId(_long(0), INDEX_MAX)
     other = KeyframeId(_long(1), INDEX_MAX)
 
-    def correction(number: int, keyframes: int) -> LogCorrection:
-        return LogCorrection(
-            _long(number),
-            leader,
-            INDEX_MAX,
-            _long(1),
-            IDENTITY,
-            Array.of(np.ones(21), "f8"),
-            INDEX_MAX - CORRECTION_KEYFRAMES_MAX + 1,
-            1,
-            poses_array(keyframes),
-            bytes(SIGNATURE_BYTES),
-        )
+    def correction(number: int, count: int) -> LogCorrection:
+        told = knots(count, Array.of(np.ones(21), "f8")) if count else None
+        return LogCorrection(_long(number), leader, INDEX_MAX, _long(1), IDENTITY, told, bytes(SIGNATURE_BYTES))
 
     return [
         Heartbeat(
@@ -193,12 +200,22 @@ def largest_messages() -> list[Message]:
             advert,
             TERM_COUNTER_MAX,
             INDEX_MAX,
-            tuple(LogDigest(_long(k), INDEX_MAX, 2**32 - 1) for k in range(LOGS_MAX)),
-            tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(LOGS_MAX)),
+            INDEX_MAX,
+            2**32 - 1,
+            TableState(HASH_MAX, INDEX_MAX),
+            TableState(HASH_MAX, INDEX_MAX),
             (keyframe,) * WANTS_MAX,
             (keyframe,) * WANTS_MAX,
             (keyframe,) * WANTS_MAX,
         ),
+        Digests(
+            INCARNATION_MAX,
+            INDEX_MAX,
+            tuple(LogDigest(_long(k), INDEX_MAX, 2**32 - 1) for k in range(LOGS_MAX)),
+            INDEX_MAX,
+            tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(LOGS_MAX)),
+        ),
+        DigestRequest(INDEX_MAX, INDEX_MAX),
         Election(TERM_COUNTER_MAX),
         Answer(TERM_COUNTER_MAX),
         Coordinator(advert),
@@ -216,9 +233,11 @@ def largest_messages() -> list[Message]:
         ),
         RecordRequest(tuple(LogPosition(_long(k), INDEX_MAX) for k in range(BATCHES_MAX))),
         CorrectionBatch(
-            tuple(correction(k, CORRECTION_KEYFRAMES_MAX // CORRECTIONS_MAX) for k in range(CORRECTIONS_MAX))
+            tuple(correction(k, KNOTS_MAX // CORRECTIONS_MAX - SHORT_WEIGHT) for k in range(CORRECTIONS_MAX))
         ),
-        CorrectionBatch((correction(0, CORRECTION_KEYFRAMES_MAX),)),
+        CorrectionBatch((correction(0, KNOTS_MAX),)),
+        CorrectionBatch(tuple(correction(k, 0) for k in range(CORRECTIONS_MAX))),
+        KnotRequest(tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(KNOT_REQUESTS_MAX))),
         CorrectionRequest(tuple(_long(k) for k in range(LOGS_MAX))),
         CandidateOffer((CandidatePair(keyframe, other),) * OFFERS_MAX, True),
         Separators(
@@ -323,6 +342,7 @@ def _tuples(items: st.SearchStrategy[object], longest: int) -> st.SearchStrategy
 
 
 _starts = st.integers(0, 2**30)
+_states = st.builds(TableState, st.integers(0, HASH_MAX), _counts)
 batches = st.builds(
     RecordBatch, log_ids, _starts, st.integers(0, 2**32 - 1), _tuples(st.binary(max_size=64), RECORDS_BATCH_MAX)
 )
@@ -333,10 +353,7 @@ corrections = st.builds(
     _counts,
     log_ids,
     poses(),
-    optional_arrays((21,)),
-    _starts,
-    st.integers(1, 1000),
-    st.builds(poses_array, st.integers(0, 20), st.integers(0, 2**32 - 1)),
+    st.none() | st.builds(knots, st.integers(1, 20), optional_arrays((21,)), st.integers(0, 2**32 - 1)),
     st.sampled_from((b"", bytes(SIGNATURE_BYTES))),
 )
 messages: st.SearchStrategy[Message] = st.one_of(
@@ -348,12 +365,23 @@ messages: st.SearchStrategy[Message] = st.one_of(
         st.none() | adverts,
         _term_counters,
         _counts,
-        _tuples(st.builds(LogDigest, log_ids, _counts, st.integers(0, 2**32 - 1)), LOGS_MAX),
-        _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), LOGS_MAX),
+        _counts,
+        st.integers(0, 2**32 - 1),
+        _states,
+        _states,
         _tuples(keyframe_ids, WANTS_MAX),
         _tuples(keyframe_ids, WANTS_MAX),
         _tuples(keyframe_ids, WANTS_MAX),
     ),
+    st.builds(
+        Digests,
+        st.integers(0, INCARNATION_MAX),
+        _counts,
+        _tuples(st.builds(LogDigest, log_ids, _counts, st.integers(0, 2**32 - 1)), LOGS_MAX),
+        _counts,
+        _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), LOGS_MAX),
+    ),
+    st.builds(DigestRequest, _counts, _counts),
     st.builds(Election, _term_counters),
     st.builds(Answer, _term_counters),
     st.builds(Coordinator, adverts),
@@ -362,6 +390,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(RecordRequest, _tuples(st.builds(LogPosition, log_ids, _counts), BATCHES_MAX)),
     st.builds(CorrectionBatch, _tuples(corrections, CORRECTIONS_MAX)),
     st.builds(CorrectionRequest, _tuples(log_ids, LOGS_MAX)),
+    st.builds(KnotRequest, _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), KNOT_REQUESTS_MAX)),
     st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
     st.builds(
         lambda anchor, iteration, n, rank: Separators(

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from tests.protocol.wire_examples import IDENTITY, descriptor, largest_messages, poses_array
+from tests.protocol.wire_examples import IDENTITY, descriptor, knots, largest_messages
 
 from flocc_protocol.arrays import Array
+from flocc_protocol.digests import HASH_MAX
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import (
     Answer,
@@ -17,10 +18,13 @@ from flocc_protocol.messages import (
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    DigestRequest,
+    Digests,
     Election,
     Envelope,
     Handover,
     Heartbeat,
+    KnotRequest,
     LeaderAdvert,
     LogCorrection,
     LogDigest,
@@ -29,6 +33,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
+    TableState,
     encode,
     kind_of,
 )
@@ -46,10 +51,15 @@ CHECKSUM = 2**32 - 1
 
 def heartbeat(logs: int) -> Heartbeat:
     """A heartbeat of a robot that holds that many logs of 1,000 records and a correction of each."""
-    digests = tuple(LogDigest(log, 1000, CHECKSUM) for log in LOGS[:logs])
-    return Heartbeat(
-        10_000, 2**52, 5, ADVERT, 7, 3, digests, tuple(CorrectionVersion(log, TERM, 200) for log in LOGS[:logs])
-    )
+    digests, versions = TableState(HASH_MAX, 1000 * logs), TableState(HASH_MAX, 200 * logs)
+    return Heartbeat(10_000, 2**52, 5, ADVERT, 7, 3, 1000, CHECKSUM, digests, versions)
+
+
+def digests(logs: int) -> Digests:
+    """All that such a robot holds, as it tells a new neighbour."""
+    held = tuple(LogDigest(log, 1000, CHECKSUM) for log in LOGS[:logs])
+    versions = tuple(CorrectionVersion(log, TERM, 200) for log in LOGS[:logs])
+    return Digests(2**52, 1000 * logs, held, 200 * logs, versions)
 
 
 def keyframe(place: Array | None) -> KeyframeRecord:
@@ -70,19 +80,20 @@ def records() -> Iterator[tuple[str, Record]]:
     yield "fix", FixRecord(1000, Array.of(np.ones(3), "f8"), Array.of(np.ones(9), "f8"))
 
 
-def correction(keyframes: int) -> CorrectionBatch:
-    """A correction of a log."""
-    return CorrectionBatch(
-        (LogCorrection(LOGS[1], TERM, 200, LOGS[0], IDENTITY, COVARIANCE, 0, 1, poses_array(keyframes)),)
-    )
+def correction(count: int) -> CorrectionBatch:
+    """A correction of a log, with so many knots; in short with none."""
+    told = knots(count, Array.of(np.ones(21), "f2")) if count else None
+    return CorrectionBatch((LogCorrection(LOGS[1], TERM, 200, LOGS[0], IDENTITY, told),))
 
 
 def messages() -> Iterator[tuple[str, Message]]:
     """Messages, by what the table calls them."""
     data = encode_record(keyframe(descriptor(512)))
     yield "heartbeat, 3 logs", heartbeat(3)
-    yield "heartbeat, 10 logs", heartbeat(10)
     yield "heartbeat, 50 logs", heartbeat(50)
+    yield "digests, 3 logs", digests(3)
+    yield "digests, 50 logs", digests(50)
+    yield "want-digests", DigestRequest(40_000, 10_000)
     yield "election", Election(7)
     yield "answer", Answer(7)
     yield "coordinator", Coordinator(ADVERT)
@@ -91,10 +102,11 @@ def messages() -> Iterator[tuple[str, Message]]:
     yield "records, as many such keyframes as fit", Records((RecordBatch.of(LOGS[1], 1000, CHECKSUM, [data] * 100),))
     yield "want-records, 1 log", RecordRequest((LogPosition(LOGS[1], 1000),))
     yield "want-records, 50 logs", RecordRequest(tuple(LogPosition(log, 1000) for log in LOGS))
-    yield "correction, 100 keyframes", correction(100)
-    yield "correction, 400 keyframes", correction(400)
-    yield "correction, 1500 keyframes", correction(1500)
+    yield "correction, in short", correction(0)
+    yield "correction, 30 knots", correction(30)
+    yield "correction, 1500 knots", correction(1500)
     yield "want-correction", CorrectionRequest(LOGS[1:2])
+    yield "want-knots", KnotRequest((CorrectionVersion(LOGS[1], TERM, 200),))
     yield "candidates, 1 pair", CandidateOffer((CandidatePair(QUERY, MATCH),))
 
 

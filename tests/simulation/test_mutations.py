@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from flocc_agent.core import corrections as corrections_module
-from flocc_agent.core.corrections import Corrections, correction_of
+from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.latents import Latents
@@ -71,7 +71,8 @@ def test_a_robot_that_never_follows_breaks_agreement(monkeypatch: pytest.MonkeyP
 
 
 def test_a_robot_that_applies_whatever_comes_breaks_fencing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Corrections, "is_news", lambda self, message: True)
+    monkeypatch.setattr(Corrections, "is_news", lambda self, message, now: True)
+    monkeypatch.setattr(Corrections, "_has_knots", lambda self, version: False)
     late = {"radio": {"jitter_s": 0.3, "duplicate_ratio": 0.5, "reorder_ratio": 0.5, "reorder_delay_s": 4.0}}
     assert "fencing" in broken(scenario(**late))
 
@@ -123,10 +124,13 @@ def test_a_robot_that_does_not_offer_leaves_pairs_unregistered(monkeypatch: pyte
 
 
 def test_corrections_in_frames_of_their_own_break_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    def own_frame(component: Any, log: Any, *rest: Any) -> Any:
-        return replace(correction_of(component, log, *rest), anchor=log)
+    original = Corrections._made
 
-    monkeypatch.setattr(corrections_module, "correction_of", own_frame)
+    def own_frame(self: Corrections, component: Any, log: Any, *rest: Any) -> Any:
+        made = original(self, component, log, *rest)
+        return None if made is None else replace(made, anchor=log)
+
+    monkeypatch.setattr(Corrections, "_made", own_frame)
     assert "one frame" in broken(scenario())
 
 

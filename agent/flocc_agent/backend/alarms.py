@@ -183,12 +183,17 @@ class Judges:
 def held_closures(
     trajectories: Mapping[LogId, Trajectory], closures: Mapping[int, LoopClosure], config: BackendConfig
 ) -> dict[int, str]:
-    """Reasons why closures are held, by number; none where measurements are to be taken as they are given."""
+    """Reasons why closures are held, by number; none where measurements are to be taken as they are given.
+
+    Only closures from images are: others (support is not 1) are fixes, tags, or of an opened map.
+    """
     if config.formulation is Formulation.BASE or config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
         return {}
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
     pairs: dict[tuple[LogId, LogId], list[int]] = {}
     for k, closure in sorted(closures.items()):
+        if closure.support != 1:
+            continue
         low, high = sorted((closure.query, closure.match))
         pairs.setdefault((low.log, high.log), []).append(k)
     judges = [judges_of(ways[a], ways[b], measured(ids, closures, config), a == b) for (a, b), ids in pairs.items()]

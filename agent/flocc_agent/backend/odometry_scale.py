@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import evenly
 from flocc_agent.backend.descent import Solved
-from flocc_agent.backend.edges import State, jacobians, residuals
+from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.linear import SingularSystem
+from flocc_agent.backend.mapped import SavedLog
 from flocc_agent.backend.posing import Posed
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, solve, solve_once
 from flocc_agent.config import Formulation, Solver
@@ -34,6 +35,10 @@ BIAS_RATIO = 0.005
 ASKED_CLOSURES_MAX = 2500
 """Of more closures so many, evenly chosen, are asked for the scales."""
 ROUNDS_MAX = 3
+ASKED_EVERY_ROUND_POSES_MAX = 5000
+"""In a larger graph, rounds that confirm the one before them do not estimate anew."""
+ASKED_POSES_MAX = 50_000
+"""A still larger graph is not asked at all: everything but the scales is eliminated for it."""
 SCALE_MIN = 0.1
 
 
@@ -101,6 +106,9 @@ def solve_with_scales(posed: Posed, initial: GraphSolution | None, anew: PosedAn
     """
     begun = posed.with_scaled(scales_before(posed, initial))
     solved = solve(begun.objective, begun.start, begun.trusted, begun.places)
+    told = told_before(posed, initial) if begun.is_confirmed(solved) else None
+    if told is not None and posed.problem.poses > ASKED_EVERY_ROUND_POSES_MAX:
+        return SolvedWithScales(begun, solved, told)
     found = settled(begun, solved)
     if not is_worth_another(found):
         return found
@@ -118,6 +126,18 @@ def lower(a: SolvedWithScales, b: SolvedWithScales) -> SolvedWithScales:
     return min(a, b, key=SolvedWithScales.penalised_cost)
 
 
+def told_before(posed: Posed, initial: GraphSolution | None) -> Estimates | None:
+    """Estimates of an earlier solution of the same robots; None where it has none."""
+    for component in initial.components if initial is not None else ():
+        scales = [component.odometry_scales.get(log) for log in scalable(posed)]
+        told = [scale for scale in scales if scale is not None]
+        if told and len(told) == len(scales):
+            ratio = np.array([scale.ratio for scale in told])
+            sigma = np.array([scale.sigma_ratio for scale in told])
+            return Estimates(tuple(scalable(posed)), 1.0 / ratio, sigma / ratio**2, told[0].is_metric)
+    return None
+
+
 def scales_before(posed: Posed, initial: GraphSolution | None) -> dict[LogId, float]:
     """Scales that an earlier solution applied."""
     told = [c.odometry_scales for c in initial.components] if initial is not None else []
@@ -130,18 +150,22 @@ def scales_before(posed: Posed, initial: GraphSolution | None) -> dict[LogId, fl
 
 
 def scalable(posed: Posed) -> list[LogId]:
-    """Logs that have a way."""
+    """Robots' logs that have a way; not those of an opened map."""
     lengths = np.diff([*posed.problem.offsets.values(), posed.problem.poses])
-    return [log for log, n in zip(posed.problem.logs, lengths, strict=True) if n > 1 and not is_landmark(log)]
+    return [
+        log
+        for log, n in zip(posed.problem.logs, lengths, strict=True)
+        if n > 1 and not is_landmark(log) and not isinstance(log, SavedLog)
+    ]
 
 
 def is_worth_another(found: SolvedWithScales) -> bool:
     """Whether closures were rejected that a scale may explain, in a round that chose its closures anew."""
     config, posed = found.posed.objective.config, found.posed
     chosen = found.solved.weights[posed.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
-    anew = posed.trusted is None or not np.array_equal(chosen, posed.trusted)
     robust = config.solver in (Solver.GNC_TLS, Solver.GNC_GM) and config.formulation is not Formulation.BASE
-    return robust and anew and not bool(np.all(chosen))
+    few = posed.problem.poses <= ASKED_POSES_MAX
+    return robust and few and not posed.is_confirmed(found.solved) and not bool(np.all(chosen))
 
 
 def settled(posed: Posed, solved: Solved) -> SolvedWithScales:
@@ -164,14 +188,14 @@ def settled(posed: Posed, solved: Solved) -> SolvedWithScales:
 def estimated(posed: Posed, solved: Solved) -> Estimates:
     """What a solution says of all scales, applied or not: one step with all of them free."""
     problem, rows = posed.problem, posed.problem.closure_rows
+    if problem.poses > ASKED_POSES_MAX:
+        return Estimates()
     now = dict.fromkeys(scalable(posed), 1.0) | applied_at(posed, solved.state)
     free = replace(posed, start=solved.state).with_scaled(now)
     weights, edges = asked(solved.weights, rows), free.problem.edges
     at = residuals(edges, free.start)
     try:
-        information, right = free.objective.linear.scales_alone(
-            edges, free.start, at, jacobians(edges, at), weights, problem.clusters
-        )
+        information, right = free.objective.linear.scales_alone(edges, free.start, at, weights, problem.clusters)
         covariance = np.linalg.inv(information)
     except (SingularSystem, np.linalg.LinAlgError):
         return Estimates()

@@ -15,8 +15,9 @@ import numpy as np
 
 from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import initial_poses
+from flocc_agent.backend.initial import component_with, initial_poses
 from flocc_agent.backend.linear import SingularSystem
+from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.odometry_scale import solve_with_scales
 from flocc_agent.backend.posing import Posed, posed
@@ -33,6 +34,7 @@ from flocc_agent.core.pose_graph import (
     components_of,
     stretched,
 )
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
@@ -55,9 +57,26 @@ def optimise(
     Returns:
         The solution, with one result per closure and a sentence for whatever was left out; or why there is none.
     """
+    if graph.saved is not None:
+        return _optimise_in_map(graph, graph.saved, config, initial, covariance_of)
     expanded = with_factors(graph, config, initial)
     solution = _optimise(expanded.graph, config, expanded.initial, covariance_of)
     return solution if isinstance(solution, OptimisationFailed) else without_factors(solution, graph, expanded)
+
+
+def _optimise_in_map(
+    graph: PoseGraph,
+    saved: SavedMap,
+    config: BackendConfig,
+    initial: GraphSolution | None,
+    covariance_of: Sequence[KeyframeId],
+) -> GraphSolution | OptimisationFailed:
+    """Optimise what a team adds to an opened map, in the map's frame."""
+    mapped = with_map(graph, saved, config, initial)
+    if mapped.graph is None:
+        return without_map(None, mapped)
+    solution = optimise(mapped.graph, config, mapped.initial, solver_keyframes(covariance_of, mapped))
+    return solution if isinstance(solution, OptimisationFailed) else without_map(solution, mapped)
 
 
 def _optimise(
@@ -186,7 +205,10 @@ def _solve_connected(
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())
     at = found.posed
-    solution = Solution(at.problem, at.objective, at.start, solved, kept.trajectories, kept.left, found.odometry_scales)
+    earlier = component_with(kept.trajectories, initial) if at.is_confirmed(solved) else None
+    solution = Solution(
+        at.problem, at.objective, at.start, solved, kept.trajectories, kept.left, earlier, found.odometry_scales
+    )
     outcome = collect(solution, wanted)
     times.append(time.perf_counter())
     spans_s = np.diff(times).tolist()

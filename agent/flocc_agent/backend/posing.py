@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import votes
-from flocc_agent.backend.descent import Objective
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, state_of
 from flocc_agent.backend.initial import Aligned, trusted_closures
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import Problem, build
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, Trajectory
 from flocc_protocol.ids import LogId
@@ -38,6 +39,11 @@ class Posed:
     start: State
     trusted: NDArray[np.bool_] | None
     places: Places
+
+    def is_confirmed(self, solved: Solved) -> bool:
+        """Whether a solution rests on the closures that the one before it trusted."""
+        chosen = solved.weights[self.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
+        return self.trusted is not None and np.array_equal(chosen, self.trusted)
 
     def with_scaled(self, scales: Mapping[LogId, float]) -> "Posed":
         """The same in which the odometry of these logs, and of no others, has a scale that starts as given."""

@@ -10,12 +10,20 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PlainSerializer, model_validator
 
-from flocc_agent.config.backend import BackendConfig
+from flocc_agent.config.backend import BackendConfig, BackendMode
 from flocc_agent.config.emulated_radio import RadioConfig
 from flocc_agent.config.network import MetricsConfig, TransportConfig
 from flocc_agent.config.perception import PerceptionConfig
 from flocc_agent.config.ros2 import Ros2Config
-from flocc_agent.config.section import Section, parsed_change, put_value, read_json, read_toml, validated
+from flocc_agent.config.section import (
+    ConfigError,
+    Section,
+    parsed_change,
+    put_value,
+    read_json,
+    read_toml,
+    validated,
+)
 from flocc_agent.core.parameters import INNER, CoreParameters
 from flocc_protocol.ids import checked_name
 
@@ -28,6 +36,9 @@ def written(value: Any) -> Any:
 
 
 CoreSection = Annotated[CoreParameters, PlainSerializer(written)]
+
+
+NO_MAPS = "a map needs a leader that solves: backend.mode = 'distributed' knows no maps"
 
 
 class KeyframeConfig(Section):
@@ -74,6 +85,8 @@ class AgentConfig(Section):
     """Seed of emulated links and synthetic perception; the same for all robots of a swarm."""
     folder: Path | None = None
     """Where the robot's log, latents and events are kept; None keeps them in memory."""
+    map: Path | None = None
+    """A saved map (docs/maps.md) in which the robot finds itself, and which it serves to others."""
     core: CoreSection = CoreParameters()
     """Neighbours, election, gossip, place recognition, loop closing, rounds."""
     keyframes: KeyframeConfig = KeyframeConfig()
@@ -98,10 +111,27 @@ class AgentConfig(Section):
     """Figures for Prometheus."""
 
     @model_validator(mode="after")
+    def _knows_how_to_use_a_map(self) -> "AgentConfig":
+        if self.map is not None and self.backend.mode is BackendMode.DISTRIBUTED:
+            raise ValueError(NO_MAPS)
+        return self
+
+    @model_validator(mode="after")
     def _has_one_source(self) -> "AgentConfig":
         if self.source.recording is not None and self.ros2 is not None and self.ros2.image_topic:
             raise ValueError("images come from source.recording or from ros2.image_topic, not from both")
         return self
+
+    def with_map(self, folder: Path | None) -> "AgentConfig":
+        """The same in a map, where one is given here.
+
+        Raises:
+            ConfigError: The back end knows no maps.
+        """
+        changed = self if folder is None else self.model_copy(update={"map": folder})
+        if changed.map is not None and changed.backend.mode is BackendMode.DISTRIBUTED:
+            raise ConfigError(NO_MAPS)
+        return changed
 
     @classmethod
     def read(cls, path: Path, changes: Iterable[str] = ()) -> "AgentConfig":

@@ -57,7 +57,7 @@ class PartitionConfig(Section):
     """Names, group by group."""
     from_s: float = Field(0.0, ge=0)
     """Begin, seconds after the start of the run."""
-    to_s: float = Field(float("inf"), gt=0)
+    to_s: float = Field(float("inf"), gt=0, allow_inf_nan=True)
     """End, seconds after the start of the run."""
 
 
@@ -68,7 +68,7 @@ class BlackoutConfig(Section):
     """Their names."""
     from_s: float = Field(0.0, ge=0)
     """Begin, seconds after the start of the run."""
-    to_s: float = Field(float("inf"), gt=0)
+    to_s: float = Field(float("inf"), gt=0, allow_inf_nan=True)
     """End, seconds after the start of the run."""
 
 

@@ -55,7 +55,7 @@ class SyntheticConfig(Section):
     """Spread of metres per network unit between registrations (log-normal)."""
     scale_drift_sigma_ratio: float = Field(0.1, ge=0)
     """How much the odometry pair's metres per network unit differ from the loop pair's (log-normal)."""
-    latent_bytes: int = Field(0, ge=0, le=64 * 1024 * 1024)
+    latent_bytes: int = inner(0, ge=0, le=64 * 1024 * 1024)
     """Latents are padded to this size, to load links like another method's; MASt3R's are 1.5 MB."""
 
 
@@ -103,7 +103,7 @@ class Mast3rConfig(Section):
     """Decode (match, query) too and reject closures on which the two disagree; doubles the time."""
     odometry_pairs_max: int = inner(256, ge=1)
     """Odometry-pair results kept in memory."""
-    batch_max: int = Field(1, ge=1, le=64)
+    batch_max: int = inner(1, ge=1, le=64)
     """Images encoded, or pairs decoded, at once; more is faster on a GPU and takes about 1 GB each."""
 
 

@@ -26,12 +26,15 @@ RosName = Annotated[str, AfterValidator(checked_topic)]
 
 
 class Ros2Config(Section):
-    """A ROS 2 robot with rmw_zenoh, without a bridge node (docs/ros2.md). Relative topics lie in the namespace."""
+    """A ROS 2 robot, without a bridge node (docs/ros2.md). Relative topics lie in the namespace."""
 
+    middleware: Literal["auto", "rclpy", "rmw_zenoh"] = "auto"
+    """How the agent speaks to ROS: rclpy of the robot's own ROS, with any middleware; rmw_zenoh without ROS here; auto:
+    rclpy where it can be imported."""
     router: Endpoint = "tcp/localhost:7447"
-    """Where the robot's rmw_zenohd listens."""
-    domain_id: int = Field(0, ge=0, le=232)
-    """The robot's ROS_DOMAIN_ID."""
+    """Where the robot's rmw_zenohd listens; unused with rclpy."""
+    domain_id: int | None = Field(None, ge=0, le=232)
+    """The robot's ROS_DOMAIN_ID; None takes that of the environment, else 0."""
     namespace: RosName = ""
     """Namespace of relative topics, such as /r1."""
     image_topic: RosName = "camera/image_raw"
@@ -49,6 +52,9 @@ class Ros2Config(Section):
     """nav_msgs/Odometry, of base_frame in odom_frame; empty where a program or a recording feeds the agent."""
     fix_topic: RosName = ""
     """sensor_msgs/NavSatFix of a GNSS receiver, whose fixes tie the map to the Earth; empty: there is none."""
+    grid_topic: RosName = ""
+    """nav_msgs/OccupancyGrid of the robot's own mapping, in odom_frame; with those of the others (the same topic in the
+    namespace that is their name) it becomes ~/merged_map. Empty: there is none."""
     map_frame: str = Field("map", min_length=1)
     """Frame that odom_frame is placed in, on /tf (REP 105)."""
     odom_frame: str = Field("odom", min_length=1)
@@ -61,9 +67,9 @@ class Ros2Config(Section):
     """Optical frame in base_frame: x y z qx qy qz qw, metres; None takes it from the topic `tf_topic`_static."""
     tf_topic: RosName = "/tf"
     """Where map_frame to odom_frame is published."""
-    path_topic: RosName = "flocc/path"
+    path_topic: RosName = inner("flocc/path")
     """Where the corrected path is published, nav_msgs/Path."""
-    pose_topic: RosName = "flocc/pose"
+    pose_topic: RosName = inner("flocc/pose")
     """Where the corrected pose is published, geometry_msgs/PoseWithCovarianceStamped."""
     tf_period_s: float = inner(0.05, gt=0)
     """Least time between two transforms, and between two poses."""
@@ -89,6 +95,8 @@ class Ros2Config(Section):
         missing = [name for name in outputs if not getattr(self, name)]
         if missing:
             raise ValueError(f"{missing[0]} must not be empty")
+        if self.grid_topic.startswith("/"):
+            raise ValueError("grid_topic must be relative: it is the same in each robot's namespace")
         if self.map_frame == self.odom_frame:
             raise ValueError("map_frame and odom_frame must differ")
         q = self.camera_mounting[3:] if self.camera_mounting else (1.0,)

@@ -26,7 +26,9 @@ class ConfigError(FloccError):
 class Section(BaseModel):
     """Base of all sections: frozen, and an unknown key is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, ser_json_inf_nan="constants")
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, ser_json_inf_nan="constants", allow_inf_nan=False
+    )
 
     @field_validator("*", mode="after")
     @classmethod

@@ -1,55 +1,59 @@
-"""What a heartbeat says of a table with one entry per log: all of it while that is little, else a part.
+"""What a robot says of a table with one entry per log: a hash of all of it, and what changed to those who ask.
 
-A part holds what changed lately, each change in `REPEATS` heartbeats, and some of the others in turn, so that a robot
-that missed a change hears of it within a few heartbeats. A new neighbour is told everything.
+Changes are numbered from the robot's start on, and each entry carries the number of its last change; so whoever knows
+the table up to a number is told what changed since, and nothing is kept of who was told what.
 """
 
+from itertools import islice
 from typing import Generic, TypeVar
 
+from flocc_protocol.digests import LogDigest, TableState, entry_hash
 from flocc_protocol.ids import LogId
+from flocc_protocol.log_corrections import CorrectionVersion
 
-TURN = 16
-REPEATS = 2
-
-Entry = TypeVar("Entry")
+Entry = TypeVar("Entry", LogDigest, CorrectionVersion)
 
 
 class Announcer(Generic[Entry]):
-    """One table's entries by log, and which of them the next heartbeat carries."""
+    """One table's entries by log, in the order of their last change."""
 
     def __init__(self) -> None:
-        self._entries: dict[LogId, Entry] = {}
-        self._all: tuple[Entry, ...] | None = ()
-        self._fresh: dict[LogId, int] = {}
-        self._logs: list[LogId] = []
-        self._position = 0
+        self._entries: dict[LogId, tuple[int, Entry, int]] = {}
+        self._hash = 0
+        self._changes = 0
 
     def put(self, log: LogId, entry: Entry) -> None:
         """Note an entry, new or changed."""
-        if log not in self._entries:
-            self._logs = sorted([*self._logs, log])
-        self._entries[log] = entry
-        self._fresh[log] = REPEATS
-        self._all = None
+        before = self._entries.pop(log, None)
+        if before is not None:
+            self._hash ^= before[2]
+        hashed = entry_hash(entry)
+        self._hash ^= hashed
+        self._changes += 1
+        self._entries[log] = (self._changes, entry, hashed)
+
+    def remove(self, log: LogId) -> None:
+        """Forget an entry; those who know of it find that hashes differ."""
+        before = self._entries.pop(log, None)
+        if before is not None:
+            self._hash ^= before[2]
+            self._changes += 1
+
+    def state(self) -> TableState:
+        """The whole table, for a heartbeat."""
+        return TableState(self._hash, self._changes)
 
     def all(self) -> tuple[Entry, ...]:
         """Every entry, in the order of the logs."""
-        if self._all is None:
-            self._all = tuple(self._entries[log] for log in self._logs)
-        return self._all
+        return tuple([self._entries[log][1] for log in sorted(self._entries)])
 
-    def say_all(self) -> None:
-        """Let the next heartbeat carry everything: somebody new listens."""
-        self._fresh = {log: self._fresh.get(log, 1) for log in self._logs}
-
-    def next(self) -> tuple[Entry, ...]:
-        """What one heartbeat carries."""
-        if len(self._entries) <= TURN:
-            self._fresh.clear()
-            return self.all()
-        said = dict.fromkeys(self._fresh)
-        self._fresh = {log: left - 1 for log, left in self._fresh.items() if left > 1}
-        for _ in range(TURN):
-            self._position = (self._position + 1) % len(self._logs)
-            said[self._logs[self._position]] = None
-        return tuple(self._entries[log] for log in said)
+    def since(self, changes: int, entries_max: int) -> tuple[int, tuple[Entry, ...]]:
+        """What changed after that many changes, at most so many entries, and the change up to which this tells."""
+        changed: list[tuple[int, Entry, int]] = []
+        for each in reversed(self._entries.values()):
+            if each[0] <= changes:
+                break
+            changed.append(each)
+        told = list(islice(reversed(changed), entries_max))
+        through = told[-1][0] if len(told) < len(changed) else self._changes
+        return through, tuple([entry for _, entry, _ in told])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
@@ -76,13 +77,14 @@ class GraphAssembly:
     """Keyframes, closures and measurements of every known log.
 
     Attributes:
-        keyframes: Number of keyframes of all logs.
+        keyframes: Number of keyframes of all logs but those of an opened map, which are solved already.
         revision: Grows when a solution is out of date: a new log, closure or fix, or a keyframe that one waited for.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, saved: SavedMap | None = None) -> None:
         self.keyframes = 0
         self.revision = 0
+        self._saved = saved
         self._odometry: dict[LogId, _Odometry] = {}
         self._closures: dict[CandidatePair, tuple[LogId, int, ClosureRecord]] = {}
         self._unbuilt: set[CandidatePair] = set()
@@ -131,12 +133,18 @@ class GraphAssembly:
             found = self._odometry_pairs[keyframe] = (KeyframeId(keyframe.log, index), T_neighbour_query)
         return found
 
+    def odometry(self, log: LogId) -> Float:
+        """T_odom_camera (N, 4, 4) of the known keyframes of a log."""
+        odometry = self._odometry.get(log)
+        return np.empty((0, 4, 4)) if odometry is None else odometry.matrices()
+
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
         trajectories = {log: self._trajectory(log) for log in sorted(self._odometry)}
         self._build()
         closures = tuple([self._built[pair] for pair in self._order])
-        return PoseGraph(trajectories, closures, measured=self._measured.factors(self._odometry, self._known))
+        measured = self._measured.factors(self._odometry, self._known)
+        return PoseGraph(trajectories, closures, measured=measured, saved=self._saved)
 
     def _trajectory(self, log: LogId) -> Trajectory:
         T_odom_keyframe = self._odometry[log].matrices()
@@ -169,7 +177,7 @@ class GraphAssembly:
         odometry.poses.append(record.T_odom_camera)
         odometry.stamps_s.append(record.stamp_s)
         odometry.encoded.append(record.descriptor is not None)
-        self.keyframes += 1
+        self.keyframes += self._saved is None or log not in self._saved.closed
         awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry.poses) - 1), 0) > 0
         awaited |= self._measured.awaited(log.robot, record.stamp_s)
         self.revision += awaited or len(odometry.poses) == 1

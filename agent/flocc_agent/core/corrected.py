@@ -1,11 +1,11 @@
 """Corrected poses: a log's correction laid over that log's odometry.
 
-A correction lists some keyframes of its log. Between two of them the correction is interpolated, after the last one
-it stays; so it says where a robot was at any keyframe, and at any time between two. Reports and programs get the
-same poses.
+A correction has knots at some keyframes of its log. Between two of them it is interpolated, after the last one it
+stays; so it says where a robot was at any keyframe, and at any time between two. Reports and programs get the same
+poses, and the leader checked them with the same function (`knots.py`).
 """
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.gossip import LogCopy
+from flocc_agent.core.knots import corrected
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import interpolated, inverse, pose_from_tq, symmetric
@@ -67,18 +68,26 @@ class CorrectedLog:
         self._correction = correction
         self._odometry = odometry
         self._T_camera_body = T_camera_body
-        self._knots: list[Float] = []
 
     def __len__(self) -> int:
         return len(self._odometry.poses())
+
+    @property
+    def log(self) -> LogId:
+        """Which log it is."""
+        return self._correction.log
+
+    @property
+    def T_map_odom(self) -> Float:
+        """(4, 4) of the odom frame that the newest keyframes are in."""
+        return pose_from_tq(np.array(self._correction.T_map_odom))
 
     def pose_of(self, index: int) -> Float | None:
         """Corrected pose (4, 4) at a keyframe, by its number; None where no such keyframe is known."""
         poses = self._odometry.poses()
         if not 0 <= index < len(poses):
             return None
-        T_map_camera = np.asarray(self._T_map_odom(index) @ poses[index])
-        return T_map_camera if self._T_camera_body is None else np.asarray(T_map_camera @ self._T_camera_body)
+        return np.asarray(self._bodies(np.array([poses[index]]), np.array([index]))[0])
 
     def pose_at(self, stamp_s: float) -> Float | None:
         """Corrected pose (4, 4) at a time; None before the first and after the last known keyframe.
@@ -101,34 +110,12 @@ class CorrectedLog:
 
     def poses(self) -> Float:
         """Corrected poses (N, 4, 4) at all known keyframes."""
-        return np.array([self.pose_of(index) for index in range(len(self))]).reshape(-1, 4, 4)
+        poses = np.array(self._odometry.poses()).reshape(-1, 4, 4)
+        return self._bodies(poses, np.arange(len(poses)))
 
-    def _T_map_odom(self, index: int) -> Float:
-        """The correction at a keyframe."""
-        listed = self._listed()
-        if not listed:
-            return pose_from_tq(np.array(self._correction.T_map_odom))
-        knots = self._knots_of(listed)
-        after = bisect_left(listed, index)
-        if after == len(listed):
-            return knots[-1]
-        if after == 0 or listed[after] == index:
-            return knots[after]
-        share = (index - listed[after - 1]) / (listed[after] - listed[after - 1])
-        return interpolated(knots[after - 1], knots[after], share)
-
-    def _listed(self) -> range:
-        """Those keyframes that the correction lists and that are known here."""
-        first, step = self._correction.first, self._correction.step
-        listed = range(first, first + step * self._correction.T_map_camera.shape[0], step)
-        return listed[: bisect_right(listed, len(self._odometry.poses()) - 1)]
-
-    def _knots_of(self, listed: range) -> list[Float]:
-        """T_map_odom at each listed keyframe."""
-        if len(self._knots) != len(listed):
-            rows, poses = self._correction.T_map_camera.numpy(), self._odometry.poses()
-            self._knots = [np.asarray(pose_from_tq(rows[k]) @ inverse(poses[index])) for k, index in enumerate(listed)]
-        return self._knots
+    def _bodies(self, T_odom_camera: Float, numbers: NDArray[np.integer]) -> Float:
+        T_map_camera = corrected(self._correction, T_odom_camera, numbers)
+        return T_map_camera if self._T_camera_body is None else np.asarray(T_map_camera @ self._T_camera_body)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +131,8 @@ class Correction:
         covariance: (6, 6) of T_map_odom, rotation first, or None.
         own: This robot's body in the map.
         others: Robot -> its camera in the same map, by the newest correction that was known when this one came. Where
-            a camera sits on its body, only its robot knows.
+            a camera sits on its body, only its robot knows. Where they are now is always known; how their earlier poses
+            were corrected only after `Agent.follow_others()`, and at a leader.
     """
 
     term: Term
@@ -177,7 +165,7 @@ class Corrector:
 
     def correction(self, applied: LogCorrection, frame_changed: bool, T_body_camera: Float) -> Correction:
         """What an applied correction says of all robots that are known in its frame."""
-        covariance = applied.covariance
+        covariance = None if applied.knots is None else applied.knots.covariance
         return Correction(
             term=applied.term,
             round=applied.round,
@@ -188,6 +176,17 @@ class Corrector:
             own=self._corrected(applied, inverse(T_body_camera)),
             others=self._others(applied),
         )
+
+    def now(self, T_body_camera: Float) -> dict[str, CorrectedLog]:
+        """All robots in this robot's map, itself among them, by the newest corrections; none before its first.
+
+        They share nothing with what programs were given, so another thread may read them.
+        """
+        own = self._robot.corrections.of(self._robot.log)
+        if own is None:
+            return {}
+        fresh = Corrector(self._robot)
+        return {own.log.robot: fresh._corrected(own, inverse(T_body_camera)), **fresh._others(own)}
 
     def _others(self, applied: LogCorrection) -> dict[str, CorrectedLog]:
         """The newest life of every other robot that has a correction in this frame."""

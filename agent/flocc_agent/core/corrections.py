@@ -1,11 +1,13 @@
-"""Corrections: made of a solution by the leader, kept by everybody, passed on, applied when newer.
+"""Corrections: made of a solution by the leader, applied by their owner when newer, known in short to everybody.
 
-A robot holds the newest correction of each log. (term, round) only grows, so a late or repeated one changes
-nothing, and a robot that was away gets the newest from whoever it meets.
+A robot holds the newest correction of each log in short: where the log's odom frame lies in the map. The knots, which
+say how the log's earlier keyframes were corrected, are its owner's business: a leader sends them to owners in range,
+and others ask for theirs, over robots that are nearer to the leader. (term, round) only grows, so a late or repeated
+correction changes nothing, and a robot that was away gets the newest from whoever it meets.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +15,24 @@ from numpy.typing import NDArray
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
+from flocc_agent.core.knot_requests import GRACE_S, KnotRequests
+from flocc_agent.core.knots import Track, corrected, knots_of, strays
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose7, pose_from_tq, tq_from_poses, upper_triangle
-from flocc_protocol.arrays import Array
+from flocc_agent.geometry import pose7, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import (
+    LOGS_MAX,
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    KnotRequest,
     LogCorrection,
+    TableState,
     encode_correction,
 )
 
@@ -34,93 +40,185 @@ Float = NDArray[np.float64]
 
 ANSWERS_MAX = 8
 """Messages with which one request is answered."""
-LISTED_MAX = 400
-"""Keyframes listed in a correction; a longer trajectory is thinned and interpolated, so that messages stay small."""
-KNOTS_MAX = 16
+ASKED_MAX = 8
+"""Times that a correction is asked for; what somebody says to hold and nobody sends is given up."""
+TOLD_MAX = 16
 """Keyframes whose poses people are told with each correction; the report interpolates between them."""
-TRANSLATION_TOLERANCE_M = 1e-3
-ROTATION_TOLERANCE_RAD = 1e-4
-"""A correction that moves no keyframe further is not sent again in one term: nobody would see the difference."""
+COVARIANCE_CHANGE_RATIO = 0.1
+"""A correction whose covariance changed by more than this is sent again although nothing moved."""
+
+
+def _nowhere(log: LogId) -> Float:  # noqa: ARG001
+    return np.empty((0, 4, 4))
+
+
+@dataclass(slots=True)
+class _Wanted:
+    """A newer correction that a peer holds: how often it was asked for, and until when that may be answered."""
+
+    version: CorrectionVersion
+    peer: str
+    asked: int = 0
+    until_s: float = float("-inf")
+
+    def may_ask(self, peer: str, now: float) -> bool:
+        """Whether it is time to ask: the one that holds it, or anybody when that one was not heard for a while."""
+        return self.until_s + (0.0 if peer == self.peer else REQUEST_TIMEOUT_S) <= now
 
 
 class Corrections:
-    """The newest correction of every log, as one robot knows them."""
+    """The newest correction of every log, as one robot knows them, and those knots that it needs.
 
-    def __init__(self, own: LogId, gossip: GossipParameters, sealer: Sealer | None = None) -> None:
+    Attributes:
+        failed_signers: Leaders who did not sign what stands under their names, until somebody clears it.
+    """
+
+    def __init__(
+        self,
+        own: LogId,
+        gossip: GossipParameters,
+        sealer: Sealer | None = None,
+        odometry: Callable[[LogId], Float] = _nowhere,
+        near: Callable[[str], bool] = lambda robot: False,  # noqa: ARG005
+        towards: Callable[[Term], list[str]] = lambda term: [],  # noqa: ARG005
+    ) -> None:
+        """Start without any.
+
+        Args:
+            own: The log that this robot writes.
+            gossip: Limits.
+            sealer: Signs and checks corrections, where the swarm has keys.
+            odometry: T_odom_camera (N, 4, 4) of the known keyframes of a log.
+            near: Whether a robot of this name is in range.
+            towards: Robots in range, those that are nearest to the leader of a term first.
+        """
+        self.failed_signers: set[str] = set()
         self._own = own
         self._gossip = gossip
         self._sealer = sealer
+        self._odometry = odometry
+        self._near = near
         self._newest: dict[LogId, LogCorrection] = {}
+        self._whole: dict[LogId, LogCorrection] = {}
+        self._requests = KnotRequests(towards)
+        self._follows_all = False
         self._frame_unknown = False
-        self._asked_until_s: dict[LogId, float] = {}
-        self._agreed: dict[LogId, CorrectionVersion] = {}
+        self._wanted: dict[LogId, _Wanted] = {}
         self._announcer: Announcer[CorrectionVersion] = Announcer()
 
     @property
     def applied(self) -> LogCorrection | None:
         """The correction that this robot applied last."""
-        return self._newest.get(self._own)
+        return self._whole.get(self._own)
 
     def of(self, log: LogId) -> LogCorrection | None:
-        """The newest known correction of a log."""
-        return self._newest.get(log)
+        """The newest known correction of a log, with its knots where they are known and not older than asked for."""
+        short, whole = self._newest.get(log), self._whole.get(log)
+        if short is None or whole is None or log == self._own:
+            return whole or (None if log == self._own else short)
+        fresh = whole.version >= short.version or (self._follows_all and whole.anchor == short.anchor)
+        return whole if fresh else short
+
+    def follow_all(self) -> None:
+        """Ask for the knots of all logs from now on: somebody looks at where everybody was."""
+        self._follows_all = True
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
         return {
             "corrections": (len(self._newest), self._gossip.logs_max),
-            "asked_corrections": (len(self._asked_until_s), REMEMBERED_MAX),
-            "agreed_corrections": (len(self._agreed), REMEMBERED_MAX),
+            "knots": (len(self._whole), self._gossip.logs_max + 1),
+            "wanted_corrections": (len(self._wanted), REMEMBERED_MAX),
+            **self._requests.sizes(),
         }
 
     def restore(self, message: LogCorrection | None, frame_changed: bool) -> None:
         """Put back the correction that was applied before a restart; consumers may not know its frame yet."""
         if message is not None:
+            self._whole[message.log] = message
             self._keep(message)
         self._frame_unknown = frame_changed
 
-    def announced(self) -> tuple[CorrectionVersion, ...]:
-        """What one heartbeat says of the corrections that this robot holds."""
-        return self._announcer.next()
+    # What is known in short
 
-    def on_neighbour(self) -> None:
-        """Somebody came into range: the next heartbeat says everything."""
-        self._announcer.say_all()
+    def state(self) -> TableState:
+        """Which corrections this robot holds, as a heartbeat says it."""
+        return self._announcer.state()
 
-    def news(self, versions: tuple[CorrectionVersion, ...]) -> tuple[CorrectionVersion, ...]:
-        """Those versions that were not yet found to be no newer than this robot's own."""
-        agreed = self._agreed
-        return tuple([version for version in versions if version is not agreed.get(version.log)])
+    def versions_since(self, changes: int) -> tuple[int, tuple[CorrectionVersion, ...]]:
+        """What of that changed after so many changes, as far as one message tells, and up to which change that is."""
+        return self._announcer.since(changes, LOGS_MAX)
+
+    def has_news(self, versions: tuple[CorrectionVersion, ...]) -> bool:
+        """Whether somebody holds newer ones than this robot."""
+        return any(self._is_newer(version) for version in versions)
 
     def on_versions(self, peer: str, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
         """Ask a peer for corrections that are newer than this robot's."""
-        wanted: list[LogId] = []
         for version in versions:
-            held = self._newest.get(version.log)
-            newer = held is None or (version.term, version.round) > (held.term, held.round)
-            if newer and self._asked_until_s.get(version.log, now) <= now:
-                remember(self._asked_until_s, version.log, now + REQUEST_TIMEOUT_S)
-                wanted.append(version.log)
-            elif not newer:
-                remember(self._agreed, version.log, version)
-        return [Unicast(peer, CorrectionRequest(tuple(wanted)))] if wanted else []
+            wanted = self._wanted.get(version.log)
+            if self._is_newer(version) and (wanted is None or wanted.version < version):
+                remember(self._wanted, version.log, _Wanted(version, peer))
+        return self.ask(peer, now)
+
+    def ask(self, peer: str, now: float) -> list[Effect]:
+        """Ask a peer for what is wanted and was not asked of anybody just now; what nobody sends is given up."""
+        asked: list[LogId] = []
+        for log, wanted in list(self._wanted.items()):
+            if not self._is_newer(wanted.version) or (wanted.asked == ASKED_MAX and wanted.until_s <= now):
+                del self._wanted[log]
+            elif wanted.may_ask(peer, now) and len(asked) < LOGS_MAX:
+                wanted.asked, wanted.until_s = wanted.asked + 1, now + REQUEST_TIMEOUT_S
+                asked.append(log)
+        return [Unicast(peer, CorrectionRequest(tuple(asked)))] if asked else []
 
     def on_request(self, peer: str, request: CorrectionRequest) -> list[Effect]:
         """Pass corrections on, so many that a request cannot call forth a flood."""
         held = [self._newest[log] for log in request.logs if log in self._newest]
-        return [Unicast(peer, batch) for batch in CorrectionBatch.packed(held)[:ANSWERS_MAX]]
+        return [Unicast(peer, batch) for batch in CorrectionBatch.batched(held)[:ANSWERS_MAX]]
 
-    def on_message(self, peer: str, message: LogCorrection) -> list[Effect]:
+    # Knots
+
+    def ask_knots(self, now: float) -> list[Effect]:
+        """Ask for the knots of newer corrections of this robot's log, and of those that somebody looks at."""
+        for log in self._newest if self._follows_all else (self._own,):
+            short = self._newest.get(log)
+            if short is not None and not self._has_knots(short.version):
+                comes_by_itself = self._near(short.term.leader.robot) and log == self._own
+                self._requests.want(short.version, now + (GRACE_S if comes_by_itself else 0.0))
+        return self._requests.ask(now)
+
+    def on_knot_request(self, peer: str, request: KnotRequest, now: float) -> list[Effect]:
+        """Send the knots that are here; ask on for others, and pass them on when they come."""
+        held = [self._whole[version.log] for version in request.versions if self._has_knots(version)]
+        for version in request.versions:
+            if not self._has_knots(version) and version.log != self._own:
+                self._requests.on_interest(peer, version, now)
+        answers: list[Effect] = [Unicast(peer, batch) for batch in CorrectionBatch.batched(held)[:ANSWERS_MAX]]
+        return answers + self._requests.ask(now)
+
+    def _has_knots(self, version: CorrectionVersion) -> bool:
+        whole = self._whole.get(version.log)
+        return whole is not None and whole.version >= version
+
+    # Corrections that came
+
+    def on_message(self, peer: str, message: LogCorrection, now: float = 0.0) -> list[Effect]:
         """Keep a newer correction that its leader made; apply it when it is this robot's."""
-        return (self.refused(peer, message) or self.take(message)) if self.is_news(message) else []
+        return (self.refused(peer, message) or self.take(message, now)) if self.is_news(message, now) else []
 
-    def is_news(self, message: LogCorrection) -> bool:
-        """Whether a correction is newer than the one that is held."""
-        held = self._newest.get(message.log)
-        return held is None or (message.term, message.round) > (held.term, held.round)
+    def is_news(self, message: LogCorrection, now: float = 0.0) -> bool:
+        """Whether a correction is newer than the one that is held, or brings knots that somebody waits for."""
+        if self._is_newer(message.version) or self._is_shorter(message):
+            return True
+        if message.knots is None or self._has_knots(message.version):
+            return False
+        return message.log == self._own or self._follows_all or self._requests.waits(message.log, now)
 
     def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Refuse a newer correction for which there is no room, or which its leader did not make."""
+        if message.log in self._wanted:
+            self._wanted[message.log].asked = 0  # somebody does send it: a counter may rise in steps until it is taken
         if message.log not in self._newest and not self._is_room(message.log):
             return [Report(PeerRefused(peer=peer, reason="too many corrections"))]
         if not self._is_signed(message):
@@ -130,12 +228,30 @@ class Corrections:
     def _is_room(self, log: LogId) -> bool:
         return len(self._newest) < self._gossip.logs_max and lives(self._newest, log.robot) < LIVES_MAX
 
-    def take(self, message: LogCorrection) -> list[Effect]:
-        """Keep a newer correction that was not refused; apply it when it is this robot's."""
-        held = self._newest.get(message.log)
-        self._keep(message)
-        self._asked_until_s.pop(message.log, None)
-        return self._apply(message, held) if message.log == self._own else []
+    def take(self, message: LogCorrection, now: float = 0.0) -> list[Effect]:
+        """Keep a newer correction that was not refused; apply it when it is this robot's and whole."""
+        if self._is_newer(message.version) or self._is_shorter(message):
+            self._keep(message)
+        if message.knots is None:
+            return self.ask_knots(now) if message.log == self._own else []
+        if self._has_knots(message.version):
+            return []
+        passed_on = self._requests.on_knots(message.version, now)
+        if message.log != self._own and not (passed_on or self._follows_all):
+            return []
+        held = self._whole.get(message.log)
+        self._whole[message.log] = message
+        effects: list[Effect] = [Unicast(peer, CorrectionBatch((message,))) for peer in passed_on]
+        return effects + (self._apply(message, held) if message.log == self._own else [])
+
+    def _is_newer(self, version: CorrectionVersion) -> bool:
+        held = self._newest.get(version.log)
+        return held is None or (version.term, version.round) > (held.term, held.round)
+
+    def _is_shorter(self, message: LogCorrection) -> bool:
+        """Whether this is the short form of what is kept whole only because a signature covers all of it."""
+        held = self._newest[message.log]
+        return message.knots is None and held.knots is not None and held.version == message.version
 
     def _is_signed(self, message: LogCorrection) -> bool:
         """Whether the leader of a correction's term made it, where the swarm has keys."""
@@ -144,12 +260,16 @@ class Corrections:
         try:
             self._sealer.check_correction(message.term.leader, encode_correction(message), message.signature)
         except DecodeError:
+            self.failed_signers.add(message.term.leader.robot)
             return False
         return True
 
     def _keep(self, message: LogCorrection) -> None:
-        self._newest[message.log] = message
-        self._announcer.put(message.log, CorrectionVersion(message.log, message.term, message.round))
+        """Keep in short what came; where corrections are signed as they came, until the short form comes, too."""
+        self._newest[message.log] = replace(message, knots=None) if self._sealer is None else message
+        self._announcer.put(message.log, message.version)
+
+    # Corrections that this robot makes
 
     def publish(self, term: Term, round_number: int, solution: GraphSolution) -> list[Effect]:
         """Send what a round changed, as the leader; a log whose solution leaves the map keeps its last correction."""
@@ -165,47 +285,67 @@ class Corrections:
         return self._publish(Term(counter, self._own), round_number, [(component, self._own)])
 
     def _publish(self, term: Term, round_number: int, solved: Sequence[tuple[Component, LogId]]) -> list[Effect]:
+        """Knots to those owners that are in range, the rest in short to all."""
         effects: list[Effect] = []
+        knots: list[Effect] = []
         published: list[LogCorrection] = []
         for component, log in solved:
             try:
-                message = correction_of(component, log, term, round_number, LISTED_MAX)
+                made = self._made(component, log, term, round_number)
             except ValueError as error:
                 reason = f"robot {log.robot}: {error}"
                 effects.append(Report(RoundFailed(term=term, round=round_number, reason=reason)))
                 continue
-            if self._changed(message):
-                message = self._signed(message)
-                published.append(message)
-                effects += self.on_message(self._own.robot, message)
-        return [*(Broadcast(batch) for batch in CorrectionBatch.packed(published)), *effects]
+            if made is not None:
+                whole, short = (self._signed(each) for each in (made, replace(made, knots=None)))
+                published.append(short)
+                effects += self._take_own(whole, short)
+                if log != self._own and self._near(log.robot):
+                    knots.append(Unicast(log.robot, CorrectionBatch((whole,))))
+        return [*knots, *(Broadcast(batch) for batch in CorrectionBatch.batched(published)), *effects]
+
+    def _made(self, component: Component, log: LogId, term: Term, round_number: int) -> LogCorrection | None:
+        """The correction of a log, None where its last one still says the same.
+
+        Raises:
+            ValueError: The solution leaves the map.
+        """
+        poses = np.asarray(component.T_map_keyframe[log])
+        if not np.isfinite(poses).all() or not np.isfinite(component.T_map_odom[log]).all():
+            raise ValueError("a correction's poses must be finite")
+        odometry = self._odometry(log)[: len(poses)]
+        track = Track(
+            odometry, poses[: len(odometry)], component.T_map_odom[log], component.covariance_map_odom.get(log)
+        )
+        held = self._whole.get(log)
+        same = held is not None and (held.term, held.anchor) == (term, component.anchor)
+        if held is not None and same and strays(held, track) <= 1.0 and not _is_surer(held, track.covariance):
+            return None
+        T_map_odom, knots = knots_of(track)
+        made = LogCorrection(log, term, round_number, component.anchor, T_map_odom, knots)
+        try:
+            encode_correction(made)
+        except DecodeError as error:
+            raise ValueError(str(error)) from error
+        return made
+
+    def _take_own(self, whole: LogCorrection, short: LogCorrection) -> list[Effect]:
+        if not self._is_newer(short.version) or (short.log not in self._newest and not self._is_room(short.log)):
+            return []
+        self._keep(short)
+        held = self._whole.get(whole.log)
+        self._whole[whole.log] = whole
+        return self._apply(whole, held) if whole.log == self._own else []
 
     def _signed(self, message: LogCorrection) -> LogCorrection:
         if self._sealer is None:
             return message
         return replace(message, signature=self._sealer.sign_correction(encode_correction(message)))
 
-    def _changed(self, message: LogCorrection) -> bool:
-        """Whether a follower would notice: another term, frame or thinning, or poses that moved."""
-        held = self._newest.get(message.log)
-        if held is None or (held.term, held.anchor, held.step) != (message.term, message.anchor, message.step):
-            return True
-        old, new = held.T_map_camera.numpy(), message.T_map_camera.numpy()
-        if len(old) > len(new):
-            return True
-        shift = np.abs(new[: len(old)] - old)
-        moved = shift[:, :3].max(initial=0.0) > TRANSLATION_TOLERANCE_M
-        turned = shift[:, 3:].max(initial=0.0) > ROTATION_TOLERANCE_RAD
-        return bool(moved or turned) or self._odom_moved(held, message)
-
-    def _odom_moved(self, held: LogCorrection, message: LogCorrection) -> bool:
-        shift = np.abs(np.array(held.T_map_odom) - np.array(message.T_map_odom))
-        return bool(shift.max() > TRANSLATION_TOLERANCE_M)
-
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
-        knots, T_map_camera = told_knots(message)
+        knots, T_map_camera = told_poses(message, self._odometry(self._own))
         fact = CorrectionApplied(
             term=message.term.counter,
             leader=message.term.leader.robot,
@@ -219,28 +359,20 @@ class Corrections:
         return [PersistCorrection(message, changed), Deliver(message, changed), Report(fact)]
 
 
-def told_knots(message: LogCorrection) -> tuple[tuple[int, ...], tuple[Pose7, ...]]:
-    """Numbers and poses of at most `KNOTS_MAX` evenly spread keyframes of a correction, the last listed among them."""
-    rows = message.T_map_camera.numpy()
-    step = max(1, -(-len(rows) // KNOTS_MAX))
-    chosen = range((len(rows) - 1) % step, len(rows), step)
-    return tuple(message.first + message.step * k for k in chosen), tuple(pose7(pose_from_tq(rows[k])) for k in chosen)
+def _is_surer(held: LogCorrection, covariance: Float | None) -> bool:
+    """Whether a covariance is another one than a correction tells: surer or less sure, or known at last."""
+    told = None if held.knots is None or held.knots.covariance is None else symmetric(held.knots.covariance.numpy())
+    if told is None or covariance is None:
+        return (told is None) != (covariance is None)
+    return bool(np.linalg.norm(covariance - told) > COVARIANCE_CHANGE_RATIO * np.linalg.norm(told))
 
 
-def correction_of(component: Component, log: LogId, term: Term, round_number: int, keyframes_max: int) -> LogCorrection:
-    """A log's part of a solution, thinned to at most `keyframes_max` keyframes; the last one is always listed."""
-    poses = np.asarray(component.T_map_keyframe[log])
-    step = max(1, -(-len(poses) // keyframes_max))
-    first = (len(poses) - 1) % step
-    covariance = component.covariance_map_odom.get(log)
-    return LogCorrection(
-        log=log,
-        term=term,
-        round=round_number,
-        anchor=component.anchor,
-        T_map_odom=pose7(component.T_map_odom[log]),
-        covariance=None if covariance is None else upper_triangle(covariance),
-        first=first,
-        step=step,
-        T_map_camera=Array.of(tq_from_poses(poses[first::step]), "f4"),
-    )
+def told_poses(message: LogCorrection, T_odom_camera: Float) -> tuple[tuple[int, ...], tuple[Pose7, ...]]:
+    """Numbers and poses of at most `TOLD_MAX` evenly spread keyframes of a correction, its last one among them."""
+    if message.knots is None or not len(T_odom_camera):
+        return (), ()
+    last = min(int(message.knots.keyframes.numpy()[-1]), len(T_odom_camera) - 1)
+    step = max(1, -(-(last + 1) // TOLD_MAX))
+    numbers = np.arange(last % step, last + 1, step)
+    poses = corrected(message, T_odom_camera[numbers], numbers)
+    return tuple(int(number) for number in numbers), tuple(pose7(T) for T in poses)

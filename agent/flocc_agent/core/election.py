@@ -43,7 +43,7 @@ COUNTER_JUMP_MAX = 1000
 FIRST_COUNTER_MAX = 2**16
 """What a robot that knows of no term yet believes at once; the rest of a greater one comes as for everybody."""
 LOST_MAX = 64
-PEERS_MAX = 256
+PEERS_MAX = 512
 
 
 class Role(Enum):

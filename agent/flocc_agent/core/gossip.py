@@ -1,8 +1,9 @@
 """Replicated logs: every robot owns one, holds copies of all others, and pulls what its copies lack.
 
-Rules: a log only grows, at its end, by its owner. Copies are prefixes. Heartbeats carry how long each copy is and
-its chained checksum; whoever has less asks for the rest, of whomever it heard that from. There is no state per
-neighbour about what was sent, so a lost, doubled, late or reordered message can do no lasting harm.
+Rules: a log only grows, at its end, by its owner. Copies are prefixes. Heartbeats carry one hash of how long all copies
+are and of their chained checksums; whoever has another hash asks what changed, and whoever has less of a log asks for
+the rest, of whomever it heard that from. There is no state per neighbour about what was sent, so a lost, doubled, late
+or reordered message can do no lasting harm.
 What is said of this robot's own log is only a reason to ask for the records; a record that this robot did not write
 is what shows that somebody else writes its log.
 """
@@ -20,6 +21,7 @@ from flocc_agent.core.reports import LogForked, PeerRefused
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import (
+    LOGS_MAX,
     RECORDS_BATCH_BYTES_MAX,
     RECORDS_BATCH_MAX,
     LogDigest,
@@ -27,6 +29,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
+    TableState,
 )
 from flocc_protocol.records import (
     KEYFRAME_CODE,
@@ -115,14 +118,19 @@ class NewRecord(NamedTuple):
 
 
 class Gossip:
-    """All logs that one robot holds."""
+    """All logs that one robot holds.
+
+    Attributes:
+        logs: Its copies, and its own.
+        failed_signers: Robots whose records the swarm's keys did not open, until somebody clears it.
+    """
 
     def __init__(
         self,
         own: LogId,
         parameters: GossipParameters,
         sealer: Sealer | None = None,
-        near: Callable[[str], bool] = lambda robot: False,  # noqa: ARG005
+        near: Callable[[str, float], bool] = lambda robot, now: False,  # noqa: ARG005
     ) -> None:
         """Start with an empty log.
 
@@ -130,15 +138,15 @@ class Gossip:
             own: The log that this robot writes.
             parameters: Limits and times.
             sealer: Signs and checks records, where the swarm has keys.
-            near: Whether a robot of this name is in range.
+            near: Whether a robot of this name was in range when it wrote what it broadcasts at that time.
         """
         self._own = own
         self._parameters = parameters
         self._sealer = sealer
+        self.failed_signers: set[str] = set()
         self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
         self._pulls = Pulls(self._held, near, parameters)
         self._forked: dict[tuple[LogId, str], None] = {}
-        self._agreed: dict[LogId, LogDigest] = {}
         self._told: dict[tuple[str, str], None] = {}
         self._announcer: Announcer[LogDigest] = Announcer()
         self._doubted_until_s: dict[str, float] = {}
@@ -150,7 +158,6 @@ class Gossip:
             **self._pulls.sizes(),
             "forked": (len(self._forked), REMEMBERED_MAX),
             "refused": (len(self._told), REMEMBERED_MAX),
-            "agreed": (len(self._agreed), REMEMBERED_MAX),
             "doubted": (len(self._doubted_until_s), REMEMBERED_MAX),
         }
 
@@ -183,24 +190,28 @@ class Gossip:
         """What this robot holds."""
         return self._announcer.all()
 
-    def announced(self) -> tuple[LogDigest, ...]:
-        """What one heartbeat says of it."""
-        return self._announcer.next()
+    def state(self) -> TableState:
+        """All of that, as a heartbeat says it."""
+        return self._announcer.state()
 
-    def on_neighbour(self) -> None:
-        """Somebody came into range: the next heartbeat says everything."""
-        self._announcer.say_all()
+    def digests_since(self, changes: int) -> tuple[int, tuple[LogDigest, ...]]:
+        """What of it changed after so many changes, as far as one message tells, and up to which change that is."""
+        return self._announcer.since(changes, LOGS_MAX)
+
+    def has_news(self, digests: tuple[LogDigest, ...]) -> bool:
+        """Whether somebody holds more than this robot."""
+        return any(digest.count > self._held(digest.log) for digest in digests)
 
     def on_lost(self, peer: str) -> None:
         """A robot is out of range."""
         self._pulls.on_lost(peer)
 
-    def on_digests(self, sender: LogId, digests: tuple[LogDigest, ...], now: float) -> list[Effect]:
-        """Ask for what others have more of."""
-        agreed = self._agreed
-        news = [digest for digest in digests if digest is not agreed.get(digest.log)]
-        effects = [effect for digest in news for effect in self._on_digest(sender.robot, digest, now)]
-        return effects + self._pulls.ask(now)
+    def on_digests(
+        self, sender: LogId, digests: tuple[LogDigest, ...], now: float, at_once: bool = False
+    ) -> list[Effect]:
+        """Ask for what others have more of; at once where the digests were asked for."""
+        effects = [effect for digest in digests for effect in self._on_digest(sender.robot, digest, now)]
+        return effects + self._pulls.ask(now, at_once)
 
     def _on_digest(self, peer: str, digest: LogDigest, now: float) -> list[Effect]:
         log, count, checksum = digest
@@ -212,7 +223,6 @@ class Gossip:
             if log == self._own:
                 return self._doubt(peer, count, now)
             return self._fork(peer, log, "two writers of one log")
-        remember(self._agreed, log, digest)
         return []
 
     def _behind(self, peer: str, log: LogId, count: int) -> list[Effect]:
@@ -257,8 +267,9 @@ class Gossip:
             new += news
             effects += more
         gap = any(batch.first > self._held(batch.log) for batch in message.batches)
-        if gap or (new and _is_full(message)):
-            effects += self._pulls.ask_on(sender.robot, now)
+        left_out = bool(new) and _is_full(message)
+        if gap or left_out:
+            effects += self._pulls.ask_on(sender.robot, now, left_out)
         return new, effects
 
     def _on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
@@ -307,7 +318,13 @@ class Gossip:
         self._announcer.put(log, LogDigest(log, len(copy), copy.checksums[-1]))
 
     def _opened(self, log: LogId, number: int, data: bytes) -> bytes:
-        return data if self._sealer is None else self._sealer.opened(log, number, data)
+        if self._sealer is None:
+            return data
+        try:
+            return self._sealer.opened(log, number, data)
+        except DecodeError:
+            self.failed_signers.add(log.robot)
+            raise
 
     def _doubt(self, peer: str, end: int, now: float) -> list[Effect]:
         """Ask for a peer's copy of the own log before this number, which it says is another one."""

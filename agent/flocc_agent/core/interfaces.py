@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import CameraDoubted
 from flocc_protocol.arrays import Array
 from flocc_protocol.records import checked_descriptor
 
@@ -43,13 +44,22 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """Pixels (H, W, 3) uint8 in RGB order, with the camera that took them."""
+    """What a camera saw.
+
+    Attributes:
+        pixels: (H, W, 3) uint8 in RGB order.
+        camera: That took them.
+        hidden: (H, W) pixels that move with the camera and show no scene; None: there are none.
+    """
 
     pixels: NDArray[np.uint8]
     camera: Camera
+    hidden: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width, 3)
+        if self.hidden is not None and (self.hidden.shape != expected[:2] or self.hidden.dtype != np.bool_):
+            raise ValueError(f"hidden is {self.hidden.shape} {self.hidden.dtype}, its camera says {expected[:2]} bool")
         if self.pixels.shape != expected or self.pixels.dtype != np.uint8:
             raise ValueError(f"image is {self.pixels.shape} {self.pixels.dtype}, its camera says {expected} uint8")
 
@@ -114,6 +124,21 @@ class PictureEncoder(Encoder, Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenMatches:
+    """Points that look alike in two images, for people to look at.
+
+    Attributes:
+        query: (K, 2) x/z and y/z of each point in the query's camera, free of distortion.
+        match: (K, 2) the same points in the match's camera.
+        agree: (K,) which of them fit one relative pose.
+    """
+
+    query: Float
+    match: Float
+    agree: NDArray[np.bool_]
+
+
 class Registrar(Protocol):
     """Two latents to correspondences and a relative pose up to scale."""
 
@@ -127,6 +152,19 @@ class Registrar(Protocol):
 
         Returns:
             The relative pose up to scale, or why there is none. Raises nothing for bad latents of a peer.
+        """
+        ...
+
+
+@runtime_checkable
+class MatchTelling(Registrar, Protocol):
+    """A registrar that can tell which points it matched."""
+
+    def matches(self, query: bytes, match: bytes, /) -> SeenMatches:
+        """Match two latents of its own.
+
+        Raises:
+            BadLatent: A latent is damaged or of another model.
         """
         ...
 
@@ -172,6 +210,10 @@ class Perception:
             raise TypeError(f"a registration is a Registration or RegistrationFailed, not {type(result).__name__}")
         return result
 
+    def matches(self, query: bytes, match: bytes) -> SeenMatches | None:
+        """Give what the registrar matched in two latents; None where it cannot tell."""
+        return self.registrar.matches(query, match) if isinstance(self.registrar, MatchTelling) else None
+
     def part(self, latent: bytes, encode_bytes: int | None) -> bytes:
         """Give what is sent of a stored latent; see `PictureEncoder.part`."""
         return self.encoder.part(latent, encode_bytes) if isinstance(self.encoder, PictureEncoder) else latent
@@ -179,3 +221,28 @@ class Perception:
     def encode_s(self) -> float | None:
         """Tell how long encoding a received picture takes, seconds; None where pictures are not wanted."""
         return self.encoder.encode_s if isinstance(self.encoder, PictureEncoder) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeLook:
+    """What became of a keyframe's image.
+
+    Attributes:
+        descriptor: None where it was not encoded.
+        latent: The same.
+        fault: Why it was not.
+        doubts: What is odd about the camera, told for the first time.
+    """
+
+    descriptor: Array | None
+    latent: bytes | None
+    fault: str = ""
+    doubts: tuple[CameraDoubted, ...] = ()
+
+
+class ImageWatch(Protocol):
+    """Looks at one robot's images, in the order in which they were taken."""
+
+    def look(self, perception: Perception, image: Image, T_odom_camera: Float) -> KeyframeLook:
+        """Describe and encode an image, and tell what is odd about the camera."""
+        ...

@@ -4,7 +4,11 @@ Who registers a pair: one of its two owners, by a checksum of the pair, so that 
 work is halved between them. A robot that has a neighbour of a higher compute class hands its pairs to it. Whoever
 found a pair that is another's to register tells it so until the record shows. When the other is out of range for
 `TAKEOVER_S`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
-exists no more is rejected, by a record like any other.
+exists no more is rejected, by a record like any other. A robot that comes back does not know what it handed over
+before: it listens who is there before it decides about any pair.
+
+Robots of closed logs (an opened map's, and this robot's own earlier journeys) register nothing: the other owner does.
+Nor are their keyframes queries, so that of their latents only the matching one is needed.
 """
 
 import zlib
@@ -16,6 +20,7 @@ from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Rea
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.pulls import remember
 from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.work import OdometryPairOf, WorkTable
 from flocc_protocol.ids import KeyframeId, LogId
@@ -40,6 +45,8 @@ class LoopClosing:
         odometry_pair: OdometryPairOf,
         parameters: LoopClosingParameters,
         spectral: SpectralOrder | None = None,
+        closed: frozenset[LogId] = frozenset(),
+        listens_until_s: float = float("-inf"),
     ) -> None:
         """Start without pairs.
 
@@ -49,18 +56,23 @@ class LoopClosing:
             odometry_pair: Gives the neighbour of a keyframe.
             parameters: Limits and times.
             spectral: Orders pairs by what they add to the pose graph; None: by similarity.
+            closed: Logs that nobody writes any more, and whose latents are here.
+            listens_until_s: Pairs wait undecided until then.
         """
         self.latents = Latents(own, parameters)
         self.dropped = 0
         self._own = own
+        self._closed = closed
         self._compute_class = compute_class
         self._parameters = parameters
         self._reach = Reach()
-        self._work = WorkTable(own, self.latents, odometry_pair)
+        self._work = WorkTable(own, self.latents, lambda k: None if k.log in closed else odometry_pair(k))
         self._offers = Offers(self.latents)
         self._spectral = spectral
         self._chosen: list[CandidatePair] | None = None
         self._resolved: set[CandidatePair] = set()
+        self._undecided: dict[CandidatePair, Candidate] = {}
+        self._listens_until_s = listens_until_s
         self._wanted: tuple[KeyframeId, ...] = ()
         self._turn = -1
         self._changed = True
@@ -73,7 +85,7 @@ class LoopClosing:
 
     def open_pairs(self) -> list[CandidatePair]:
         """Pairs that this robot is to register, or waits for others to register; sorted."""
-        return sorted([*self._work.pairs(), *self._offers])
+        return sorted([*self._work.pairs(), *self._offers, *self._undecided])
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Queues and tables with their maximum."""
@@ -81,6 +93,7 @@ class LoopClosing:
         return {
             "candidates": (len(self._work), candidates_max),
             "offers": (len(self._offers), candidates_max),
+            "undecided": (len(self._undecided), candidates_max),
             **self.latents.sizes(),
         }
 
@@ -103,8 +116,9 @@ class LoopClosing:
         for pair in offer.pairs:
             if offer.transferred and pair not in self._resolved and pair not in self._work:
                 self._offers.remove(pair)
+                self._undecided.pop(pair, None)
                 self._add(Candidate(pair, 0.0))
-            elif registrar_of(pair) == self._own and not self._knows(pair):
+            elif self._owner(pair) == self._own and not self._knows(pair):
                 self._assign(Candidate(pair, 0.0), now)
 
     def roles(self, pair: CandidatePair) -> tuple[KeyframeId, KeyframeId] | None:
@@ -115,6 +129,7 @@ class LoopClosing:
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
+        self._undecided.pop(pair, None)
         if pair in self._work or pair in self._offers:
             self._work.remove(pair)
             self._offers.remove(pair)
@@ -146,12 +161,18 @@ class LoopClosing:
         self._work.on_evicted(keyframe)
         self._work.stop(pair)
         self._changed = True
-        return self._using(keyframe) if keyframe.log == self._own else []
+        is_lost = keyframe.log == self._own or keyframe.log in self._closed
+        return self._using(keyframe) if is_lost else []
 
     def on_latent_lost(self, keyframe: KeyframeId, now: float) -> list[CandidatePair]:
         """A latent exists no more: the pairs that need it, which are to be rejected; relays pass it on."""
         self.latents.on_gone(keyframe, now)
         return self._using(keyframe)
+
+    def own_lost(self) -> list[KeyframeId]:
+        """Own latents that a pair needs and that the disk did not bring back; nobody else has them."""
+        of_own = self._work.lacking.get(self._own.robot)
+        return sorted(k for k in of_own if k.log == self._own) if of_own else []
 
     def on_lost_elsewhere(self, lost: Iterable[KeyframeId], now: float) -> list[tuple[KeyframeId, CandidatePair]]:
         """A neighbour knows of latents that exist no more; believed where nobody in range has them. Pairs to reject."""
@@ -209,14 +230,17 @@ class LoopClosing:
         if not self._changed and now < self._due_s:
             return []
         self._give_up(now)
-        effects = self._offers.tell(self._reach, now)
+        if self._undecided and self._listens_until_s <= now:
+            self._decide(now)
         for candidate in self._offers.taken_over(self._reach, now):
-            self._add(candidate)
+            self._hand_on_or_add(candidate, now)
+        effects = self._offers.tell(self._reach, now)
         if self.latents.free() > 0:
             effects += self.latents.fetch(self._fetchable(), self._reach, now)
         effects += self._register(now)
         self._changed = False
-        self._due_s = min(self._offers.due_s(), self._work.due_s(), self.latents.due_s(now))
+        heard_s = self._listens_until_s if self._undecided else float("inf")
+        self._due_s = min(self._offers.due_s(), self._work.due_s(), self.latents.due_s(now), heard_s)
         return effects
 
     def deadline(self) -> float:
@@ -226,18 +250,38 @@ class LoopClosing:
     # Assignment
 
     def _knows(self, pair: CandidatePair) -> bool:
-        return pair in self._resolved or pair in self._work or pair in self._offers
+        return pair in self._resolved or pair in self._work or pair in self._offers or pair in self._undecided
+
+    def _decide(self, now: float) -> None:
+        """Listening is over: assign what was found meanwhile."""
+        undecided, self._undecided = self._undecided, {}
+        for candidate in undecided.values():
+            self._assign(candidate, now)
 
     def _assign(self, candidate: Candidate, now: float) -> None:
-        owner = registrar_of(candidate.pair)
+        if now < self._listens_until_s:
+            remember(self._undecided, candidate.pair, candidate, self._parameters.candidates_max)
+            self._changed = True
+            return
+        owner = self._owner(candidate.pair)
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
             self._offer(candidate, Recipient(owner.robot, owner), now)
             return
+        self._hand_on_or_add(candidate, now)
+
+    def _hand_on_or_add(self, candidate: Candidate, now: float) -> None:
+        """A pair that is this robot's goes to a stronger one, where one is in range."""
         stronger = self._reach.stronger(self._compute_class)
         if stronger is not None:
             self._offer(candidate, Recipient(stronger, None), now)
             return
         self._add(candidate)
+
+    def _owner(self, pair: CandidatePair) -> LogId:
+        """Which of its owners registers a pair: one that is there."""
+        if pair.low.log in self._closed:
+            return pair.high.log
+        return pair.low.log if pair.high.log in self._closed else registrar_of(pair)
 
     def _offer(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
         self._offers.add(candidate, recipient, now)

@@ -5,20 +5,24 @@ from dataclasses import dataclass
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.parameters import NeighbourParameters
 from flocc_agent.core.reports import NameTaken, NeighbourRestarted, NeighbourUp, PeerRefused
-from flocc_protocol.ids import LogId
-from flocc_protocol.messages import Heartbeat
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import HOPS_MAX, Heartbeat
 
 LOSS_WEIGHT = 0.05
 """How much one heartbeat weighs in the running share of lost ones: about the last twenty count."""
 
+SETTLED_S = 1.0
+"""A robot that came into range less than this ago wrote most of what it has before it could be heard."""
+
 
 @dataclass(slots=True)
 class Neighbour:
-    """A robot in range: its log, its last heartbeat and when it came, and the running share of heartbeats lost."""
+    """A robot in range: its log, its last heartbeat and when it came, since when, and the share of heartbeats lost."""
 
     log: LogId
     heartbeat: Heartbeat
     heard_s: float
+    since_s: float
     previous_boot: int | None = None
     loss_ratio: float = 0.0
 
@@ -28,6 +32,14 @@ class Neighbour:
         if heartbeat.boot == self.heartbeat.boot and missing >= 0:
             kept = (1.0 - LOSS_WEIGHT) ** missing
             self.loss_ratio = (1.0 - LOSS_WEIGHT) * (1.0 - kept * (1.0 - self.loss_ratio))
+
+
+def _hops(neighbour: Neighbour, term: Term) -> int:
+    """Robots between a neighbour and the leader of a term; more than there may be where it follows another one."""
+    if neighbour.log == term.leader:
+        return -1
+    advert = neighbour.heartbeat.leader
+    return advert.hops if advert is not None and advert.term == term else HOPS_MAX + 1
 
 
 class Neighbours:
@@ -41,12 +53,25 @@ class Neighbours:
         self._duplicates: set[str] = set()
         self._due_s = float("inf")
 
+    def __len__(self) -> int:
+        return len(self._by_name)
+
     def __contains__(self, name: str) -> bool:
         return name in self._by_name
 
     def get(self, name: str) -> Neighbour | None:
         """The neighbour of that name, or None where it is not in range."""
         return self._by_name.get(name)
+
+    def was_near(self, name: str, now: float) -> bool:
+        """Whether a robot was in range already before what it broadcasts now can have been lost on the way."""
+        known = self._by_name.get(name)
+        return known is not None and known.since_s + SETTLED_S <= now
+
+    def towards(self, term: Term) -> list[str]:
+        """Robots in range: the leader of a term, those that follow it over ever more robots, then all others."""
+        away = {name: _hops(neighbour, term) for name, neighbour in self._by_name.items()}
+        return sorted(away, key=lambda name: (away[name], name))
 
     def is_double(self, name: str) -> bool:
         """Whether two robots were heard under this name."""
@@ -68,7 +93,7 @@ class Neighbours:
         if known is None:
             if len(self._by_name) >= self._parameters.neighbours_max:
                 return [Report(PeerRefused(peer=sender.robot, reason="too many neighbours"))]
-            self._by_name[sender.robot] = Neighbour(sender, heartbeat, now)
+            self._by_name[sender.robot] = Neighbour(sender, heartbeat, now, now)
             self._due_s = min(self._due_s, self._expires_s(sender.robot))
             return [Report(NeighbourUp(peer=sender.robot, log=sender))]
         effects = self._restarted(known, sender, heartbeat)

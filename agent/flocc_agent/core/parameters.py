@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 _FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 
-
+CROWD = 32
+"""Robots in range up to which the heartbeat's period is the shortest."""
 INNER = "inner"
 
 
@@ -29,16 +30,24 @@ class NeighbourParameters:
     __pydantic_config__ = _FORBID
 
     heartbeat_period_s: float = _inner(0.5)
-    """Time between heartbeats; shorter notices a lost robot sooner and costs more bytes."""
+    """Time between heartbeats with few robots in range; shorter notices a lost robot sooner and costs more bytes."""
     timeout_s: float = 3.0
     """A robot that was silent for this long is out of range; six periods ride through 30 % loss."""
-    neighbours_max: int = _inner(64)
+    neighbours_max: int = _inner(512)
     """Robots heard at once; further ones are refused and counted."""
 
     def __post_init__(self) -> None:
         _require(self.heartbeat_period_s > 0, "heartbeat_period_s must be positive")
         _require(self.timeout_s > self.heartbeat_period_s, "timeout_s must exceed heartbeat_period_s")
         _require(self.neighbours_max >= 1, "neighbours_max must be at least 1")
+
+    def period_s(self, neighbours: int) -> float:
+        """Time between heartbeats with so many robots in range, at most a third of the timeout.
+
+        Until there, what a robot hears per second grows no further than with `CROWD` of them.
+        """
+        longest_s = max(self.heartbeat_period_s, self.timeout_s / 3.0)
+        return min(self.heartbeat_period_s * max(1.0, neighbours / CROWD), longest_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +74,11 @@ class GossipParameters:
 
     __pydantic_config__ = _FORBID
 
-    logs_max: int = _inner(128)
+    logs_max: int = _inner(512)
     """Logs that are kept; further ones are refused and counted."""
 
     def __post_init__(self) -> None:
-        _require(1 <= self.logs_max <= 256, "logs_max must be in [1, 256]")
+        _require(1 <= self.logs_max <= 1024, "logs_max must be in [1, 1024]")
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,8 @@ class _Descriptors:
 class PlaceRecognition:
     """Compares each new keyframe with those of the other robots.
 
-    A robot with keyframes of its own looks at pairs that it is part of, since both partners do the same.
+    A robot with keyframes of its own looks at pairs that it is part of, since both partners do the same. Its own
+    earlier logs that it knows for closed are compared like another robot's.
 
     Attributes:
         refused: Descriptors of another length than their log's, or without direction.
@@ -64,12 +65,20 @@ class PlaceRecognition:
             threshold; at most as many as logs are kept.
     """
 
-    def __init__(self, own: LogId, parameters: PlaceRecognitionParameters) -> None:
+    def __init__(
+        self, own: LogId, parameters: PlaceRecognitionParameters, closed: frozenset[LogId] = frozenset()
+    ) -> None:
         self._own = own
+        self._closed = closed
         self._parameters = parameters
         self._by_log: dict[LogId, _Descriptors] = {}
         self.refused = 0
         self.best_similarities: dict[str, float] = {}
+
+    @property
+    def similarity_threshold(self) -> float:
+        """From which on two keyframes are candidates."""
+        return self._parameters.similarity_threshold
 
     def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
         """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
@@ -79,7 +88,7 @@ class PlaceRecognition:
             descriptor = direction(place)
             if descriptor is None or not self._add(keyframe, descriptor):
                 self.refused += 1
-            elif keyframe.log.robot != self._own.robot:
+            elif self._is_compared(keyframe.log):
                 others.append((keyframe, descriptor))
             elif keyframe.log == self._own:
                 found += self._among_own(others)
@@ -102,9 +111,9 @@ class PlaceRecognition:
         found = self._within(keyframe, descriptor) if self._parameters.own_gap_keyframes > 0 else []
         for log in sorted(self._by_log):
             others = self._by_log[log]
-            if log.robot != self._own.robot and others.dimension == len(descriptor):
+            if self._is_compared(log) and others.dimension == len(descriptor):
                 similarities = others.matrix @ descriptor
-                found += self._best(keyframe, log, others.indices, similarities, log.robot)
+                found += self._best(keyframe, log, others.indices, similarities, self._name(log))
         return _sorted(found)
 
     def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
@@ -117,8 +126,16 @@ class PlaceRecognition:
         if fitting:
             similarities = np.array([descriptor for _, descriptor in fitting]) @ own.matrix.T
             for (keyframe, _), row in zip(fitting, similarities, strict=True):
-                found += _sorted(self._best(keyframe, self._own, own.indices, row, keyframe.log.robot))
+                found += _sorted(self._best(keyframe, self._own, own.indices, row, self._name(keyframe.log)))
         return found
+
+    def _is_compared(self, log: LogId) -> bool:
+        """Whether a log's keyframes may be partners of this robot's."""
+        return log.robot != self._own.robot or (log in self._closed and log != self._own)
+
+    def _name(self, log: LogId) -> str:
+        """Whose log it is, for people: a robot, or an earlier journey of this one."""
+        return str(log) if log.robot == self._own.robot else log.robot
 
     def _within(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
         """Candidates among this robot's own keyframes that are far enough apart."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.geodesy import Place
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -101,11 +102,19 @@ class MeasuredFactor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraph:
-    """Everything the optimiser needs, for all components at once."""
+    """Everything the optimiser needs, for all components at once.
+
+    Attributes:
+        trajectories: Odometry of every log.
+        closures: Between their keyframes.
+        measured: What else was measured.
+        saved: The opened map, whose logs are among the others; None where there is none.
+    """
 
     trajectories: Mapping[LogId, Trajectory]
     closures: Sequence[LoopClosure] = ()
     measured: Sequence[MeasuredFactor] = ()
+    saved: SavedMap | None = None
 
 
 class ClosureState(Enum):
@@ -173,7 +182,7 @@ class Component:
     """One connected part of the graph, solved in one map frame.
 
     Attributes:
-        logs: Its logs, sorted; the first is the anchor.
+        logs: Its logs, sorted, those of an opened map before all others; the first is the anchor.
         T_map_keyframe: (N, 4, 4) corrected camera poses of each log.
         T_map_odom: (4, 4) of each log: `T_map_keyframe[-1] @ inverse(T_odom_keyframe[-1])`.
         covariance_map_odom: (6, 6) marginal covariance of each log's `T_map_odom`, or None where not computed.
@@ -182,6 +191,7 @@ class Component:
         covariance_keyframe: (6, 6) marginal covariance of keyframes that were asked for, in their own tangent spaces.
         T_map_world: (4, 4) pose of the fixes' world frame, or None without fixes.
         T_map_landmark: (4, 4) pose of each landmark, by name: `tag/NAME`, `world`, `earth` (east, north, up).
+        covariance_rounds: How many rounds ago `covariance_map_odom` was computed; 0 for this one.
         odometry_scales: Of each log whose odometry could be compared with something.
     """
 
@@ -194,6 +204,7 @@ class Component:
     covariance_keyframe: Mapping[KeyframeId, Float] = field(default_factory=dict)
     T_map_world: Float | None = None
     T_map_landmark: Mapping[str, Float] = field(default_factory=dict)
+    covariance_rounds: int = 0
     odometry_scales: Mapping[LogId, OdometryScale] = field(default_factory=dict)
 
     @property

@@ -20,7 +20,7 @@ Entry = TypeVar("Entry")
 
 REMEMBERED_MAX = 1024
 """Open requests and pauses that are remembered; beyond this the oldest are forgotten."""
-PEERS_MAX = 64
+PEERS_MAX = 128
 BROADCAST_RECORDS = 3
 BROADCAST_S = 0.2
 """A robot in range sends its last few records itself; others who heard them sooner are asked only after this time."""
@@ -35,21 +35,24 @@ REQUEST_TIMEOUT_S = 1.0
 
 @dataclass(slots=True)
 class _Asked:
-    """An open request for a log's missing records."""
+    """An open request for a log's missing records, from a number on."""
 
     peer: str
     until_s: float
+    first: int
 
 
 class Pulls:
     """What others hold beyond this robot's copies, and what was asked of them."""
 
-    def __init__(self, held: Callable[[LogId], int], near: Callable[[str], bool], parameters: GossipParameters) -> None:
+    def __init__(
+        self, held: Callable[[LogId], int], near: Callable[[str, float], bool], parameters: GossipParameters
+    ) -> None:
         """Start with nothing to ask for.
 
         Args:
             held: How many records of a log this robot holds.
-            near: Whether a robot of this name is in range.
+            near: Whether a robot of this name was in range when it wrote what it broadcasts at that time.
             parameters: Limits and times.
         """
         self._held = held
@@ -100,9 +103,9 @@ class Pulls:
             self._pauses_s.pop((log, peer), None)
             self._not_before_s.pop((log, peer), None)
 
-    def ask(self, now: float) -> list[Effect]:
-        """Ask whoever is ahead, those with the most first, unless that was done just now."""
-        if not self._ahead or now < self._next_s:
+    def ask(self, now: float, at_once: bool = False) -> list[Effect]:
+        """Ask whoever is ahead, those with the most first, unless that was done just now or it is to be at once."""
+        if not self._ahead or (now < self._next_s and not at_once):
             return []
         effects: list[Effect] = []
         for peer in sorted(self._ahead, key=lambda peer: (-len(self._ahead[peer]), peer)):
@@ -111,11 +114,15 @@ class Pulls:
             self._next_s = now + REQUEST_PERIOD_S
         return effects
 
-    def ask_on(self, peer: str, now: float) -> list[Effect]:
-        """A peer's answer was as long as a message may be, or shows a gap: ask at once for what it left out."""
-        return self._request(peer, now, again=True)
+    def ask_on(self, peer: str, now: float, left_out: bool) -> list[Effect]:
+        """A peer's answer was as long as a message may be, or shows a gap: ask at once for what lacks.
 
-    def _request(self, peer: str, now: float, again: bool) -> list[Effect]:
+        What was asked of it already is asked again only where the answer left logs out, so that many records behind
+        one gap call for one request.
+        """
+        return self._request(peer, now, again=True, repeats=left_out)
+
+    def _request(self, peer: str, now: float, again: bool, repeats: bool = False) -> list[Effect]:
         positions: list[LogPosition] = []
         for log, count in sorted(self._ahead.get(peer, {}).items()):
             held = self._held(log)
@@ -123,14 +130,14 @@ class Pulls:
                 self.on_level(peer, log)
             elif not again and self._is_on_its_way(log, held, count, now):
                 continue
-            elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again):
-                remember(self._asked, log, _Asked(peer, now + REQUEST_TIMEOUT_S))
+            elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again, repeats):
+                remember(self._asked, log, _Asked(peer, now + REQUEST_TIMEOUT_S, held))
                 positions.append(LogPosition(log, held))
         return [Unicast(peer, RecordRequest(tuple(positions)))] if positions else []
 
     def _is_on_its_way(self, log: LogId, held: int, count: int, now: float) -> bool:
         """Whether the records may still come from their writer, who broadcasts them."""
-        if count - held > BROADCAST_RECORDS or not self._near(log.robot):
+        if count - held > BROADCAST_RECORDS or not self._near(log.robot, now):
             return False
         noticed = self._noticed.get(log)
         if noticed is None or noticed[0] != held:
@@ -138,12 +145,12 @@ class Pulls:
             remember(self._noticed, log, noticed)
         return noticed[1] + BROADCAST_S > now
 
-    def _may_ask(self, peer: str, log: LogId, now: float, again: bool) -> bool:
+    def _may_ask(self, peer: str, log: LogId, now: float, again: bool, repeats: bool) -> bool:
         """Whether nobody else is to send the log, and the peer did not disappoint just now."""
         asked = self._asked.get(log)
         if asked is not None:
             if asked.until_s > now:
-                return again and asked.peer == peer
+                return again and asked.peer == peer and (repeats or self._held(log) > asked.first)
             self._did_not_deliver(log, asked.peer, now)
         return self._not_before_s.get((log, peer), now) <= now
 

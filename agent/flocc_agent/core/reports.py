@@ -80,6 +80,25 @@ class EncodingFailed:
     reason: str
 
 
+@fact("camera_doubted")
+class CameraDoubted:
+    """A robot's own pictures contradict its odometry, its calibration, or each other.
+
+    Attributes:
+        doubt: "focal length", "mounting", "focal length and mounting", "mirrored", "inverted poses", "mixed frames",
+            "overlay" (what moves with the camera) or "frozen" (pictures that were taken before).
+        amount: True focal length over the configured one; degrees of a mounting; share of an overlay in the picture;
+            number of frozen pictures; 1 elsewhere.
+        where: An overlay's place in the picture, or the turn about the camera's axes; else empty.
+        pairs: Of consecutive keyframes that say so.
+    """
+
+    doubt: str
+    amount: float
+    where: str
+    pairs: int
+
+
 @fact("candidate")
 class CandidateFound:
     """Two keyframes look alike."""
@@ -308,6 +327,34 @@ class RoundTimedOut:
 
     term: Term
     round: int
+
+
+@fact("map_opened")
+class MapOpened:
+    """A robot began with a saved map: its frame and logs, how many keyframes it has, and whether it is fixed."""
+
+    map_frame: str
+    logs: tuple[LogId, ...]
+    keyframes: int
+    is_fixed: bool
+
+
+@fact("found_in_map")
+class FoundInMap:
+    """A robot's first correction in the frame of the map that it opened: so long after its start and first keyframe."""
+
+    map_frame: str
+    keyframes: int
+    after_start_s: float
+    after_keyframe_s: float
+
+
+@fact("map_log_written")
+class MapLogWritten:
+    """A robot in range writes a log of the opened map, which nobody should write any more."""
+
+    peer: str
+    log: LogId
 
 
 @fact("stale_solution")

@@ -10,9 +10,10 @@ from typing import assert_never
 
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
+from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, DistributedOptimisation
-from flocc_agent.core.effects import Broadcast, Effect, Encode, Report
+from flocc_agent.core.effects import Broadcast, Effect, Encode, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
     LATENT_UNKNOWN,
@@ -33,6 +34,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
+from flocc_agent.core.in_map import InMap
 from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import LoopClosing
@@ -47,6 +49,7 @@ from flocc_agent.core.measurements import (
 )
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.peer_budgets import AnswerBudget, Muted
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
@@ -60,6 +63,7 @@ from flocc_agent.core.reports import (
     SolutionIgnored,
 )
 from flocc_agent.core.rounds import Rounds, solution_report
+from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
@@ -71,12 +75,15 @@ from flocc_protocol.messages import (
     Coordinator,
     CorrectionBatch,
     CorrectionRequest,
-    CorrectionVersion,
+    DigestRequest,
+    Digests,
     Election,
     Envelope,
     Handover,
     Heartbeat,
+    KnotRequest,
     LogCorrection,
+    LogDigest,
     RecordRequest,
     Records,
     Separators,
@@ -106,6 +113,8 @@ class Restored:
         term_counter: Highest term counter the robot claimed.
         correction: The correction it applied last.
         frame_changed: That correction changed the map frame, and nobody knows whether consumers heard of it.
+        saved: The map that it opens; its logs are among the records, its latents among the latents.
+        journeys: Earlier logs of its own that it goes on from.
     """
 
     records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
@@ -113,6 +122,12 @@ class Restored:
     term_counter: int = 0
     correction: LogCorrection | None = None
     frame_changed: bool = False
+    saved: SavedMap | None = None
+    journeys: frozenset[LogId] = frozenset()
+
+    def closed(self) -> frozenset[LogId]:
+        """Logs that nobody writes any more, and whose latents are on this robot's disk."""
+        return self.journeys if self.saved is None else self.journeys | self.saved.closed
 
     def counter_max(self) -> int:
         """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
@@ -154,14 +169,32 @@ class Robot:
         self._heartbeat_s = float("-inf")
         self._pending: list[_Pending] = []
         self._waiting: dict[int, list[Measurement]] = {}
+        self._served = frozenset(restored.latents if restored.saved is not None else ())
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
-        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.__contains__)
-        self.assembly = GraphAssembly()
-        self.recognition = PlaceRecognition(log, parameters.place_recognition)
+        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
+        self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
+        self._answers = AnswerBudget()
+        self._muted = Muted()
+        self.assembly = GraphAssembly(restored.saved)
+        closed = restored.closed()
+        self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
-        self.closing = LoopClosing(log, compute_class, self.assembly.odometry_pair, parameters.loop_closing, spectral)
-        self.corrections = Corrections(log, parameters.gossip, sealer)
+        comes_back = any(each not in closed for each, _ in restored.records)
+        listens_until_s = now + parameters.election.startup_s if comes_back else float("-inf")
+        pair_of = self.assembly.odometry_pair
+        self.closing = LoopClosing(
+            log, compute_class, pair_of, parameters.loop_closing, spectral, closed, listens_until_s
+        )
+        self.in_map = None if restored.saved is None else InMap(restored.saved, now)
+        self.corrections = Corrections(
+            log,
+            parameters.gossip,
+            sealer,
+            odometry=self.assembly.odometry,
+            near=self.neighbours.__contains__,
+            towards=self.neighbours.towards,
+        )
         self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
@@ -172,7 +205,7 @@ class Robot:
     def handle(self, event: Event, now: float) -> list[Effect]:
         """Something happened."""
         effects = self._dispatch(event, now)
-        return effects + self._settle(now)
+        return self._placed(effects + self._settle(now), now)
 
     def tick(self, now: float) -> list[Effect]:
         """Time passed."""
@@ -180,7 +213,13 @@ class Robot:
         effects += self.election.tick(now)
         if self._heartbeat_due_s <= now:
             effects += self._heartbeat(now)
-        return effects + self._settle(now)
+        return self._placed(effects + self._settle(now), now)
+
+    def _placed(self, effects: list[Effect], now: float) -> list[Effect]:
+        """Tell of the opened map, and when this robot finds itself in it."""
+        if self.in_map is None:
+            return effects
+        return effects + self.in_map.told(effects, self.gossip.logs[self.log].keyframes, now)
 
     def deadline(self) -> float:
         """When `tick` is due next, in seconds of the driver's clock."""
@@ -203,9 +242,12 @@ class Robot:
             "neighbours": neighbours,
             "measurements": (sum(map(len, self._waiting.values())), WAITING_MAX * max(len(self._pending), 1)),
             **self.gossip.sizes(),
+            **self.comparisons.sizes(),
             **self.closing.sizes(),
             **self.corrections.sizes(),
             **self.election.sizes(),
+            **self._answers.sizes(),
+            **self._muted.sizes(),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
 
@@ -217,12 +259,12 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor):
+            case KeyframeEncoded(keyframe, descriptor, doubts):
                 self.closing.on_held(keyframe)
-                return self._on_encoded(keyframe, descriptor, now)
-            case KeyframeEncodingFailed(keyframe, reason):
-                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
-                return [report, *self._on_encoded(keyframe, None, now)]
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
+                return [*reports, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
@@ -253,6 +295,10 @@ class Robot:
         match message:
             case Heartbeat():
                 return self._on_heartbeat(sender, message, now)
+            case Digests():
+                return self._on_digests(sender, message, now)
+            case DigestRequest():
+                return self._on_digest_request(sender, message, now)
             case Election():
                 return self.election.on_election(sender, now)
             case Answer():
@@ -261,15 +307,16 @@ class Robot:
                 return self.election.on_coordinator(sender, message, now)
             case Handover():
                 return self.election.on_handover(sender, message, now)
-            case Records():
-                new, effects = self.gossip.on_records(sender, message, now)
-                return effects + self._take(new, now)
+            case Records() | CorrectionBatch():
+                return self._on_signed(sender, message, now)
             case RecordRequest():
-                return self.gossip.on_request(sender, message)
-            case CorrectionBatch(corrections):
-                return [effect for correction in corrections for effect in self._on_correction(sender, correction)]
+                return self._answers.within(sender.robot, self.gossip.on_request(sender, message), now)
             case CorrectionRequest():
-                return self.corrections.on_request(sender.robot, message)
+                return self._answers.within(sender.robot, self.corrections.on_request(sender.robot, message), now)
+            case KnotRequest():
+                near = sender.robot in self.neighbours
+                answers = self.corrections.on_knot_request(sender.robot, message, now) if near else []
+                return self._answers.within(sender.robot, answers, now)
             case CandidateOffer():
                 self.closing.on_offer(message, now)
                 return []
@@ -278,6 +325,22 @@ class Robot:
                     self.distributed.on_separators(sender, message)
                 return []
 
+    def _on_signed(self, sender: LogId, message: Records | CorrectionBatch, now: float) -> list[Effect]:
+        """Take in what is signed, but for what of this sender failed lately."""
+        peer, muted = sender.robot, self._muted
+        if isinstance(message, Records):
+            batches = tuple(b for b in message.batches if not muted.is_muted(peer, b.log.robot, now))
+            new, effects = self.gossip.on_records(sender, Records(batches), now)
+            effects += self._take(new, now)
+        else:
+            heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
+            effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
+        for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
+            for signer in failed:
+                muted.on_failed(peer, signer, now)
+            failed.clear()
+        return effects
+
     def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         known = sender.robot in self.neighbours
         effects = self.neighbours.on_heartbeat(sender, heartbeat, now)
@@ -285,9 +348,10 @@ class Robot:
             return effects
         if not known:
             self._greet(heartbeat, now)
+        if self.in_map is not None:
+            effects += self.in_map.on_heartbeat(sender)
         effects += self.election.on_heartbeat(sender, heartbeat, now)
-        effects += self.gossip.on_digests(sender, heartbeat.digests, now)
-        effects += self._on_versions(sender, heartbeat.corrections, now)
+        effects += self._compare(sender, heartbeat, now)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else heartbeat.compute_class
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
         self.closing.on_wants(heartbeat.wants, now)
@@ -295,17 +359,36 @@ class Robot:
             effects += self._reject_lost([pair], keyframe, now)
         return effects
 
-    def _on_correction(self, sender: LogId, message: LogCorrection) -> list[Effect]:
+    def _on_correction(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
         """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
-        if not self.corrections.is_news(message):
+        if not self.corrections.is_news(message, now):
             return []
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
-        return refused or self.corrections.take(message)
+        return refused or self.corrections.take(message, now)
 
-    def _on_versions(self, sender: LogId, versions: tuple[CorrectionVersion, ...], now: float) -> list[Effect]:
-        """What others say they apply: whoever has something older asks for it, and a leader then outbids it."""
-        news = self.corrections.news(versions)
-        return self.corrections.on_versions(sender.robot, news, now) if news else []
+    def _compare(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
+        """Ask a neighbour for what it has more of, and for what changed in its tables where they are others."""
+        peer, digests, versions = sender.robot, self.gossip.state(), self.corrections.state()
+        own = (LogDigest(sender, heartbeat.records, heartbeat.checksum),) if heartbeat.records else ()
+        effects = self.gossip.on_digests(sender, own, now)
+        if heartbeat.versions.hash != versions.hash:
+            effects += self.corrections.ask(peer, now)
+        effects += self.corrections.ask_knots(now)
+        return effects + self.comparisons.on_heartbeat(peer, heartbeat, digests, versions, now)
+
+    def _on_digests(self, sender: LogId, message: Digests, now: float) -> list[Effect]:
+        """What others hold: whoever has less of a log or an older correction asks for it."""
+        helped = self.gossip.has_news(message.digests) or self.corrections.has_news(message.versions)
+        self.comparisons.on_digests(sender.robot, message, helped, now)
+        effects = self.gossip.on_digests(sender, message.digests, now, at_once=True)
+        return effects + self.corrections.on_versions(sender.robot, message.versions, now)
+
+    def _on_digest_request(self, sender: LogId, request: DigestRequest, now: float) -> list[Effect]:
+        if sender.robot not in self.neighbours or not self.comparisons.may_answer(sender.robot, now):
+            return []
+        digests = self.gossip.digests_since(request.digests_since)
+        versions = self.corrections.versions_since(request.versions_since)
+        return [Unicast(sender.robot, Digests(self._boot, *digests, *versions))]
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
         """Try again later, unless the owner itself no longer has the latent."""
@@ -325,7 +408,7 @@ class Robot:
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
-        return [Encode(KeyframeId(self.log, index), event.image)]
+        return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
@@ -402,7 +485,7 @@ class Robot:
             match record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
-                    if descriptor is not None:
+                    if descriptor is not None and self._may_match(KeyframeId(new.log, index)):
                         described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match))
@@ -412,12 +495,21 @@ class Robot:
                     assert_never(record)
         return self._recognise(described, now) if described else []
 
+    def _may_match(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe can be registered; of a pruned map not all have a latent."""
+        saved = None if self.in_map is None else self.in_map.saved
+        return saved is None or keyframe.log not in saved.closed or keyframe in self._served
+
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
-        """Look for keyframes' candidates; after a restart not between a keyframe and a log where it had a partner."""
+        """Look for keyframes' candidates; after a restart not where both already had a partner in the other's log."""
         found = self.recognition.on_keyframes(keyframes)
         if self._partnered:
-            found = [(k, c) for k, c in found if (k, c.pair.other(k).log) not in self._partnered]
+            found = [(k, c) for k, c in found if not self._had_partners(k, c.pair.other(k))]
         return self.closing.on_candidates([candidate for _, candidate in found], now) if found else []
+
+    def _had_partners(self, one: KeyframeId, other: KeyframeId) -> bool:
+        """Whether each of two keyframes was registered with one of the other's log; else their pair waits still."""
+        return (one, other.log) in self._partnered and (other, one.log) in self._partnered
 
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
@@ -451,12 +543,13 @@ class Robot:
 
     def _heartbeat(self, now: float) -> list[Effect]:
         """Say who is here; a late tick does not make up for heartbeats it missed."""
-        period = self._parameters.neighbours.heartbeat_period_s
+        period = self._parameters.neighbours.period_s(len(self.neighbours))
         self._heartbeat_due_s += period
         if self._heartbeat_due_s <= now:
             self._heartbeat_due_s = now + period
         self._heartbeat_s = now
         self._sequence += 1
+        own = self.gossip.logs[self.log]
         return [
             Broadcast(
                 Heartbeat(
@@ -466,8 +559,10 @@ class Robot:
                     leader=self.election.advert(),
                     term_counter_max=self.election.counter_max,
                     load=self.closing.load,
-                    digests=self.gossip.announced(),
-                    corrections=self.corrections.announced(),
+                    records=len(own),
+                    checksum=own.checksums[-1],
+                    digests=self.gossip.state(),
+                    versions=self.corrections.state(),
                     wants=self.closing.wants(now),
                     holds=self.closing.holds(),
                     lost=self.closing.lost(now),
@@ -476,9 +571,7 @@ class Robot:
         ]
 
     def _greet(self, heartbeat: Heartbeat, now: float) -> None:
-        """Tell a new neighbour everything at once; where groups meet, a leader expects news."""
-        self.gossip.on_neighbour()
-        self.corrections.on_neighbour()
+        """Greet a new neighbour at once; where groups meet, a leader expects news."""
         term = self.election.term
         if term is None or heartbeat.leader is None or heartbeat.leader.term.leader != term.leader:
             self.rounds.hurry(now)
@@ -490,15 +583,19 @@ class Robot:
         for name in gone:
             self.election.on_lost(name)
             self.gossip.on_lost(name)
+            self.comparisons.on_lost(name)
             self.closing.on_lost(name, now)
         return [Report(NeighbourDown(peer=name)) for name in gone]
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
+        effects = self.closing.tick(now)
+        for keyframe in self.closing.own_lost():
+            effects += self._reject_lost(self.closing.on_latent_lost(keyframe, now), keyframe, now)
         if self.distributed is not None:
-            return [*self.closing.tick(now), *self._optimise_together(self.distributed, now)]
+            return [*effects, *self._optimise_together(self.distributed, now)]
         self.rounds.on_term(self.election.term if self.election.leading else None)
-        return [*self.closing.tick(now), *self.rounds.tick(now)]
+        return [*effects, *self.rounds.tick(now)]
 
     def _optimise_together(self, distributed: DistributedOptimisation, now: float) -> list[Effect]:
         """Iterate on the own block, and correct itself."""

@@ -73,9 +73,14 @@ class AgentStopped:
     """An agent ended in order."""
 
 
+@fact("journey_ended")
+class JourneyEnded:
+    """The robot's odometry began anew, as its ROS 2 service was told: from now on it is another journey."""
+
+
 @fact("ros2_router")
 class RouterConnected:
-    """The router of the robot's ROS 2 graph was reached, or is gone."""
+    """The robot's ROS 2 graph was reached (a router, or other nodes), or is gone."""
 
     router: str
     connected: bool

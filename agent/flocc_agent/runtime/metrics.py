@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from flocc_agent.config import MetricsConfig
+from flocc_agent.extras import to_install
 from flocc_agent.runtime.transport import ByPeer, TransportCounters
 from flocc_agent.stages import BOUNDS_S, Histogram
 from flocc_protocol.errors import FloccError
@@ -64,7 +65,7 @@ class MetricsServer:
         try:
             from prometheus_client import CollectorRegistry, start_http_server
         except ImportError as error:
-            raise MetricsError("metrics need prometheus-client: pip install 'flocc[metrics]'") from error
+            raise MetricsError(f"metrics need prometheus-client: {to_install('metrics')}") from error
         assert config.port is not None
         registry = CollectorRegistry()
         registry.register(_Collector(asyncio.get_running_loop(), look))

@@ -2,12 +2,13 @@
 
 import asyncio
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import assert_never
 
 from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.robot import Restored
+from flocc_agent.runtime.map_folder import BadMap, MapFolder
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_agent.runtime.stored_correction import correction_in, stored
 from flocc_protocol.errors import DecodeError
@@ -101,8 +102,10 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
                 assert_never(effect)
 
 
-def restore(store: Store, sealer: Sealer | None = None) -> Restored:
-    """Read everything back; of another robot's log as far as it has no gap.
+def restore(
+    store: Store, sealer: Sealer | None = None, opened: MapFolder | None = None, fixed: bool = False
+) -> Restored:
+    """Read everything back; of another robot's log as far as it has no gap. The logs of an opened map come with it.
 
     A log that the swarm does not take any more is set aside: of a robot that is no member, or signed with other keys or
     with none. Where it is the robot's own, the robot begins another one.
@@ -114,13 +117,45 @@ def restore(store: Store, sealer: Sealer | None = None) -> Restored:
             del read[log]
             store.set_aside(log)
             logger.warning("%s: its %d records on the disk are set aside: %s", log, len(records), fault)
+    latents = set(store.latent_keyframes())
+    own = store.identity.log
+    journeys = frozenset(k.log for k in latents if k.log.robot == own.robot and k.log != own and k.log in read)
+    if opened is not None:
+        read |= joined_logs(opened, read, own, sealer)
+        latents |= set(opened.latent_keyframes())
     return Restored(
         records=tuple(read.items()),
-        latents=tuple(store.latent_keyframes()),
+        latents=tuple(sorted(latents)),
         term_counter=store.term_counter(),
         correction=_correction(store, store.identity.log, sealer),
         frame_changed=store.fact(FRAME_CHANGED) == b"1",
+        saved=None if opened is None else opened.saved(fixed),
+        journeys=journeys,
     )
+
+
+def joined_logs(
+    opened: MapFolder, held: Mapping[LogId, tuple[bytes, ...]], own: LogId | None, sealer: Sealer | None
+) -> dict[LogId, tuple[bytes, ...]]:
+    """The logs of a map, each with what the store holds beyond it.
+
+    Raises:
+        BadMap: The swarm has other keys, this robot writes one of its logs, or the store has another log of that name.
+    """
+    opened.check_keys(sealer)
+    found: dict[LogId, tuple[bytes, ...]] = {}
+    for log, records in opened.records.items():
+        if log == own:
+            raise BadMap(
+                f"{opened.path}: holds the log {log}, which robot {log.robot} goes on writing: "
+                "begin a new journey (--new-journey), or give another folder"
+            )
+        kept = held.get(log, ())
+        both = min(len(kept), len(records))
+        if kept[:both] != records[:both]:
+            raise BadMap(f"{opened.path}: holds another log {log} than the robot's own folder")
+        found[log] = max(kept, records, key=len)
+    return found
 
 
 def _fault(log: LogId, records: Iterable[bytes], sealer: Sealer | None) -> str | None:

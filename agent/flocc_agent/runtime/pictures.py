@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.runtime.decoder_noise import quiet_decoders
 from flocc_agent.runtime.picture_heads import Encoded, PictureError, PictureHead, head_of, stored_tiff
 
 __all__ = [
@@ -134,7 +135,8 @@ def decoded(encoded: Encoded, size: Size | None = None) -> Pixels:
         encoded = stored_tiff(encoded)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        bgr = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+        with quiet_decoders():
+            bgr = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
     except cv2.error:
         bgr = None
     if bgr is None or bgr.shape[:2] != (head.height, head.width):

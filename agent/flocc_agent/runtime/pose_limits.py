@@ -110,3 +110,28 @@ def possible(stamps_s: Float, positions_m: Float) -> NDArray[np.bool_]:
             good[k] = np.linalg.norm(positions_m[k] - positions_m[last]) <= reach_m
             last = k if good[k] else last
     return good
+
+
+SPIKE_STEPS = 20.0
+SPIKE_MIN_M = 10.0
+SPIKE_POSES_MIN = 8
+
+
+def spikes(positions_m: Float) -> NDArray[np.bool_]:
+    """Single poses that jump away from both sides and back, far beyond any other step; of no speed, so of any stamps.
+
+    Args:
+        positions_m: (N, 3) in order of time.
+
+    Returns:
+        (N,) bool; all False where there are too few poses to tell.
+    """
+    found = np.zeros(len(positions_m), dtype=bool)
+    if len(positions_m) < SPIKE_POSES_MIN:
+        return found
+    steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+    far_m = max(SPIKE_MIN_M, SPIKE_STEPS * float(np.quantile(steps_m, 0.75)))
+    away_m = np.minimum(steps_m[:-1], steps_m[1:])
+    across_m = np.linalg.norm(positions_m[2:] - positions_m[:-2], axis=1)
+    found[1:-1] = (away_m > far_m) & (across_m < 0.1 * away_m)
+    return found

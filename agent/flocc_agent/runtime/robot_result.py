@@ -5,6 +5,7 @@ unit length and keyframe identifiers well formed.
 """
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -38,6 +39,9 @@ Keyframe = Annotated[str, AfterValidator(checked_keyframe_id)]
 """A keyframe as text, such as `r1/12`."""
 Pose7 = Annotated[list[float], Field(min_length=7, max_length=7), AfterValidator(with_direction)]
 """Seven finite numbers: translation x y z in metres, quaternion w x y z."""
+
+
+POSE_ORDER = "x y z qw qx qy qz"
 
 
 class Record(BaseModel):
@@ -75,6 +79,8 @@ class RobotResult(Record):
 
     robot: str
     incarnation: int = 0
+    pose_order: str = POSE_ORDER
+    """What the seven numbers of each pose `T_*` are."""
     map_frame: str | None = None
     T_map_odom: Pose7 | None = None
     T_body_camera: Pose7 | None = None
@@ -94,3 +100,18 @@ def stacked_poses(rows: Iterable[Sequence[float]]) -> Float:
     """Poses (N, 4, 4) of rows of seven numbers."""
     poses = [pose_from_tq(np.array(row)) for row in rows]
     return np.array(poses) if poses else np.zeros((0, 4, 4))
+
+
+def write_result(folder: Path, result: RobotResult | None) -> Path:
+    """Write `result.json`, whole or not at all.
+
+    Raises:
+        OSError: There is no result yet, or the disk does not take it.
+    """
+    if result is None:
+        raise FileNotFoundError("there is no result yet")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "result.json"
+    path.with_suffix(".tmp").write_text(result.model_dump_json(), encoding="utf-8")
+    path.with_suffix(".tmp").replace(path)
+    return path

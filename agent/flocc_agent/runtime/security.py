@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import TlsConfig
+from flocc_agent.extras import to_install
 from flocc_agent.runtime.transport import TransportError
 from flocc_protocol import keys
 from flocc_protocol.errors import DecodeError
@@ -264,4 +265,4 @@ def _check_installed() -> None:
     try:
         import cryptography  # noqa: F401
     except ImportError as error:
-        raise TransportError("signed records need the extra 'secure': pip install 'flocc[secure]'") from error
+        raise TransportError(f"signed records need the extra 'secure': {to_install('secure')}") from error

@@ -6,12 +6,17 @@ its form, and a later form keeps a reader for the earlier ones (docs/compatibili
 
 from typing import Any
 
+import numpy as np
+
+from flocc_protocol.arrays import Array
 from flocc_protocol.codec import (
     ARRAY,
     COUNT,
+    FRAME,
     LOG_ID,
     POSE,
     TERM,
+    Pose7,
     blob,
     from_bytes,
     integer,
@@ -20,14 +25,47 @@ from flocc_protocol.codec import (
     to_bytes,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.messages import MESSAGE_BYTES_MAX, LogCorrection
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.log_corrections import KNOTS
+from flocc_protocol.messages import MESSAGE_BYTES_MAX, Knots, LogCorrection
 from flocc_protocol.records import SIGNATURE_BYTES
 
-FORM = 1
+FORM = 2
 
 
 _FIELDS = struct(
     LogCorrection,
+    log=LOG_ID,
+    term=TERM,
+    round=COUNT,
+    anchor=LOG_ID,
+    T_map_odom=FRAME,
+    knots=optional(KNOTS),
+    signature=blob(SIGNATURE_BYTES),
+)
+
+
+def _of_form_1(
+    log: LogId,
+    term: Term,
+    round: int,
+    anchor: LogId,
+    T_map_odom: Pose7,
+    covariance: Array | None,
+    first: int,
+    step: int,
+    T_map_camera: Array,
+    signature: bytes,  # noqa: ARG001  # of other bytes than today's
+) -> LogCorrection:
+    """Poses were listed then; without the odometry they only say where the odom frame lay at the last of them."""
+    last = first + step * max(T_map_camera.shape[0] - 1, 0)
+    numbers = np.zeros(3), np.array([last]), np.zeros((1, 6))
+    about, keyframes, twists = (Array.of(n, dtype) for n, dtype in zip(numbers, ("f8", "u4", "f4"), strict=True))
+    return LogCorrection(log, term, round, anchor, T_map_odom, Knots(covariance, about, keyframes, twists))
+
+
+_FIELDS_1 = struct(
+    _of_form_1,
     log=LOG_ID,
     term=TERM,
     round=COUNT,
@@ -39,6 +77,7 @@ _FIELDS = struct(
     T_map_camera=ARRAY,
     signature=blob(SIGNATURE_BYTES),
 )
+_FORMS = {1: _FIELDS_1, FORM: _FIELDS}
 
 
 def stored(correction: LogCorrection) -> bytes:
@@ -50,7 +89,8 @@ def correction_in(data: bytes) -> LogCorrection | None:
     """Read what `stored` gave; None where it is of a later form, or damaged: the next correction takes its place."""
     try:
         value = from_bytes(data, MESSAGE_BYTES_MAX)
-        return _FIELDS.unpack(value[1:]) if type(value) is list and value[:1] == [FORM] else None
+        form = _FORMS.get(value[0]) if type(value) is list and value and type(value[0]) is int else None
+        return None if form is None else form.unpack(value[1:])
     except DecodeError:
         return None
 
@@ -63,7 +103,7 @@ def from_envelope(robot: str, data: bytes) -> bytes | None:
     try:
         version, _, _, (pairs,) = from_bytes(data, MESSAGE_BYTES_MAX)
         found = [(_fields_of(packed), signature) for packed, signature in pairs] if version == 2 else []
-        return next((to_bytes([FORM, *values, sig]) for values, sig in found if values[0][0] == robot), None)
+        return next((to_bytes([1, *values, sig]) for values, sig in found if values[0][0] == robot), None)
     except (DecodeError, ValueError, TypeError, IndexError):
         return None
 

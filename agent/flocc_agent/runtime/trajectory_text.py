@@ -8,7 +8,7 @@ row costs itself.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
 from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of
-from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, possible
+from flocc_agent.runtime.dated_rows import dated
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
 from flocc_agent.runtime.text_tables import RecordingError, Table, is_number, read_table
@@ -89,7 +90,7 @@ def read_trajectory(
             raise RecordingError(
                 f"{path}: has {len(poses.lines)} poses without stamps, but there are {len(stamps_s)} images"
             )
-        return Trajectory(np.array(stamps_s, dtype=float), poses.T_fixed_body), poses.notes
+        poses = replace(poses, stamps_s=np.array(stamps_s, dtype=float))
     return _in_order(poses, path)
 
 
@@ -111,7 +112,7 @@ def read_poses(path: Path, form: str | None = None, otherwise: str | None = None
     Raises:
         RecordingError: As `read_trajectory`.
     """
-    table = read_table(path)
+    table = dated(read_table(path))
     if not table.rows:
         first = f"; it begins with {table.headers[0][1][:60]!r}" if table.headers else ""
         raise RecordingError(f"{path}: holds no pose{first}")
@@ -443,7 +444,23 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     good = possible(stamps_s, T[:, :3, 3])
     if not np.all(good):
         notes.append(_too_fast(path, lines[~good], len(lines)))
-    return Trajectory(stamps_s[good], T[good]), tuple(notes)
+    stamps_s, T, lines = stamps_s[good], T[good], lines[good]
+    odd = spikes(T[:, :3, 3])
+    if np.any(odd):
+        notes.append(_jumps(path, lines[odd], len(lines)))
+    return Trajectory(stamps_s[~odd], T[~odd]), tuple(notes)
+
+
+def _jumps(path: Path, lines: NDArray[np.int64], count: int) -> str:
+    """Say how many single poses jump away from both sides.
+
+    Raises:
+        RecordingError: They are too many.
+    """
+    fault = f"{len(lines)} of {count} poses jump away from those on both sides"
+    if len(lines) > DAMAGED_RATIO_MAX * count:
+        raise RecordingError(f"{path}:{lines[0]}: {fault}")
+    return f"{path}:{lines[0]}: {fault} and were left out"
 
 
 def _too_fast(path: Path, lines: NDArray[np.int64], count: int) -> str:

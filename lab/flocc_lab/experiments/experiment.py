@@ -70,7 +70,7 @@ class ExperimentFinding:
 
     Attributes:
         claim: In one sentence.
-        source: Where the paper says so, as `Sec. IV-B, Fig. 5`.
+        source: Where the paper says so, as `Sec. IV-B, Fig. 5`; else the page of the repository that does.
         verdict: Whether it holds here.
         numbers: The figures that decide, in one sentence.
     """

@@ -132,7 +132,14 @@ def findings(rows: Sequence[Row]) -> list[ExperimentFinding]:
         f"{merged} of {len(lossy)} runs with {worst:.0%} loss end in one frame; median ATE "
         f"{_metres(ate[1])} against {_metres(ate[0])} without loss."
     )
-    return [judged("A swarm that loses messages still ends in one map", "DESIGN.md 4", merged == len(lossy), numbers)]
+    return [
+        judged(
+            "A swarm that loses messages still ends in one map",
+            "docs/concepts.md, What robots tell each other",
+            merged == len(lossy),
+            numbers,
+        )
+    ]
 
 
 def notes(rows: Sequence[Row]) -> list[str]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.extras import to_install
 from flocc_lab.experiments.experiment import ExperimentError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def keyed_engine(network: Literal["none", "tiny", "small", "full"], exact: bool 
     try:
         import torch
     except ImportError as error:
-        raise ExperimentError("MASt3R needs torch: pip install 'flocc[mast3r]'") from error
+        raise ExperimentError(f"MASt3R needs torch: {to_install('mast3r')}") from error
     from flocc_agent.perception.mast3r.device import choose_compute
     from flocc_agent.perception.mast3r.engine import Engine
     from flocc_agent.perception.mast3r.keyed import MAST3R_SEED, keyed_state

@@ -9,17 +9,22 @@ All of them say where they are partial.
 
 import csv
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from flocc_lab.experiments.experiment import Experiment, ExperimentError, Row, S, Settings, Summary
+from flocc_agent.extras import to_install
+from flocc_lab.experiments.experiment import Experiment, Row, S, Settings, Summary
 from flocc_lab.experiments.folder import ExperimentFolder
 from flocc_launch.runs.run_folder import write_json
 
 FIGURE_INCHES = (8.0, 4.5)
 DOTS_PER_INCH = 150
+logger = logging.getLogger(__name__)
+
+HOW = to_install("figures")
 STYLE: Any = {
     "font.size": 10,
     "axes.grid": True,
@@ -32,16 +37,14 @@ STYLE: Any = {
 }
 
 
-def require_matplotlib() -> None:
-    """Refuse before hours of measuring.
-
-    Raises:
-        ExperimentError: The extra is not installed.
-    """
+def can_draw() -> bool:
+    """Whether figures can be drawn; tables and findings need no matplotlib. Where not, that is said."""
     try:
         import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise ExperimentError("experiments draw figures with matplotlib: pip install 'flocc[figures]'") from error
+    except ImportError:
+        logger.warning("without figures, which need matplotlib: %s, and the same command again draws them", HOW)
+        return False
+    return True
 
 
 def write_outputs(
@@ -61,7 +64,7 @@ def write_outputs(
     (path / f"{name}.md").write_text(text, encoding="utf-8")
     findings = [{**asdict(finding), "verdict": finding.verdict.value} for finding in summary.findings]
     write_json(path / "findings.json", {"partial": partial, "findings": findings})
-    if good:
+    if good and can_draw():
         write_figures(path / name, experiment, settings, good, partial)
 
 

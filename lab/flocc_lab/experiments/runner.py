@@ -19,7 +19,7 @@ from typing import Any
 
 from flocc_lab.experiments.experiment import Cell, Experiment, ExperimentError, Progress, Row, S, Summary
 from flocc_lab.experiments.folder import ExperimentFolder, configuration_of
-from flocc_lab.experiments.outputs import require_matplotlib, write_outputs
+from flocc_lab.experiments.outputs import write_outputs
 from flocc_protocol.errors import FloccError
 
 OnRow = Callable[[Row, int, int], None]
@@ -77,7 +77,6 @@ def run_experiment(
         Interrupted: Ctrl-C.
         FloccError: The data cannot be used.
     """
-    require_matplotlib()
     configuration = configuration_of(experiment.name, settings.model_dump(mode="json"), seed)
     folder = ExperimentFolder.start(out, configuration)
     try:

@@ -1,11 +1,13 @@
 """What commands share: endings, progress, and how a scenario's report is shown."""
 
+import json
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,6 +20,34 @@ EXIT_TRY_AGAIN = 75
 """An agent's disk or machine was at its end: systemd starts it again, which it does not after bad input."""
 
 
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts; all else goes to stderr.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say only what came of it, and what was missed.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say bytes by kind and times by stage as well.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Speech:
+    """How much a command says, and in which form."""
+
+    as_json: bool = False
+    quiet: bool = False
+    verbose: bool = False
+
+    def __post_init__(self) -> None:
+        if self.quiet and self.verbose:
+            raise typer.BadParameter("--quiet and --verbose contradict each other")
+
+    def tell(self, sentence: str) -> None:
+        """Say something on the way; where JSON is wanted, beside it."""
+        if not self.quiet:
+            typer.echo(sentence, err=self.as_json)
+
+
+def facts(fields: Any) -> None:
+    """Print facts as JSON; what JSON has no word for, such as a path, as text."""
+    typer.echo(json.dumps(fields, indent=1, default=str))
+
+
 PROGRESS_LINE_PERIOD_S = 15.0
 """Where nobody looks at a terminal, a long job says a line this often, so that a log shows that it goes on."""
 
@@ -25,13 +55,15 @@ PROGRESS_LINE_PERIOD_S = 15.0
 @contextmanager
 def progress_bar(what: str, unit: str = "picture") -> Iterator[Callable[[int, int], None]]:
     """A progress bar with an estimate, which takes (done, all); without a terminal, a line now and then."""
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    if not sys.stdout.isatty():
+    if not sys.stderr.isatty():
         yield ProgressLines(what, unit, time.monotonic).tell
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(unit), MofNCompleteColumn(" of "))
-    with Progress(*columns, TimeRemainingColumn(elapsed_when_finished=True), transient=True) as bar:
+    left = TimeRemainingColumn(elapsed_when_finished=True)
+    with Progress(*columns, left, transient=True, console=Console(stderr=True)) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
@@ -48,19 +80,24 @@ class ProgressLines:
         now_s = self._clock()
         if now_s - self._said_s < PROGRESS_LINE_PERIOD_S or done == 0:
             return
+        from flocc_launch.runs.plain_numbers import duration
+
         self._said_s = now_s
         left_s = (now_s - self._begin_s) / done * (total - done)
-        typer.echo(f"{self._what}: {self._unit} {done} of {total}, about {left_s:.0f} s left", err=True)
+        typer.echo(f"{self._what}: {self._unit} {done} of {total}, about {duration(left_s)} left", err=True)
 
 
-def show_report(report: "RunReport", out: Path) -> None:
+def show_report(report: "RunReport", out: Path, speech: Speech | None = None) -> None:
     """Print what came of a run, what was missed in red; exit code 1 where something was, or where no robot lived."""
-    from flocc_launch.report.text import MISSED, sentences
+    from flocc_launch.report.text import MISSED, sentences, short_sentences
 
-    for sentence in sentences(report):
+    said = speech or Speech()
+    if said.as_json:
+        typer.echo(report.model_dump_json(indent=1))
+    for sentence in () if said.as_json else short_sentences(report) if said.quiet else sentences(report, said.verbose):
         is_missed = sentence.startswith(MISSED)
         typer.secho(sentence, fg="red" if is_missed else None, bold=is_missed or None)
-    typer.echo(f"report: {(out / 'report.html').resolve()}")
+    typer.echo(f"report: {(out / 'report.html').resolve()}", err=said.as_json)
     none_lived = bool(report.robot_details) and all(robot.end == "died" for robot in report.robot_details)
     if none_lived or any(expectation.met is not True for expectation in report.expectations):
         sys.exit(EXIT_MISSED)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flocc_launch.commands.common import progress_bar
+from flocc_launch.commands.common import Json, facts, progress_bar
 
 dataset = typer.Typer(help="Look at data sets and bags, convert them, cut them.", rich_markup_mode=None)
 weights = typer.Typer(help="Weights of the learned and the mast3r front end.", rich_markup_mode=None)
@@ -45,10 +45,15 @@ def add_data(app: typer.Typer) -> None:
 
 
 @dataset.command()
-def info(source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None) -> None:
+def info(
+    source: Source, format_name: Format = None, trajectory_format: TrajectoryFormat = None, json_out: Json = False
+) -> None:
     """Say what a data set holds, without writing anything."""
     from flocc_launch.datasets.commands import info_lines, infos
 
+    if json_out:
+        facts([asdict(found) for found in infos(source, format_name, trajectory_format)])
+        return
     for number, found in enumerate(infos(source, format_name, trajectory_format)):
         if number:
             typer.echo("")
@@ -62,11 +67,15 @@ def clock(
     odometry: Annotated[Path | None, typer.Option(help="Another trajectory than the folder's.")] = None,
     camera: CameraFile = None,
     trajectory_format: TrajectoryFormat = None,
+    json_out: Json = False,
 ) -> None:
     """Measure how far pictures and odometry are apart in time, by turns that both show."""
     from flocc_launch.datasets.commands import clock as run
 
     fit = run(source, odometry, camera, trajectory_format)
+    if json_out:
+        facts(asdict(fit))
+        return
     typer.echo(f"{'offset':14} {fit.offset_s:+.3f} s to be added to odometry: flocc dataset convert --time-offset")
     drift = "not to be told from none" if fit.drift_ratio is None else f"{1e6 * fit.drift_ratio:+.0f} ppm"
     typer.echo(f"{'drift':14} {drift}")
@@ -168,6 +177,7 @@ def split(
 @weights.command()
 def status(
     config: Annotated[Path | None, typer.Option(help="An agent's configuration that names the files.")] = None,
+    json_out: Json = False,
 ) -> None:
     """Say which files are needed, under which licence, and whether they are there."""
     from flocc_agent.config import AgentConfig, Mast3rConfig
@@ -175,7 +185,11 @@ def status(
     from flocc_launch.setup.weight_files import status as look
 
     mast3r = Mast3rConfig() if config is None else AgentConfig.read(config).perception.mast3r
-    for needed in [*map(asdict, look(mast3r)), *map(asdict, look_at_learned())]:
+    files = [*map(asdict, look(mast3r)), *map(asdict, look_at_learned())]
+    if json_out:
+        facts(files)
+        return
+    for needed in files:
         for key, value in needed.items():
             typer.echo(f"{key:12} {'not configured' if value is None else value}")
         typer.echo("")
@@ -197,11 +211,14 @@ def get(
 
 
 @weights.command()
-def check(file: Annotated[Path, typer.Argument(help="Checkpoint.")]) -> None:
+def check(file: Annotated[Path, typer.Argument(help="Checkpoint.")], json_out: Json = False) -> None:
     """Verify a checkpoint: names, shapes, hash, and a small run of the network."""
     from flocc_launch.setup.weight_files import check as run
 
     found = run(file)
+    if json_out:
+        facts(asdict(found))
+        return
     for field in fields(found):
         typer.echo(f"{field.name.replace('_', ' '):14} {getattr(found, field.name)}")
 
@@ -235,9 +252,14 @@ def keys(
     folder: Annotated[Path, typer.Argument(help="Where the authority and a folder per robot stand or will stand.")],
     robots: Annotated[list[str], typer.Argument(help="Names of the robots to admit.")],
     swarm: Annotated[str, typer.Option(help="Name of the swarm; one authority certifies one swarm.")] = "swarm",
+    json_out: Json = False,
 ) -> None:
     """Make a swarm's certificate authority, and a certificate and a signing key per robot."""
     from flocc_launch.setup.credentials import make_keys
 
-    for name, path in make_keys(folder, swarm, robots).items():
+    made = make_keys(folder, swarm, robots)
+    if json_out:
+        facts(made)
+        return
+    for name, path in made.items():
         typer.echo(f"{name}: {path}")

@@ -5,6 +5,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from flocc_launch.runs.plain_numbers import duration
 from flocc_launch.swarm.launching import Watch
 from flocc_launch.swarm.processes import AgentProcess
 
@@ -43,7 +44,7 @@ PRINT_PERIOD_S = 10.0
 
 def table_of(watch: Watch) -> Table:
     """The table of one moment."""
-    table = Table(title=f"{watch.scenario.name}   {watch.elapsed_s:.0f} s", title_justify="left")
+    table = Table(title=f"{watch.scenario.name}   {duration(watch.elapsed_s)}", title_justify="left")
     for column in COLUMNS:
         table.add_column(column, justify="left" if column in ("robot", "state", "leader", "map frame") else "right")
     for agent in watch.agents:
@@ -90,4 +91,4 @@ def line_of(watch: Watch) -> str:
         said = agent.said
         counts = f"{said.keyframes} keyframes, {said.closures} closures, {said.map_frame or '-'}"
         parts.append(f"{agent.name} {state_of(agent)}: {counts}")
-    return f"{watch.elapsed_s:6.0f} s  " + "; ".join(parts)
+    return f"{duration(watch.elapsed_s):>10}  " + "; ".join(parts)

@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from flocc_launch.commands.common import EXIT_BAD_INPUT, EXIT_TRY_AGAIN, progress_bar, show_report
+from flocc_launch.commands.common import (
+    EXIT_BAD_INPUT,
+    EXIT_TRY_AGAIN,
+    Json,
+    Quiet,
+    Speech,
+    Verbose,
+    progress_bar,
+    show_report,
+)
 from flocc_launch.commands.data import add_data
 from flocc_launch.commands.lab import add_lab
+from flocc_launch.commands.map_commands import add_maps
 from flocc_launch.commands.offline import add_offline, run_campaign
 from flocc_launch.commands.tools import add_tools
 from flocc_launch.setup.world_faults import may_pass, sentence_of, speak_utf8
@@ -17,6 +27,7 @@ from flocc_launch.setup.world_faults import may_pass, sentence_of, speak_utf8
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from flocc_launch.maps.opening import MapUse
     from flocc_launch.scenarios.scenario import Scenario
     from flocc_launch.swarm.launching import OnWatch
 
@@ -50,7 +61,9 @@ def options(
     """Decentralized collaborative SLAM: run swarms of agents on one machine, in simulation, or on robots."""
 
 
+FIXED_WHAT = "--map-fixed says of --map that it does not move; give --map FOLDER"
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
+ROS_ARGS = "All that follows goes to ROS 2: -p KEY:=VALUE, -r FROM:=TO, --params-file FILE."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
 Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
@@ -59,6 +72,8 @@ Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a 
 Range = Annotated[float | None, typer.Option("--range", min=0.0, help="Communication range by true position, metres.")]
 Duration = Annotated[float | None, typer.Option(min=0.0, help="End after so many seconds, not when all is settled.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
+Map = Annotated[Path | None, typer.Option("--map", help="A saved map in which the robots find themselves.")]
+MapFixed = Annotated[bool, typer.Option("--map-fixed", help="The map does not move, whatever is measured in it.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Another value for a key, such as radio.loss_ratio=0.3.")]
 
 
@@ -66,7 +81,7 @@ def main() -> None:
     """Entry point: one clear sentence and exit code 2 for bad input, a traceback only for a bug."""
     speak_utf8()
     try:
-        app()
+        app(with_ros_args(sys.argv[1:]), prog_name="flocc")
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -74,6 +89,17 @@ def main() -> None:
         if sentence is None:
             raise
         fail(sentence)
+
+
+def with_ros_args(words: list[str]) -> list[str]:
+    """Words of a command line with each one between `--ros-args` and its end (or `--`) as that option's value."""
+    if "--ros-args" not in words:
+        return words
+    at = words.index("--ros-args")
+    given, rest = words[at + 1 :], list[str]()
+    if "--" in given:
+        given, rest = given[: given.index("--")], given[given.index("--") + 1 :]
+    return [*words[:at], *rest, *(f"--ros-args={word}" for word in given)]
 
 
 def fail(sentence: str, code: int = EXIT_BAD_INPUT) -> NoReturn:
@@ -87,14 +113,22 @@ def demo(
     out: Out = Path("runs/demo"),
     robots: Annotated[int, typer.Option(min=2, max=8, help="Robots in the generated world.")] = 3,
     seed: Annotated[int, typer.Option(help="Another seed is another world.")] = 7,
+    small: Annotated[bool, typer.Option("--small", help="Shorter routes, smaller pictures: within a minute.")] = False,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run the main job: robots in a generated world, real images, real zenoh, one report."""
-    from flocc_launch.scenarios.scenario import Scenario
     from flocc_launch.scenarios.shipped import read_shipped
+    from flocc_launch.scenarios.small_demo import small_demo
 
-    scenario = read_shipped("demo", {"world.robots": robots, "world.seed": seed})
-    assert isinstance(scenario, Scenario)
-    _launch(scenario, out)
+    speech = Speech(json_out, quiet, verbose)
+    if not small:
+        _launch(read_shipped("demo", {"world.robots": robots, "world.seed": seed}), out, speech)
+        return
+    with progress_bar("preparing data") as progress:
+        scenario = small_demo(robots, seed, progress)
+    _launch(scenario, out, speech)
 
 
 @app.command(short_help="Run a scenario or your own data, a process per robot.")
@@ -113,12 +147,25 @@ def launch(
     dashboard: Annotated[str | None, typer.Option(help="Serve a live page at [HOST:]PORT.")] = None,
     metrics: Annotated[str | None, typer.Option(help="Serve metrics at [HOST:]PORT, one port per robot.")] = None,
     secure: Annotated[bool, typer.Option(help="Mutual TLS and signed records, with keys made for this run.")] = False,
+    mcap: Annotated[Path | None, typer.Option(help="The run as MCAP; run.mcap in --out where not given.")] = None,
+    foxglove: Annotated[str | None, typer.Option(help="Serve the run to Foxglove at [HOST:]PORT.")] = None,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    map_folder: Map = None,
+    map_fixed: MapFixed = False,
 ) -> None:
     """Run a scenario with one process per robot on this machine, over real zenoh."""
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     changes |= {} if rate is None else {"rate": rate}
     changes |= _parsed(sets)
-    _launch(_read(scenario, changes, agents), out, secure, dashboard, metrics)
+    if mcap is not None or foxglove is not None:
+        from flocc_launch.view.scene_drawing import foxglove_module
+
+        foxglove_module()  # a missing package is said before the run, not after it
+    use = _map_use(map_folder, map_fixed)
+    speech = Speech(json_out, quiet, verbose)
+    _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics, mcap, foxglove, use)
 
 
 @app.command(short_help="Run the same on virtual time: one process, repeatable.")
@@ -135,15 +182,22 @@ def simulate(
     sets: Set = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
     shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    map_folder: Map = None,
+    map_fixed: MapFixed = False,
 ) -> None:
     """Run a scenario in one process on virtual time; the same seed gives the same run, bit for bit."""
+    speech = Speech(json_out, quiet, verbose)
     if seeds is not None and sets:
         fail("a campaign draws its scenarios; --set changes one, without --seeds")
     if seeds is not None:
-        run_campaign(seeds, seed or 0, shrink, out)
+        run_campaign(seeds, seed or 0, shrink, out, speech)
         return
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
+    use = _map_use(map_folder, map_fixed)
     from flocc_launch.scenarios.expectations import check_measurable
     from flocc_launch.scenarios.recordings import recordings
     from flocc_launch.setup.cache import cache_folder
@@ -151,12 +205,12 @@ def simulate(
     from flocc_launch.swarm.launching import fresh_folder
 
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
-    read = _read(scenario, changes | _parsed(sets), agents)
+    read = _read(scenario, changes | _parsed(sets), agents, speech)
     with progress_bar("preparing data") as progress:
         paths = recordings(read, progress)
     check_measurable(read, paths)
     fresh_folder(out)
-    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception"), out)
+    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 
 
 @app.command()
@@ -168,7 +222,13 @@ def agent(
     bandwidth: Annotated[
         float | None, typer.Option(min=0.001, help="Budget of this robot, kilobytes per second.")
     ] = None,
+    map_folder: Map = None,
+    map_fixed: MapFixed = False,
+    new_journey: Annotated[
+        bool, typer.Option("--new-journey", help="The odometry began anew: another log of the same robot.")
+    ] = False,
     verbose: Annotated[bool, typer.Option(help="Log every message.")] = False,
+    ros_args: Annotated[list[str] | None, typer.Option("--ros-args", help=ROS_ARGS)] = None,
 ) -> None:
     """Run one robot's agent until it is stopped."""
     import asyncio
@@ -176,7 +236,7 @@ def agent(
     import time
 
     from flocc_agent.config import AgentConfig, MetricsConfig
-    from flocc_launch.swarm.agent_process import run_agent
+    from flocc_launch.swarm.agent_process import Beginning, ToldOfMap, run_agent
 
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
@@ -184,8 +244,21 @@ def agent(
     if bandwidth is not None:
         given["bandwidth_bytes_s"] = 1000.0 * bandwidth
     read = AgentConfig.read(config, changes or ()).model_copy(update=given)
+    read = read.with_map(map_folder)
+    if map_fixed and read.map is None:
+        fail(FIXED_WHAT)
+    beginning = Beginning(map_fixed, new_journey)
     try:
-        asyncio.run(run_agent(read, time.monotonic(), lambda _: None, dashboard=dashboard))
+        asyncio.run(
+            run_agent(
+                read,
+                time.monotonic(),
+                ToldOfMap(read.name).tell,
+                dashboard=dashboard,
+                beginning=beginning,
+                ros_args=ros_args or (),
+            )
+        )
     except Exception as error:
         if not may_pass(error):
             raise
@@ -196,18 +269,27 @@ def agent(
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     evo: Annotated[bool, typer.Option("--evo", help="Compute the errors with evo (GPL-3) beside ours.")] = False,
-    json_out: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    json_out: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Write trajectories and errors as PNG and SVG.")] = False,
+    pictures: Annotated[
+        int | None, typer.Option(min=0, max=200, help="Pairs of keyframes that the report shows as pictures; else 24.")
+    ] = None,
 ) -> None:
     """Evaluate a run folder anew: ATE and RPE against ground truth, closures, bytes, leaders."""
     from flocc_launch.report.evaluate import evaluate as run_evaluation
 
-    typer.echo(run_evaluation(run, with_evo=evo, as_json=json_out))
+    speech = Speech(json_out, quiet, verbose)
+    with progress_bar("matching pictures") as progress:
+        said = run_evaluation(run, evo, json_out, plot, pictures, progress, quiet=speech.quiet, verbose=speech.verbose)
+    typer.echo(said)
 
 
-def _read(scenario: str, changes: dict[str, Any], agents: int | None) -> "Scenario":
+def _read(scenario: str, changes: dict[str, Any], agents: int | None, speech: Speech) -> "Scenario":
     from flocc_launch.scenarios.shipped import read_scenario
 
-    return read_scenario(scenario, changes, agents, typer.echo)
+    return read_scenario(scenario, changes, agents, speech.tell)
 
 
 def _changes(
@@ -238,8 +320,25 @@ def _parsed(sets: list[str] | None) -> dict[str, Any]:
     return dict(parsed_change(text) for text in sets or ())
 
 
+def _map_use(folder: Path | None, fixed: bool) -> "MapUse | None":
+    """The map in which a team is to work."""
+    from flocc_launch.maps.opening import MapUse
+
+    if folder is None and fixed:
+        fail(FIXED_WHAT)
+    return None if folder is None else MapUse(folder, fixed)
+
+
 def _launch(
-    scenario: "Scenario", out: Path, secure: bool = False, dashboard: str | None = None, metrics: str | None = None
+    scenario: "Scenario",
+    out: Path,
+    speech: Speech,
+    secure: bool = False,
+    dashboard: str | None = None,
+    metrics: str | None = None,
+    mcap: Path | None = None,
+    foxglove: str | None = None,
+    use: "MapUse | None" = None,
 ) -> None:
     from rich.console import Console
 
@@ -248,14 +347,48 @@ def _launch(
     from flocc_launch.swarm.launching import launch as run
 
     with progress_bar("preparing data") as progress:
-        recordings(scenario, progress)
-    with LiveTable(Console()) as table, _dashboard(out, dashboard, table.show) as show:
-        report = run(scenario, out, show, secure=secure, metrics=metrics)
-    show_report(report, out)
+        paths = recordings(scenario, progress)
+    console = Console(stderr=speech.as_json, quiet=speech.quiet)
+    with (
+        LiveTable(console) as table,
+        _dashboard(out, dashboard, table.show, speech) as show,
+        _foxglove(out, foxglove, speech),
+    ):
+        report = run(scenario, out, show, secure=secure, metrics=metrics, paths=paths, use=use)
+    _record(out, mcap)
+    show_report(report, out, speech)
+
+
+def _record(out: Path, mcap: Path | None) -> None:
+    """Write the run as MCAP; without the package only where somebody asked for it."""
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+    from flocc_launch.view.scene_drawing import FoxgloveMissing
+
+    try:
+        write_mcap(RunFolder.open(out), mcap or out / MCAP_NAME)
+    except FoxgloveMissing:
+        if mcap is not None:
+            raise
 
 
 @contextmanager
-def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWatch]":
+def _foxglove(out: Path, where: str | None, speech: Speech) -> "Iterator[None]":
+    """Serve the run to Foxglove, where somebody wants it."""
+    if where is None:
+        yield
+        return
+    from flocc_launch.dashboard import address
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import foxglove_server
+
+    with foxglove_server(RunFolder(out), *address(where)) as url:
+        speech.tell(f"foxglove: {url}")
+        yield
+
+
+@contextmanager
+def _dashboard(out: Path, where: str | None, show: "OnWatch", speech: Speech) -> "Iterator[OnWatch]":
     """Serve the dashboard beside the table, where somebody wants one."""
     if where is None:
         yield show
@@ -265,12 +398,13 @@ def _dashboard(out: Path, where: str | None, show: "OnWatch") -> "Iterator[OnWat
 
     host, port = address(where)
     with live_dashboard(RunFolder(out), port, show, host) as both:
-        typer.echo(f"dashboard: http://{host}:{port}/")
+        speech.tell(f"dashboard: http://{host}:{port}/")
         yield both
 
 
 add_tools(app)
 add_data(app)
+add_maps(app)
 add_offline(app)
 add_lab(app)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from flocc_launch.commands.common import EXIT_MISSED
+from flocc_launch.commands.common import EXIT_MISSED, Json, Speech, facts
 from flocc_protocol.errors import FloccError
 
 PROCESSES = 2
@@ -40,6 +40,7 @@ def optimise(
         str | None, typer.Option(help="gaussian (the file's information matrices) or isotropic (SE-Sync's objective).")
     ] = None,
     seed: Annotated[int, typer.Option(help="Recorded; nothing in the back end is drawn by chance.")] = 0,
+    json_out: Json = False,
 ) -> None:
     """Optimise the pose graph of a file, with any formulation and solver."""
     from flocc_agent.config import Formulation, ScaleInitial, Solver
@@ -48,16 +49,19 @@ def optimise(
     result = optimise_file(
         file,
         out,
-        formulation=_chosen(Formulation, formulation, "--formulation"),
-        solver=_chosen(Solver, solver, "--solver"),
-        scale_initial=_chosen(ScaleInitial, scale_initial, "--scale-initial"),
+        formulation=chosen(Formulation, formulation, "--formulation"),
+        solver=chosen(Solver, solver, "--solver"),
+        scale_initial=chosen(ScaleInitial, scale_initial, "--scale-initial"),
         pairwise_consistency=consistency,
         unit_scale=unit_scale,
         drop_labelled_outliers=drop_outliers,
         from_file_initialisation=from_file,
-        noise=_chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
+        noise=chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
         seed=seed,
     )
+    if json_out:
+        facts(result)
+        return
     for key in ("formulation", "solver", "cost_initial", "cost", "ate_m", "iterations", "solve_s"):
         typer.echo(f"{key.replace('_', ' '):14} {result[key] if result[key] is not None else 'not known'}")
     typer.echo(f"{'components':14} {_count(result['components'])}")
@@ -65,7 +69,7 @@ def optimise(
     typer.echo(f"result: {(out / 'result.json').resolve()}")
 
 
-def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
+def run_campaign(seeds: int, first: int, shrink: bool, out: Path, speech: Speech) -> None:
     """Simulate drawn scenarios under all checkers; leave with exit code 1 when an invariant was violated."""
     from flocc_launch.simulation.campaign import SeedOutcome, campaign, write_campaign
     from flocc_launch.simulation.campaign import shrink as smaller
@@ -73,23 +77,26 @@ def run_campaign(seeds: int, first: int, shrink: bool, out: Path) -> None:
 
     def tell(outcome: SeedOutcome) -> None:
         for violation in outcome.violations:
-            typer.echo(f"seed {outcome.seed}: {violation.invariant} at {violation.at_s:.2f} s")
+            speech.tell(f"seed {outcome.seed}: {violation.invariant} at {violation.at_s:.2f} s")
 
     found = campaign(range(first, first + seeds), PROCESSES, tell)
     out.mkdir(parents=True, exist_ok=True)
     path = out / "campaign.json"
     write_campaign(found, path)
     failed = [outcome.seed for outcome in found.outcomes if outcome.violations]
-    typer.echo(f"{seeds} runs, {len(failed)} with violations: {path.resolve()}")
+    if speech.as_json:
+        typer.echo(path.read_text(encoding="utf-8"))
+    else:
+        typer.echo(f"{seeds} runs, {len(failed)} with violations: {path.resolve()}")
     for seed in failed if shrink else ():
         small = out / f"seed-{seed}.json"
         small.write_text(smaller(drawn_scenario(seed)).model_dump_json(indent=1) + "\n", encoding="utf-8")
-        typer.echo(f"smaller scenario: {small.resolve()}")
+        speech.tell(f"smaller scenario: {small.resolve()}")
     if failed:
         sys.exit(EXIT_MISSED)
 
 
-def _chosen(choices: type[E], text: str | None, option: str) -> E | None:
+def chosen(choices: type[E], text: str | None, option: str) -> E | None:
     """One of an enumeration's values.
 
     Raises:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flocc_launch.commands.common import Json, facts
+
 if TYPE_CHECKING:
     from flocc_agent.config import TransportConfig
     from flocc_launch.doctor import Finding
@@ -18,7 +20,6 @@ WIDTH_PIPE = 140
 RunArgument = Annotated[Path | None, typer.Argument(help="Run folder.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="An agent's configuration: its swarm and how to reach it.")]
 SwarmOption = Annotated[str | None, typer.Option(help="Name of a running swarm, found by scouting.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
 TimeoutOption = Annotated[
     float, typer.Option(min=0.1, help="Seconds for finding agents, and for each of two tries to be answered.")
@@ -31,6 +32,7 @@ def add_tools(app: typer.Typer) -> None:
     app.command(short_help="Show all robots of a swarm or of a run in one table.")(status)
     app.command(short_help="Serve one page that shows a run while it goes on.")(dashboard)
     app.command(short_help="Show a run or a running swarm in rerun.")(view)
+    app.command(short_help="Write a run as one MCAP file, for Foxglove, rerun and others.")(export)
     app.command(short_help="Cause a fault in a running swarm, or take it back.")(chaos)
 
 
@@ -39,7 +41,7 @@ def doctor(
     config: ConfigOption = None,
     swarm: SwarmOption = None,
     installation: Annotated[bool, typer.Option("--installation", help="Check this machine for --config.")] = False,
-    json_out: JsonOption = False,
+    json_out: Json = False,
     timeout: TimeoutOption = 3.0,
 ) -> None:
     """Say why maps have or have not merged: of a run folder, of a running swarm, or check this installation."""
@@ -66,7 +68,7 @@ def status(
     run: RunArgument = None,
     config: ConfigOption = None,
     swarm: SwarmOption = None,
-    json_out: JsonOption = False,
+    json_out: Json = False,
     timeout: TimeoutOption = 3.0,
     watch_s: Annotated[float | None, typer.Option("--watch", min=0.2, help="Ask again after so many seconds.")] = None,
 ) -> None:
@@ -104,6 +106,18 @@ def dashboard(
         typer.echo(f"dashboard: {page.url}")
         while True:
             time.sleep(3600)
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    mcap: Annotated[Path | None, typer.Option(help="The file; run.mcap in the run folder where not given.")] = None,
+) -> None:
+    """Write a run as MCAP with Foxglove's schemas, and a layout beside it."""
+    from flocc_launch.runs.run_folder import RunFolder
+    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+
+    path = write_mcap(RunFolder.open(run), run / MCAP_NAME if mcap is None else mcap)
+    typer.echo(f"{path} ({path.stat().st_size / 1e6:.1f} MB), layout {path.with_suffix('.layout.json')}")
 
 
 def view(
@@ -146,12 +160,17 @@ def chaos(
     order: Annotated[list[str], typer.Argument(help="Such as: loss 0.3, 'partition r1,r2 | r3', heal, kill r2.")],
     config: ConfigOption = None,
     swarm: SwarmOption = None,
+    json_out: Json = False,
 ) -> None:
     """Cause a fault in a running swarm whose agents allow it (transport.chaos), or take faults back."""
     from flocc_launch.swarm.chaos_orders import disturb, parse_order
 
     parsed = parse_order(" ".join(order))
-    for robot, answer in disturb(*_reach(config, swarm), parsed).items():
+    answers = disturb(*_reach(config, swarm), parsed)
+    if json_out:
+        facts(answers)
+        return
+    for robot, answer in answers.items():
         typer.echo(f"{robot}: {answer}")
 
 

@@ -11,14 +11,16 @@ from collections.abc import Callable
 import numpy as np
 
 from flocc_agent.agent import Agent
+from flocc_agent.core.knots import corrected
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import Float
 from flocc_agent.runtime.event_lines import Reported
 from flocc_launch.dashboard.snapshot import Snapshot
 from flocc_launch.dashboard.state import SwarmState
 from flocc_launch.runs.heard import Heard
 from flocc_protocol.ids import LogId
-from flocc_protocol.messages import LogCorrection
+from flocc_protocol.messages import Knots, LogCorrection
 
 ANSWER_S_MAX = 5.0
 RECORDS_MAX = 2000
@@ -43,6 +45,7 @@ class AgentSource:
         self._clock_s = clock_s
         self._state = SwarmState([robot])
         self._heard = Heard(steepness)
+        self._knots: dict[LogId, Knots | None] = {}
         self._read: dict[LogId, int] = {}
         self._agent: Agent | None = None
         self._loop = asyncio.get_running_loop()
@@ -72,6 +75,7 @@ class AgentSource:
 
     def _read_robot(self, robot: Robot) -> None:
         """Take in what is new in the core: records, corrections, and whom the neighbours follow."""
+        robot.corrections.follow_all()
         t = self._clock_s()
         for log, copy in sorted(robot.gossip.logs.items()):
             read = self._read.get(log, 0)
@@ -80,21 +84,22 @@ class AgentSource:
             self._read[log] = min(read + RECORDS_MAX, len(copy.records))
             correction = robot.corrections.of(log)
             if correction is not None:
-                self._correct(correction, t)
+                self._correct(correction, robot.assembly.odometry(log), t)
         for name in robot.neighbours.names():
             neighbour = robot.neighbours.get(name)
             if neighbour is not None:
                 self._apply(self._heard.heartbeat(neighbour.log, neighbour.heartbeat, t))
                 self._state.heard(name, neighbour.heard_s)
 
-    def _correct(self, correction: LogCorrection, t: float) -> None:
-        """Take a newer correction with the keyframes that it lists."""
+    def _correct(self, correction: LogCorrection, T_odom_camera: Float, t: float) -> None:
+        """Take a newer correction, or its knots, and where that puts the log's keyframes."""
         event = self._heard.correction(correction, t)
         if event is not None:
             self._state.apply(event)
-            listed = enumerate(correction.T_map_camera.numpy()[:, :3].astype(np.float64))
-            positions_m = {correction.first + correction.step * k: position_m for k, position_m in listed}
-            self._state.place(correction.log.robot, positions_m)
+        if event is not None or correction.knots is not self._knots.get(correction.log):
+            self._knots[correction.log] = correction.knots
+            poses = corrected(correction, T_odom_camera, np.arange(len(T_odom_camera)))
+            self._state.place(correction.log.robot, dict(enumerate(poses[:, :3, 3])))
 
     def _apply(self, event: Reported[Fact] | None) -> None:
         if event is not None:

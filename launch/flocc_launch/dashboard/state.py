@@ -34,6 +34,8 @@ PATH_POINTS_MAX = 600
 KEYFRAMES_MAX = 200_000
 CLOSURES_MAX = 2000
 SILENT_S = 20.0
+COUNTED_ONLY = ClosureRejected
+"""Facts whose number is shown, since there are so many of them."""
 
 
 @dataclass(slots=True)
@@ -115,7 +117,7 @@ class SwarmState:
             self.closures[event.fact.query, event.fact.match] = event.fact.probability
         if is_of(event, RoundSolved):
             self.optimised = event
-        said = sentence_of(event)
+        said = None if isinstance(event.fact, COUNTED_ONLY) else sentence_of(event)
         if said is not None:
             self.recent.append(Said(event.t, event.robot, said))
 

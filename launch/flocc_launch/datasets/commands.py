@@ -22,7 +22,7 @@ from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, read_source, team_folder
 from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
-from flocc_launch.datasets.plain import expected_files
+from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
@@ -66,6 +66,8 @@ class Info:
         topics: Of a bag, with types and numbers of messages.
         notes: What was left out, or concluded where nothing said it.
         robots: Of a bag, which topics belong together.
+        odometry_file: Where odometry was read, where it has a file of its own.
+        truth_file: The same of ground truth.
     """
 
     path: Path
@@ -82,6 +84,8 @@ class Info:
     topics: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
+    odometry_file: Path | None = None
+    truth_file: Path | None = None
 
 
 def info(path: Path, format_name: str | None = None, form: str | None = None) -> Info:
@@ -114,6 +118,8 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source)),
         notes=(*source.notes, *_unused(source)),
+        odometry_file=taken_file(path, ODOMETRY_STEMS) if source.odometry else None,
+        truth_file=taken_file(path, TRUTH_STEMS) if source.truth else None,
     )
 
 
@@ -147,6 +153,7 @@ def _missing(source: Source) -> list[str]:
 def info_lines(found: Info) -> Iterator[tuple[str, str]]:
     """Yield names and values of what was found, for people."""
     camera, poses = found.camera, {"odometry": found.odometry_poses, "ground truth": found.truth_poses}
+    files = {"odometry": found.odometry_file, "ground truth": found.truth_file}
     yield "path", str(found.path)
     yield "format", found.format
     covered = "" if found.posed in (None, found.images) else f"; {found.posed} of them within the trajectory"
@@ -156,10 +163,14 @@ def info_lines(found: Info) -> Iterator[tuple[str, str]]:
         yield from (("robot", robot) for robot in found.robots)
     else:
         yield "camera", "none" if camera is None else _told(camera)
-        yield from ((name, "none" if count is None else f"{count} poses") for name, count in poses.items())
+        yield from ((name, _poses_told(count, files[name])) for name, count in poses.items())
         yield "length", "not known" if found.length_m is None else f"{found.length_m:.1f} m"
     yield from (("note", note) for note in found.notes)
     yield from (("fault", fault) for fault in found.faults)
+
+
+def _poses_told(count: int | None, file: Path | None) -> str:
+    return "none" if count is None else f"{count} poses" + (f", {file.name}" if file is not None else "")
 
 
 def _told(camera: CameraModel) -> str:

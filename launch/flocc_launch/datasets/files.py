@@ -102,10 +102,16 @@ def natural(file: Path) -> tuple[object, ...]:
     return (*((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts), (1, 0, file.suffix))
 
 
+def image_numbers(files: Sequence[Path]) -> list[int]:
+    """Numbers that are the names of images; empty where not all names are numbers."""
+    numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
+    return numbers if len(numbers) == len(files) else []
+
+
 def image_rows(files: Sequence[Path], rows: int) -> Sequence[int]:
     """Which row of a table each image belongs to: that of its number where images are missing, else one by one."""
-    numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
-    by_number = len(numbers) == len(files) < rows and max(numbers, default=rows) < rows
+    numbers = image_numbers(files)
+    by_number = 0 < len(numbers) < rows and max(numbers) < rows
     return numbers if by_number else range(len(files))
 
 

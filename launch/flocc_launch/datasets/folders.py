@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.lenses import CameraModel
+from flocc_agent.runtime.pose_limits import spikes
 from flocc_agent.runtime.text_tables import RecordingError, number_lines
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import DAMAGED_RATIO_MAX, read_trajectory
 from flocc_launch.datasets.files import (
     camera_file,
     image_files,
+    image_numbers,
     image_rows,
     increasing_stamps_s,
     listed_images,
@@ -97,21 +99,39 @@ def read_kitti(path: Path) -> Source:
     files = image_files(folder)
     times = path / "times.txt"
     poses, poses_file = _kitti_poses(path)
-    stamps_s = increasing_stamps_s(times) if times.exists() else _rate_stamps_s(max(len(files), len(poses)))
-    stamps = len(stamps_s) if times.exists() else len(files)
+    numbers = image_numbers(files)
+    last = max(numbers) + 1 if numbers else 0
+    stamps_s = increasing_stamps_s(times) if times.exists() else _rate_stamps_s(max(len(files), len(poses), last))
+    by_number = not times.exists() and last > len(files)
+    stamps = len(stamps_s) if times.exists() or by_number else len(files)
     count = min(len(poses), len(stamps_s))
-    truth = Trajectory(np.array(stamps_s[:count]), np.array(poses[:count])) if count else None
+    posed_s = [stamps_s[number] for number in numbers] if by_number and len(poses) == len(files) else stamps_s[:count]
+    truth, notes = posed(posed_s, poses[:count], poses_file) if count and poses_file else (None, ())
     fault = f"{poses_file}: has {len(poses)} poses, but the sequence has {stamps} images or stamps"
-    faults = (fault,) if poses_file is not None and len(poses) != stamps else ()
+    faults = (fault,) if poses_file is not None and len(poses) not in (stamps, len(posed_s)) else ()
+    if by_number:
+        told = f"numbers of images have gaps and there is no times.txt; number N was taken at N/{KITTI_RATE_HZ:g} s"
+        notes = (*notes, f"{folder}: {told}")
     of_images = len(files) if truth is None else min(count, stamps)
-    faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, stamps, of_images))
-    rows = image_rows(files, len(stamps_s))
+    if not by_number or (poses and len(poses) != len(files)):
+        faults = (*faults, *unequal(folder, len(files), times if times.exists() else path, stamps, of_images))
+    rows = numbers if by_number else image_rows(files, len(stamps_s))
     images = tuple((stamps_s[row], file) for row, file in zip(rows, files, strict=True) if row < len(stamps_s))
     calibration, number = path / "calib.txt", "2" if folder.name == "image_2" else "0"
     lens = camera_file(path, images)
     if lens is None and calibration.exists() and files:
         lens = rectified_lens(calibration, number, files[0])
-    return Source(path, "kitti", some(images, folder), lens, truth=truth, up_world=UP_CAMERA, faults=faults)
+    shown = some(images, folder)
+    return Source(path, "kitti", shown, lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes)
+
+
+def posed(stamps_s: list[float], poses: list[Float], file: Path) -> tuple[Trajectory, tuple[str, ...]]:
+    """Stamped poses without those that jump away from both sides, which are counted."""
+    stamps, T = np.array(stamps_s), np.array(poses)
+    odd = spikes(T[:, :3, 3])
+    first = int(np.argmax(odd)) + 1
+    told = f"{np.count_nonzero(odd)} of {len(T)} poses jump away from those on both sides and were left out"
+    return Trajectory(stamps[~odd], T[~odd]), (f"{file}:{first}: {told}",) if np.any(odd) else ()
 
 
 def _rate_stamps_s(count: int) -> list[float]:

@@ -5,6 +5,9 @@ Each sentence says what to convert. Nothing here is opened but to look whether i
 
 from pathlib import Path
 
+from flocc_agent.runtime.text_tables import RecordingError
+from flocc_agent.runtime.trajectory_text import read_poses
+
 FOLDERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ScanNet, exported", ("color", "pose", "intrinsic"), "put color/ into images/ and make groundtruth.tum of pose/"),
     ("TartanAir", ("image_left", "pose_left.txt"), "make groundtruth.tum of pose_left.txt, which is in NED axes"),
@@ -44,16 +47,49 @@ FILES: dict[str, tuple[str, str]] = {
 SUFFIX_GLOBS = (".sens", ".svo", ".svo2", ".klg", ".oni", ".db", ".tfrecord")
 
 
+TRAJECTORIES = (".tum", ".txt", ".csv")
+GRAPHS = (".g2o", ".jrl")
+GRAPH = (
+    "is a pose graph, which has no images: flocc optimise FILE --out DIR solves it, and flocc dataset graph FILE makes "
+    "a scenario of a .jrl of several robots"
+)
+WITH_IMAGES = (
+    "flocc needs the images, too: put it into a folder as odometry.tum (or groundtruth.tum), beside images/ and "
+    "camera.yaml; evo compares trajectories alone"
+)
+TRACKS_MAX = 20
+
+
+def is_trajectory(path: Path) -> bool:
+    """Whether a text holds poses."""
+    try:
+        return len(read_poses(path).lines) > 0
+    except RecordingError:
+        return False
+
+
 def kind_of_folder(path: Path) -> str | None:
     """What a folder is and what to convert, or None where it is no kind that is known."""
     for name, markers, advice in FOLDERS:
         if all((path / marker).exists() for marker in markers):
             return f"is {name}, which flocc does not read; {advice}"
+    files = [entry for entry in sorted(path.iterdir()) if entry.is_file()]
+    graphs = [file.name for file in files if file.suffix.lower() in GRAPHS]
+    if graphs:
+        return f"holds {', '.join(graphs[:4])}: {GRAPH.replace('is a', 'a', 1)}"
+    texts = [file for file in files[:TRACKS_MAX] if file.suffix.lower() in TRAJECTORIES]
+    tracks = [file.name for file in texts if is_trajectory(file)]
+    if tracks and len(tracks) == len(files):
+        return f"holds trajectories only ({', '.join(tracks[:4])}); {WITH_IMAGES}"
     inside = next((file for suffix in SUFFIX_GLOBS for file in sorted(path.glob(f"*{suffix}"))), None)
     return None if inside is None else f"holds {inside.name}: {kind_of_file(inside)}"
 
 
 def kind_of_file(path: Path) -> str | None:
     """What a file is and what to do with it, or None where it is no kind that is known."""
+    if path.suffix.lower() in GRAPHS:
+        return GRAPH
+    if path.suffix.lower() in TRAJECTORIES and path.is_file() and is_trajectory(path):
+        return f"is a trajectory; {WITH_IMAGES}"
     found = FILES.get(path.suffix.lower())
     return None if found is None else f"is {found[0]}, which flocc does not read; {found[1]}"

@@ -66,6 +66,11 @@ def expected_files(path: Path) -> str:
     return f"{', '.join((*ODOMETRY_STEMS, *TRUTH_STEMS))} (.tum, .txt or .csv) was looked for in {path}"
 
 
+def taken_file(path: Path, stems: tuple[str, ...]) -> Path | None:
+    """The trajectory that is read of a folder under one of the names, or None."""
+    return next(iter(_trajectory_files(path, stems)), None)
+
+
 def _has_trajectory(path: Path) -> bool:
     return any(_trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
 

@@ -5,6 +5,8 @@ own: stamps are those that the names say, else one image every `STEP_S`; and tha
 """
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ REPLICA_RATE_HZ = 30.0
 CAMERA_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera looks along -z with y up; ours along z with y down."""
 
+COUNTED = re.compile(r"#\s*Number of images:\s*(\d+)")
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap_text")
 
 
@@ -58,11 +61,19 @@ def read_colmap(path: Path) -> Source:
         )
     poses: dict[str, Float] = {}
     used: dict[str, int] = {}
-    lines = [(line, text.split()) for line, text in numbered_lines(place / "images.txt") if not text.startswith("#")]
+    file = place / "images.txt"
+    lines = [(line, text.split()) for line, text in numbered_lines(file) if not text.startswith("#")]
+    cut, after_image = [], False
     for line, words in lines:
         if len(words) < 10 or is_number(words[9]) or not all(is_number(word) for word in words[:9]):
-            continue  # the 2-D points of the image above
-        where = f"{place / 'images.txt'}:{line}"
+            is_points = after_image and len(words) % 3 == 0 and all(is_number(word) for word in words)
+            cut += [] if is_points else [line]
+            after_image = False
+            continue
+        after_image = True
+        where = f"{file}:{line}"
+        if not words[8].isdecimal():
+            raise DatasetError(f"{where}: CAMERA_ID must be a whole number, not {words[8]!r}")
         w, x, y, z, *t_m = (float(word) for word in words[1:8])
         try:
             T_camera_world = pose(R_from_q_wxyz(np.array([w, x, y, z])), np.array(t_m))
@@ -79,7 +90,17 @@ def read_colmap(path: Path) -> Source:
     if len(set(used.values())) > 1:
         raise DatasetError(f"{place / 'images.txt'}: images are of {len(set(used.values()))} cameras; flocc takes one")
     lens = read_lens(place / f"cameras.txt#{next(iter(used.values()))}")
-    return _source(path, "colmap", _image_folder(path), poses, lens)
+    source = _source(path, "colmap", _image_folder(path), poses, lens)
+    return replace(source, notes=(*source.notes, *_cut_rows(file, cut, len(poses))))
+
+
+def _cut_rows(file: Path, cut: list[int], count: int) -> list[str]:
+    """What is to be said of rows that are neither an image nor its points, and of images that the file counts only."""
+    if cut:
+        more = f" (and {len(cut) - 1} others)" if len(cut) > 1 else ""
+        return [f"{file}:{cut[0]}: is no whole row of an image (IMAGE_ID QW QX ... NAME) and was left out{more}"]
+    said = next((int(m[1]) for _, text in numbered_lines(file) if (m := COUNTED.match(text))), count)
+    return [f"{file}: says that it has {said} images, but has {count}: it may be cut off"] if said > count else []
 
 
 def read_transforms(path: Path) -> Source:

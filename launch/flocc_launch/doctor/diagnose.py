@@ -5,12 +5,13 @@ arrive, registrations are accepted, a leader optimises, its corrections arrive. 
 did not merge, the pair that came furthest is looked at, and the first step that failed is named.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.doctor.general import GENERAL
+from flocc_launch.doctor.merge_evidence import named
 from flocc_launch.doctor.steps import STEPS
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
@@ -40,8 +41,15 @@ def merging(loaded: LoadedRun) -> list[Finding]:
         return []
     if len(groups) == 1 and loaded.tracks[groups[0][0]].map_frame is not None:
         frame = loaded.tracks[groups[0][0]].map_frame
-        return [Finding("merged", Severity.GOOD, f"All {len(groups[0])} robots are in {frame}.", robots=groups[0])]
+        sentence = f"All {len(groups[0])} robots{living(loaded, groups[0])} are in {frame}."
+        return [Finding("merged", Severity.GOOD, sentence, robots=groups[0])]
     return [furthest(loaded, first, second) for k, first in enumerate(groups) for second in groups[k + 1 :]]
+
+
+def living(loaded: LoadedRun, group: Sequence[str]) -> str:
+    """That others do not count, where there are any."""
+    others = [robot for robot in loaded.robots if robot not in group and robot not in loaded.run.servers]
+    return f" that lived to the end (without {named(others)})" if others else ""
 
 
 def groups_of(loaded: LoadedRun) -> list[tuple[str, ...]]:

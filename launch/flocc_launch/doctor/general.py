@@ -1,20 +1,39 @@
 """Findings that do not concern two robots: deaths, warnings, failures, unsteady leaders."""
 
+import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from statistics import median
 
 from flocc_agent.core.reports import EncodingFailed, NameTaken, RoundSolved
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.doctor.cameras import doubted_cameras
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import seconds
+from flocc_launch.runs.right_closures import verdicts
 from flocc_launch.runs.timeline import deaths_unasked, how_it_died
 
 LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3
+REFUSED_MIN = 4
+CLOSURES_WRONG = (
+    "places that look alike are taken for one (look at the pictures in the report, then raise "
+    "core.loop_closing.match_ratio_threshold or use the learned front end)",
+    "the camera's intrinsics or T_body_camera are wrong",
+    "odometry is not metric, or jumps",
+)
+MEASURED_WRONG = (
+    "the camera's intrinsics or T_body_camera are wrong",
+    "odometry is not metric, or jumps",
+    "places that look alike are taken for one (look at the pictures in the report)",
+)
+REASONS_LEFT = (
+    "odometry drifts more than backend.odometry_translation_sigma_m and backend.odometry_rotation_sigma_rad say",
+)
 
 
 SOLVER_ADVICE = {
@@ -29,14 +48,15 @@ def deaths(loaded: LoadedRun) -> list[Finding]:
     """Agents that died; one that the scenario or an operator killed needs no advice."""
     unasked = Counter(deaths_unasked(loaded.events))
     return [
-        _asked_death(event) if event.fact.scripted or not unasked[event.robot] else _death(event)
+        _asked_death(event) if event.fact.scripted or not unasked[event.robot] else _death(loaded, event)
         for event in of_kind(loaded.events, AgentDied)
     ]
 
 
-def _death(event: Reported[AgentDied]) -> Finding:
+def _death(loaded: LoadedRun, event: Reported[AgentDied]) -> Finding:
     sentence = f"{event.robot} died at {seconds(event.t)} ({how_it_died(event)})."
-    advice = f"Read robots/{event.robot}/agent.log; start it again, it comes back with the same identity."
+    read = "" if loaded.run.driver == "simulate" else f"Read robots/{event.robot}/agent.log. "
+    advice = f"{read}An agent that is started again comes back with the same identity."
     return Finding("agent-died", Severity.HINDERS, sentence, advice, (event.robot,))
 
 
@@ -46,12 +66,17 @@ def _asked_death(event: Reported[AgentDied]) -> Finding:
 
 
 def solver_warnings(loaded: LoadedRun) -> list[Finding]:
-    """What the solver warned of last."""
+    """What the solver warned of last; of warnings that differ in names and numbers only, one."""
     rounds = of_kind(loaded.events, RoundSolved)
-    warnings = rounds[-1].fact.warnings if rounds else ()
-    return [
-        Finding("solver-warning", Severity.HINDERS, f"The solver warns: {text}.", _advice(text)) for text in warnings
-    ]
+    alike: dict[str, list[str]] = {}
+    for text in rounds[-1].fact.warnings if rounds else ():
+        alike.setdefault(re.sub(r"\S*\d\S*", "#", text), []).append(text.rstrip("."))
+    return [Finding("solver-warning", Severity.HINDERS, _warned(texts), _advice(texts[0])) for texts in alike.values()]
+
+
+def _warned(texts: Sequence[str]) -> str:
+    more = f" (the first of {len(texts)} such warnings)" if len(texts) > 1 else ""
+    return f"The solver warns: {texts[0]}{more}."
 
 
 def _advice(warning: str) -> str:
@@ -59,7 +84,36 @@ def _advice(warning: str) -> str:
     for said, advice in SOLVER_ADVICE.items():
         if said in warning:
             return advice
-    return "See docs/report.md on the pose graph; more closures from other view points make scales observable."
+    return "See docs/back-end.md; more closures from other view points make scales observable."
+
+
+def solver_refusals(loaded: LoadedRun) -> list[Finding]:
+    """A solver that leaves out over half of the closures it was given."""
+    rounds = of_kind(loaded.events, RoundSolved)
+    used, refused = (rounds[-1].fact.closures_used, rounds[-1].fact.closures_rejected) if rounds else (None, None)
+    if used is None or refused is None or refused < REFUSED_MIN or refused <= used:
+        return []
+    right = Counter(verdicts(loaded)[pair.query, pair.match] for pair in left_out(loaded))
+    told = f" By ground truth {right[True]} of {right.total()} of these are right." if right else ""
+    sentence = f"The solver left out {refused} of {used + refused} accepted closures.{told}"
+    few = CLOSURES_WRONG if right[False] > right[True] or (not right and look_weak(loaded)) else MEASURED_WRONG
+    advice = f"Likely reasons, in this order: {'; '.join((*few, *REASONS_LEFT))}."
+    return [Finding("solver-refuses", Severity.HINDERS, sentence, advice)]
+
+
+def left_out(loaded: LoadedRun) -> list[Pair]:
+    """Accepted pairs that the last solution did not use, and that ground truth can judge."""
+    known = verdicts(loaded)
+    return [pair for pair in loaded.pairs if pair.used is False and (pair.query, pair.match) in known]
+
+
+def look_weak(loaded: LoadedRun) -> bool:
+    """Whether the closures that were left out have lower match ratios than those that were used."""
+    ratios: dict[bool, list[float]] = {True: [], False: []}
+    for pair in loaded.pairs:
+        if pair.used is not None and pair.ratio is not None:
+            ratios[pair.used].append(pair.ratio)
+    return bool(ratios[True] and ratios[False]) and median(ratios[False]) < 0.5 * median(ratios[True])
 
 
 def encoding_failures(loaded: LoadedRun) -> list[Finding]:
@@ -116,10 +170,11 @@ def weak_links(loaded: LoadedRun) -> list[Finding]:
         if track.map_frame is None or not others or not 0 < len(ties) < CLOSURES_FEW:
             continue
         accepted = sum(pair.accepted and robot in robots_of(pair) and pair.inter_robot for pair in loaded.pairs)
-        sentence = (
-            f"{robot} hangs on {track.map_frame} by {len(ties)} of {accepted} accepted closures; the solver did not "
-            "use the rest. One false closure misplaces it."
-        )
+        closures = "closure" if len(ties) == 1 else "closures"
+        counted = f"{len(ties)} {closures}, all that were accepted"
+        if accepted > len(ties):
+            counted = f"{len(ties)} of {accepted} accepted closures; the solver did not use the rest"
+        sentence = f"{robot} hangs on {track.map_frame} by {counted}. One false closure misplaces it."
         advice = "Let it meet the others again, or use a front end that sees further (perception.method = 'learned')."
         findings.append(Finding("weak-link", Severity.HINDERS, sentence, advice, (robot,)))
     return findings
@@ -144,7 +199,9 @@ GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     deaths,
     shared_names,
     weak_links,
+    doubted_cameras,
     solver_warnings,
+    solver_refusals,
     encoding_failures,
     unsteady_leaders,
     odd_truths,

@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from flocc_agent.config import Mast3rConfig, PerceptionConfig, TransportConfig
+from flocc_agent.extras import to_install
 from flocc_agent.perception.backends import OWN, PerceptionError, check_perception, methods
 from flocc_launch.doctor.finding import Finding, Severity, good
 from flocc_launch.doctor.network_check import configured_network, discovery, ports
@@ -22,7 +23,7 @@ CLOCK_YEAR_MIN = 2025
 REQUIRED = {"zenoh": "eclipse-zenoh", "gtsam": "gtsam", "cv2": "opencv-python-headless", "scipy": "scipy"}
 OPTIONAL = {
     "rosbags": "bags", "cryptography": "secure", "rerun": "view", "torch": "mast3r", "prometheus_client": "metrics",
-    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval",
+    "xxhash": "ros2", "matplotlib": "figures", "evo": "eval", "foxglove": "mcap",
 }  # fmt: skip
 
 
@@ -65,10 +66,11 @@ def packages() -> list[Finding]:
         else:
             advice = f"Install it again: pip install --force-reinstall {package}."
             found.append(Finding("package", Severity.BLOCKS, f"{package} cannot be imported: {problem}.", advice))
-    for module, extra in OPTIONAL.items():
-        if importlib.util.find_spec(module) is None:
-            sentence = f"{module} is not installed; it is needed for flocc[{extra}] only."
-            found.append(Finding("extra", Severity.NOTE, sentence, f"pip install 'flocc[{extra}]' if you want it."))
+    lacking = {extra: module for module, extra in OPTIONAL.items() if importlib.util.find_spec(module) is None}
+    if lacking:
+        named_ = ", ".join(f"{extra} ({module})" for extra, module in lacking.items())
+        sentence = f"Extras that are not installed, and needed for what they are named after only: {named_}."
+        found.append(Finding("extra", Severity.NOTE, sentence, f"{to_install(','.join(lacking))} brings them."))
     return found
 
 
@@ -84,7 +86,7 @@ def networks(config: PerceptionConfig) -> list[Finding]:
         return [good("checkpoint", f"Perception '{config.method}' needs neither torch nor checkpoints.")]
     problem = import_problem("torch")
     if problem is not None:
-        advice = "Install it: pip install 'flocc[mast3r]'."
+        advice = f"Install it: {to_install('mast3r')}."
         return [Finding("torch", Severity.BLOCKS, f"torch cannot be imported: {problem}.", advice)]
     return [*device(config.mast3r), *checkpoints(config.mast3r)]
 

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse
+from flocc_launch.report.album import EMPTY, Album
+from flocc_launch.report.shown_pairs import anchor
 from flocc_launch.report.svg import PALETTE_SIZE, Axis, element, nice_step, path, svg, text_of, title
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.loaded_run import LoadedRun
@@ -126,8 +128,8 @@ def view_of(shown: Iterable[MapScene]) -> MapView:
     return MapView(across, up, x, y, height_px)
 
 
-def map_figure(scene: MapScene, view: MapView, loaded: LoadedRun) -> str:
-    """Draw one scene."""
+def map_figure(scene: MapScene, view: MapView, loaded: LoadedRun, album: Album = EMPTY) -> str:
+    """Draw one scene; closures and places with pictures lead to them."""
     robots = list(loaded.robots)
     layers = [element("rect", x=0.5, y=0.5, width=WIDTH_PX - 1, height=view.height_px - 1, rx=8, class_="frame")]
     truth = "".join(line_of(points, view, "truth") for points in scene.truth_m.values())
@@ -135,7 +137,8 @@ def map_figure(scene: MapScene, view: MapView, loaded: LoadedRun) -> str:
     for robot, points in scene.lines_m.items():
         layers.append(element("g", line_of(points, view, "track"), class_=colour(robots, robot)))
     if scene.with_closures:
-        layers.append(pairs_layer(scene, view, loaded))
+        layers.append(pairs_layer(scene, view, loaded, album))
+        layers.append(views_layer(scene, view, loaded, album))
     layers.extend(start_of(robot, points, view, colour(robots, robot)) for robot, points in scene.lines_m.items())
     layers.append(scale_bar(view))
     layers.append(compass(view))
@@ -169,18 +172,42 @@ def start_of(robot: str, points_m: Float, view: MapView, class_: str) -> str:
     return element("g", element("circle", cx=x, cy=y, r=5, class_="dot"), name, class_=class_)
 
 
-def pairs_layer(scene: MapScene, view: MapView, loaded: LoadedRun) -> str:
+def pairs_layer(scene: MapScene, view: MapView, loaded: LoadedRun, album: Album) -> str:
     """Accepted closures coloured by probability, rejected candidates as crosses."""
     accepted, rejected = [], []
+    sheets = {(each.pair.query, each.pair.match): each.name for each in album.pairs}
     for pair in loaded.pairs:
         ends = [position_of(scene, loaded, keyframe) for keyframe in (pair.query, pair.match)]
         if ends[0] is None or ends[1] is None:
             continue
+        sheet = sheets.get((pair.query, pair.match))
         if pair.accepted:
-            accepted.append(closure_mark(pair, view(ends[0]), view(ends[1])))
+            accepted.append(linked(closure_mark(pair, view(ends[0]), view(ends[1])), sheet))
         elif pair.rejected:
-            rejected.append(cross(pair, view(ends[0])))
+            rejected.append(linked(cross(pair, view(ends[0])), sheet))
     return element("g", *rejected, class_="rejected") + element("g", *accepted, class_="accepted")
+
+
+def linked(mark: str, name: str | None) -> str:
+    """A mark that opens a pair's pictures, where it has some."""
+    return mark if name is None else element("a", mark, href=f"#{name}")
+
+
+def views_layer(scene: MapScene, view: MapView, loaded: LoadedRun, album: Album) -> str:
+    """Numbers where the pictures along the way were taken."""
+    numbers: dict[str, int] = {}
+    marks = []
+    for keyframe in album.views:
+        robot = keyframe.log.robot
+        numbers[robot] = numbers.get(robot, 0) + 1
+        position_m = position_of(scene, loaded, keyframe)
+        if position_m is not None:
+            x, y = view(position_m)
+            disc = element("circle", cx=x, cy=y, r=6.5, class_="dot")
+            digit = element("text", str(numbers[robot]), x=x, y=y + 3.4, class_="digit", text_anchor="middle")
+            link = element("a", disc, digit, href=f"#view-{anchor(keyframe)}")
+            marks.append(element("g", link, class_=colour(list(loaded.robots), robot)))
+    return element("g", *marks, class_="views")
 
 
 def position_of(scene: MapScene, loaded: LoadedRun, keyframe: KeyframeId) -> Float | None:

@@ -3,18 +3,25 @@
 from pathlib import Path
 
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_launch.report.album import Progress, album_of
 from flocc_launch.report.build import build
 from flocc_launch.report.html import write_html
 from flocc_launch.report.model import SCHEMA_VERSION, RunReport
 from flocc_launch.report.run_graph import write_pose_graph
+from flocc_launch.report.shown_pairs import PAIRS_SHOWN
 from flocc_launch.runs.ground_truth import write_truth
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder, RunFolderError, read_record, write_json
 from flocc_launch.runs.tracks import Float, Mask
 
 
-def finish(folder: RunFolder) -> RunReport:
+def finish(folder: RunFolder, pairs_max: int = PAIRS_SHOWN, progress: Progress | None = None) -> RunReport:
     """Write trajectories, pose graph, report.json and report.html; doing it again gives the same files.
+
+    Args:
+        folder: The run.
+        pairs_max: Pairs of keyframes that report.html shows as pictures.
+        progress: Called with (done, all) while pictures are looked at.
 
     Raises:
         RunFolderError: The folder is cut off or damaged.
@@ -24,7 +31,7 @@ def finish(folder: RunFolder) -> RunReport:
     write_trajectories(folder.path, loaded)
     write_pose_graph(folder.path / "pose_graph.g2o", loaded)
     write_json(folder.path / "report.json", report.model_dump(mode="json"))
-    write_html(folder.path / "report.html", report, loaded)
+    write_html(folder.path / "report.html", report, loaded, album_of(folder, loaded, pairs_max, progress))
     return report
 
 

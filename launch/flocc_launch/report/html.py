@@ -3,19 +3,20 @@
 from importlib.resources import files
 from pathlib import Path
 
-from flocc_launch.report import section_accounts, sections
+from flocc_launch.report import section_accounts, section_pictures, sections
+from flocc_launch.report.album import EMPTY, Album
 from flocc_launch.report.model import RunReport
 from flocc_launch.report.svg import element, text_of
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.loaded_run import LoadedRun
 
 
-def write_html(path: Path, report: RunReport, loaded: LoadedRun) -> None:
+def write_html(path: Path, report: RunReport, loaded: LoadedRun, album: Album = EMPTY) -> None:
     """Write report.html."""
-    path.write_text(page(report, loaded), encoding="utf-8")
+    path.write_text(page(report, loaded, album), encoding="utf-8")
 
 
-def page(report: RunReport, loaded: LoadedRun) -> str:
+def page(report: RunReport, loaded: LoadedRun, album: Album = EMPTY) -> str:
     """The whole page: the verdict first, then what it rests on."""
     body = element(
         "main",
@@ -25,9 +26,11 @@ def page(report: RunReport, loaded: LoadedRun) -> str:
         sections.findings(loaded),
         sections.expectations(report),
         sections.warnings(report),
-        sections.trajectories(report, loaded),
+        sections.trajectories(report, loaded, album),
+        section_pictures.way_strips(report, album),
         sections.over_time(report, loaded),
         sections.closures(report, loaded),
+        section_pictures.gallery(album),
         sections.network(report),
         section_accounts.links(report),
         section_accounts.stages(report),

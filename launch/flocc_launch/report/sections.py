@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from flocc_launch.doctor import Severity, diagnose_loaded
+from flocc_launch.doctor.cameras import CAUSES
+from flocc_launch.report.album import Album
 from flocc_launch.report.figure_charts import error_figure, ratio_figure
 from flocc_launch.report.figure_map import colour, map_figure, scenes, view_of
 from flocc_launch.report.figure_time import time_figure
@@ -88,7 +90,7 @@ def warnings(report: RunReport) -> str:
     return element("div", element("h3", "Worth knowing"), element("ul", items), class_="callout")
 
 
-UNDER_WARNINGS = ("agent-died", "agent-killed", "solver-warning", "truth-clock", "truth-frames")
+UNDER_WARNINGS = (*CAUSES.values(), "agent-died", "agent-killed", "solver-warning", "truth-clock", "truth-frames")
 """Findings that the report's warnings say already."""
 
 
@@ -104,7 +106,7 @@ def findings(loaded: LoadedRun) -> str:
     return element("div", element("h3", heading), element("ul", *items), class_="callout")
 
 
-def trajectories(report: RunReport, loaded: LoadedRun) -> str:
+def trajectories(report: RunReport, loaded: LoadedRun, album: Album) -> str:
     """Before and after, seen from above, with what is needed to read it."""
     shown = scenes(loaded)
     heading = element("h2", "Where the robots went")
@@ -115,8 +117,12 @@ def trajectories(report: RunReport, loaded: LoadedRun) -> str:
         element(
             "figure",
             element("h3", text_of(scene.name)),
-            map_figure(scene, view, loaded),
-            element("figcaption", text_of(scene.caption)),
+            map_figure(scene, view, loaded, album),
+            element(
+                "figcaption",
+                text_of(scene.caption),
+                " Click a closure to see its pictures." * bool(album.pairs and scene.with_closures),
+            ),
         )
         for scene in shown
     ]

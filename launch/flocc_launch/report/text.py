@@ -8,12 +8,21 @@ MISSED = "MISSED: "
 """How the first line begins where an expectation was missed."""
 
 
-def sentences(report: RunReport) -> list[str]:
-    """Lines that a person reads after a run: what was missed, the verdict, the figures, the robots, expectations."""
+def short_sentences(report: RunReport) -> list[str]:
+    """What was missed, and the verdict."""
+    return [*missed_lines(report), verdict(report)]
+
+
+def sentences(report: RunReport, verbose: bool = False) -> list[str]:
+    """Lines that a person reads after a run: what was missed, the verdict, the figures, the robots, expectations.
+
+    Args:
+        report: The run's.
+        verbose: Say bytes by kind and times by stage as well.
+    """
     closures, bytes_sent = report.closures, sum(report.bytes.values())
     lines = [
-        *missed_lines(report),
-        verdict(report),
+        *short_sentences(report),
         "",
         f"map frames    {', '.join(report.map_frames) or 'none'}",
         f"merged after  {seconds(report.merged_after_s)}",
@@ -24,16 +33,21 @@ def sentences(report: RunReport) -> list[str]:
         f"during it     ATE {number(report.iate_m, 'm')}; odometry {number(report.iate_odometry_m, 'm')} "
         f"(mean of {count_of(report.iate_moments)} rounds in one map); F1 of closures {number(report.if1)}",
         f"sent          {size_of(bytes_sent) if report.bytes else '–'}"
-        + "".join(f", {kind} {size_of(n)}" for kind, n in sorted(report.bytes.items(), key=lambda item: -item[1])),
+        + "".join(f", {kind} {size_of(n)}" for kind, n in by_size(report) if verbose),
         f"leaders       {', '.join(f'{span.leader} (term {span.term})' for span in report.leaders) or 'none'}",
         "",
         *robot_lines(report),
-        *stage_lines(report),
+        *(stage_lines(report) if verbose else ()),
     ]
     lines += [
         f"expected      {e.name} {plain(e.limit)}: {plain(e.value)}, {judged(e.met)}" for e in report.expectations
     ]
     return lines + [f"note          {warning}" for warning in report.warnings]
+
+
+def by_size(report: RunReport) -> list[tuple[str, int]]:
+    """Kinds of messages with their bytes, the largest first."""
+    return sorted(report.bytes.items(), key=lambda item: -item[1])
 
 
 def missed_lines(report: RunReport) -> list[str]:

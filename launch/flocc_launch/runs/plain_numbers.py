@@ -34,6 +34,11 @@ def seconds(value: float | None) -> str:
     return f"{minutes} min {rest} s" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def duration(value_s: float) -> str:
+    """A duration in whole seconds, minutes or hours, for lines that come again and again."""
+    return f"{value_s:.0f} s" if value_s < 120 else seconds(value_s)
+
+
 def size_of(count: float | None) -> str:
     """Bytes for people, powers of ten."""
     if count is None:

@@ -37,15 +37,25 @@ class Judged:
 
 def judged_closures(loaded: LoadedRun) -> list[Judged]:
     """All accepted closures with a pose, a time and ground truth of both keyframes."""
+    known = verdicts(loaded)
+    return [
+        Judged(pair.at_s, known[pair.query, pair.match], pair.used is not False)
+        for pair in loaded.pairs
+        if pair.at_s is not None and (pair.query, pair.match) in known
+    ]
+
+
+def verdicts(loaded: LoadedRun) -> dict[tuple[KeyframeId, KeyframeId], bool]:
+    """Query and match of every accepted closure with a pose and ground truth -> whether it is right."""
     poses = {
         (closure.query, closure.match): closure for result in loaded.results.values() for closure in result.closures
     }
-    found = []
+    found = {}
     for pair in loaded.pairs:
         closure = poses.get((str(pair.query), str(pair.match))) or poses.get((str(pair.match), str(pair.query)))
-        right = None if closure is None else agrees(closure, loaded)
-        if pair.accepted and pair.at_s is not None and right is not None:
-            found.append(Judged(pair.at_s, right, pair.used is not False))
+        right = None if closure is None or not pair.accepted else agrees(closure, loaded)
+        if right is not None:
+            found[pair.query, pair.match] = right
     return found
 
 

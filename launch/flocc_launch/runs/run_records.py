@@ -33,6 +33,8 @@ class Run(Record):
     """Settings of the link model: loss, latency, bandwidth, range, as the scenario gave them."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings worth reading beside the result, nested as in the configuration."""
+    perception: dict[str, Any] = Field(default_factory=dict)
+    """What the robots saw with, as configured; empty in a run of an earlier version."""
     expectations: dict[str, float | str] = Field(default_factory=dict)
     """Expectation -> limit, of the scenario; of `leader` the robot's name."""
     duration_s: float | None = None

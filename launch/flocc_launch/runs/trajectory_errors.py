@@ -14,6 +14,7 @@ from shutil import which
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.extras import to_install
 from flocc_agent.geometry import between, inverse, so3_log, umeyama
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_protocol.errors import FloccError
@@ -125,7 +126,7 @@ def evo_program() -> str:
     beside = Path(sys.executable).parent
     program = which("evo_ape", path=str(beside)) or which("evo_ape")
     if program is None:
-        raise EvaluationError("--evo needs evo: pip install 'flocc[eval]'")
+        raise EvaluationError(f"--evo needs evo: {to_install('eval')}")
     return program
 
 

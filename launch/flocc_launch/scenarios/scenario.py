@@ -444,7 +444,7 @@ def agent_config(scenario: Scenario, name: str, **changes: object) -> AgentConfi
         name=name,
         swarm=scenario.name,
         compute_class=scenario.robot(name).compute_class,
-        incarnation=0,
+        incarnation=changes.pop("incarnation", 0),
         seed=scenario.seed,
         core=scenario.core,
         keyframes=scenario.keyframes,

@@ -15,6 +15,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flocc_agent.extras import to_install
 from flocc_agent.runtime.security import CA, CERTIFICATE, KEY, MEMBERS, SIGNING_KEY
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import checked_name
@@ -243,4 +244,4 @@ def _check_installed() -> None:
     try:
         import cryptography  # noqa: F401
     except ImportError as error:
-        raise KeysError("flocc keys needs the extra 'secure': pip install 'flocc[secure]'") from error
+        raise KeysError(f"flocc keys needs the extra 'secure': {to_install('secure')}") from error

@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from flocc_agent.backend import build_optimiser
+from flocc_agent.core.interfaces import Perception
 from flocc_agent.core.reports import (
     CandidateFound,
     ClosureAccepted,
@@ -19,6 +21,8 @@ from flocc_agent.runtime.measurement_file import rows_of
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.stages import counts_of
+from flocc_launch.datasets.drift import DriftSpec
+from flocc_launch.maps.opening import MapUse, opened_for
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
 from flocc_launch.runs.ground_truth import truth_path, write_truth
@@ -30,6 +34,7 @@ from flocc_launch.scenarios.walks import walks
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
 from flocc_launch.simulation.rigid_alignment import Alignment
+from flocc_launch.simulation.stored_stations import write_store
 from flocc_launch.simulation.swarm import Equipment, Swarm
 from flocc_launch.simulation.virtual_playback import Playback, nothing, of_recording, of_walk
 from flocc_launch.simulation.virtual_workers import WorkTimes
@@ -45,6 +50,7 @@ def simulate(
     seed: int | None = None,
     recordings: Mapping[str, Path] | None = None,
     cache: Path | None = None,
+    use: MapUse | None = None,
 ) -> RunReport:
     """Run a scenario on virtual time.
 
@@ -54,6 +60,7 @@ def simulate(
         seed: Seed of links, boots and workers.
         recordings: Robots' recordings, where the scenario's world or data set was made into some.
         cache: Folder that keeps what perception found out about images, so that a second run is fast.
+        use: The map in which the robots are to find themselves; None: there is none.
 
     Returns:
         The report, which the folder holds as well.
@@ -63,28 +70,46 @@ def simulate(
     """
     check_measurable(scenario, recordings or {})
     chosen = scenario.seed if seed is None else seed
+    lives = {} if use is None else use.checked(scenario)
     folder = RunFolder.create(out)
     playbacks = playbacks_of(scenario, recordings or {})
-    swarm = swarm_of(scenario, playbacks, chosen, cache)
+    perception = build_perception(scenario.perception, chosen)
+    swarm = swarm_of(scenario, playbacks, chosen, cache, use, lives, perception)
     end_s = run(swarm)
-    write(folder, swarm, chosen, end_s, recordings)
+    write(folder, swarm, chosen, end_s, recordings, use)
+    for name, station in swarm.stations.items():
+        source = (recordings or {}).get(name) or scenario.robot(name).recording
+        write_store(folder.path / "robots" / name / "store", station, scenario, perception, source)
     return finish(folder)
 
 
-def swarm_of(scenario: Scenario, playbacks: Mapping[str, Playback], seed: int, cache: Path | None = None) -> Swarm:
-    """Put the robots of a scenario on virtual time, with their faults to come."""
-    eyes = ImageEyes(build_perception(scenario.perception, seed), scenario.perception, cache)
+def swarm_of(
+    scenario: Scenario,
+    playbacks: Mapping[str, Playback],
+    seed: int,
+    cache: Path | None = None,
+    use: MapUse | None = None,
+    lives: Mapping[str, int] = MappingProxyType({}),
+    perception: Perception | None = None,
+) -> Swarm:
+    """Put the robots of a scenario on virtual time, with their faults to come, and the map that they open."""
+    perception = perception or build_perception(scenario.perception, seed)
+    opened = None if use is None else opened_for(use, scenario, perception)
+    eyes = ImageEyes(perception, scenario.perception, cache)
     given = scenario.simulation
     optimiser = Alignment() if given.optimiser == "quick" else build_optimiser(scenario.backend)
     times = WorkTimes(given.encode_s, given.register_s, given.optimise_s)
-    swarm = Swarm(scenario, playbacks, Equipment(eyes, optimiser, times), seed)
+    fixed = use is not None and use.fixed
+    swarm = Swarm(scenario, playbacks, Equipment(eyes, optimiser, times, opened, fixed, lives), seed)
     schedule(swarm, scenario.faults)
     return swarm
 
 
-def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str, Playback]:
-    """What each robot of a scenario sees."""
-    drawn = walks(scenario.tracks) if scenario.tracks else []
+def playbacks_of(
+    scenario: Scenario, recordings: Mapping[str, Path], drift: DriftSpec | None = None
+) -> dict[str, Playback]:
+    """What each robot of a scenario sees; walks drift as given, or as usual."""
+    drawn = walks(scenario.tracks, drift) if scenario.tracks else []
     walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
     measured = sense(scenario.sensors, {name: walk.truth for name, walk in walked.items()}) if scenario.sensors else {}
     playbacks = {}
@@ -115,7 +140,12 @@ def run(swarm: Swarm) -> float:
 
 
 def write(
-    folder: RunFolder, swarm: Swarm, seed: int, end_s: float, recordings: Mapping[str, Path] | None = None
+    folder: RunFolder,
+    swarm: Swarm,
+    seed: int,
+    end_s: float,
+    recordings: Mapping[str, Path] | None = None,
+    use: MapUse | None = None,
 ) -> None:
     """Write what happened, what every robot knew at the end, and where its images are."""
     scenario = swarm.scenario
@@ -134,7 +164,8 @@ def write(
             driver="simulate",
             recordings={name: str(path.resolve()) for name, path in given.items() if path is not None},
             radio=scenario.links().model_dump(mode="json", exclude_defaults=True),
-            settings=scenario.settings(),
+            settings={**scenario.settings(), **({} if use is None else use.settings())},
+            perception=scenario.perception.model_dump(mode="json"),
             expectations=scenario.expectations.limits(),
             duration_s=end_s,
         )

@@ -108,7 +108,7 @@ class _FetchUnderWay:
         """At the holder: send a piece, or say that it is not there. Whether the holder is switched on."""
         if not holder.running:
             return False
-        latent = holder.disk.latents.get(self._job.keyframe)
+        latent = holder.disk.latent(self._job.keyframe)
         size = 0 if latent is None else min(PIECE_BYTES, len(latent) - offset)
         self._fetcher._network.carry(
             holder.name,

@@ -13,8 +13,9 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.runtime.event_lines import Reported, line_of
-from flocc_agent.runtime.facts import AgentStopped
-from flocc_agent.runtime.robot_result import RobotResult
+from flocc_agent.runtime.facts import AgentStopped, JourneyEnded
+from flocc_agent.runtime.robot_result import RobotResult, write_result
 from flocc_agent.runtime.status import AgentStatus
 from flocc_launch.setup.world_faults import sentence_of
 
@@ -37,6 +38,33 @@ STATUS_PERIOD_S = 0.5
 RETRY_S = 5.0
 """A disk that took no event is tried again so often."""
 EXIT_BAD_INPUT = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """How an agent begins.
+
+    Attributes:
+        map_fixed: The map that it opens does not move.
+        new_journey: Its odometry began anew since it ran last.
+    """
+
+    map_fixed: bool = False
+    new_journey: bool = False
+
+
+class ToldOfMap:
+    """Logs whether a robot has found itself in the map that it opened, whenever that changes."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._said: str | None = None
+
+    def tell(self, status: AgentStatus) -> None:
+        """Look at a state."""
+        if status.in_map not in (None, self._said):
+            self._said = status.in_map
+            logger.info("%s: %s", self._robot, status.in_map)
 
 
 class Lines:
@@ -97,6 +125,8 @@ async def run_agent(
     on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None = None,
     dashboard: str | None = None,
+    beginning: Beginning | None = None,
+    ros_args: Sequence[str] = (),
 ) -> None:
     """Run one agent until it is told to stop, by a signal or an order.
 
@@ -106,31 +136,34 @@ async def run_agent(
         on_status: Takes a state, twice a second.
         orders: JSON lines from the launcher.
         dashboard: [HOST:]PORT of a page that shows this agent's own view of its swarm.
+        beginning: How it begins; None: as always.
+        ros_args: What ROS 2 is started with.
 
     Raises:
         FloccError: The configuration, the recording or the network cannot be used.
     """
     lines = Lines(config.folder / "events.jsonl" if config.folder else None)
     with _page(config, dashboard, lambda: time.monotonic() - epoch_s) as source:
-        await _run(config, epoch_s, on_status, orders, lines, source)
+        life = _Life(config, epoch_s, lines, source, beginning or Beginning(), ros_args)
+        await _run(life, config, epoch_s, on_status, orders, lines)
 
 
 async def _run(
+    life: "_Life",
     config: AgentConfig,
     epoch_s: float,
     on_status: Callable[[AgentStatus], None],
     orders: asyncio.StreamReader | None,
     lines: Lines,
-    source: "AgentSource | None",
 ) -> None:
     """Live; where the robot's own log turns out to be lost, live once more, with another log.
 
-    Once at most, since without keys anybody can end a log; and not under a launcher, which expects one life.
+    Once at most, since without keys anybody can end a log; and not under a launcher, which expects one life. A journey
+    that the robot's ROS ended is followed by another one, each time.
     """
-    life = _Life(config, epoch_s, lines, source)
     try:
         await life.live(on_status, orders)
-        if life.log_ended and not life.stopped and orders is None:
+        while life.begins_anew() and not life.stopped and orders is None:
             logger.warning("%s: begins anew, with another log", config.name)
             await life.live(on_status, orders)
     finally:
@@ -152,12 +185,23 @@ class _Life:
         stopped: A signal ended it.
     """
 
-    def __init__(self, config: AgentConfig, epoch_s: float, lines: Lines, source: "AgentSource | None") -> None:
+    def __init__(
+        self,
+        config: AgentConfig,
+        epoch_s: float,
+        lines: Lines,
+        source: "AgentSource | None",
+        beginning: Beginning,
+        ros_args: Sequence[str] = (),
+    ) -> None:
         self.log_ended = self.stopped = False
+        self._renewed = self._journey_ended = False
+        self._ros_args = ros_args
         self._config = config
         self._epoch_s = epoch_s
         self._lines = lines
         self._source = source
+        self._beginning = beginning
         self._agent: Agent | None = None
 
     async def live(self, on_status: Callable[[AgentStatus], None], orders: asyncio.StreamReader | None) -> None:
@@ -166,7 +210,14 @@ class _Life:
 
         may_renew = orders is None and not self.log_ended
         on_report = self._ends_with_its_log if may_renew else self._report
-        agent = Agent(self._config, on_report=on_report, clock_s=lambda: time.monotonic() - self._epoch_s)
+        agent = Agent(
+            self._config,
+            on_report=on_report,
+            clock_s=lambda: time.monotonic() - self._epoch_s,
+            map_fixed=self._beginning.map_fixed,
+            new_journey=self._beginning.new_journey,
+            ros_args=self._ros_args,
+        )
         self._agent = agent
         for number in ending_signals():
             asyncio.get_running_loop().add_signal_handler(number, self._stop)
@@ -184,12 +235,20 @@ class _Life:
                 task.cancel()
             _keep_result(self._config, agent.result())
 
+    def begins_anew(self) -> bool:
+        """Whether another life follows the one that ended."""
+        lost = self.log_ended and not self._renewed
+        self._renewed = self._renewed or lost
+        journey, self._journey_ended = self._journey_ended, False
+        return lost or journey
+
     def _stop(self) -> None:
         self.stopped = True
         if self._agent is not None:
             self._agent.stop()
 
     def _report(self, event: Reported[Fact]) -> None:
+        self._journey_ended |= isinstance(event.fact, JourneyEnded)
         self._lines.write(event)
         if self._source is not None:
             self._source.take(event)
@@ -226,22 +285,17 @@ def recover_result(config: AgentConfig) -> None:
     from flocc_agent.agent import stored_result
 
     if config.folder is not None and (config.folder / "store").exists():
-        _write_result(config.folder, stored_result(config))
+        write_result(config.folder, stored_result(config))
 
 
 def _keep_result(config: AgentConfig, result: RobotResult | None) -> None:
     """Write the result, unless the disk does not take it."""
+    if config.folder is None or result is None:
+        return
     try:
-        _write_result(config.folder, result)
+        write_result(config.folder, result)
     except OSError as error:
         logger.error("%s: the result is not written: %s", config.name, error.strerror or error)
-
-
-def _write_result(folder: Path | None, result: RobotResult | None) -> None:
-    if folder is not None and result is not None:
-        path = folder / "result.json"
-        path.with_suffix(".tmp").write_text(result.model_dump_json(), encoding="utf-8")
-        path.with_suffix(".tmp").replace(path)
 
 
 async def _tell(agent: Any, on_status: Callable[[AgentStatus], None]) -> None:
@@ -276,8 +330,8 @@ def _print_status(status: AgentStatus) -> None:
     sys.stdout.flush()
 
 
-async def _run_launched(config: AgentConfig, epoch_s: float) -> None:
-    await run_agent(config, epoch_s, _print_status, await _standard_input())
+async def _run_launched(config: AgentConfig, epoch_s: float, beginning: Beginning) -> None:
+    await run_agent(config, epoch_s, _print_status, await _standard_input(), beginning=beginning)
 
 
 def main() -> None:
@@ -285,11 +339,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("config", type=Path)
     parser.add_argument("--epoch-s", type=float, required=True)
+    parser.add_argument("--map-fixed", action="store_true")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     try:
         config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))
-        asyncio.run(_run_launched(config, arguments.epoch_s))
+        asyncio.run(_run_launched(config, arguments.epoch_s, Beginning(map_fixed=arguments.map_fixed)))
     except Exception as error:
         sentence = sentence_of(error)
         if sentence is None:

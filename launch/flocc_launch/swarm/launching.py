@@ -19,6 +19,7 @@ from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
 from flocc_agent.perception.backends import check_perception
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.maps.opening import MapUse
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
 from flocc_launch.runs.run_folder import Run, RunFolder
@@ -71,6 +72,8 @@ def launch(
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
     metrics: str | None = None,
+    paths: dict[str, Path] | None = None,
+    use: MapUse | None = None,
 ) -> RunReport:
     """Run a scenario and write its run folder.
 
@@ -80,7 +83,9 @@ def launch(
         on_watch: Called four times a second.
         progress: Called while data is generated, with (done, all).
         secure: Make keys for this run, and let agents trust those who have them only.
+        paths: Recordings by robot, where they were made already.
         metrics: [HOST:]PORT of the first robot's metrics, by name; each further robot has the next port.
+        use: The map in which the robots are to find themselves; None: there is none.
 
     Raises:
         FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
@@ -88,11 +93,13 @@ def launch(
     check_faults(scenario)
     check_perception(scenario.perception)
     names = scenario.names()
+    lives = {} if use is None else use.checked(scenario)
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
-    paths = recordings(scenario, progress)
+    paths = recordings(scenario, progress) if paths is None else paths
     check_measurable(scenario, paths)
     folder = fresh_folder(out)
-    return asyncio.run(_Launch(scenario, folder, paths, on_watch or (lambda _: None), secure, served).run())
+    given = on_watch or (lambda _: None)
+    return asyncio.run(_Launch(scenario, folder, paths, given, secure, served, use, lives).run())
 
 
 def fresh_folder(out: Path) -> RunFolder:
@@ -130,6 +137,8 @@ class _Launch:
         on_watch: OnWatch,
         secure: bool,
         metrics: dict[str, MetricsConfig],
+        use: MapUse | None = None,
+        lives: dict[str, int] | None = None,
     ) -> None:
         self._scenario = scenario
         self._folder = folder
@@ -137,6 +146,8 @@ class _Launch:
         self._on_watch = on_watch
         self._secure = secure
         self._metrics = metrics
+        self._map = use
+        self._lives = lives or {}
         self._epoch_s = time.monotonic()
         self._lines = Lines(folder.path / LAUNCHER_EVENTS)
         self._radio = scenario.links()
@@ -181,8 +192,10 @@ class _Launch:
                 transport=transports[name],
                 folder=folder.resolve(),
                 metrics=self._metrics.get(name, MetricsConfig()),
+                map=None if self._map is None else self._map.folder.resolve(),
+                incarnation=self._lives.get(name, 0),
             )
-            agents.append(AgentProcess(config, folder))
+            agents.append(AgentProcess(config, folder, map_fixed=self._map is not None and self._map.fixed))
         return agents
 
     async def _live(self) -> None:
@@ -312,7 +325,8 @@ class _Launch:
             driver="launch",
             recordings={name: str(path.resolve()) for name, path in self._paths.items()},
             radio=json.loads(scenario.links().model_dump_json(), parse_constant=lambda _: None),
-            settings=scenario.settings(),
+            settings={**scenario.settings(), **({} if self._map is None else self._map.settings())},
+            perception=scenario.perception.model_dump(mode="json"),
             expectations=scenario.expectations.limits(),
             duration_s=wall_s,
             wall_s=wall_s,

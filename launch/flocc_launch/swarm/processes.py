@@ -28,6 +28,7 @@ class AgentProcess:
 
     Attributes:
         config: Its configuration.
+        map_fixed: The map in which it works does not move.
         folder: Where its files are.
         process: The process, None before it was started.
         status: Its last state, None before the first.
@@ -44,6 +45,7 @@ class AgentProcess:
     asked: bool = False
     exit_code: int | None = None
     reader: asyncio.Task[None] | None = None
+    map_fixed: bool = False
 
     @property
     def name(self) -> str:
@@ -66,6 +68,7 @@ class AgentProcess:
         path = self.folder / "config.json"
         path.write_text(self.config.model_dump_json(indent=1), encoding="utf-8")
         command = [sys.executable, "-m", "flocc_launch.swarm.agent_process", str(path), "--epoch-s", repr(epoch_s)]
+        command += ["--map-fixed"] if self.map_fixed else []
         with (self.folder / "agent.log").open("ab") as log:
             self.process = await asyncio.create_subprocess_exec(
                 *command,

@@ -2,8 +2,8 @@
 
 From a run folder that grows, which costs the swarm nothing; or from the air, as a passive observer that only subscribes
 (`runtime/zenoh_observer`). From the air there are no links and no images: robots do not say whom they hear, and images
-are sent only where a closure needs them. A robot that was heard late is drawn from its corrections, which list all of
-its keyframes.
+are sent only where a closure needs them. A robot that was heard late is drawn from there on: the knots of its
+correction, which say how its earlier poses were corrected, go to that robot alone.
 """
 
 import time
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.core.reports import Fact
+from flocc_agent.geometry import Float, pose_from_tq
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.zenoh_observer import Observer
 from flocc_launch.dashboard.tail import RunTail
@@ -25,7 +26,7 @@ from flocc_launch.view.run_view import images_of, opened, rerun_module
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import CorrectionBatch, Envelope, Heartbeat, LogCorrection, RecordBatch, Records
-from flocc_protocol.records import SIGNATURE_BYTES, decode_record
+from flocc_protocol.records import SIGNATURE_BYTES, KeyframeRecord, decode_record
 
 PERIOD_S = 0.25
 SILENT_S_MAX = 10.0
@@ -89,7 +90,8 @@ def view_swarm(observer: Observer, save: Path | None, steepness: float, is_over:
                 for event in overheard.events(envelope, now_s):
                     drawing.take(event)
                 for correction in corrections_of(envelope):
-                    log_corrected(rr, recording, correction, drawing.colour(correction.log.robot))
+                    colour = drawing.colour(correction.log.robot)
+                    log_corrected(rr, recording, correction, overheard.positions_m(correction.log), colour)
             if not overheard.anybody and now_s > SILENT_S_MAX:
                 raise NobodyHeard(f"swarm {observer.swarm}: no robot was heard within {SILENT_S_MAX:g} s")
             time.sleep(PERIOD_S)
@@ -109,6 +111,7 @@ class Overheard:
         self._heard = Heard(steepness)
         self._signature_bytes = SIGNATURE_BYTES if signed else 0
         self._seen: set[tuple[LogId, int]] = set()
+        self._positions_m: dict[LogId, dict[int, tuple[float, float, float]]] = {}
 
     def events(self, envelope: Envelope, t: float) -> Iterator[Reported[Fact]]:
         """What one message tells."""
@@ -127,6 +130,11 @@ class Overheard:
                     if applied is not None:
                         yield applied
 
+    def positions_m(self, log: LogId) -> Float:
+        """Positions (N, 3) of a log's keyframes that were heard, in its odom frame."""
+        heard = self._positions_m.get(log, {})
+        return np.array([heard[index] for index in sorted(heard)]).reshape(-1, 3)
+
     def _records(self, batch: RecordBatch, t: float) -> Iterator[Reported[Fact]]:
         for number, data in enumerate(batch.records, start=batch.first):
             if (batch.log, number) in self._seen or len(self._seen) >= RECORDS_MAX:
@@ -135,6 +143,8 @@ class Overheard:
             try:
                 record = decode_record(data[: len(data) - self._signature_bytes])
                 event = self._heard.record(batch.log, record, t)
+                if isinstance(record, KeyframeRecord):
+                    self._positions_m.setdefault(batch.log, {})[record.index] = record.T_odom_camera[:3]
             except DecodeError:
                 continue
             if event is not None:
@@ -147,7 +157,8 @@ def corrections_of(envelope: Envelope) -> tuple[LogCorrection, ...]:
     return message.corrections if isinstance(message, CorrectionBatch) else ()
 
 
-def log_corrected(rr: Any, recording: Any, correction: LogCorrection, colour: Colour) -> None:
-    """A robot's whole corrected trajectory, as its leader sent it."""
-    positions_m = np.asarray(correction.T_map_camera.numpy()[:, :3], dtype=np.float64)
+def log_corrected(rr: Any, recording: Any, correction: LogCorrection, positions_odom_m: Float, colour: Colour) -> None:
+    """A robot's trajectory as far as its keyframes were heard, laid into the map as its leader said last."""
+    T_map_odom = pose_from_tq(np.array(correction.T_map_odom))
+    positions_m = positions_odom_m @ T_map_odom[:3, :3].T + T_map_odom[:3, 3]
     recording.log(f"corrected/{correction.log.robot}", rr.LineStrips3D([positions_m], colors=[colour]))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.extras import to_install
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.robot_result import ClosureKnown
@@ -67,7 +68,7 @@ def rerun_module() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise ViewError("flocc view needs rerun: pip install 'flocc[view]'") from error
+        raise ViewError(f"flocc view needs rerun: {to_install('view')}") from error
     return rerun
 
 
@@ -88,7 +89,28 @@ def opened(rr: Any, name: str, save: Path | None) -> Any:
     except (RuntimeError, OSError) as error:
         what = "the viewer cannot be opened" if save is None else f"{save}: cannot be written"
         raise ViewError(f"{what} ({error}); write a file with --save RUN.rrd") from error
+    recording.send_blueprint(blueprint())
     return recording
+
+
+def blueprint() -> Any:
+    """How the viewer opens: the maps, beside them the images of closures, the solver's curves, errors and events."""
+    import rerun.blueprint as rrb
+
+    images = rrb.Horizontal(
+        rrb.Spatial2DView(origin="closure/query", name="closure: query"),
+        rrb.Spatial2DView(origin="closure/match", name="closure: match"),
+    )
+    curves = rrb.Tabs(
+        rrb.TimeSeriesView(origin="solver", name="solver"),
+        rrb.TimeSeriesView(origin="closure", name="probability of closures"),
+        rrb.TimeSeriesView(origin="residual", name="what is left of closures"),
+        rrb.TimeSeriesView(origin="error_m", name="error, m"),
+    )
+    outside = [f"- /{name}/**" for name in ("closure", "solver", "residual", "error_m", "events")]
+    scene = rrb.Spatial3DView(origin="/", contents=["+ $origin/**", *outside], name="maps")
+    events = rrb.TextLogView(origin="events", name="events")
+    return rrb.Blueprint(rrb.Horizontal(scene, rrb.Vertical(images, curves, events), column_shares=[2, 1]))
 
 
 def has_display() -> bool:

@@ -1,14 +1,16 @@
 """A correction laid over a log: at listed keyframes, between them, after them, and at any time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flocc_agent.core.corrected import CorrectedLog, RecordedOdometry
 from flocc_agent.core.gossip import LogCopy
-from flocc_agent.geometry import Float, pose, pose7, se3_exp, tq_from_poses
+from flocc_agent.geometry import Float, inverse, pose, pose7, se3_exp, twists_of_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
-from flocc_protocol.messages import LogCorrection
+from flocc_protocol.messages import Knots, LogCorrection
 from flocc_protocol.records import KeyframeRecord, encode_record
 
 R1 = LogId("r1")
@@ -28,8 +30,13 @@ def recorded(copy: LogCopy, *indices: int) -> None:
 
 
 def correction(first: int, step: int, *T_map_camera: Float) -> LogCorrection:
-    listed = Array.of(tq_from_poses(np.array(T_map_camera).reshape(-1, 4, 4)), "f4")
-    return LogCorrection(R1, Term(1, R1), 1, R1, pose7(TURN), None, first, step, listed)
+    """One whose knots put these keyframes of the recorded ones where they are to be."""
+    numbers = first + step * np.arange(len(T_map_camera))
+    T_map_odom = [T @ inverse(at(float(k))) for k, T in zip(numbers, T_map_camera, strict=True)]
+    told = T_map_odom[-1]
+    twists = Array.of(twists_of_poses(np.array([inverse(told) @ T for T in T_map_odom])), "f4")
+    knots = Knots(None, Array.of(np.zeros(3), "f8"), Array.of(numbers, "u4"), twists)
+    return LogCorrection(R1, Term(1, R1), 1, R1, pose7(told), knots)
 
 
 def corrected(message: LogCorrection, keyframes: int, T_camera_body: Float | None = None) -> CorrectedLog:
@@ -56,9 +63,14 @@ def test_before_the_first_and_after_the_last_listed_keyframe_the_correction_stay
     assert log.pose_of(4) == pytest.approx(TURN @ at(4.0), abs=1e-6)
 
 
-def test_a_correction_that_lists_nothing_known_moves_everything_with_the_odom_frame() -> None:
-    log = corrected(correction(3, 1, at(9.0)), 2)
-    assert log.pose_of(1) == pytest.approx(TURN @ at(1.0), abs=1e-6)
+def test_a_correction_in_short_moves_everything_with_the_odom_frame() -> None:
+    log = corrected(replace(correction(0, 1, at(0.0), TURN @ at(1.0)), knots=None), 2)
+    assert log.poses() == pytest.approx(np.array([TURN @ at(0.0), TURN @ at(1.0)]), abs=1e-6)
+
+
+def test_knots_beyond_what_is_known_of_the_log_count_all_the_same() -> None:
+    log = corrected(correction(0, 4, at(0.0), at(8.0)), 3)
+    assert [log.poses()[k][0, 3] for k in range(3)] == pytest.approx([0.0, 2.0, 4.0], abs=1e-6)
 
 
 def test_poses_are_the_bodys_where_its_mounting_is_known() -> None:
@@ -85,7 +97,7 @@ def test_keyframes_that_come_later_move_with_the_end_until_more_is_known() -> No
     copy = LogCopy()
     recorded(copy, 0, 1)
     log = CorrectedLog(correction(0, 1, at(0.0), at(1.0), TURN @ at(2.0)), RecordedOdometry(copy))
-    assert log.last() == pytest.approx(at(1.0), abs=1e-6)
+    assert len(log.poses()) == 2
     recorded(copy, 2, 3)
     assert log.pose_of(2) == pytest.approx(TURN @ at(2.0), abs=1e-6)
     assert log.last() == pytest.approx(TURN @ at(3.0), abs=1e-6)

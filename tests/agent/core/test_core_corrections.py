@@ -3,19 +3,23 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tests.agent.core.virtual_time import Robots
+from tests.protocol.wire_examples import knots
 
-from flocc_agent.core.corrections import KNOTS_MAX, LISTED_MAX, Corrections
+from flocc_agent.core.corrections import ASKED_MAX, TOLD_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.gossip import LIVES_MAX
+from flocc_agent.core.gossip import LIVES_MAX, Sealer
+from flocc_agent.core.knot_requests import GRACE_S
 from flocc_agent.core.parameters import CoreParameters, GossipParameters
+from flocc_agent.core.peer_budgets import MUTED_FIRST_S
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused
 from flocc_agent.core.robot import Restored, Robot
-from flocc_agent.geometry import pose, pose7
+from flocc_agent.geometry import Float, pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
@@ -23,8 +27,10 @@ from flocc_protocol.messages import (
     CorrectionBatch,
     CorrectionRequest,
     CorrectionVersion,
+    Digests,
     Envelope,
-    Heartbeat,
+    KnotRequest,
+    Knots,
     LogCorrection,
 )
 from flocc_protocol.records import SIGNATURE_BYTES
@@ -37,8 +43,25 @@ def corrections(own: LogId = R1) -> Corrections:
 
 
 def correction(term: Term, number: int, log: LogId = R1, anchor: LogId = R1) -> LogCorrection:
-    poses = Array.of(np.array([[0.0, 0, 0, 1, 0, 0, 0]]), "f4")
-    return LogCorrection(log, term, number, anchor, pose7(np.eye(4)), None, 0, 1, poses)
+    """With one knot: all of the odometry moves as one."""
+    return LogCorrection(log, term, number, anchor, pose7(np.eye(4)), knots(1))
+
+
+def short(message: LogCorrection) -> LogCorrection:
+    """As everybody but its owner gets it."""
+    return replace(message, knots=None)
+
+
+def line(keyframes: int) -> Float:
+    """Odometry along x."""
+    return np.array([pose(np.eye(3), np.array([float(k), 0.0, 0.0])) for k in range(keyframes)])
+
+
+def leader(
+    own: LogId = R1, near: tuple[str, ...] = (), sealer: Sealer | None = None, keyframes: int = 3
+) -> Corrections:
+    """With as long an odometry of every log."""
+    return Corrections(own, GossipParameters(), sealer, lambda log: line(keyframes), near.__contains__)
 
 
 def delivered(effects: list[Effect]) -> list[tuple[int, int, bool]]:
@@ -92,40 +115,46 @@ def test_a_restarted_robot_bids_above_what_it_applied() -> None:
 def test_another_robots_correction_is_kept_and_passed_on() -> None:
     machine, message = corrections(R1), correction(Term(1, R2), 1, log=R3)
     assert machine.on_message("r2", message) == []
-    assert machine.on_request("r3", CorrectionRequest((R3,))) == [Unicast("r3", CorrectionBatch((message,)))]
+    assert machine.on_request("r3", CorrectionRequest((R3,))) == [Unicast("r3", CorrectionBatch((short(message),)))]
 
 
 def test_a_newer_version_elsewhere_is_asked_for_once_per_timeout() -> None:
     machine, versions = corrections(), (CorrectionVersion(R1, Term(1, R2), 1),)
     assert machine.on_versions("r2", versions, 0.0) == [Unicast("r2", CorrectionRequest((R1,)))]
-    assert machine.on_versions("r3", versions, 0.5) == []
-    assert machine.on_versions("r3", versions, 1.0) == [Unicast("r3", CorrectionRequest((R1,)))]
+    assert machine.on_versions("r2", versions, 0.5) == []
+    assert machine.on_versions("r2", versions, 1.0) == [Unicast("r2", CorrectionRequest((R1,)))]
+
+
+def test_another_peer_is_asked_for_it_when_the_first_was_not_heard_again() -> None:
+    machine, versions = corrections(), (CorrectionVersion(R1, Term(1, R2), 1),)
+    machine.on_versions("r2", versions, 0.0)
+    assert machine.on_versions("r3", versions, 1.0) == []
+    assert machine.ask("r3", 2.0) == [Unicast("r3", CorrectionRequest((R1,)))]
+
+
+def test_what_somebody_says_to_hold_and_nobody_sends_is_given_up() -> None:
+    machine, questions = corrections(), 0
+    machine.on_versions("r2", (CorrectionVersion(R1, Term(1, R2), 1),), 0.0)
+    for second in range(1, 60):
+        questions += len(machine.ask("r2", float(second)))
+    assert questions == ASKED_MAX - 1
+    assert machine.sizes()["wanted_corrections"][0] == 0
 
 
 def test_versions_of_strangers_do_not_fill_the_memory() -> None:
     machine = corrections()
     for t in range(2000):
-        machine.on_versions("r2", (CorrectionVersion(LogId("r9", t), Term(1, R2), 1),), float(t))
-    assert machine.sizes()["asked_corrections"] == (REMEMBERED_MAX, REMEMBERED_MAX)
+        machine.on_versions("r2", (CorrectionVersion(LogId("r9", t), Term(1, R2), 1),), 0.0)
+    assert machine.sizes()["wanted_corrections"] == (REMEMBERED_MAX, REMEMBERED_MAX)
 
 
 def test_what_did_not_move_is_not_sent_again_in_one_term() -> None:
-    machine = corrections()
+    machine = leader()
     first = machine.publish(Term(1, R1), 1, solution())
     assert isinstance(first[0], Broadcast)
     assert machine.publish(Term(1, R1), 2, solution()) == []
     assert delivered(machine.publish(Term(1, R1), 3, solution(shift_m=0.5))) == [(1, 3, False)]
     assert delivered(machine.publish(Term(2, R1), 1, solution(shift_m=0.5))) == [(2, 1, False)]
-
-
-def test_a_long_trajectory_is_thinned_and_keeps_its_last_keyframe() -> None:
-    machine = corrections()
-    machine.publish(Term(1, R1), 1, solution(keyframes=1001))
-    message = machine.applied
-    assert message is not None
-    count = message.T_map_camera.shape[0]
-    assert count <= LISTED_MAX
-    assert message.first + message.step * (count - 1) == 1000
 
 
 class Seals:
@@ -177,7 +206,7 @@ def test_a_relay_cannot_forge_a_correction() -> None:
 
 
 def test_a_leader_signs_what_it_publishes() -> None:
-    machine = Corrections(R2, GossipParameters(), Seals("r2"))
+    machine = leader(R2, sealer=Seals("r2"))
     (sent,) = [e.message for e in machine.publish(Term(1, R2), 1, solution()) if isinstance(e, Broadcast)]
     assert isinstance(sent, CorrectionBatch)
     assert [c.signature.rstrip(b".") for c in sent.corrections] == [b"r2"]
@@ -198,14 +227,14 @@ def test_a_forged_correction_raises_no_counter() -> None:
     robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((forged,)))), 0.1)
     assert robot.election.counter_max == 0
     genuine = replace(forged, signature=Seals("r2").sign_correction(b""))
-    effects = robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((genuine,)))), 0.2)
+    effects = robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((genuine,)))), 0.1 + MUTED_FIRST_S)
     assert robot.election.counter_max == 900
     assert delivered(effects) == [(900, 1, False)]
 
 
 def test_versions_that_nobody_holds_raise_no_counter() -> None:
     robot = Robot(R1, 0, 1, CoreParameters(), 0.0)
-    lie = Heartbeat(1, 7, 0, None, 0, 0, (), (CorrectionVersion(R2, Term(900, R2), 1),))
+    lie = Digests(7, 0, (), 1, (CorrectionVersion(R2, Term(900, R2), 1),))
     robot.handle(MessageReceived(Envelope(R2, lie)), 0.1)
     assert robot.election.counter_max == 0
 
@@ -263,18 +292,87 @@ def test_after_a_merge_a_follower_of_the_other_leader_applies_the_common_leaders
 
 
 def test_people_are_told_some_keyframes_of_a_correction_and_the_last_one() -> None:
-    long = np.array([pose7(pose(np.eye(3), np.array([k, 0.0, 0.0]))) for k in range(40)])
-    message = LogCorrection(R1, Term(1, R2), 1, R2, pose7(np.eye(4)), None, 2, 3, Array.of(long, "f4"))
+    twists = Array.of(np.array([[0.0, 0.0, 0.0, 8.0, 0.0, 0.0], [0.0] * 6]), "f4")
+    told_knots = Knots(None, Array.of(np.zeros(3), "f8"), Array.of(np.array([0, 80]), "u4"), twists)
+    message = LogCorrection(R1, Term(1, R2), 1, R2, pose7(np.eye(4)), told_knots)
+    (told,) = (e.fact for e in leader(keyframes=90).on_message("r2", message) if isinstance(e, Report))
+    assert isinstance(told, CorrectionApplied)
+    assert len(told.knots) <= TOLD_MAX
+    assert told.knots[-1] == 80
+    assert [T[0] for T in told.T_map_body] == pytest.approx([k + 8.0 * (1 - k / 80) for k in told.knots])
     (told,) = (e.fact for e in corrections().on_message("r2", message) if isinstance(e, Report))
     assert isinstance(told, CorrectionApplied)
-    assert told.knots == tuple(2 + 3 * k for k in range(0, 40, 3))
-    assert len(told.knots) <= KNOTS_MAX
-    assert told.knots[-1] == 2 + 3 * 39
-    assert [T[0] for T in told.T_map_body] == list(range(0, 40, 3))
-    empty = LogCorrection(R1, Term(2, R2), 1, R2, pose7(np.eye(4)), None, 0, 1, Array.of(np.zeros((0, 7)), "f4"))
-    (told,) = (e.fact for e in corrections().on_message("r2", empty) if isinstance(e, Report))
-    assert isinstance(told, CorrectionApplied)
     assert (told.knots, told.T_map_body) == ((), ())
+
+
+def test_everybody_is_told_in_short_and_an_owner_in_range_all() -> None:
+    both = replace(solution().components[0], logs=(R1, R2), T_map_keyframe={R1: line(3), R2: line(3)})
+    both = replace(both, T_map_odom={R1: np.eye(4), R2: np.eye(4)}, covariance_map_odom={R1: None, R2: None})
+    effects = leader(near=("r2",)).publish(Term(1, R1), 1, GraphSolution((both,), ()))
+    (told,) = [e.message for e in effects if isinstance(e, Broadcast)]
+    assert isinstance(told, CorrectionBatch)
+    assert [(c.log, c.knots) for c in told.corrections] == [(R1, None), (R2, None)]
+    (sent,) = [e for e in effects if isinstance(e, Unicast)]
+    assert sent.to == "r2"
+    assert isinstance(sent.message, CorrectionBatch)
+    assert [(c.log, c.knots is None) for c in sent.message.corrections] == [(R2, False)]
+
+
+def test_a_covariance_that_changed_by_a_tenth_is_sent_though_nothing_moved() -> None:
+    machine = leader()
+    sure = [replace(solution().components[0], covariance_map_odom={R1: c * np.eye(6)}) for c in (1.0, 1.05, 1.3)]
+    rounds = [machine.publish(Term(1, R1), k, GraphSolution((c,), ())) for k, c in enumerate(sure, 1)]
+    assert [bool(effects) for effects in rounds] == [True, False, True]
+
+
+def test_knots_that_were_lost_are_asked_for_on_the_way_to_the_leader_and_passed_back() -> None:
+    """r1 leads; r3 hears only r2, and r2 only them."""
+    owner = Corrections(R3, GossipParameters(), towards=lambda term: ["r2"])
+    relay = Corrections(R2, GossipParameters(), towards=lambda term: ["r1", "r3"])
+    source, message = leader(), correction(Term(1, R1), 1, log=R3)
+    source._take_own(message, short(message))
+    assert relay.on_message("r1", short(message), 0.0) == []
+    assert owner.on_message("r2", short(message), 0.4) == [Unicast("r2", KnotRequest((message.version,)))]
+    assert owner.ask_knots(0.5) == []
+    assert relay.on_knot_request("r3", KnotRequest((message.version,)), 0.5) == [
+        Unicast("r1", KnotRequest((message.version,)))
+    ]
+    assert relay.on_knot_request("r3", KnotRequest((message.version,)), 0.6) == []
+    assert source.on_knot_request("r2", KnotRequest((message.version,)), 0.7) == [
+        Unicast("r2", CorrectionBatch((message,)))
+    ]
+    assert relay.on_message("r1", message, 0.8) == [Unicast("r3", CorrectionBatch((message,)))]
+    assert delivered(owner.on_message("r2", message, 0.9)) == [(1, 1, False)]
+    assert relay.on_message("r1", message, 1.0) == []
+
+
+def test_knots_that_a_leader_in_range_sends_by_itself_are_not_asked_for_at_once() -> None:
+    gossip, message = GossipParameters(), correction(Term(1, R1), 1, log=R3)
+    owner = Corrections(R3, gossip, near=lambda robot: robot == "r1", towards=lambda term: ["r1"])
+    assert owner.on_message("r1", short(message), 0.0) == []
+    assert owner.ask_knots(GRACE_S) == [Unicast("r1", KnotRequest((message.version,)))]
+    assert owner.ask_knots(GRACE_S) == []
+
+
+def test_knots_of_others_that_nobody_waits_for_are_not_kept() -> None:
+    machine, message = corrections(R1), correction(Term(1, R2), 1, log=R3)
+    assert machine.on_message("r2", message) == []
+    assert machine.of(R3) == short(message)
+    machine.follow_all()
+    assert machine.on_message("r2", message) == []
+    assert machine.of(R3) == message
+
+
+def test_questions_for_knots_are_bounded() -> None:
+    machine = Corrections(R1, GossipParameters(), towards=lambda term: ["r2"])
+    asked = 0
+    for k in range(3000):
+        version = CorrectionVersion(LogId("r9", k), Term(1, R2), 1)
+        asked += len(machine.on_knot_request(f"r{k}", KnotRequest((version,)), 0.0))
+        machine.on_knot_request(f"r{k}", KnotRequest((CorrectionVersion(R3, Term(1, R2), 1),)), 0.0)
+    assert all(size <= size_max for size, size_max in machine.sizes().values())
+    answers = sum(len(machine.ask_knots(float(second))) for second in range(100))
+    assert answers < 200
 
 
 def test_a_newcomer_that_believed_a_false_correction_is_won_back() -> None:

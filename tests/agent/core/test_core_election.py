@@ -19,7 +19,7 @@ R1, R2, R3 = LogId("r1"), LogId("r2"), LogId("r3")
 
 
 def heartbeat(leader: LeaderAdvert | None = None, counter: int = 0, compute_class: int = 0) -> Heartbeat:
-    return Heartbeat(1, 7, compute_class, leader, counter, 0, ())
+    return Heartbeat(1, 7, compute_class, leader, counter, 0)
 
 
 def election(own: LogId = R2, counter: int = 0) -> LeaderElection:

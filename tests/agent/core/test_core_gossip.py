@@ -248,7 +248,7 @@ def test_requests_that_heartbeats_call_for_have_a_least_pause() -> None:
 
 
 def test_the_last_record_of_a_robot_in_range_is_left_to_its_own_broadcast_for_a_moment() -> None:
-    reader = Gossip(R3, PARAMETERS, near=lambda robot: robot == "r1")
+    reader = Gossip(R3, PARAMETERS, near=lambda robot, now: robot == "r1")
     source, relay = writer(R1, 5), library(R2, {R1: 6})
     reader.on_records(R1, batch(source, R1, 0), 0.0)
     assert requests(reader.on_digests(R2, relay.digests(), 1.0)) == []
@@ -257,7 +257,7 @@ def test_the_last_record_of_a_robot_in_range_is_left_to_its_own_broadcast_for_a_
 
 
 def test_many_missing_records_are_asked_for_at_once() -> None:
-    reader = Gossip(R3, PARAMETERS, near=lambda robot: True)
+    reader = Gossip(R3, PARAMETERS, near=lambda robot, now: True)
     assert requests(reader.on_digests(R2, library(R2, {R1: 6}).digests(), 1.0)) == [("r2", 0)]
 
 

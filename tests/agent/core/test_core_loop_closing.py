@@ -38,11 +38,14 @@ def pairs_of(registrar: LogId, count: int) -> list[CandidatePair]:
     return [pair for pair in pairs if registrar_of(pair) == registrar][:count]
 
 
-def closing(compute_class: int = 0, own: LogId = R1, **changes: Any) -> LoopClosing:
+def closing(
+    compute_class: int = 0, own: LogId = R1, listens_until_s: float = float("-inf"), **changes: Any
+) -> LoopClosing:
     def odometry_pair(k: KeyframeId) -> tuple[KeyframeId, Any]:
         return KeyframeId(k.log, k.index - 1), ONE
 
-    return LoopClosing(own, compute_class, odometry_pair, LoopClosingParameters(**changes))
+    parameters = LoopClosingParameters(**changes)
+    return LoopClosing(own, compute_class, odometry_pair, parameters, listens_until_s=listens_until_s)
 
 
 def found(machine: LoopClosing, pair: CandidatePair, similarity: float = 0.9, now: float = 0.0) -> None:
@@ -145,6 +148,18 @@ def test_a_transferred_pair_is_taken_over_when_the_stronger_robot_is_gone() -> N
     assert [type(e) for e in machine.tick(machine.deadline())] == [Register]
 
 
+def test_a_pair_that_is_taken_over_goes_to_another_stronger_robot() -> None:
+    machine = closing()
+    pair = pair_of(R1)
+    hold_all(machine, pair)
+    machine.on_peer("r8", Peer(9))
+    found(machine, pair)
+    machine.tick(0.0)
+    machine.on_lost("r8", 1.0)
+    machine.on_peer("r9", Peer(9))
+    assert offers(machine.tick(1.0 + TAKEOVER_S)) == [("r9", True)]
+
+
 def test_a_registrar_that_comes_back_in_time_keeps_its_pair() -> None:
     machine, pair = closing(), pair_of(R2)
     machine.on_peer("r2", Peer(0))
@@ -183,6 +198,17 @@ def test_an_offer_of_a_pair_that_is_neither_transferred_nor_own_is_ignored() -> 
     machine, pair = closing(), pair_of(R2)
     machine.on_offer(CandidateOffer((pair,)), 0.0)
     assert machine.open_pairs() == []
+
+
+def test_a_robot_that_comes_back_listens_before_it_decides_about_a_pair() -> None:
+    machine = closing(listens_until_s=1.5)
+    pair = pair_of(R1)
+    hold_all(machine, pair)
+    found(machine, pair)
+    assert machine.tick(0.0) == []
+    assert machine.deadline() == 1.5
+    machine.on_peer("r9", Peer(9))
+    assert offers(machine.tick(1.5)) == [("r9", True)]
 
 
 def test_a_resolved_pair_is_never_taken_up_again() -> None:
@@ -396,6 +422,15 @@ def test_an_own_latent_that_the_store_evicted_rejects_its_pair() -> None:
     meet(robots, "r1", "r2")
     robots.run(30.0)
     assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
+
+
+def test_an_own_latent_that_the_disk_did_not_bring_back_rejects_its_pairs() -> None:
+    machine = closing()
+    pair = pair_of(R1)
+    machine.on_held(pair.high)
+    found(machine, pair)
+    assert machine.own_lost() == [KeyframeId(R1, pair.low.index - 1), pair.low]
+    assert machine.on_latent_lost(pair.low, 0.0) == [pair]
 
 
 def test_an_evicted_latent_of_another_robot_is_fetched_again() -> None:

@@ -21,7 +21,7 @@ R1, R2 = LogId("r1"), LogId("r2")
 
 
 def heartbeat(boot: int, sequence: int = 1) -> Heartbeat:
-    return Heartbeat(sequence, boot, 0, None, 0, 0, ())
+    return Heartbeat(sequence, boot, 0, None, 0, 0)
 
 
 def disk_of(robots: Robots, name: str) -> Restored:
@@ -223,7 +223,7 @@ def test_no_pair_is_handed_to_a_name_under_which_two_robots_run() -> None:
     robots = Robots()
     robot = robots.add("r1")
     for boot in (7, 8, 7):
-        message = Heartbeat(boot, boot, 9, None, 0, 0, ())
+        message = Heartbeat(boot, boot, 9, None, 0, 0)
         robots.put("r1", MessageReceived(Envelope(LogId("server", boot), message)))
     found = Candidate(CandidatePair.of(keyframe("r3/1"), keyframe("r4/1")), 0.9)
     robots.carry_out("r1", robot.closing.on_candidates([found], robots.now_s))
@@ -231,6 +231,19 @@ def test_no_pair_is_handed_to_a_name_under_which_two_robots_run() -> None:
     sent = [effect for _, _, effect in robots.done if isinstance(effect, Unicast)]
     assert not [effect for effect in sent if isinstance(effect.message, CandidateOffer)]
     assert robot.closing.roles(found.pair) is not None
+
+
+def test_the_heartbeat_is_slower_in_a_crowd_and_never_too_slow_for_the_timeout() -> None:
+    parameters = NeighbourParameters()
+    assert [parameters.period_s(count) for count in (0, 8, 32, 48, 64, 512)] == [0.5, 0.5, 0.5, 0.75, 1.0, 1.0]
+    assert 3 * parameters.period_s(512) <= parameters.timeout_s
+    robots = Robots()
+    robots.add("r1")
+    for k in range(64):
+        robots.put("r1", MessageReceived(Envelope(LogId(f"s{k:02d}"), heartbeat(1, k))))
+    before = len(robots.effects("r1", Broadcast))
+    robots.run(2.5)
+    assert len(robots.effects("r1", Broadcast)) - before <= 4
 
 
 def test_neighbours_beyond_the_maximum_are_refused() -> None:

@@ -13,6 +13,7 @@ from tests.agent.perception.learned_examples import MODELS, SMALL, front_end, te
 from flocc_agent.config import LearnedConfig
 from flocc_agent.core.interfaces import Camera, Image, OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.extras import to_install
 from flocc_agent.geometry import angle_rad, between
 from flocc_agent.perception.latent import BadLatent, pack
 from flocc_agent.perception.learned.keypoints import read_features, write_features
@@ -176,7 +177,7 @@ def test_without_the_extra_one_sentence_says_what_to_install(missing: str) -> No
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
-    assert done.stdout.strip() == "the learned front end needs torch and kornia: pip install 'flocc[learned]'"
+    assert done.stdout.strip() == f"the learned front end needs torch and kornia: {to_install('learned')}"
 
 
 def test_the_configuration_names_the_models() -> None:

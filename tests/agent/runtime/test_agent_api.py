@@ -30,7 +30,7 @@ from flocc_agent.perception.synthetic import pose_image
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import Envelope, Heartbeat, LogDigest, RecordBatch, Records
+from flocc_protocol.messages import Digests, Envelope, LogDigest, RecordBatch, Records
 from flocc_protocol.records import FixRecord, KeyframeRecord, PoseFixRecord, encode_record
 
 ALONE = TransportConfig(
@@ -85,11 +85,11 @@ async def test_a_robot_whose_disk_is_behind_what_it_published_begins_another_log
         assert agent.log != old
 
 
-async def test_what_a_heartbeat_claims_ends_no_log(tmp_path: Path) -> None:
+async def test_what_a_digest_claims_ends_no_log(tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
     async with Agent(config, camera()) as agent:
         old = agent.log
-        lie = Heartbeat(1, 7, 0, None, 0, 0, (LogDigest(old, 5, 77), LogDigest(old, 0, 77)))
+        lie = Digests(7, 2, (LogDigest(old, 5, 77), LogDigest(old, 0, 77)), 0, ())
         assert agent._driver is not None
         agent._driver.put(MessageReceived(Envelope(LogId("r2"), lie)))
         await agent.add_keyframe(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 1.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.geometry import Float, pose, so3_exp
-from flocc_agent.runtime.pose_limits import POSITION_MAX_M, PoseGate, possible
+from flocc_agent.runtime.pose_limits import POSITION_MAX_M, PoseGate, possible, spikes
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory_text import read_trajectory
 
@@ -89,3 +89,44 @@ def test_rotations_alone_are_never_too_fast() -> None:
     gate = PoseGate()
     gate.let_in(at_m(5.0), 1.0, kept=True)
     assert gate.fault(pose(so3_exp(np.array([0.0, 0.0, 3.0])), np.array([5.0, 0.0, 0.0])), 1.0 + 1e-6) is None
+
+
+@pytest.mark.parametrize("step_s", [0.05, 1.0, 10.0])
+@pytest.mark.parametrize("form", ["tum", "kitti"])
+def test_a_single_pose_that_jumps_away_is_left_out_and_counted(tmp_path: Path, step_s: float, form: str) -> None:
+    """Of any stamps: at one pose in ten seconds, 5 km are within the speed that a robot may have."""
+    poses = [at_m(0.1 * k + (5000.0 if k == 30 else 0.0)) for k in range(60)]
+    stamps_s = [1.7e9 + step_s * k for k in range(60)]
+    path = tmp_path / "odometry.txt"
+    if form == "tum":
+        path.write_text("".join(line(s, T) for s, T in zip(stamps_s, poses, strict=True)))
+    else:
+        np.savetxt(path, np.array(poses)[:, :3].reshape(60, 12))
+    trajectory, notes = read_trajectory(path, stamps_s=stamps_s)
+    assert len(trajectory) == 59
+    assert float(np.abs(trajectory.T_fixed_body[:, 0, 3]).max()) < 10.0
+    assert len(notes) == 1
+    assert notes[0].startswith(f"{path}:31: 1 of 60 poses ")
+
+
+def drawn_walk(rng: np.random.Generator) -> Float:
+    """Positions of somebody who walks, stands, turns round and is carried; of any rate."""
+    steps = rng.normal(0, rng.choice([0.01, 0.3, 5.0]), (rng.integers(20, 200), 3))
+    steps[rng.random(len(steps)) < rng.choice([0.0, 0.7])] = 0.0
+    return np.cumsum(steps, axis=0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_walks_have_no_spike_and_one_that_is_put_in_is_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    walk = drawn_walk(rng)
+    assert not spikes(walk).any()
+    k = int(rng.integers(1, len(walk) - 1))
+    walk[k] += 5000.0
+    assert np.flatnonzero(spikes(walk)).tolist() == [k]
+
+
+def test_a_ride_that_goes_on_elsewhere_has_no_spike() -> None:
+    ferry = np.concatenate([np.arange(20.0), 5000.0 + np.arange(20.0)])[:, None] * [1.0, 0.0, 0.0]
+    assert not spikes(ferry).any()
+    assert not spikes(np.array([[0.0, 0, 0], [5000.0, 0, 0], [0.0, 0, 0]])).any()

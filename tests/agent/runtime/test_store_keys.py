@@ -5,8 +5,8 @@ import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
+from tests.protocol.wire_examples import knots
 
 from flocc_agent.config import StoreConfig, TlsConfig
 from flocc_agent.core.gossip import Sealer
@@ -17,7 +17,6 @@ from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.stored_correction import stored
 from flocc_launch.setup.credentials import make_keys
-from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import LogCorrection, encode_correction
 from flocc_protocol.records import KeyframeRecord, encode_record
@@ -50,9 +49,7 @@ def filled(path: Path, folders: dict[str, Path] | None) -> Path:
             store.put_record(
                 log, number, data if folders is None else sealer(folders[log.robot]).seal(log, number, data)
             )
-    correction = LogCorrection(
-        OWN, Term(3, R4), 1, R2, IDENTITY, None, 0, 1, Array.of(np.array([IDENTITY], np.float32), "f4")
-    )
+    correction = LogCorrection(OWN, Term(3, R4), 1, R2, IDENTITY, knots(1))
     if folders is not None:
         signature = sealer(folders["r4"]).sign_correction(encode_correction(correction))
         correction = replace(correction, signature=signature)

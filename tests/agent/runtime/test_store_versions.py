@@ -22,11 +22,18 @@ from flocc_agent.runtime.record_tables import MIGRATIONS
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.stored_correction import correction_in, stored
 from flocc_protocol.codec import to_bytes
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import LogId, Term
 from flocc_protocol.records import UnknownRecord
 
 OLD = Path(__file__).parent / "store_04961b5" / "r2"
 OWN = LogId("r2")
+FORM_1 = (
+    "9b0192a2723100920992a27232000492a2723100c438000000000000f03f000000000000004000000000000000000000"
+    "00000000000000000000000000000000000000000000000000000000f03fc0030294a26634920207c438000000000000"
+    "0000000000000000803f0000000000000000000000000000803f00000000000000000000803f00000000000000000000"
+    "0000cb3ff0000000000000c400"
+)
+"""A correction as commit d7e3ab6 kept it."""
 
 
 def old_store(folder: Path) -> Path:
@@ -121,6 +128,19 @@ def test_a_stored_correction_reads_back(correction: object) -> None:
     assert correction_in(stored(correction)) == correction  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("data", [b"", b"\x00", to_bytes([2, "a later form"]), to_bytes([1, 2, 3]), to_bytes({})])
+def test_a_correction_of_form_1_keeps_its_number_and_where_the_odom_frame_lies() -> None:
+    """It listed poses; without the odometry they say nothing, and the next correction takes its place."""
+    correction = correction_in(bytes.fromhex(FORM_1))
+    assert correction is not None
+    assert correction.version == (LogId("r1"), Term(9, LogId("r2")), 4)
+    assert correction.T_map_odom == (1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    assert correction.knots is not None
+    assert correction.knots.keyframes.numpy().tolist() == [5]
+    assert not correction.knots.twists.numpy().any()
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00", to_bytes([3, "a later form"]), to_bytes([2, "a form"]), to_bytes([1, 2, 3]), to_bytes({})]
+)
 def test_what_is_no_stored_correction_is_none(data: bytes) -> None:
     assert correction_in(data) is None

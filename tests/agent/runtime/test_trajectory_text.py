@@ -307,3 +307,28 @@ def test_what_is_no_trajectory_is_shown_and_what_is_no_file_is_not_opened(tmp_pa
     (tmp_path / "endless.tum").symlink_to("/dev/zero")
     with pytest.raises(RecordingError, match="is not a file"):
         read_trajectory(tmp_path / "endless.tum")
+
+
+DATES = {
+    "T": lambda s: f"2023-11-14T22:13:{20 + s:04.1f}",
+    "zone": lambda s: f"2023-11-15T00:13:{20 + s:04.1f}+02:00",
+    "Z": lambda s: f"2023-11-14T22:13:{20 + s:06.3f}Z",
+    "space": lambda s: f"2023-11-14 22:13:{20 + s:04.1f}",
+}
+
+
+@pytest.mark.parametrize("name", DATES)
+@pytest.mark.parametrize("header", ["", "# timestamp tx ty tz qx qy qz qw\n"])
+def test_dates_are_stamps(tmp_path: Path, name: str, header: str) -> None:
+    """1 700 000 000 s is 2023-11-14 22:13:20 UTC."""
+    lines = [row(*t, *q, separator=" ") for _, t, q in rows()]
+    text = header + "".join(f"{DATES[name](0.1 * k)} {line}" for k, line in enumerate(lines))
+    trajectory, notes = read_trajectory(write(tmp_path, "odometry.txt", text.encode()))
+    assert trajectory.stamps_s == pytest.approx([ZERO_S + 0.1 * k for k in range(10)], abs=1e-6)
+    assert notes == ()
+
+
+def test_a_date_that_is_none_is_refused_with_its_line(tmp_path: Path) -> None:
+    path = write(tmp_path, "odometry.txt", b"2023-13-45T22:13:20 1 2 3 0 0 0 1\n2023-13-45T22:13:21 1 2 3 0 0 0 1\n")
+    with pytest.raises(RecordingError, match=r"odometry\.txt:1: '2023-13-45T22:13:20' is not a number"):
+        read_trajectory(path)

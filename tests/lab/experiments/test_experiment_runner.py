@@ -1,5 +1,6 @@
 """Experiments: what is finished is kept, resumed, never mixed, and marked partial until all is there."""
 
+import ast
 import json
 import multiprocessing
 import os
@@ -208,3 +209,25 @@ def test_times_are_measured_one_after_the_other_and_processes_are_bounded_by_cor
 def test_a_table_for_people_rounds_and_says_what_is_not_known() -> None:
     table = [{"a": 0.123456, "b": None, "c": True, "d": 123456.7}]
     assert markdown_table(table).splitlines()[-1] == "| 0.1235 | n/a | yes | 123457 |"
+
+
+def test_without_matplotlib_all_but_the_figure_is_written_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setattr(outputs, "write_figures", lambda *_: pytest.fail("drawn without matplotlib"))
+    run(tmp_path / "toy")
+    assert {"toy.csv", "toy.md", "findings.json"} <= {path.name for path in (tmp_path / "toy").iterdir()}
+    assert "pip install '.[figures]'" in caplog.text
+
+
+def test_findings_cite_the_paper_or_a_page_that_exists() -> None:
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "lab/flocc_lab/experiments").glob("*.py")]
+    calls = [node for text in sources for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
+    made = [call for call in calls if getattr(call.func, "id", "") in ("judged", "ExperimentFinding")]
+    given = [call.args[1] for call in made if len(call.args) > 1]
+    cited = {str(source.value) for source in given if isinstance(source, ast.Constant)}
+    assert len(cited) > 3
+    pages = {source.split(",")[0]: source for source in cited if not source.startswith(("Sec. ", "Fig. ", "Eq. "))}
+    for page, source in pages.items():
+        assert f"## {source.split(', ')[1]}" in (ROOT / page).read_text(encoding="utf-8"), source

@@ -1,12 +1,13 @@
 """The learned front end: ALIKED or XFeat features matched by LightGlue, free for commercial use (docs/learned.md).
 
 The networks are kornia's classes, the weights files that `flocc weights get learned` brings. Torch and kornia are an
-optional extra (`pip install flocc[learned]`): nothing outside this package imports them at import time, and this
+optional extra (`pip install '.[learned]'`): nothing outside this package imports them at import time, and this
 `__init__` and `files` do not either.
 """
 
 from flocc_agent.config import LearnedConfig
 from flocc_agent.core.interfaces import Describer, Encoder, Registrar
+from flocc_agent.extras import to_install
 from flocc_protocol.errors import FloccError
 
 
@@ -26,5 +27,5 @@ def build(config: LearnedConfig) -> tuple[Describer, Encoder, Registrar]:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] not in ("torch", "kornia"):
             raise
-        raise LearnedMissing("the learned front end needs torch and kornia: pip install 'flocc[learned]'") from error
+        raise LearnedMissing(f"the learned front end needs torch and kornia: {to_install('learned')}") from error
     return frontend.build(config)

@@ -1,12 +1,13 @@
 """The paper's front end: CosPlace descriptors and MASt3R registration, split across two robots.
 
 Written from a specification of the published networks; no reference code and no weights live here. Torch is an
-optional extra (`pip install flocc[mast3r]`): nothing outside this package imports it at import time, and this
+optional extra (`pip install '.[mast3r]'`): nothing outside this package imports it at import time, and this
 `__init__` does not either.
 """
 
 from flocc_agent.config import Mast3rConfig
 from flocc_agent.core.interfaces import Describer, Encoder, Registrar
+from flocc_agent.extras import to_install
 from flocc_protocol.errors import FloccError
 
 
@@ -26,5 +27,5 @@ def build(config: Mast3rConfig) -> tuple[Describer, Encoder, Registrar]:
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "PIL"):
             raise
-        raise TorchMissing("the mast3r front end needs torch and Pillow: pip install 'flocc[mast3r]'") from error
+        raise TorchMissing(f"the mast3r front end needs torch and Pillow: {to_install('mast3r')}") from error
     return frontend.build(config)

@@ -4,6 +4,7 @@ Beside the agent's own two sessions, because it goes to another network: the rou
 Callbacks run on zenoh's threads and may only enqueue.
 """
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,18 +12,21 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
+from flocc_agent.config import Ros2Config
+from flocc_agent.runtime.ros2.node import Act
 from flocc_agent.runtime.ros2.topics import (
     EntityRole,
     Node,
     Offer,
     Qos,
     Topic,
+    answer_attachment,
     attachment,
     full_name,
     offers_of,
     read_offer,
 )
-from flocc_agent.runtime.ros2.types import MessageTypes, gid_of
+from flocc_agent.runtime.ros2.types import TRIGGER, TRIGGER_HASH, MessageTypes, domain_of, gid_of, trigger_response
 from flocc_agent.runtime.zenoh_session import open_session
 
 MESSAGE_BYTES_MAX = 64 * 1024 * 1024
@@ -79,15 +83,22 @@ class Publisher:
 class Ros2Session:
     """The session and its node."""
 
-    def __init__(self, router: str, domain_id: int, namespace: str, node: str, types: MessageTypes) -> None:
+    def __init__(self, config: Ros2Config, name: str, types: MessageTypes) -> None:
         """Open; blocks for up to half a second, also where no router is there: zenoh goes on dialling.
 
         Raises:
             TransportError: The settings cannot be used.
+            Ros2Error: ROS_DOMAIN_ID is no number.
         """
+        self.config = config
+        self.where = config.router
+        self.advice = f"nobody answers at {config.router}; is rmw_zenohd running?"
+        self.notes: list[str] = []
         self._types = types
-        self._session = open_session(session_settings(router), f"ROS 2 node {node}")
-        self._node = Node(domain_id, str(self._session.zid()), full_name("", namespace) if namespace else "", node)
+        domain_id = domain_of(os.environ) if config.domain_id is None else config.domain_id
+        self._session = open_session(session_settings(config.router), f"ROS 2 node {name}")
+        namespace = full_name("", config.namespace) if config.namespace else ""
+        self._node = Node(domain_id, str(self._session.zid()), namespace, name)
         self._numbers = 0
         self._kept: list[object] = [self._session.liveliness().declare_token(self._node.token())]
 
@@ -115,6 +126,22 @@ class Ros2Session:
         self._kept += [token, subscriber]
         return described
 
+    def serve(self, name: str, act: Act) -> None:
+        """Offer a std_srvs/Trigger service, `~/name`."""
+        own = f"{self._node.namespace}/{self._node.name}/{name}"
+        service = Topic(own, TRIGGER, TRIGGER_HASH, Qos(10))
+
+        def answer(query: zenoh.Query) -> None:
+            worked, said = act()
+            attached = answer_attachment(query.attachment.to_bytes() if query.attachment else b"", time.time_ns())
+            if attached is not None:
+                query.reply(query.key_expr, trigger_response(worked, said), attachment=attached)
+            query.drop()
+
+        key = service.key(self._node.domain_id)
+        token = self._session.liveliness().declare_token(self._token(EntityRole.SERVES, service))
+        self._kept += [token, self._session.declare_queryable(key, answer, complete=True)]
+
     def watch_offers(self, on_offer: Callable[[Offer], None]) -> None:
         """Tell of every publisher in the domain, those that are there first."""
 
@@ -131,12 +158,17 @@ class Ros2Session:
         info = self._session.info
         return bool(info.routers_zid() or info.peers_zid())
 
+    def now_ns(self) -> int:
+        """The computer's time."""
+        return time.time_ns()
+
     def close(self) -> None:
         """Close; blocks for a moment."""
         self._session.close()
 
     def _topic(self, topic: str, type_name: str, qos: Qos) -> Topic:
-        return Topic(full_name(self._node.namespace, topic), type_name, self._types.hash(type_name), qos)
+        inside = topic.replace("~", self._node.name, 1) if topic.startswith("~/") else topic
+        return Topic(full_name(self._node.namespace, inside), type_name, self._types.hash(type_name), qos)
 
     def _token(self, role: EntityRole, topic: Topic) -> str:
         self._numbers += 1

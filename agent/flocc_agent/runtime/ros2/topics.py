@@ -24,6 +24,7 @@ class EntityRole(Enum):
 
     PUBLISHES = "MP"
     SUBSCRIBES = "MS"
+    SERVES = "SS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +103,21 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """What another node's liveliness token says it publishes."""
+    """What another node publishes.
+
+    Attributes:
+        node: Full name.
+        topic: Full name.
+        type: As of `Topic`.
+        hash: As of `Topic`.
+        misfit: Why its quality of service does not fit ours, in words; empty where it does.
+    """
 
     node: str
     topic: str
     type: str
     hash: str
+    misfit: str = ""
 
 
 def offers_of(domain_id: int) -> str:
@@ -148,3 +158,11 @@ def full_name(namespace: str, topic: str) -> str:
 def attachment(number: int, source_stamp_ns: int, gid: bytes) -> bytes:
     """What rmw_zenoh attaches to a sample, 33 bytes: its number from 1, when it was sent, and who publishes."""
     return _ATTACHMENT.pack(number, source_stamp_ns, GID_BYTES, gid)
+
+
+def answer_attachment(asked: bytes, source_stamp_ns: int) -> bytes | None:
+    """What is attached to the answer of a service: the question's number and asker; None where that said neither."""
+    if len(asked) != _ATTACHMENT.size:
+        return None
+    number, _, _, gid = _ATTACHMENT.unpack(asked)
+    return attachment(number, source_stamp_ns, gid)

@@ -4,8 +4,10 @@ The definitions are those of Jazzy; the messages used here have had the same one
 """
 
 import struct
+from collections.abc import Mapping
 from typing import Any
 
+from flocc_agent.extras import to_install
 from flocc_protocol.errors import FloccError
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -16,10 +18,19 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ODOMETRY = "nav_msgs/msg/Odometry"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+GRID = "nav_msgs/msg/OccupancyGrid"
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+
+TRIGGER = "std_srvs/srv/Trigger"
+TRIGGER_HASH = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+"""rosbags has no services."""
 
 SEC_MAX = 2**31 - 3600
 """ROS counts seconds in 32 bits; an hour is left for what is dated ahead."""
+
+DOMAIN_ID_MAX = 232
 
 _HEADER = {b"\x00\x01": "<", b"\x00\x00": ">"}
 _FRAME_AT = 16
@@ -42,7 +53,7 @@ class MessageTypes:
             from rosbags.serde import SerdeError
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise Ros2Error("the ROS 2 side needs rosbags and xxhash: pip install 'flocc[ros2]'") from error
+            raise Ros2Error(f"the ROS 2 side needs rosbags and xxhash: {to_install('ros2')}") from error
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._broken = (SerdeError, struct.error, ValueError, IndexError, AssertionError, OverflowError, MemoryError)
 
@@ -96,6 +107,24 @@ def checked_stamp_ns(sec: int, nanosec: int) -> int:
     if not 0 <= sec < SEC_MAX or nanosec >= 10**9:
         raise BadMessage(f"the stamp {sec} s and {nanosec} ns is no time")
     return int(sec) * 10**9 + int(nanosec)
+
+
+def trigger_response(success: bool, message: str) -> bytes:
+    """Response of a std_srvs/Trigger service as CDR."""
+    text = message.encode() + b"\0"
+    return b"\x00\x01\x00\x00" + struct.pack("<?3xI", success, len(text)) + text
+
+
+def domain_of(environment: Mapping[str, str]) -> int:
+    """The ROS_DOMAIN_ID of an environment; 0 where there is none.
+
+    Raises:
+        Ros2Error: It is no number from 0 to 232.
+    """
+    given = environment.get("ROS_DOMAIN_ID", "") or "0"
+    if not given.isdecimal() or int(given) > DOMAIN_ID_MAX:
+        raise Ros2Error(f"ROS_DOMAIN_ID is {given!r}; it must be a number from 0 to {DOMAIN_ID_MAX}")
+    return int(given)
 
 
 def gid_of(token: str) -> bytes:

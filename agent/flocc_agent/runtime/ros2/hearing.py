@@ -1,0 +1,229 @@
+"""What a robot's messages say, kind by kind: intrinsics, mounting, odometry, images, fixes. Called on one thread.
+
+What cannot be used is said once, counted and left out.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.config import Ros2Config
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, step_fault
+from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
+from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
+from flocc_agent.runtime.ros2.problems import Problems
+from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
+from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
+from flocc_agent.runtime.ros2.synchroniser import Synchroniser
+from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
+from flocc_agent.runtime.ros2.types import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    TF,
+    BadMessage,
+    MessageTypes,
+    header_of,
+)
+
+Float = NDArray[np.float64]
+
+KINDS = ("tf_static", "camera_info", "odometry", "fix", "image")
+"""What is taken in first where much has come at once: images last, since they need all the others."""
+IMAGES_MAX = 64
+IMAGES_BYTES_MAX = 64 * 1024 * 1024
+"""Images that wait for odometry or for the encoder; the oldest gives way."""
+ODOMETRY_GAP_MAX_S = 0.5
+"""Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
+BACK_IN_TIME = (
+    "time goes backwards; such messages are left out. After a reset of odometry or clock, call ~/reset_odometry"
+)
+CLOCKS_APART_MAX_S = 10.0
+
+SENSOR = Qos(5, best_effort=True)
+TF_STATIC = Qos(100, transient_local=True)
+
+
+class Hearing:
+    """Takes messages of each kind."""
+
+    def __init__(
+        self,
+        config: Ros2Config,
+        types: MessageTypes,
+        problems: Problems,
+        fixes: SatelliteFixes,
+        mount_camera: Callable[[Float], None],
+    ) -> None:
+        """Prepare; a mounting that is configured is told at once.
+
+        Args:
+            config: Topics and frames.
+            types: Reads messages.
+            problems: Takes what is wrong.
+            fixes: Takes fixes.
+            mount_camera: Told `T_body_camera` once it is known.
+        """
+        self._config = config
+        self._types = types
+        self._problems = problems
+        self._fixes = fixes
+        self._mount_camera = mount_camera
+        self._static = StaticFrames()
+        self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
+        self._compared_ns: int | None = None
+        self.covariances = StepCovariances()
+        self.heard = Counter[str]()
+        self.subscribed: dict[str, Topic] = {}
+        self.eye: Eye | None = None
+        self.T_body_camera: Float | None = None
+        if config.camera_mounting is not None:
+            self.mount(pose_of_numbers(config.camera_mounting, "camera_mounting"))
+
+    def wanted(self) -> dict[str, tuple[str, str, Qos]]:
+        """Topic, type and quality of service of each subscription."""
+        config = self._config
+        wanted: dict[str, tuple[str, str, Qos]] = {}
+        if config.odometry_topic:
+            wanted["odometry"] = (config.odometry_topic, ODOMETRY, Qos(200))
+        if config.image_topic:
+            wanted["image"] = (config.image_topic, self.image_type(), SENSOR)
+            wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)
+            if config.camera_mounting is None:
+                wanted["tf_static"] = (f"{config.tf_topic}_static", TF, TF_STATIC)
+        if config.fix_topic:
+            wanted["fix"] = (config.fix_topic, NAV_SAT_FIX, SENSOR)
+        return wanted
+
+    def image_type(self) -> str:
+        """Type of the images' messages."""
+        return COMPRESSED_IMAGE if self._config.is_compressed() else IMAGE
+
+    def take(self, kind: str, payload: bytes) -> bool:
+        """Take in a message; returns whether it is odometry or an image that counts."""
+        self.heard[kind] += 1
+        try:
+            match kind:
+                case "odometry":
+                    return self._take_odometry(payload)
+                case "image":
+                    return self._take_image(payload)
+                case "camera_info":
+                    self._take_camera_info(payload)
+                case "fix":
+                    self._take_fix(payload)
+                case "tf_static":
+                    self._static.add(self._types.read(payload, TF))
+        except BadMessage as error:
+            self.refuse(kind, str(error))
+        return False
+
+    def _take_camera_info(self, payload: bytes) -> None:
+        model = model_of(self._types.read(payload, CAMERA_INFO), self._config.rectified)
+        if self.eye is None or self.eye.model != model:
+            view_deg = self._config.field_of_view_deg
+            self.eye = Eye(model, None if view_deg is None else math.radians(view_deg))
+
+    def _take_odometry(self, payload: bytes) -> bool:
+        config = self._config
+        message = self._types.read(payload, ODOMETRY)
+        sample = odometry_of(message, config.odom_frame, config.base_frame)
+        self._check_step(*sample)
+        if not self.synchroniser.add_odometry(*sample):
+            self.complain("odometry", BACK_IN_TIME)
+            return False
+        self.covariances.add(sample[0], np.reshape(message.pose.covariance, (6, 6)))
+        return True
+
+    def _check_step(self, stamp_ns: int, T_odom_body: Float) -> None:
+        """Refuse odometry that lies out of reach of the newest.
+
+        Raises:
+            BadMessage: It moved faster than any robot.
+        """
+        if self.synchroniser.latest is None or stamp_ns <= self.synchroniser.latest[0]:
+            return
+        last_ns, T_odom_last = self.synchroniser.latest
+        if step_fault(T_odom_body[:3, 3] - T_odom_last[:3, 3], (stamp_ns - last_ns) * 1e-9) is not None:
+            raise BadMessage(f"odometry jumps out of reach (faster than {SPEED_MAX_M_S:g} m/s)")
+
+    def _take_image(self, payload: bytes) -> bool:
+        stamp_ns, frame = header_of(payload)
+        wanted = self._config.camera_frame
+        if wanted and frame.lstrip("/") != wanted:
+            raise BadMessage(f"images are in frame {frame!r}, but the configuration says {wanted!r}")
+        if not self.synchroniser.add_image(stamp_ns, payload):
+            self.complain("image", BACK_IN_TIME)
+            return False
+        return True
+
+    def _take_fix(self, payload: bytes) -> None:
+        if not self._fixes.add_fix(fix_of(self._types.read(payload, NAV_SAT_FIX))):
+            self.complain("fix", BACK_IN_TIME)
+
+    def mounting(self, camera_frame: str) -> Float | None:
+        """`T_body_camera`, found once; None while /tf_static does not connect the two."""
+        if self.T_body_camera is None:
+            T_body_camera = self._static.between(self._config.base_frame, camera_frame)
+            if T_body_camera is not None:
+                self.mount(T_body_camera)
+        return self.T_body_camera
+
+    def mount(self, T_body_camera: Float) -> None:
+        """Know where the camera sits."""
+        self.T_body_camera = T_body_camera
+        self._mount_camera(T_body_camera)
+
+    def compare(self, offer: Offer) -> None:
+        """Say when a node publishes one of our topics as something else: its messages would never come."""
+        for kind, topic in self.subscribed.items():
+            if offer.topic != topic.name:
+                continue
+            if (offer.type, offer.hash) != (topic.type, topic.hash):
+                told = offer.type if offer.type != topic.type else f"{offer.type} of another definition ({offer.hash})"
+                self.complain(kind, f"{offer.node} publishes it as {told}, but {topic.type} is needed")
+            elif offer.misfit:
+                self.complain(kind, f"{offer.node} {offer.misfit}: --ros-args -p qos_overrides (docs/ros2.md)")
+
+    def say_what_is_missing(self) -> None:
+        """Say what has not come, and what does not connect."""
+        for kind, topic in self.subscribed.items():
+            if not self.heard[kind]:
+                self.complain(kind, f"no {topic.type} has come yet")
+        if self.heard["image"] and self._problems.counts["image without mounting"] and self.T_body_camera is None:
+            self.complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
+
+    def compare_clocks(self, now_ns: int) -> None:
+        """Say when odometry that still comes is stamped by another clock than the node's: tf2 finds nothing then.
+
+        Args:
+            now_ns: The node's time; 0 while simulated time has not begun.
+        """
+        if now_ns == 0:
+            self.complain("clock", "use_sim_time is set, but no /clock has come")
+        elif self.synchroniser.latest is not None and self.synchroniser.latest[0] != self._compared_ns:
+            self._compared_ns = self.synchroniser.latest[0]
+            behind_s = (now_ns - self.synchroniser.latest[0]) * 1e-9
+            if abs(behind_s) > CLOCKS_APART_MAX_S:
+                aside = "behind" if behind_s > 0 else "ahead of"
+                self.complain(
+                    "odometry",
+                    f"its stamps are more than {CLOCKS_APART_MAX_S:g} s {aside} this node's clock; where the robot has "
+                    "simulated time, start every node with it (-p use_sim_time:=true)",
+                )
+
+    def refuse(self, kind: str, sentence: str) -> None:
+        """Count a message that cannot be used, and say why once."""
+        self._problems.refuse(kind, self._name(kind), sentence)
+
+    def complain(self, kind: str, sentence: str) -> None:
+        """Say something of a topic once."""
+        self._problems.say(self._name(kind), sentence)
+
+    def _name(self, kind: str) -> str:
+        return self.subscribed[kind].name if kind in self.subscribed else "ROS 2"

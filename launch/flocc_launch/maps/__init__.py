@@ -1,0 +1,1 @@
+"""Maps that outlive their missions: saved from stores, shown, merged, pruned, exported."""

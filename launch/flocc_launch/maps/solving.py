@@ -1,0 +1,128 @@
+"""The solution of a map: all logs in one frame, with covariances and the closures that it used."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend.alignment import evenly
+from flocc_agent.config import BackendConfig
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.gossip import NewRecord
+from flocc_agent.core.pose_graph import ClosureState, Component, OptimisationFailed, map_frame
+from flocc_agent.core.saved_map import SavedClosure, SavedMap
+from flocc_agent.geometry import upper_triangle
+from flocc_launch.maps.gathering import Logs, opened_record
+from flocc_protocol.errors import DecodeError, FloccError
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+
+COVARIANCES_MAX = 2000
+"""Keyframes whose covariance is computed; of more, so many evenly spread ones."""
+UPPER = 21
+
+
+class NotSolved(FloccError):
+    """Logs that give no map."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedMap:
+    """All logs of a map in one frame.
+
+    Attributes:
+        saved: Poses and used closures; its closed logs are all that belong to the map.
+        covariances: (N, 21) upper triangles by log, NaN where there is none.
+        left_out: Logs that are not part of it, with the reason.
+        warnings: What the solver said.
+    """
+
+    saved: SavedMap
+    covariances: Mapping[LogId, NDArray[np.float32]]
+    left_out: Mapping[LogId, str]
+    warnings: Sequence[str] = ()
+
+
+def solved_map(
+    where: str, logs: Logs, saved: SavedMap | None = None, frame: str | None = None, config: BackendConfig | None = None
+) -> SolvedMap:
+    """Solve the pose graph of logs, and keep the part with the most keyframes, or the one of a frame.
+
+    Args:
+        where: Whose logs they are, for sentences.
+        logs: Records of each log, as stores keep them.
+        saved: The map in which the mission took place: its frame is the frame, its logs are among the logs.
+        frame: Name of the frame to keep; None: the largest, or the saved map's.
+        config: The back end; None: as agents have it.
+
+    Raises:
+        NotSolved: There is no keyframe, no such frame, or the solver fails.
+    """
+    from flocc_agent.backend.optimiser import optimise
+
+    assembly, described = _assembled(where, logs, saved)
+    graph = assembly.graph()
+    if not graph.trajectories:
+        raise NotSolved(f"{where}: its logs hold no keyframe")
+    wanted = [KeyframeId(log, k) for log, t in graph.trajectories.items() for k in range(len(t))]
+    chosen = [wanted[k] for k in evenly(np.arange(len(wanted)), COVARIANCES_MAX)]
+    solution = optimise(graph, config or BackendConfig(), None, chosen)
+    if isinstance(solution, OptimisationFailed):
+        raise NotSolved(f"{where}: its pose graph cannot be solved: {solution.reason}")
+    component = _chosen(where, solution.components, frame, saved)
+    own = {log for log in logs if log in component.logs or not _has_poses(log, described)}
+    used = {
+        (r.query, r.match): SavedClosure(r.scale, r.weight)
+        for r in solution.closures
+        if r.state is ClosureState.USED and r.query.log in own and r.match.log in own
+    }
+    poses = {log: np.asarray(component.T_map_keyframe[log]) for log in component.logs}
+    return SolvedMap(
+        SavedMap(component.logs, frozenset(own), poses, used),
+        {log: _triangles(log, len(poses[log]), component) for log in component.logs},
+        {log: f"is in a map of its own, {_frame_of(log, solution.components)}" for log in logs if log not in own},
+        solution.warnings,
+    )
+
+
+def _assembled(where: str, logs: Logs, saved: SavedMap | None) -> tuple[GraphAssembly, set[LogId]]:
+    assembly = GraphAssembly(saved)
+    for log in sorted(logs):
+        for number, data in enumerate(logs[log]):
+            try:
+                assembly.add(NewRecord(log, number, opened_record(data)[0]))
+            except DecodeError as error:
+                raise NotSolved(f"{where}: record {number} of log {log} cannot be read: {error}") from error
+    return assembly, set(assembly.graph().trajectories)
+
+
+def _has_poses(log: LogId, described: set[LogId]) -> bool:
+    return log in described
+
+
+def _chosen(where: str, components: Sequence[Component], frame: str | None, saved: SavedMap | None) -> Component:
+    """The part that becomes the map."""
+    if frame is None and saved is not None:
+        frame = map_frame(saved.anchor)
+    if frame is None:
+        return max(components, key=lambda c: sum(map(len, c.T_map_keyframe.values())))
+    found = next((component for component in components if component.map_frame == frame), None)
+    if found is None:
+        known = ", ".join(component.map_frame for component in components)
+        raise NotSolved(f"{where}: has no map {frame}; there are {known}")
+    return found
+
+
+def _frame_of(log: LogId, components: Sequence[Component]) -> str:
+    return next((component.map_frame for component in components if log in component.logs), "without poses")
+
+
+def _triangles(log: LogId, count: int, component: Component) -> NDArray[np.float32]:
+    rows = np.full((count, UPPER), np.nan, dtype=np.float32)
+    for k in range(count):
+        S = component.covariance_keyframe.get(KeyframeId(log, k))
+        if S is not None:
+            rows[k] = upper_triangle(S).numpy()
+    return rows

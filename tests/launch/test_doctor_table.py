@@ -1,0 +1,328 @@
+"""The table of docs/doctor.md has every sentence of the doctor, and every row of it can be brought about."""
+
+import ast
+import importlib.util
+import json
+import locale
+import os
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.launch import synthetic_run
+from tests.launch.synthetic_run import Synthetic
+from tests.launch.test_doctor import PAIR, SETUPS, Story, corrections_lost
+from tests.launch.test_ground_truth import lifted, truth_of
+from tests.launch.test_status import apart, pair, row
+
+from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.geometry import pose_from_tq, so3_exp, tq_from_pose
+from flocc_agent.runtime.robot_result import ClosureKnown
+from flocc_agent.runtime.trajectory import write_tum
+from flocc_launch import doctor
+from flocc_launch.dashboard.status_table import NO_ANSWER
+from flocc_launch.doctor import Finding, Severity, cameras, diagnose, installation, network_check
+from flocc_launch.doctor.live import diagnose_live
+from flocc_launch.runs.run_folder import RunFolder
+
+PAGE = Path(__file__).parents[2] / "docs/doctor.md"
+KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
+OF = {
+    "run": ("diagnose", "steps", "general", "cameras"),
+    "swarm": ("live", "live_steps"),
+    "machine": ("installation", "network_check"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    of: str
+    cause: str
+    kind: Severity
+    says: str
+
+    def fits(self, finding: Finding) -> bool:
+        """Whether a finding is the one of this row; `…` stands for anything, and for nothing at its end."""
+        pattern = "".join(".*" if part == "…" else re.escape(part) for part in re.split("(…)", self.says))
+        same = (finding.cause, finding.severity) == (self.cause, self.kind)
+        return same and re.fullmatch(pattern, finding.sentence) is not None
+
+
+def table() -> list[Row]:
+    rows = re.findall(
+        r"^\| (run|swarm|machine) \| `([\w-]+)` \| (\w+) \| [^|]+ \| ([^|]+) \|", PAGE.read_text(encoding="utf-8"), re.M
+    )
+    return [Row(of, cause, KINDS[kind], says) for of, cause, kind, says in rows]
+
+
+ROWS = table()
+
+
+def causes_in(module: str) -> set[str]:
+    """Causes that the code of a module names."""
+    if module == "cameras":
+        return {*cameras.CAUSES.values(), cameras.OTHER_CAUSE}
+    source = Path(doctor.__path__[0]) / f"{module}.py"
+    calls = [node for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+    makers = ("Finding", "blocked", "good", "discovered")
+    first = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id in makers and call.args]
+    return {str(cause.value) for cause in first if isinstance(cause, ast.Constant)}
+
+
+@pytest.mark.parametrize("of", OF)
+def test_the_table_has_every_cause_of_the_code_and_no_other(of: str) -> None:
+    assert set().union(*(causes_in(module) for module in OF[of])) == {each.cause for each in ROWS if each.of == of}
+
+
+def test_no_module_of_the_doctor_is_forgotten() -> None:
+    modules = {path.stem for path in Path(doctor.__path__[0]).glob("*.py")}
+    looked_at = {module for group in OF.values() for module in group}
+    assert {module for module in modules if causes_in(module)} == looked_at
+
+
+def merged() -> Story:
+    story = corrections_lost()
+    story.frames["r2"] = "map/r1"
+    return story
+
+
+def unsteady() -> Story:
+    story = merged()
+    for k in range(8):
+        story.say(16.0 + k, "r2", "leader", term=2 + k, leader=f"r{1 + k % 2}")
+    return story
+
+
+def hanging() -> Story:
+    story = merged()
+    story.closures = [ClosureKnown(**PAIR, scale=1.3)]
+    return story
+
+
+def refusing(refused: int = 7, used: int = 5) -> Story:
+    counts = {"closures_used": used, "closures_rejected": refused}
+    return merged().say(14.0, "r1", "optimised", term=1, round=3, components=[["r1", "r2"]], **counts)
+
+
+def warning(*texts: str) -> Story:
+    parts = {"components": [["r1", "r2"]], "warnings": list(texts)}
+    return merged().say(14.0, "r1", "optimised", term=1, round=3, **parts)
+
+
+def doubting(doubt: str, amount: float, where: str = "") -> Callable[[], Story]:
+    fields = {"doubt": doubt, "amount": amount, "where": where, "pairs": 12}
+    return lambda: merged().say(14.0, "r2", "camera_doubted", **fields)
+
+
+STORIES: dict[str, Callable[[], Story]] = {
+    **SETUPS,
+    "focal-length": doubting("focal length", 1.25),
+    "camera-turned": doubting("mounting", 5.0, "5 degrees about x (right)"),
+    "mirrored": doubting("mirrored", 1.0),
+    "inverted-poses": doubting("inverted poses", 1.0),
+    "mixed-frames": doubting("mixed frames", 1.0),
+    "overlay": doubting("overlay", 0.3, "bottom"),
+    "frozen-pictures": doubting("frozen", 10),
+    "camera": doubting("of a later version", 2.0),
+    "merged": merged,
+    "unknown": lambda: corrections_lost().say(
+        13.1, "r2", "correction", term=1, round=2, map_frame="map/r2", T_map_odom=[0.0] * 3 + [0.0, 0.0, 0.0, 1.0]
+    ),
+    "agent-died": lambda: merged().say(13.0, "r2", "agent_died", signal=9),
+    "agent-killed": lambda: merged().say(13.0, "r2", "agent_died", signal=9, scripted=True),
+    "weak-link": hanging,
+    "solver-warning": lambda: warning("a scale collapsed"),
+    "solver-refuses": refusing,
+    "encoding-failed": lambda: merged().say(15.0, "r2", "encoding_failed", keyframe="r2/3", reason="image is black"),
+    "unsteady-leader": unsteady,
+}
+
+
+def of_truth(path: Path, move: bool) -> list[Finding]:
+    made = Synthetic()
+    folder = synthetic_run.write(path, made)
+    truth = truth_of(made, "r2")
+    changed = type(truth)(truth.stamps_s, lifted(truth.T_fixed_body)) if move else truth.later(-3600.0)
+    write_tum(folder.path / "recordings" / "r2" / "groundtruth.tum", changed)
+    return diagnose(folder)
+
+
+def of_a_run(cause: str, path: Path) -> list[Finding]:
+    if cause.startswith("truth"):
+        return of_truth(path, move=cause == "truth-frames")
+    return diagnose(STORIES[cause]().write(path))
+
+
+SWARMS = {
+    "merged": [row("r1", "r2"), row("r2", "r1")],
+    "no-answer": [row("r1", "r2"), row("r2", state=NO_ANSWER)],
+    "no-peer": [row("r1"), row("r2", map_frame="map/r2")],
+    "one-way-link": [row("r1", "r2 r3"), row("r2", "r3"), row("r3", "r1 r2", map_frame="map/r2")],
+    "no-keyframes": [row("r1", "r2"), row("r2", "r1", keyframes=0, map_frame=None)],
+    "no-leader": [row("r1", "r2", leader=None), row("r2", "r1", map_frame="map/r2")],
+    "two-leaders": [row("r1", "r2"), row("r2", "r1", leader="r2", map_frame="map/r2")],
+    "refused": [row("r1", "r2"), row("r2", "r1", refused={"refused unknown version": 3})],
+    "no-descriptors": apart(logs={"r1": [9, 1]}, peer_logs={"r2": [9, 1]}),
+    "low-similarity": apart(best_similarities={"r2": 0.41}),
+    "registrations-rejected": apart(pairs=[pair(rejected=3, best_ratio=0.21)]),
+    "closures-not-connecting": apart(pairs=[pair(accepted=3)], solver={"components": [["r1"], ["r2"]]}),
+    "not-merged-yet": apart(pairs=[pair(accepted=3)]),
+}
+
+
+def of_a_machine(each: Row, path: Path, patch: pytest.MonkeyPatch) -> list[Finding]:
+    """What the part of the doctor that is concerned says of a machine that is well, or is not."""
+    well = each.kind is Severity.GOOD
+    no_config = TransportConfig(interface="flocc-none", roster={})
+    match each.cause:
+        case "python":
+            return installation.python_found()
+        case "package":
+            patch.setattr(installation, "import_problem", lambda module: None if well else "torn")
+            return installation.packages()
+        case "extra":
+            patch.setattr(importlib.util, "find_spec", lambda name: None)
+            return installation.packages()
+        case "perception":
+            patch.setattr(installation, "check_perception", lambda config: None) if well else None
+            patch.setattr(installation, "methods", lambda: {"grey": "greyeyes 1.0"})
+            return installation.networks(PerceptionConfig(method="grey"))
+        case "torch" if not well:
+            patch.setattr(installation, "import_problem", lambda module: "No module named 'torch'")
+            return installation.networks(PerceptionConfig(method="mast3r"))
+        case "torch":
+            pytest.importorskip("torch")
+            return installation.networks(PerceptionConfig(method="mast3r"))
+        case "checkpoint" if not well:
+            return installation.checkpoints(PerceptionConfig().mast3r)
+        case "checkpoint":
+            return installation.networks(PerceptionConfig())
+        case "disk":
+            usage = shutil.disk_usage(path)
+            patch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10**10 if well else 10**8))
+            return installation.disk(path)
+        case "folder":
+            patch.setattr(os, "access", lambda *_: False)
+            return installation.surroundings(path)
+        case "cache":
+            patch.setenv("FLOCC_CACHE", str(path / "cache"))
+            patch.setattr(installation, "can_be_written", lambda _: well)
+            return installation.surroundings(path)
+        case "locale":
+            patch.setattr(locale, "getpreferredencoding", lambda _: "ANSI_X3.4-1968")
+            return installation.surroundings(path)
+        case "clock":
+            return installation.clock(1.8e9 if well else 86_400.0)
+        case "port":
+            patch.setattr(network_check, "port_problem", lambda host, port: None if well else "Address in use")
+            return network_check.ports(TransportConfig(control_listen=("tcp/127.0.0.1:7447",)))
+        case "network":
+            return network_check.configured_network(no_config)
+        case _:
+            patch.setattr(network_check, "two_peers", lambda config, by_multicast: well)
+            patch.setattr(network_check, "by_gossip", lambda config: well)
+            return network_check.discovery(TransportConfig())
+
+
+@pytest.mark.parametrize("each", ROWS, ids=lambda each: f"{each.of}-{each.cause}-{each.kind.name.lower()}")
+def test_every_row_can_be_brought_about(each: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if each.of == "run":
+        found = of_a_run(each.cause, tmp_path / "run")
+    elif each.of == "swarm":
+        found = diagnose_live(SWARMS[each.cause])
+    else:
+        found = of_a_machine(each, tmp_path, monkeypatch)
+    fitting = [finding for finding in found if each.fits(finding)]
+    assert fitting, [finding for finding in found if finding.cause == each.cause]
+    for finding in fitting:
+        assert finding.sentence.endswith(".")
+        assert bool(finding.advice) == (each.kind is not Severity.GOOD and each.cause != "agent-killed")
+
+
+def test_every_page_that_advice_names_holds_what_it_is_named_for() -> None:
+    sources = "".join(path.read_text(encoding="utf-8") for path in Path(doctor.__path__[0]).glob("*.py"))
+    pages = set(re.findall(r"docs/[\w-]+\.md", sources))
+    assert pages == {"docs/back-end.md"}
+    text = (PAGE.parents[1] / "docs/back-end.md").read_text(encoding="utf-8").lower()
+    assert "warnings" in text
+    assert "scale" in text
+
+
+@pytest.mark.parametrize(("refused", "used", "told"), [(7, 5, True), (6, 6, False), (3, 0, False), (4, 3, True)])
+def test_a_solver_that_refuses_most_closures_is_a_finding_of_its_own(
+    refused: int, used: int, told: bool, tmp_path: Path
+) -> None:
+    found = [f for f in diagnose(refusing(refused, used).write(tmp_path / "run")) if f.cause == "solver-refuses"]
+    assert [f.sentence for f in found] == [
+        f"The solver left out {refused} of {used + refused} accepted closures."
+    ] * told
+
+
+def judged_run(path: Path, wrong: bool) -> RunFolder:
+    """Three robots whose solver left out five closures: by ground truth these are right, or wrong."""
+    made = Synthetic()
+    folder = synthetic_run.write(path, made)
+    closures = [closure.model_copy(update={"scale": None if k < 5 else 2.0}) for k, closure in enumerate(made.closures)]
+    for k in range(5 if wrong else 0):
+        T = pose_from_tq(np.array(closures[k].T_query_match_unscaled))
+        T[:3, :3] = T[:3, :3] @ so3_exp(np.array([0.0, 0.0, 0.5]))
+        closures[k] = closures[k].model_copy(update={"T_query_match_unscaled": [float(v) for v in tq_from_pose(T)]})
+    for robot, result in folder.results().items():
+        folder.write_result(result.model_copy(update={"closures": closures, "robot": robot}))
+    solved = {
+        "t": 500.0,
+        "robot": "r1",
+        "event": "optimised",
+        "term": 2,
+        "round": 99,
+        "components": [["r1", "r2", "r3"]],
+    }
+    with (folder.path / "events.jsonl").open("a") as file:
+        file.write(json.dumps(solved | {"closures_used": 4, "closures_rejected": 5}) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_the_likely_reasons_follow_ground_truth(wrong: bool, tmp_path: Path) -> None:
+    (found,) = [f for f in diagnose(judged_run(tmp_path / "run", wrong)) if f.cause == "solver-refuses"]
+    right = 0 if wrong else 5
+    assert (
+        found.sentence
+        == f"The solver left out 5 of 9 accepted closures. By ground truth {right} of 5 of these are right."
+    )
+    first = "places that look alike" if wrong else "the camera's intrinsics"
+    assert found.advice.startswith(f"Likely reasons, in this order: {first}")
+
+
+def test_warnings_that_differ_in_names_and_numbers_only_are_one(tmp_path: Path) -> None:
+    alike = [f"the scale of closure r1/{k} – r2/{k} is unobservable" for k in range(6)]
+    found = diagnose(warning(*alike, "a scale collapsed").write(tmp_path / "run"))
+    assert [f.sentence for f in found if f.cause == "solver-warning"] == [
+        "The solver warns: the scale of closure r1/0 – r2/0 is unobservable (the first of 6 such warnings).",
+        "The solver warns: a scale collapsed.",
+    ]
+
+
+def test_a_robot_that_hangs_by_all_of_its_closures_is_not_said_to_have_more(tmp_path: Path) -> None:
+    found = [f for f in diagnose(hanging().write(tmp_path / "run")) if f.cause == "weak-link"]
+    assert [f.sentence for f in found] == [
+        f"{robot} hangs on map/r1 by 1 closure, all that were accepted. One false closure misplaces it."
+        for robot in ("r1", "r2")
+    ]
+
+
+def test_robots_that_died_are_not_counted_among_all(tmp_path: Path) -> None:
+    found = diagnose(synthetic_run.write(tmp_path / "run", Synthetic(died=("r1", 50.0))))
+    assert found[0].sentence == "All 2 robots that lived to the end (without r1) are in map/r1."
+
+
+def test_a_simulated_robot_has_no_log_to_read(tmp_path: Path) -> None:
+    folder = STORIES["agent-died"]().write(tmp_path / "run")
+    advice = [f.advice for f in diagnose(folder) if f.cause == "agent-died"]
+    folder.write_run(folder.run().model_copy(update={"driver": "simulate"}))
+    simulated = [f.advice for f in diagnose(folder) if f.cause == "agent-died"]
+    assert ("agent.log" in advice[0], "agent.log" in simulated[0]) == (True, False)

@@ -1,0 +1,519 @@
+"""Maps: saved whole or not at all, never changed by reading, opened by teams, merged, pruned, exported."""
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.launch.map_missions import AGAIN, BLOCK, FAR, mission, scenario
+
+from flocc_agent.config import TlsConfig
+from flocc_agent.core.reports import FoundInMap, MapOpened
+from flocc_agent.runtime.map_folder import BadMap, LensModel, MapFolder, read_manifest
+from flocc_agent.runtime.persistence import joined_logs
+from flocc_agent.runtime.record_tables import PUT_RECORD, row
+from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.trajectory_text import read_tum
+from flocc_launch.commands.main import main
+from flocc_launch.graph_files.g2o import read_g2o
+from flocc_launch.maps.gathering import gathered
+from flocc_launch.maps.map_export import export_map
+from flocc_launch.maps.map_merging import MERGER, merge_maps
+from flocc_launch.maps.map_pruning import prune_map
+from flocc_launch.maps.map_saving import save_map
+from flocc_launch.maps.opening import MapUse
+from flocc_launch.maps.solving import NotSolved, solved_map
+from flocc_launch.maps.writing import MapContent, write_map
+from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.setup.credentials import make_keys
+from flocc_launch.simulation.sessions import map_of_sessions
+from flocc_launch.simulation.simulate import simulate
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import LogId
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two robots around a block."""
+    run = tmp_path_factory.mktemp("first") / "run"
+    mission(run, BLOCK)
+    return run
+
+
+@pytest.fixture(scope="module")
+def block(first: Path) -> Path:
+    """Its map."""
+    save_map(first, first.parent / "block")
+    return first.parent / "block"
+
+
+@pytest.fixture(scope="module")
+def second(block: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one robot that begins elsewhere in that map."""
+    run = tmp_path_factory.mktemp("second") / "run"
+    mission(run, AGAIN, MapUse(block))
+    return run
+
+
+def content_of(folder: Path) -> dict[str, str]:
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*")}
+
+
+def facts(run: Path, kind: type) -> list[object]:
+    return [told.fact for told in RunFolder.open(run).events() if isinstance(told.fact, kind)]
+
+
+def said(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["flocc", *words])
+    try:
+        main()
+    except SystemExit as left:
+        code = left.code
+    else:
+        code = 0
+    out, err = capsys.readouterr()
+    assert isinstance(code, int)
+    return code, " ".join((out + err).split())
+
+
+# Save
+
+
+def test_a_map_holds_logs_latents_and_solution_of_the_run(first: Path, block: Path) -> None:
+    opened, found = MapFolder.open(block), gathered(first)
+    assert opened.records == dict(found.logs)
+    assert opened.manifest.frame == "map/r1"
+    assert opened.manifest.edition == 1
+    assert opened.manifest.front_end.model == "synthetic/1"
+    latents = {keyframe: data for keyframe, _, data in found.latents()}
+    assert {k: opened.latent(k) for k in opened.latent_keyframes()} == latents
+    assert {log: len(T) for log, T in opened.poses().items()} == {
+        log: sum(k.log == log for k in latents) for log in (LogId("r1"), LogId("r2"))
+    }
+    covariances = opened.covariances()[LogId("r2")]
+    assert np.isfinite(covariances).all()
+    assert (block / "index.html").read_text().count("<svg") == 1
+
+
+def test_poses_of_a_map_are_near_the_truth(first: Path, block: Path) -> None:
+    truth = read_tum(first / "groundtruth" / "r2.tum")
+    poses = MapFolder.open(block).poses()[LogId("r2")]
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps.sum() == pytest.approx(truth.length_m(), rel=0.1)
+
+
+def test_saving_reads_stores_that_are_in_use_and_changes_nothing(first: Path, tmp_path: Path) -> None:
+    before = content_of(first / "robots" / "r1" / "store")
+    held = sqlite3.connect(first / "robots" / "r1" / "store" / "robot.sqlite")
+    try:
+        held.execute("BEGIN")
+        held.execute("SELECT * FROM records").fetchone()
+        save_map(first, tmp_path / "map")
+    finally:
+        held.close()
+    after = content_of(first / "robots" / "r1" / "store")
+    assert {name: after[name] for name in before if "-" not in name} == {
+        n: s for n, s in before.items() if "-" not in n
+    }
+
+
+def test_one_agents_folder_gives_a_map_as_well(first: Path, tmp_path: Path) -> None:
+    manifest = save_map(first / "robots" / "r1", tmp_path / "map")
+    assert [entry.log for entry in manifest.logs] == ["r1"]
+
+
+def test_a_damaged_record_ends_its_log_there(first: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(first, tmp_path / "run"))
+    with sqlite3.connect(run / "robots" / "r2" / "store" / "robot.sqlite") as store:
+        store.execute("UPDATE records SET data = x'00' WHERE log = 'r2' AND number = 5")
+    store.close()
+    assert len(gathered(run).logs[LogId("r2")]) == 5
+
+
+def test_a_kill_during_save_leaves_the_old_map_or_the_new_one(first: Path, block: Path, tmp_path: Path) -> None:
+    """A child writes two maps over each other until it is killed, at another moment each time."""
+    out = tmp_path / "map"
+    found = gathered(first)
+    solved = solved_map("run", found.logs)
+    latents = list(found.latents())
+    some = [MapContent("one", found.logs, solved, found.front_end, {}, latents)]
+    some.append(replace(some[0], name="two", latents=latents[: len(latents) // 2], edition=2))
+    counts = {1: len(latents), 2: len(latents) // 2}
+    began_s = time.monotonic()
+    write_map(out, some[0])
+    lasts_s = time.monotonic() - began_s
+    rng = np.random.default_rng(7)
+    seen: set[int] = set()
+    for kills in range(60):
+        if kills >= 12 and seen == {1, 2}:
+            break
+        child = os.fork()
+        if child == 0:
+            while True:
+                write_map(out, some[1])
+                write_map(out, some[0])
+        time.sleep(float(rng.uniform(0.0, 4 * lasts_s)))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        opened = MapFolder.open(out)
+        assert opened.records == dict(found.logs)
+        assert opened.saved().logs == solved.saved.logs
+        assert len(opened.latent_keyframes()) == counts[opened.manifest.edition]
+        assert all(opened.latent(k) is not None for k in opened.latent_keyframes())
+        seen.add(opened.manifest.edition)
+        opened.close()
+    assert seen == {1, 2}
+    write_map(out, some[0])
+    assert len(list(out.glob("latents-*"))) == 1
+    assert list(out.glob("*.partial")) == []
+
+
+def test_a_first_save_that_was_cut_off_is_no_map_and_may_be_done_again(first: Path, tmp_path: Path) -> None:
+    save_map(first, tmp_path / "map")
+    (tmp_path / "map" / "map.json").unlink()
+    (tmp_path / "map" / "index.html").unlink()
+    with pytest.raises(BadMap, match="it is no map, or saving it did not end"):
+        MapFolder.open(tmp_path / "map")
+    assert save_map(first, tmp_path / "map").edition == 1
+
+
+# Open
+
+
+def test_a_robot_finds_itself_in_the_maps_frame(block: Path, second: Path) -> None:
+    (opened,) = facts(second, MapOpened)
+    (found,) = facts(second, FoundInMap)
+    assert isinstance(opened, MapOpened)
+    assert isinstance(found, FoundInMap)
+    assert (opened.map_frame, found.map_frame) == ("map/r1", "map/r1")
+    assert found.keyframes <= 10
+    result = RunFolder.open(second).results()["r1"]
+    assert (result.incarnation, result.map_frame) == (1, "map/r1")
+    T_map_camera = MapFolder.open(block).poses()[LogId("r1")]
+    start = np.array(result.keyframes[0].T_map_body)[:3]
+    assert np.linalg.norm(start - T_map_camera[8, :3, 3]) < 0.6, "it began where r1 was at its ninth keyframe, 6 m on"
+
+
+def test_nothing_that_reads_a_map_changes_it(block: Path, tmp_path: Path) -> None:
+    before = content_of(block)
+    mission(tmp_path / "run", AGAIN, MapUse(block, fixed=True))
+    save_map(tmp_path / "run", tmp_path / "next")
+    export_map(MapFolder.open(block), tmp_path / "files")
+    prune_map(block, tmp_path / "pruned", 2.0, 30.0)
+    assert content_of(block) == before
+
+
+def test_what_a_robot_adds_is_the_next_edition_and_the_frame_stays(block: Path, second: Path, tmp_path: Path) -> None:
+    manifest = save_map(second, tmp_path / "next")
+    old, new = MapFolder.open(block), MapFolder.open(tmp_path / "next")
+    assert (manifest.edition, manifest.frame, manifest.name) == (2, "map/r1", "block")
+    assert [entry.log for entry in manifest.logs] == ["r1", "r2", "r1~1"]
+    assert set(old.latent_keyframes()) < set(new.latent_keyframes())
+    assert {log: new.records[log] for log in old.records} == old.records
+    third = mission(tmp_path / "third", AGAIN, MapUse(tmp_path / "next"))
+    assert (third.map_frames, third.maps_used) == (["map/r1"], [str(tmp_path / "next")])
+
+
+def test_a_fixed_map_does_not_move(block: Path, tmp_path: Path) -> None:
+    mission(tmp_path / "run", AGAIN, MapUse(block, fixed=True))
+    save_map(tmp_path / "run", tmp_path / "next")
+    old, new = MapFolder.open(block).poses(), MapFolder.open(tmp_path / "next").poses()
+    for log, poses in old.items():
+        np.testing.assert_allclose(new[log], poses, atol=1e-12)
+    assert len(new) == len(old) + 1
+
+
+def test_a_map_is_not_written_over_the_one_that_the_team_worked_in(block: Path, second: Path) -> None:
+    with pytest.raises(BadMap, match="the new one needs another folder"):
+        save_map(second, block)
+
+
+def test_a_team_that_never_found_itself_adds_nothing(block: Path, tmp_path: Path) -> None:
+    mission(tmp_path / "run", FAR, MapUse(block))
+    with pytest.raises(NotSolved, match=r"none of its robots found itself in .*block \(map/r1\)"):
+        save_map(tmp_path / "run", tmp_path / "next")
+    assert facts(tmp_path / "run", FoundInMap) == []
+
+
+# Merge, prune, export
+
+
+def test_maps_of_teams_that_never_met_become_one(block: Path, tmp_path: Path) -> None:
+    mission(tmp_path / "run", AGAIN, lives={"r1": 7})
+    save_map(tmp_path / "run", tmp_path / "other")
+    merged = merge_maps(block, tmp_path / "other", tmp_path / "both", clock_ms=lambda: 5)
+    opened = MapFolder.open(tmp_path / "both")
+    assert opened.manifest.frame == "map/r1"
+    assert [entry.log for entry in opened.manifest.logs] == ["r1", "r2", "r1~7", f"{MERGER}~5"]
+    assert merged.closures >= 10
+    start = opened.poses()[LogId("r1", 7)][0, :3, 3]
+    assert np.linalg.norm(start - opened.poses()[LogId("r1")][8, :3, 3]) < 0.6
+    assert mission(tmp_path / "third", AGAIN, MapUse(tmp_path / "both")).map_frames == ["map/r1"]
+
+
+def test_maps_with_nothing_in_common_are_refused_with_the_best_similarities(block: Path, tmp_path: Path) -> None:
+    mission(tmp_path / "run", FAR, lives={"r1": 7, "r2": 7})
+    save_map(tmp_path / "run", tmp_path / "far")
+    with pytest.raises(BadMap, match=r"too little in common .* closures; most similar: r\d/\d+ and r\d~7/\d+ 0\.\d+"):
+        merge_maps(block, tmp_path / "far", tmp_path / "both")
+    assert not (tmp_path / "both").exists()
+
+
+def test_maps_that_hold_one_log_are_told_apart(block: Path, second: Path, tmp_path: Path) -> None:
+    save_map(second, tmp_path / "next")
+    with pytest.raises(BadMap, match="both hold the log r1: they are editions of one map"):
+        merge_maps(block, tmp_path / "next", tmp_path / "both")
+    mission(tmp_path / "run", FAR)
+    save_map(tmp_path / "run", tmp_path / "far")
+    with pytest.raises(BadMap, match=r"both are of map/r1, and each has another log r1"):
+        merge_maps(block, tmp_path / "far", tmp_path / "both")
+
+
+def test_a_pruned_map_is_smaller_and_still_found(block: Path, tmp_path: Path) -> None:
+    manifest = prune_map(block, tmp_path / "pruned", 1.6, 30.0)
+    assert manifest.latents < 0.6 * read_manifest(block).latents
+    mission(tmp_path / "run", AGAIN, MapUse(tmp_path / "pruned"))
+    (found,) = facts(tmp_path / "run", FoundInMap)
+    assert isinstance(found, FoundInMap)
+    assert found.keyframes <= 10
+    kept = set(MapFolder.open(tmp_path / "pruned").latent_keyframes())
+    closures = RunFolder.open(tmp_path / "run").results()["r1"].closures
+    ends = {end for c in closures for end in (c.query, c.match) if not end.startswith("r1~1/")}
+    new = {end for end in ends if f"{end}" in {str(k) for k in kept}}
+    old = {str(e) for q, m in MapFolder.open(block).used_closures() for e in (q, m)}
+    assert ends - new <= old, "a keyframe without a latent is no candidate"
+
+
+def test_an_exported_map_opens_in_what_it_is_made_for(block: Path, tmp_path: Path) -> None:
+    opened = MapFolder.open(block)
+    export_map(opened, tmp_path)
+    poses = opened.poses()
+    assert len(read_tum(tmp_path / "r1.tum")) == len(poses[LogId("r1")])
+    graph = read_g2o(tmp_path / "map.g2o")
+    assert len(graph.graph.closures) == opened.manifest.closures
+    header, _, points = (tmp_path / "cameras.ply").read_bytes().partition(b"end_header\n")
+    count = sum(map(len, poses.values()))
+    assert f"element vertex {count}".encode() in header
+    assert len(points) == 27 * count
+    np.testing.assert_allclose(np.frombuffer(points[:12], "<f4"), poses[LogId("r1")][0, :3, 3], atol=1e-6)
+
+
+# Bad input: one sentence each
+
+
+def spoilt(block: Path, tmp_path: Path, **changes: object) -> Path:
+    """A copy of a map whose manifest says something else."""
+    folder = Path(shutil.copytree(block, tmp_path / "spoilt"))
+    manifest = json.loads((folder / "map.json").read_text())
+    (folder / "map.json").write_text(json.dumps(manifest | changes))
+    return folder
+
+
+def test_a_folder_that_is_no_map_is_named(tmp_path: Path, block: Path) -> None:
+    with pytest.raises(BadMap, match="is not a folder"):
+        MapFolder.open(tmp_path / "nowhere")
+    (tmp_path / "map.json").write_text('{"a": 1}')
+    with pytest.raises(BadMap, match="is not of a flocc map"):
+        MapFolder.open(tmp_path)
+    (tmp_path / "map.json").write_text((block / "map.json").read_text()[:200])
+    with pytest.raises(BadMap, match="is cut off or not JSON"):
+        MapFolder.open(tmp_path)
+
+
+def test_a_map_of_another_version_is_named(block: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadMap, match="is of format 2, and this flocc reads 1"):
+        MapFolder.open(spoilt(block, tmp_path, format=2))
+
+
+@pytest.mark.parametrize("pattern", ["records-*", "solution-*", "latents-*"])
+def test_a_map_that_was_cut_off_is_named(block: Path, tmp_path: Path, pattern: str) -> None:
+    folder = Path(shutil.copytree(block, tmp_path / "spoilt"))
+    (file,) = folder.glob(pattern)
+    file.write_bytes(file.read_bytes()[:-20])
+    with pytest.raises(BadMap, match="it is cut off or altered"):
+        MapFolder.open(folder)
+    file.unlink()
+    with pytest.raises(BadMap, match="is missing; the map is not whole"):
+        MapFolder.open(folder)
+
+
+def test_an_altered_byte_is_found(block: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(block, tmp_path / "spoilt"))
+    for pattern in ("records-*", "solution-*", "latents-*"):
+        (file,) = folder.glob(pattern)
+        data = bytearray(file.read_bytes())
+        data[len(data) // 2] ^= 1
+        file.write_bytes(data)
+    opened = MapFolder.open(folder)
+    with pytest.raises(BadMap, match="its checksum is another one"):
+        _ = opened.records
+    with pytest.raises(BadMap, match="its checksum is another one"):
+        opened.saved()
+
+
+def test_a_manifest_that_names_a_file_elsewhere_is_refused(block: Path, tmp_path: Path) -> None:
+    wrong = {"name": "../records.bin", "bytes": 1, "sha256": ""}
+    with pytest.raises(BadMap, match="names a file elsewhere"):
+        MapFolder.open(spoilt(block, tmp_path, records=wrong))
+
+
+def test_a_map_of_another_front_end_is_named(block: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadMap, match=r"was made with perception\.method 'synthetic', and block has 'classical'"):
+        simulate(scenario(AGAIN, perception={"method": "classical"}), tmp_path / "run", use=MapUse(block))
+    front_end = json.loads((block / "map.json").read_text())["front_end"] | {"model": "synthetic/0"}
+    other = spoilt(block, tmp_path, front_end=front_end)
+    with pytest.raises(BadMap, match="its latents are of 'synthetic/0', and this front end makes 'synthetic/1'"):
+        simulate(scenario(AGAIN), tmp_path / "run2", use=MapUse(other))
+
+
+def test_a_much_wider_lens_is_said_and_allowed(block: Path) -> None:
+    lens = LensModel(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    opened = MapFolder.open(block)
+    entries = tuple(entry.model_copy(update={"camera": lens}) for entry in opened.manifest.logs)
+    opened.manifest = opened.manifest.model_copy(update={"logs": entries})
+    assert opened.other_lens(lens.model_copy(update={"fx": 600.0})) is None
+    warning = opened.other_lens(lens.model_copy(update={"fx": 200.0}))
+    assert warning is not None
+    assert "lenses of 65 degrees and this one has 116" in warning
+
+
+def test_distributed_mode_and_the_quick_optimiser_know_no_maps(block: Path, tmp_path: Path) -> None:
+    wrong: list[dict[str, Any]] = [
+        {"backend": {"mode": "distributed", "formulation": "base"}},
+        {"simulation": {"optimiser": "quick"}},
+    ]
+    for changes in wrong:
+        with pytest.raises(FloccError, match="knows no maps"):
+            simulate(scenario(AGAIN, **changes), tmp_path / "run", use=MapUse(block))
+
+
+def test_runs_that_hold_no_store_or_no_keyframe_give_no_map(tmp_path: Path, first: Path) -> None:
+    with pytest.raises(BadMap, match="holds no robot's store"):
+        save_map(tmp_path, tmp_path / "map")
+    with pytest.raises(NotSolved, match=r"has no map map/r9; there are map/r1"):
+        save_map(first, tmp_path / "map", frame="map/r9")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(BadMap, match="it is no map"):
+        save_map(first, tmp_path / "mine")
+    assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_two_missions_in_one_folder_are_told_apart(first: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(first, tmp_path / "run"))
+    mission(tmp_path / "far", FAR)
+    shutil.copytree(tmp_path / "far" / "robots" / "r1", run / "robots" / "r1b")
+    with pytest.raises(BadMap, match="two robots hold different logs r1"):
+        save_map(run, tmp_path / "map")
+
+
+def test_a_robot_does_not_go_on_with_a_log_of_the_map(block: Path) -> None:
+    opened = MapFolder.open(block)
+    with pytest.raises(BadMap, match=r"holds the log r1, which robot r1 goes on writing: begin a new journey"):
+        joined_logs(opened, {}, LogId("r1"), None)
+    other = {LogId("r2"): (b"another",)}
+    with pytest.raises(BadMap, match=r"holds another log r2 than the robot's own folder"):
+        joined_logs(opened, other, LogId("z"), None)
+    longer = {LogId("r2"): (*opened.records[LogId("r2")], b"more")}
+    assert joined_logs(opened, longer, LogId("z"), None)[LogId("r2")][-1] == b"more"
+
+
+@pytest.fixture
+def signed(first: Path, tmp_path: Path) -> tuple[Path, dict[str, RecordSealer]]:
+    """The same run in a swarm with keys: every record with its writer's signature, and who can check them."""
+    pytest.importorskip("cryptography")
+    run = Path(shutil.copytree(first, tmp_path / "signed"))
+    folders = make_keys(tmp_path / "keys", "block", ["r1", "r2", "z"])
+    sealers = {name: RecordSealer.of(TlsConfig(folder=folder)) for name, folder in folders.items()}
+    for name in ("r1", "r2"):
+        log = LogId(name)
+        with closing(sqlite3.connect(run / "robots" / name / "store" / "robot.sqlite")) as store, store:
+            plain = store.execute("SELECT number, data FROM records WHERE log = ?", (name,)).fetchall()
+            store.execute("DELETE FROM records")
+            rows = [row("records", name, n, sealers[name].seal(log, n, data)) for n, data in plain]
+            store.executemany(PUT_RECORD, rows)
+    return run, sealers
+
+
+def test_a_map_keeps_signatures_and_is_believed_by_its_own_swarm_only(
+    signed: tuple[Path, dict[str, RecordSealer]], tmp_path: Path
+) -> None:
+    run, sealers = signed
+    manifest = save_map(run, tmp_path / "map")
+    assert manifest.signed
+    opened = MapFolder.open(tmp_path / "map")
+    opened.check_keys(sealers["z"])
+    records = opened.records[LogId("r2")]
+    assert all(sealers["z"].opened(LogId("r2"), n, data) for n, data in enumerate(records))
+    with pytest.raises(BadMap, match="its logs are signed, and this swarm has no keys"):
+        opened.check_keys(None)
+    others = make_keys(tmp_path / "others", "block", ["r1", "r2", "z"])
+    with pytest.raises(BadMap, match="is of a swarm with other keys: log r1"):
+        opened.check_keys(RecordSealer.of(TlsConfig(folder=others["z"])))
+    save_map(run, tmp_path / "again")
+    with pytest.raises(BadMap, match="their logs are signed"):
+        merge_maps(tmp_path / "map", _renamed(tmp_path / "again"), tmp_path / "both")
+
+
+def _renamed(folder: Path) -> Path:
+    """Make a map's logs look like those of other robots."""
+    path = folder / "map.json"
+    manifest = json.loads(path.read_text())
+    for entry in manifest["logs"]:
+        entry["log"] = entry["log"].replace("r", "s")
+    path.write_text(json.dumps(manifest))
+    return folder
+
+
+# The command line
+
+
+def test_commands_say_what_they_did(
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = str(tmp_path / "map")
+    code, text = said(capsys, monkeypatch, "map", "save", str(first), "--out", out)
+    assert (code, text.split(": ")[0]) == (0, "map/r1")
+    code, text = said(capsys, monkeypatch, "map", "info", out)
+    assert code == 0
+    assert "frame map/r1 logs 2 keyframes" in text
+    assert said(capsys, monkeypatch, "map", "export", out, "--out", str(tmp_path / "files"))[0] == 0
+    code, text = said(capsys, monkeypatch, "map", "prune", out, "--out", str(tmp_path / "small"))
+    assert code == 0
+    assert " latents, " in text
+    code, text = said(capsys, monkeypatch, "map", "merge", out, str(tmp_path / "small"), "--out", str(tmp_path / "b"))
+    assert (code, "editions of one map" in text) == (2, True)
+    code, text = said(capsys, monkeypatch, "simulate", "meeting", "--map-fixed")
+    assert (code, text) == (2, "error: --map-fixed says of --map that it does not move; give --map FOLDER")
+
+
+# Sessions
+
+
+def test_sessions_one_after_the_other_make_one_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    given = scenario({**BLOCK, "r3": FAR["r1"]})
+    paths = recordings(given)
+    told: list[tuple[str, bool]] = []
+    manifest = map_of_sessions(
+        given, paths, tmp_path / "map", tmp_path / "runs", tell=lambda s: told.append((s.name, s.left_out is None))
+    )
+    assert told == [("r1", True), ("r2", True), ("r3", False)], "the third was never near"
+    assert (manifest.frame, manifest.edition, manifest.name) == ("map/r1", 2, "map")
+    assert [entry.log for entry in manifest.logs] == ["r1", "r2"]
+    assert MapFolder.open(tmp_path / "map").records == MapFolder.open(tmp_path / "runs" / "02-r2" / "map").records
+    with pytest.raises(BadMap, match="is not empty; choose another --runs"):
+        map_of_sessions(given, paths, tmp_path / "map", tmp_path / "runs")
+    later = map_of_sessions(given, {"r1": paths["r1"]}, tmp_path / "next", tmp_path / "more", begin=tmp_path / "map")
+    assert [entry.log for entry in later.logs] == ["r1", "r2", "r1~1"]
