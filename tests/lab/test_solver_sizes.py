@@ -18,7 +18,8 @@ def test_a_round_ends_where_a_whole_solve_ends() -> None:
 
 
 def test_the_result_is_told_in_lines() -> None:
-    answer = CliRunner().invoke(bench, ["solver", "--keyframes", "400", "--closures", "30", "--lm"])
+    asked = ["--formulation", "base", "--method", "lm"]
+    answer = CliRunner().invoke(bench, ["solver", "--keyframes", "400", "--closures", "30", *asked])
     assert answer.exit_code == 0, answer.output
     assert "400 keyframes, 30 closures, base, lm" in answer.output
     assert "ten closures more" in answer.output

@@ -120,6 +120,7 @@ def doubting(doubt: str, amount: float, where: str = "") -> Callable[[], Story]:
 
 STORIES: dict[str, Callable[[], Story]] = {
     **SETUPS,
+    "front-ends-differ": lambda: merged().say(14.0, "r2", "front_ends_differ", peer="r1"),
     "focal-length": doubting("focal length", 1.25),
     "camera-turned": doubting("mounting", 5.0, "5 degrees about x (right)"),
     "mirrored": doubting("mirrored", 1.0),

@@ -30,7 +30,9 @@ from flocc_agent.geometry import Float, pose_from_tq, tq_from_pose
 from flocc_agent.runtime.recording import Frame, Recording
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-COVARIANCE = np.diag([1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3])
+COVARIANCE = np.diag([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
+STANDING_PERIOD_NS = 100_000_000
+"""A robot whose recording is over stands, and goes on publishing odometry."""
 
 
 def stamp_of(t_ns: int) -> Time:
@@ -123,6 +125,8 @@ class Drivers:
             frame = frames[self.played]
             self._publish(frame, start_ns + round((frame.stamp_s - frames[0].stamp_s) * 1e9))
             self.played += 1
+        if self.played == len(frames) and start_ns + since_ns > max(self.odometry_ns) + STANDING_PERIOD_NS:
+            self._place(frames[-1].T_odom_body, start_ns + since_ns)
 
     def _publish(self, frame: Frame, t_ns: int) -> None:
         image = self.recording.load_image(frame)
@@ -132,13 +136,17 @@ class Drivers:
         info.d = [0.0] * 5
         self._infos.publish(self._headed(info, t_ns))
         self._images.publish(self._headed(self._picture(image.pixels), t_ns))
+        self._place(frame.T_odom_body, t_ns)
+        self.images_ns.append(t_ns)
+
+    def _place(self, T_odom_body: Float, t_ns: int) -> None:
+        """Publish odometry whose covariance grows, as that of one that integrates its errors does."""
         odometry = Odometry(child_frame_id=f"{self.name}/base_link")
         odometry.header.stamp, odometry.header.frame_id = stamp_of(t_ns), f"{self.name}/odom"
-        fill(odometry.pose.pose, frame.T_odom_body)
-        odometry.pose.covariance = COVARIANCE.ravel()
+        fill(odometry.pose.pose, T_odom_body)
+        odometry.pose.covariance = (COVARIANCE * (1 + len(self.odometry_ns))).ravel()
         self._odometry.publish(odometry)
-        self.odometry_ns[t_ns] = frame.T_odom_body
-        self.images_ns.append(t_ns)
+        self.odometry_ns[t_ns] = T_odom_body
 
     def _picture(self, pixels: "np.ndarray[Any, np.dtype[np.uint8]]") -> Any:
         if self.compressed:

@@ -80,6 +80,7 @@ class Team:
         self.since_ns = 0
         for robot in self.robots:
             robot.played = 0
+            robot.odometry_ns.clear()
 
     def error_m(self) -> float:
         """How far the second robot's odometry, as /tf places it beside the first's, is from the truth."""

@@ -16,6 +16,7 @@ from collections.abc import Iterable
 
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
+from flocc_agent.core.front_ends import FrontEnds
 from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -69,6 +70,7 @@ class LoopClosing:
         self._work = WorkTable(own, self.latents, lambda k: None if k.log in closed else odometry_pair(k))
         self._offers = Offers(self.latents)
         self._spectral = spectral
+        self._front_ends = FrontEnds()
         self._chosen: list[CandidatePair] | None = None
         self._resolved: set[CandidatePair] = set()
         self._undecided: dict[CandidatePair, Candidate] = {}
@@ -103,7 +105,7 @@ class LoopClosing:
         """Pairs that place recognition found here."""
         effects: list[Effect] = []
         for candidate in candidates:
-            if self._knows(candidate.pair):
+            if self._knows(candidate.pair) or self._front_ends.are_apart(candidate.pair):
                 continue
             similarity = round(candidate.similarity, 4)
             fact = CandidateFound(query=candidate.pair.low, match=candidate.pair.high, similarity=similarity)
@@ -139,7 +141,20 @@ class LoopClosing:
         """A record of this pair is in a log, and it is a closure."""
         if self._spectral is not None:
             self._spectral.on_closure(pair)
+        self._front_ends.on_closure(pair)
         self.on_resolved(pair)
+
+    def on_rejection(self, pair: CandidatePair, reason: str) -> bool:
+        """A record of this pair is in a log, and it is none; whether its logs' front ends turned out to differ."""
+        self.on_resolved(pair)
+        if not self._front_ends.on_rejection(pair, reason):
+            return False
+        for other in filter(self._front_ends.are_apart, self.open_pairs()):
+            self._undecided.pop(other, None)
+            self._work.remove(other)
+            self._offers.remove(other)
+        self._chosen, self._changed = None, True
+        return True
 
     def on_keyframe(self, log: LogId) -> None:
         """A log grew: a keyframe may have got the neighbour that it lacked."""

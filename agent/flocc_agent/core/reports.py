@@ -254,6 +254,13 @@ class PeerRefused:
     reason: str
 
 
+@fact("front_ends_differ")
+class FrontEndsDiffer:
+    """Another robot's latents cannot be registered with this one's; they are fetched no more."""
+
+    peer: str
+
+
 @fact("duplicate_name")
 class NameTaken:
     """Two robots run with one name."""

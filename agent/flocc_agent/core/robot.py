@@ -54,6 +54,7 @@ from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
     EncodingFailed,
+    FrontEndsDiffer,
     KeyframeTaken,
     LatentArrived,
     LatentFailed,
@@ -477,6 +478,7 @@ class Robot:
     def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records; places are recognised at the end."""
         described: list[tuple[KeyframeId, Array]] = []
+        effects: list[Effect] = []
         for new in new_records:
             self.assembly.add(new)
             record = new.record
@@ -489,11 +491,12 @@ class Robot:
                         described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match))
-                case RejectionRecord(query, match):
-                    self.closing.on_resolved(CandidatePair.of(query, match))
+                case RejectionRecord(query, match, reason):
+                    if self.closing.on_rejection(CandidatePair.of(query, match), reason):
+                        effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     assert_never(record)
-        return self._recognise(described, now) if described else []
+        return effects + (self._recognise(described, now) if described else [])
 
     def _may_match(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe can be registered; of a pruned map not all have a latent."""
@@ -515,6 +518,11 @@ class Robot:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
         iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
         return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, iteration)
+
+    def _front_ends_differ(self, first: LogId, second: LogId) -> list[Effect]:
+        """Tell, where it concerns this robot."""
+        others = [log.robot for log in (first, second) if log != self.log]
+        return [Report(FrontEndsDiffer(peer=others[0]))] if len(others) == 1 else []
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""

@@ -13,6 +13,7 @@ from flocc_agent.core.reports import (
     ClosureAccepted,
     CorrectionApplied,
     Fact,
+    FrontEndsDiffer,
     LatentLost,
     LeaderFollowed,
     LeaderLost,
@@ -207,7 +208,7 @@ class Telemetry:
         return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = (CameraDoubted, PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_WARNINGS = (CameraDoubted, FrontEndsDiffer, PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
 _INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 

@@ -20,14 +20,22 @@ from flocc_lab.bench.generated_graph import generate
 NEW_CLOSURES = 10
 
 
-def run(robots: int, keyframes: int, closures: int, lm: bool = False, seed: int = 1) -> dict[str, Any]:
+def run(
+    robots: int,
+    keyframes: int,
+    closures: int,
+    formulation: Formulation | None = None,
+    solver: Solver | None = None,
+    seed: int = 1,
+) -> dict[str, Any]:
     """Solve a graph of so many keyframes and closures in all, without ten closures, whole, and whole from the former.
 
     Args:
         robots: That share the keyframes.
         keyframes: Of all robots.
         closures: Wanted; the robots may meet less often.
-        lm: The base formulation with LM in place of the default.
+        formulation: The default is the agent's.
+        solver: The default is the agent's.
         seed: Of the graph.
 
     Returns:
@@ -35,9 +43,8 @@ def run(robots: int, keyframes: int, closures: int, lm: bool = False, seed: int 
     """
     generated = generate(np.random.default_rng(seed), robots, keyframes // robots, closures)
     graph = generated.graph
-    config = BackendConfig(weight_by_probability=False)
-    if lm:
-        config = config.model_copy(update={"formulation": Formulation.BASE, "solver": Solver.LM})
+    asked = {"formulation": formulation, "solver": solver}
+    config = BackendConfig(weight_by_probability=False, **{k: v for k, v in asked.items() if v is not None})
     before_mb = peak_mb()
     full, full_s = timed(lambda: optimise(graph, config))
     full_mb = peak_mb()

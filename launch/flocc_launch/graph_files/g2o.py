@@ -101,13 +101,25 @@ def _measurement(line: Line, isotropic: bool, planar: bool) -> Measurement | Non
         raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
 
 
+def _key(word: str) -> int:
+    """A vertex's key.
+
+    Raises:
+        ValueError: It is none.
+    """
+    key = int(word)
+    if not 0 <= key < 2**64:
+        raise ValueError(f"{key} is no key of a vertex")
+    return key
+
+
 def _vertex(line: Line) -> tuple[int, Float] | None:
     """Key and pose of a vertex line; None where it has none."""
     kind, *numbers = line.words
     if kind not in VERTICES:
         return None
     try:
-        key, *v = int(numbers[0]), *(float(number) for number in numbers[1:])
+        key, *v = _key(numbers[0]), *(float(number) for number in numbers[1:])
         if len(v) != VERTICES[kind] or not np.all(np.isfinite(v)):
             raise ValueError(f"a vertex has {len(v)} finite numbers, expected {VERTICES[kind]}")
         if kind == "VERTEX_SE2":
@@ -140,7 +152,7 @@ def _numbers(words: list[str], count: int) -> tuple[int, int, Float]:
     values = np.array([float(word) for word in words[2:]])
     if not np.all(np.isfinite(values)):
         raise ValueError("an edge has a value that is not finite")
-    return int(words[0]), int(words[1]), values
+    return _key(words[0]), _key(words[1]), values
 
 
 def _symmetric(upper: Float, size: int) -> Float:

@@ -72,6 +72,8 @@ class Right:
             yield from (f"{name}, {what}" for what in _differs(record, event.result))
 
     def _delivered(self, station: Station, correction: LogCorrection) -> Iterator[str]:
+        if station.disk.went_back:
+            return  # its own log may be another version than the leader's
         solution = self._solutions.get((correction.term, correction.round))
         component = None if solution is None else component_of(solution, correction.log)
         if component is None:

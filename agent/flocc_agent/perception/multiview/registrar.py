@@ -24,7 +24,7 @@ from flocc_agent.core.registration import (
     odometry_scale,
 )
 from flocc_agent.geometry import angle_rad, inverse
-from flocc_agent.perception.latent import BadLatent
+from flocc_agent.perception.latent import BadLatent, failed_by
 from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, evidence_of, evidence_of_neighbour
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
@@ -78,7 +78,7 @@ class PairRegistrar(Generic[F]):
         try:
             return self.examined(query, match, odometry)[0]
         except BadLatent as error:
-            return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
+            return failed_by(error)
 
     def examined(
         self, query: bytes, match: bytes, odometry: OdometryPair | None, always: bool = False

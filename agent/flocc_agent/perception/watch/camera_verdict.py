@@ -18,7 +18,7 @@ from flocc_agent.perception.watch.mount_fit import (
     Motions,
     constant_turn,
     costs,
-    direction_costs,
+    direction_angles_rad,
     motions_of,
     trimmed,
     turn_costs,
@@ -43,6 +43,8 @@ DISAGREEMENT_MAX = 4.0
 AGREEING_SHARE_MIN = 0.65
 """Share of the pairs that must prefer an explanation to none."""
 FOCAL_ERROR_MIN_RATIO = 0.05
+MIXED_ANGLE_MIN_RAD = float(np.radians(30.0))
+"""Between directions of motion, at the median: less may be few or badly spread matches; other axes give far more."""
 MOUNT_ERROR_MIN_RAD = float(np.radians(2.5))
 
 
@@ -200,11 +202,11 @@ def _named(found: _Explanation, nothing: _Explanation) -> CameraVerdict | None:
 
 def _mixed_frames(motions: Motions) -> CameraVerdict | None:
     """Whether orientations agree with the pictures and positions do not, whatever the camera."""
-    directions = direction_costs(motions, np.eye(3))[motions.has_direction & motions.is_seen]
+    angles_rad = direction_angles_rad(motions, np.eye(3))[motions.has_direction & motions.is_seen]
     turns_agree = trimmed(turn_costs(motions, np.eye(3))) < 1.0
-    if not turns_agree or len(directions) < PAIRS_MIN or trimmed(directions) < DISAGREEMENT_MAX:
+    if not turns_agree or len(angles_rad) < PAIRS_MIN or float(np.median(angles_rad)) < MIXED_ANGLE_MIN_RAD:
         return None
-    return CameraVerdict(CameraFault.MIXED_FRAMES, 1.0, np.eye(3), len(directions))
+    return CameraVerdict(CameraFault.MIXED_FRAMES, 1.0, np.eye(3), len(angles_rad))
 
 
 def _vertex(left: dict[int, float], best: int) -> float:

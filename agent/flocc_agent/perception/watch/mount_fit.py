@@ -100,8 +100,14 @@ def turn_costs(motions: Motions, X: Float) -> Float:
 
 def direction_costs(motions: Motions, X: Float) -> Float:
     """(N,) that of the directions alone; 0 where one is not known."""
-    cosine = np.clip((motions.direction_seen * (motions.direction_odom @ X)).sum(axis=1), -1.0, 1.0)
-    return _robust(np.where(motions.has_direction, np.arccos(cosine) / motions.direction_sigma_rad, 0.0))
+    error = direction_angles_rad(motions, X) / motions.direction_sigma_rad
+    return _robust(np.where(motions.has_direction, error, 0.0))
+
+
+def direction_angles_rad(motions: Motions, X: Float) -> Float:
+    """(N,) between the directions of motion under a mounting error; meaningless where one is not known."""
+    cosine = (motions.direction_seen * (motions.direction_odom @ X)).sum(axis=1)
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def constant_turn(motions: Motions) -> Float:

@@ -77,6 +77,7 @@ class Hearing:
         self._static = StaticFrames()
         self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
         self._compared_ns: int | None = None
+        self._were_apart = False
         self.covariances = StepCovariances()
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
@@ -209,7 +210,8 @@ class Hearing:
         elif self.synchroniser.latest is not None and self.synchroniser.latest[0] != self._compared_ns:
             self._compared_ns = self.synchroniser.latest[0]
             behind_s = (now_ns - self.synchroniser.latest[0]) * 1e-9
-            if abs(behind_s) > CLOCKS_APART_MAX_S:
+            was_apart, self._were_apart = self._were_apart, abs(behind_s) > CLOCKS_APART_MAX_S
+            if was_apart and self._were_apart:  # twice: a clock that begins anew is apart for a moment
                 aside = "behind" if behind_s > 0 else "ahead of"
                 self.complain(
                     "odometry",

@@ -56,6 +56,15 @@ def test_odometry_that_no_longer_comes_is_not_compared_with_the_clock() -> None:
     heard.odometry(100)
     heard.hearing.compare_clocks(105 * 10**9)
     heard.hearing.compare_clocks(10**9)
+    heard.hearing.compare_clocks(2 * 10**9)
+    assert heard.said == []
+
+
+def test_a_clock_that_begins_anew_is_apart_for_a_moment() -> None:
+    heard = Heard()
+    for stamp_s, now_s in ((100, 101), (102, 1), (103, 103), (104, 1), (105, 106)):
+        heard.odometry(stamp_s)
+        heard.hearing.compare_clocks(now_s * 10**9)
     assert heard.said == []
 
 

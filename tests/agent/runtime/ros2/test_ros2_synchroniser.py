@@ -100,3 +100,15 @@ def test_large_images_wait_only_within_their_bytes_and_one_always_may() -> None:
     synchroniser.add_image(6, bytes(500))
     synchroniser.add_odometry(7, np.eye(4))
     assert synchroniser.next() is not None
+
+
+def test_bytes_of_images_that_were_taken_make_room() -> None:
+    synchroniser = Synchroniser(64, 0.5, bytes_max=100)
+    synchroniser.add_odometry(0, np.eye(4))
+    for t in range(10, 100, 20):
+        synchroniser.add_image(t, bytes(50))
+        synchroniser.add_image(t + 1, bytes(50))
+        synchroniser.add_odometry(t + 2, np.eye(4))
+        assert synchroniser.next() is not None
+        assert synchroniser.next() is not None
+    assert synchroniser.dropped == {}
