@@ -4,7 +4,8 @@
 # make check   the same without installing anything
 # make docs    the pages as a searchable site: build/site/index.html
 # make release-check   builds what would be published, checks its metadata, installs it in a fresh environment, runs flocc demo --small
-# make campaign     the back end and others on 300 drawn graphs (DRAWS=60 for a sweep), at most an hour (LIMIT_S)
+# make campaign     cores broken on purpose, with the seeds that each took; the back end and others on 300 drawn graphs
+#                   (DRAWS=60 for a sweep), at most an hour (LIMIT_S)
 # make clean   removes .venv and everything that was generated
 
 SHELL := /bin/bash
@@ -58,9 +59,10 @@ tests:
 swarm-test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -m scenarios
 
-# The back end on 300 graphs of the family, beside what others do; rows stay, so that a second run goes on.
+# Every mutant of the core; then the back end on 300 graphs of the family, beside what others do, whose rows stay.
 campaign: $(VENV)/.test
 	@mkdir -p build
+	FLOCC_MUTANTS=all nice -n 19 $(BIN)/python -m pytest -q -s -n0 tests/simulation/test_mutants.py
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/python -m flocc_lab.graph_family --draws $(DRAWS) --methods "" \
 		--rows build/graph_family.jsonl --limit-s $(LIMIT_S) | tee build/graph_family.md
 

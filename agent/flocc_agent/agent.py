@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from flocc_agent.backend import build_iterator, build_optimiser
 from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
-from flocc_agent.core.interfaces import Camera, Image, Perception
+from flocc_agent.core.interfaces import Camera, Image, ImageWatch, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import inverse
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
@@ -32,12 +33,13 @@ from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.facts import JourneyEnded, KilledByOrder
 from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
 from flocc_agent.runtime.jobs import Tools
-from flocc_agent.runtime.kept_for_maps import keep_camera, keep_front_end, keep_map, lens_of
+from flocc_agent.runtime.kept_for_maps import keep_back_end, keep_camera, keep_front_end, keep_map, lens_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.new_journeys import began_anew, last_body
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
@@ -49,7 +51,8 @@ from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
-from flocc_protocol.ids import LogId
+from flocc_protocol.errors import FloccError
+from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.keys import Admin
 
 if TYPE_CHECKING:
@@ -61,6 +64,10 @@ Float = NDArray[np.float64]
 
 KILL_AFTER_S = 0.2
 """Time for the answer to an operator's order to leave."""
+
+
+class JourneyError(FloccError):
+    """Another journey cannot begin here."""
 
 
 class Agent:
@@ -129,6 +136,8 @@ class Agent:
         self._radio: Radio | None = None
         self._metrics: MetricsServer | None = None
         self._workers: Workers | None = None
+        self._before: Float | None = None
+        self._renewal = asyncio.Lock()
 
     @property
     def log(self) -> LogId:
@@ -140,9 +149,8 @@ class Agent:
         try:
             self._driver = await asyncio.to_thread(self._compose)
             if self.config.metrics.port is not None:
-                self._metrics = MetricsServer(self.config.metrics, self.config.name, self._driver.look)
-            self._run = asyncio.create_task(self._driver.run())
-            await self._driver.opened(self._run)
+                self._metrics = MetricsServer(self.config.metrics, self.config.name, lambda: self._started.look())
+            await self._begin(self._driver)
         except BaseException:
             await self._close()
             raise
@@ -167,6 +175,45 @@ class Agent:
         finally:
             await self._close()
 
+    async def _begin(self, driver: Driver) -> None:
+        """Open the network, and start the loop."""
+        self._run = asyncio.create_task(driver.run())
+        await driver.opened(self._run)
+        self._before = last_body(driver.robot, self._T_body_camera)
+
+    async def begin_journey(self) -> None:
+        """The odometry began anew, because the robot was carried or its odometry started again: write another log.
+
+        The keyframes so far stay the robot's earlier journey, and closures join both. Keyframes that still wait for the
+        encoder are lost. `corrections()` goes on, at first in a frame of the new journey's own.
+
+        Raises:
+            JourneyError: There is no folder to keep the earlier journey in, or frames do not come from this program.
+        """
+        if self.config.folder is None or self._recording is not None or self._ros2 is not None:
+            reason = "has no folder (the key 'folder') that keeps what it did so far"
+            fed = "is fed by a recording or by ROS 2, which begin journeys themselves"
+            raise JourneyError(f"robot {self.config.name}: {reason if self.config.folder is None else fed}")
+        async with self._renewal:
+            assert self._run is not None
+            self._new_journey = True
+            self._started.stop()
+            await self._run
+            assert self._store is not None
+            self._store.close()
+            self._gate, self._selector = PoseGate(), KeyframeSelector(self.config.keyframes)
+            self._driver = await asyncio.to_thread(self._compose)
+            await self._begin(self._driver)
+        logger.info("robot %s: begins another journey, %s", self.config.name, self.log)
+
+    async def _journey_of(self, T_odom_body: Float) -> None:
+        """Begin another journey where the first pose after a start is that of odometry which began meanwhile."""
+        before, self._before = self._before, None
+        if self.config.folder is not None and began_anew(before, np.asarray(T_odom_body, dtype=float)):
+            logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
+            await self.begin_journey()
+            self._before = None
+
     async def _look_at_network(self) -> None:
         """Say once what of the configured network is not there; the agent goes on trying."""
         for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
@@ -185,6 +232,7 @@ class Agent:
                 newer than the one before; the image does not fit the camera, or there is no camera.
         """
         self._check(T_odom_body, stamp_s)
+        await self._journey_of(T_odom_body)
         await self._add(pixels, np.asarray(T_odom_body, dtype=float), stamp_s)
 
     async def add_frame(
@@ -199,6 +247,7 @@ class Agent:
             BadKeyframe: As `add_keyframe`, of every frame.
         """
         self._check(T_odom_body, stamp_s)
+        await self._journey_of(T_odom_body)
         T_odom_body = np.asarray(T_odom_body, dtype=float)
         if not keep and not self._selector.wants(T_odom_body):
             self._gate.let_in(T_odom_body, stamp_s, kept=False)
@@ -268,9 +317,18 @@ class Agent:
 
     async def corrections(self) -> AsyncIterator[Correction]:
         """Corrections as they come, the last one first; ends when the agent stops."""
-        queue = self._started.subscribe()
-        while (correction := await queue.get()) is not None:
-            yield correction
+        lived: Driver | None = None
+        while self._started is not lived:
+            lived = self._started
+            queue = lived.subscribe()
+            while (correction := await queue.get()) is not None:
+                yield correction
+            await self._while_journey_begins()
+
+    async def _while_journey_begins(self) -> None:
+        """Wait as long as one journey has ended and the next has not begun."""
+        async with self._renewal:
+            return
 
     def follow_others(self) -> None:
         """Learn from now on how all robots' earlier poses were corrected (`Correction.others`), not only the last."""
@@ -292,12 +350,19 @@ class Agent:
         Raises:
             FloccError: The recording cannot be played on.
         """
-        assert self._run is not None
-        waiting = {self._run, *(task for task in (self._playing, self._bridging) if task is not None)}
-        while self._run not in (done := (await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED))[0]):
-            waiting -= done
-            for task in done:
-                task.result()
+        ended: asyncio.Task[None] | None = None
+        while self._run is not None and self._run is not ended:
+            ended = self._run
+            waiting = {ended, *(task for task in (self._playing, self._bridging) if task is not None)}
+            while ended not in (done := (await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED))[0]):
+                waiting -= done
+                for task in done:
+                    task.result()
+            await self._while_journey_begins()
+
+    async def fetch_latent(self, keyframe: KeyframeId, deadline_s: float) -> bool:
+        """Bring another robot's latent into this one's store, where that robot is in range; whether it came."""
+        return await self._started.fetch_latent(keyframe, deadline_s)
 
     def result(self) -> RobotResult | None:
         """What this robot knows (`result.json`), None before it started."""
@@ -341,6 +406,7 @@ class Agent:
         if self._new_journey:
             self._store.begin_journey()
         keep_front_end(self._store, self._method, config.perception, perception)
+        keep_back_end(self._store, config.backend)
         if self._camera is not None:
             keep_camera(self._store, self._camera, self._T_body_camera)
         if opened is not None:
@@ -366,6 +432,7 @@ class Agent:
             transport.serve_admin(Admin.CHAOS, self._disturb)
         tools = Tools(
             perception,
+            self._camera_watch(),
             build_optimiser(config.backend),
             build_iterator(config.backend),
             self._workers,
@@ -376,6 +443,12 @@ class Agent:
         return Driver(
             core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
         )
+
+    def _camera_watch(self) -> ImageWatch:
+        """What looks at this robot's images."""
+        from flocc_agent.perception.watch.camera_watch import CameraWatch
+
+        return CameraWatch(None if self._recording is None else self._recording.hidden)
 
     @property
     def _method(self) -> str | None:
@@ -435,20 +508,33 @@ class Agent:
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
+        from flocc_agent.runtime.ros2.markers import known_closures
 
         def report(fact: Fact) -> None:
             self._on_report(Reported(self._clock_s(), self.config.name, fact))
 
         host = Host(
-            lambda *keyframe: self._started.add_keyframe(*keyframe),
+            self._add_of_ros,
             lambda T_body_camera: self._started.mount_camera(T_body_camera),
             lambda: self._started.corrected_bodies(),
             lambda measurement, stamp_s: self._started.add_measurement(measurement, stamp_s),
             report,
             self._save_result,
             self._begin_anew,
+            lambda: known_closures(self._started.robot, self.config.backend.steepness),
+            self._state,
+            lambda: self._started.corrected_logs(),
         )
         return Ros2Adapter(config, self.config.name, self._selector, host, self._ros_args)
+
+    async def _add_of_ros(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
+        """A keyframe of the robot's ROS 2; odometry that began while the agent was off begins another journey."""
+        before, self._before = self._before, None
+        if began_anew(before, T_odom_camera @ inverse(self._T_body_camera)):
+            logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
+            self._begin_anew()
+            return
+        await self._started.add_keyframe(image, T_odom_camera, stamp_s)
 
     def _save_result(self) -> str:
         """Write what the robot knows now, and say where.
@@ -459,6 +545,11 @@ class Agent:
         if self.config.folder is None:
             raise FileNotFoundError("the agent has no folder (the key 'folder'), so nothing was written")
         return str(write_result(self.config.folder, self._started.result()).resolve())
+
+    def _state(self) -> tuple[AgentStatus, tuple[str, ...]]:
+        """What a robot monitor is told: the status, and what the last own solution warned of."""
+        solution = self._started.last_solution
+        return self.status(), () if solution is None else solution.warnings
 
     def _begin_anew(self) -> None:
         """End this journey: who runs the agent starts it again, and it begins another log."""

@@ -46,7 +46,7 @@ from flocc_agent.core.effects import (
     Unicast,
 )
 from flocc_agent.core.events import Event, MessageReceived
-from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.interfaces import KeyframeLook, OdometryPair
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
 from flocc_agent.core.reports import (
@@ -88,10 +88,14 @@ class TraceError(FloccError):
 class PlaceEyes:
     """Perception that recognises places by their letter; every registration is perfect."""
 
-    def encode(self, capture: Capture) -> tuple[Array, bytes]:
+    def watch(self, hidden: object) -> "PlaceEyes":  # noqa: ARG002
+        """Sees no camera."""
+        return self
+
+    def look(self, capture: Capture, T_odom_camera: object) -> KeyframeLook:  # noqa: ARG002
         """A unit vector per place."""
         place = round(capture.stamp_s - NEVER_S)
-        return Array.of(np.eye(len(PLACES))[place], "f4"), PLACES[place].encode()
+        return KeyframeLook(Array.of(np.eye(len(PLACES))[place], "f4"), PLACES[place].encode())
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration:  # noqa: ARG002
         """Both cameras stood at one place."""

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from flocc_agent.config import AgentConfig, TransportConfig
+from flocc_agent.config import AgentConfig, ConfigError, TransportConfig
 from flocc_launch.scenarios.scenario import Scenario
 
 AGENT = """
@@ -82,3 +82,14 @@ def test_no_key_takes_a_number_that_is_not_finite(value: float) -> None:
             AgentConfig.model_validate({"name": "r1", **given})
             taken.append(path)
     assert taken == []
+
+
+def test_a_swarm_with_keys_listens_with_tls_without_being_told(tmp_path: Path) -> None:
+    path = tmp_path / "agent.toml"
+    path.write_text('name = "r1"\n[transport.tls]\nfolder = "keys"\n')
+    read = AgentConfig.read(path).transport
+    assert (read.control_listen, read.bulk_listen) == (("tls/0.0.0.0:0",), ("tls/0.0.0.0:0",))
+    assert TransportConfig().control_listen == ("tcp/0.0.0.0:0",)
+    path.write_text('name = "r1"\n[transport]\ncontrol_listen = ["tcp/0.0.0.0:7"]\n[transport.tls]\nfolder = "keys"\n')
+    with pytest.raises(ConfigError, match="with tls every endpoint begins with tls/, but there is 'tcp/0"):
+        AgentConfig.read(path)

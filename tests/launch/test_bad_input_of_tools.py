@@ -34,6 +34,32 @@ BAD_SCENARIOS = [
 ]
 
 
+DEEP = 50_000
+EDGE = "EDGE_SE3:QUAT -1 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
+HOSTILE_FILES = [
+    ("x.toml", ["launch"], f"a = {'[' * DEEP}{']' * DEEP}\n", "is nested too deeply"),
+    ("x.toml", ["launch"], ".".join(["a"] * DEEP) + " = 1\n", "has a key of more than 64 parts"),
+    ("x.jrl", ["optimise", "--out", "o"], '{"a":' + "[" * DEEP + "]" * DEEP + "}", "is nested too deeply"),
+    ("x.g2o", ["optimise", "--out", "o"], EDGE, "line 1: -1 is no key of a vertex"),
+]
+
+
+@pytest.mark.parametrize(("name", "command", "text", "said"), HOSTILE_FILES, ids=["deep", "long", "json", "negative"])
+def test_a_file_that_would_exhaust_its_reader_is_refused(
+    name: str,
+    command: list[str],
+    text: str,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_text(text)
+    assert run(monkeypatch, command[0], name, *command[1:]) == 2
+    assert said in sentence(capsys)
+
+
 @pytest.mark.parametrize(("text", "said"), BAD_SCENARIOS)
 def test_a_scenario_that_contradicts_itself_is_named(
     text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -5,6 +5,7 @@ import re
 import shutil
 import socket
 import subprocess
+import threading
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
-from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard
+from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard, server
 from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.snapshot import LinkView, MapGroup, RobotView, Said, Snapshot
 from flocc_launch.dashboard.state import SwarmState
@@ -168,6 +169,20 @@ def test_the_server_answers_two_paths_and_nothing_else(tmp_path: Path) -> None:
             assert not re.search(rb"(src|href)=.?https?:", answer.read())
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(dashboard.url + "../run.json")
+
+
+def test_idle_connections_are_few_and_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "IDLE_S", 0.5)
+    threads = threading.active_count()
+    with Dashboard(synthetic_run.write(tmp_path / "run", Synthetic()), port=0) as dashboard:
+        host, port = dashboard.url.removeprefix("http://").strip("/").split(":")
+        idle = [socket.create_connection((host, int(port)), timeout=10.0) for _ in range(3 * server.CONNECTIONS_MAX)]
+        assert idle[-1].recv(1) == b""
+        assert threading.active_count() <= threads + 1 + server.CONNECTIONS_MAX
+        assert [connection.recv(1) for connection in idle] == [b""] * len(idle)
+        assert urllib.request.urlopen(dashboard.url, timeout=10.0).status == 200
+    for connection in idle:
+        connection.close()
 
 
 def test_a_port_in_use_is_one_sentence(tmp_path: Path) -> None:

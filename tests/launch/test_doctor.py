@@ -13,6 +13,9 @@ from tests.launch.synthetic_run import Synthetic
 
 from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_launch.doctor import Finding, Severity, diagnose
+from flocc_launch.report.build import build
+from flocc_launch.report.verdict import verdict
+from flocc_launch.runs.loaded_run import load
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.run_records import Run
 from flocc_launch.scenarios.scenario import Scenario
@@ -260,6 +263,27 @@ def test_warnings_failures_and_restless_leaders_are_told(tmp_path: Path) -> None
     findings = diagnose(story.write(tmp_path / "run"))
     assert [finding.cause for finding in findings] == ["merged", "solver-warning", "encoding-failed", "unsteady-leader"]
     assert "a scale collapsed" in findings[1].sentence
+
+
+def test_a_camera_that_does_not_fit_is_named_with_its_latest_figure(tmp_path: Path) -> None:
+    story = corrections_lost()
+    story.frames["r2"] = "map/r1"
+    for t, amount in ((14.0, 1.4), (15.0, 1.5)):
+        story.say(t, "r2", "camera_doubted", doubt="focal length", amount=amount, where="", pairs=10)
+    story.say(16.0, "r1", "camera_doubted", doubt="mounting", amount=90.0, where="90 degrees about x", pairs=12)
+    story.say(17.0, "r1", "camera_doubted", doubt="overlay", amount=0.3, where="bottom", pairs=5)
+    story.say(18.0, "r1", "camera_doubted", doubt="of a later version", amount=2.0, where="", pairs=5)
+    folder = story.write(tmp_path / "run")
+    findings = {finding.cause: finding for finding in diagnose(folder)}
+    assert set(findings) == {"merged", "focal-length", "camera-turned", "overlay", "camera"}
+    assert "r2's focal length is 1.50 times (+50 %)" in findings["focal-length"].sentence
+    assert "another convention" in findings["camera-turned"].advice
+    assert findings["overlay"].severity is Severity.NOTE
+    assert "30 % of r1's pictures (bottom)" in findings["overlay"].sentence
+    report = build(load(folder))
+    assert report.doubted_cameras == ["r1", "r2"]
+    assert verdict(report).endswith("Look at r1's and r2's cameras: their pictures and odometry do not fit.")
+    assert any("1.50 times" in warning for warning in report.warnings)
 
 
 def test_a_robot_that_left_no_result_is_judged_by_the_events(tmp_path: Path) -> None:

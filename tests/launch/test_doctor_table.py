@@ -25,14 +25,14 @@ from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_agent.runtime.trajectory import write_tum
 from flocc_launch import doctor
 from flocc_launch.dashboard.status_table import NO_ANSWER
-from flocc_launch.doctor import Finding, Severity, diagnose, installation, network_check
+from flocc_launch.doctor import Finding, Severity, cameras, diagnose, installation, network_check
 from flocc_launch.doctor.live import diagnose_live
 from flocc_launch.runs.run_folder import RunFolder
 
 PAGE = Path(__file__).parents[2] / "docs/doctor.md"
 KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
 OF = {
-    "run": ("diagnose", "steps", "general"),
+    "run": ("diagnose", "steps", "general", "cameras"),
     "swarm": ("live", "live_steps"),
     "machine": ("installation", "network_check"),
 }
@@ -64,6 +64,8 @@ ROWS = table()
 
 def causes_in(module: str) -> set[str]:
     """Causes that the code of a module names."""
+    if module == "cameras":
+        return {*cameras.CAUSES.values(), cameras.OTHER_CAUSE}
     source = Path(doctor.__path__[0]) / f"{module}.py"
     calls = [node for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
     makers = ("Finding", "blocked", "good", "discovered")
@@ -111,8 +113,22 @@ def warning(*texts: str) -> Story:
     return merged().say(14.0, "r1", "optimised", term=1, round=3, **parts)
 
 
+def doubting(doubt: str, amount: float, where: str = "") -> Callable[[], Story]:
+    fields = {"doubt": doubt, "amount": amount, "where": where, "pairs": 12}
+    return lambda: merged().say(14.0, "r2", "camera_doubted", **fields)
+
+
 STORIES: dict[str, Callable[[], Story]] = {
     **SETUPS,
+    "front-ends-differ": lambda: merged().say(14.0, "r2", "front_ends_differ", peer="r1"),
+    "focal-length": doubting("focal length", 1.25),
+    "camera-turned": doubting("mounting", 5.0, "5 degrees about x (right)"),
+    "mirrored": doubting("mirrored", 1.0),
+    "inverted-poses": doubting("inverted poses", 1.0),
+    "mixed-frames": doubting("mixed frames", 1.0),
+    "overlay": doubting("overlay", 0.3, "bottom"),
+    "frozen-pictures": doubting("frozen", 10),
+    "camera": doubting("of a later version", 2.0),
     "merged": merged,
     "unknown": lambda: corrections_lost().say(
         13.1, "r2", "correction", term=1, round=2, map_frame="map/r2", T_map_odom=[0.0] * 3 + [0.0, 0.0, 0.0, 1.0]

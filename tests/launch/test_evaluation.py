@@ -127,7 +127,7 @@ def test_evo_is_found_beside_this_python_before_the_path(tmp_path: Path, monkeyp
 def test_evo_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    with pytest.raises(evaluation.EvaluationError, match=r"flocc\[eval\]"):
+    with pytest.raises(evaluation.EvaluationError, match=r"\.\[eval\]"):
         evaluation.evo_program()
 
 

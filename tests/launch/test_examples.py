@@ -17,12 +17,14 @@ from tests.doc_props import FOCAL, HEIGHT, WIDTH, photographs, walk
 from tests.launch.bag_fixtures import BagScript
 
 from flocc_agent.geometry import tq_from_pose
+from flocc_launch.report import read_report
 from flocc_launch.runs.run_folder import RunFolder
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RUN_ELSEWHERE = {
     "robot_program.py": "docs/python-api.md, by tests/test_docs.py",
     "own_perception": "tests/swarm/test_own_perception.py",
+    "ros2": "tests/agent/runtime/ros2/test_ros2_node.py, as far as it goes without ROS",
 }
 
 
@@ -78,6 +80,16 @@ def test_a_teams_bags_become_one_report(tmp_path: Path) -> None:
     assert RunFolder.open(tmp_path / "out").run().robots == ["drone", "rover"]
     assert (tmp_path / "out/report.html").exists()
     assert re.search(r"^ok +All 2 robots", ran.stdout, re.M), ran.stdout
+
+
+@pytest.mark.slow
+def test_a_map_is_saved_and_opened_again(tmp_path: Path) -> None:
+    script = EXAMPLES / "saved_map.sh"
+    ran = in_examples("sh", str(script), "out", folder=tmp_path, FLOCC_CACHE=str(tmp_path / "cache"))
+    assert ran.returncode == 0, f"{ran.stdout[-2000:]}\n{ran.stderr[-2000:]}"
+    monday, tuesday = (read_report(tmp_path / "out" / day / "report.json") for day in ("monday", "tuesday"))
+    assert tuesday.map_frames == monday.map_frames
+    assert re.search(r"^ok +All \d robots", ran.stdout, re.M), ran.stdout
 
 
 async def test_a_robots_program_says_that_it_waits(capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,6 +29,7 @@ OPTIMA = {
     "MITb": 61.1541,
     "INTEL": 393.653,
     "M3500": 193.862,
+    "cubicle": 717.126,
 }
 
 
@@ -69,7 +70,7 @@ def test_a_line_that_occurs_twice_counts_twice(tmp_path: Path) -> None:
         ("short.g2o", "EDGE_SE3:QUAT 0 1 1 2 3\n", "line 1"),
         ("words.g2o", EDGE.replace(" 1 0 0 0 0 0 1 1", " x 0 0 0 0 0 1 1", 1) + "\n", "line 1"),
         ("nan.g2o", EDGE.replace("0 1 1 0", "0 1 nan 0", 1) + "\n", "line 1"),
-        ("gap.g2o", f"{EDGE}\n{EDGE.replace('QUAT 0 1', 'QUAT 1 5')}\n", "no odometry from keyframe 1"),
+        ("gap.g2o", f"{EDGE}\n{EDGE.replace('QUAT 0 1', 'QUAT 5 6')}\n", "no odometry from keyframe 1 to 5"),
         ("bad.jrl", "{", "not JSON"),
         ("other.jrl", "{}", "not a JRL file"),
         ("none.jrl", '{"measurements": {"a": []}}', "has no measurements"),
@@ -196,6 +197,42 @@ def test_a_second_measurement_of_a_pair_counts(tmp_path: Path) -> None:
     text = edge(0, 1, 1, 0, of) + edge(1, 2, 1, 0, of) + edge(0, 2, 3, 0, of) + edge(0, 2, 3.3, 0, of)
     x = (2 / 2 + 3 + 3.3) / (1 / 2 + 1 + 1)
     np.testing.assert_allclose(positions_of(tmp_path, text)[2, 0], x, atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", NoiseModel)
+def test_odometry_may_be_written_backwards(tmp_path: Path, noise: NoiseModel) -> None:
+    """By hand: the turn of a backward step counts with its arm, as the same line forwards would."""
+    of, sure = information(4.0, 4.0, 4.0, *[1e6] * 3), information(*[1e6] * 6)
+    loop = edge(0, 2, 2.3, 0.0, of)
+    forward = edge(0, 1, 1, 0, of) + edge(1, 2, 1, 0, of) + loop
+    backward = edge(0, 1, 1, 0, of) + edge(2, 1, -1, 0, of) + loop
+    np.testing.assert_allclose(
+        positions_of(tmp_path, backward, noise), positions_of(tmp_path, forward, noise), atol=1e-5
+    )
+    turned = edge(0, 1, 1, 0, sure) + edge(2, 1, 0, -1, sure, yaw=np.pi / 2)
+    np.testing.assert_allclose(positions_of(tmp_path, turned, noise)[2], [2, 0, 0], atol=1e-3)
+
+
+def test_a_step_that_nothing_measured_is_bridged_by_the_way_round_and_named(tmp_path: Path) -> None:
+    of = information(*[1.0] * 6)
+    text = edge(0, 1, 1, 0, of) + edge(4, 9, 1, 0, of) + edge(1, 9, 2, 0, of) + edge(0, 4, 2.5, 0, of)
+    (tmp_path / "x.g2o").write_text(text)
+    result = optimise_file(tmp_path / "x.g2o", tmp_path / "out", formulation=Formulation.BASE, solver=Solver.LM)
+    assert [w for w in result["warnings"] if w.startswith("1 steps of robot robot-0 are not measured")]
+    read = read_g2o(tmp_path / "out" / "optimised.g2o")
+    x = np.concatenate([read.T_initial[log][:, 0, 3] for log in read.T_initial])
+    misfit = (1 + 2) - (2.5 + 1)
+    np.testing.assert_allclose(x, [0, 1 - misfit / 4, 2.5 + misfit / 4, 3 - misfit / 2], atol=1e-5)
+
+
+def test_a_closure_of_a_million_kilometres_is_refused_by_name_and_ends_no_solve(tmp_path: Path) -> None:
+    of = information(*[1.0] * 6)
+    text = edge(0, 1, 1, 0, of) + edge(1, 2, 1, 0, of) + edge(0, 2, 1e9, 0, of) + edge(0, 2, 2, 0, of)
+    (tmp_path / "x.g2o").write_text(text)
+    result = optimise_file(tmp_path / "x.g2o", tmp_path / "out", formulation=Formulation.BASE, solver=Solver.LM)
+    (refused,) = result["closures_excluded"]
+    assert "the measured length of 1e+09 m is longer" in refused["reason"]
+    assert result["cost"] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("fixed", [0, 2])

@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,13 @@ import numpy as np
 import pytest
 from tests.launch.map_missions import AGAIN, BLOCK, FAR, mission, scenario
 
+from flocc_agent.config import TlsConfig
 from flocc_agent.core.reports import FoundInMap, MapOpened
+from flocc_agent.geometry import symmetric
 from flocc_agent.runtime.map_folder import BadMap, LensModel, MapFolder, read_manifest
+from flocc_agent.runtime.persistence import joined_logs
+from flocc_agent.runtime.record_tables import PUT_RECORD, row
+from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.commands.main import main
 from flocc_launch.graph_files.g2o import read_g2o
@@ -30,6 +36,9 @@ from flocc_launch.maps.opening import MapUse
 from flocc_launch.maps.solving import NotSolved, solved_map
 from flocc_launch.maps.writing import MapContent, write_map
 from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.setup.credentials import make_keys
+from flocc_launch.simulation.sessions import map_of_sessions
 from flocc_launch.simulation.simulate import simulate
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
@@ -103,6 +112,15 @@ def test_poses_of_a_map_are_near_the_truth(first: Path, block: Path) -> None:
     poses = MapFolder.open(block).poses()[LogId("r2")]
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps.sum() == pytest.approx(truth.length_m(), rel=0.1)
+
+
+def test_a_map_is_solved_as_its_robots_solved(block: Path, tmp_path: Path) -> None:
+    simulate(scenario(BLOCK, backend={"odometry_translation_sigma_m": 0.5}), tmp_path / "run")
+    save_map(tmp_path / "run", tmp_path / "map")
+    assert read_manifest(tmp_path / "map").back_end["odometry_translation_sigma_m"] == 0.5
+    folders = (block, tmp_path / "map")
+    usual, loose = (symmetric(MapFolder.open(folder).covariances()[LogId("r1")][1])[3, 3] for folder in folders)
+    assert loose > 10 * usual
 
 
 def test_saving_reads_stores_that_are_in_use_and_changes_nothing(first: Path, tmp_path: Path) -> None:
@@ -410,6 +428,64 @@ def test_two_missions_in_one_folder_are_told_apart(first: Path, tmp_path: Path) 
         save_map(run, tmp_path / "map")
 
 
+def test_a_robot_does_not_go_on_with_a_log_of_the_map(block: Path) -> None:
+    opened = MapFolder.open(block)
+    with pytest.raises(BadMap, match=r"holds the log r1, which robot r1 goes on writing: begin a new journey"):
+        joined_logs(opened, {}, LogId("r1"), None)
+    other = {LogId("r2"): (b"another",)}
+    with pytest.raises(BadMap, match=r"holds another log r2 than the robot's own folder"):
+        joined_logs(opened, other, LogId("z"), None)
+    longer = {LogId("r2"): (*opened.records[LogId("r2")], b"more")}
+    assert joined_logs(opened, longer, LogId("z"), None)[LogId("r2")][-1] == b"more"
+
+
+@pytest.fixture
+def signed(first: Path, tmp_path: Path) -> tuple[Path, dict[str, RecordSealer]]:
+    """The same run in a swarm with keys: every record with its writer's signature, and who can check them."""
+    pytest.importorskip("cryptography")
+    run = Path(shutil.copytree(first, tmp_path / "signed"))
+    folders = make_keys(tmp_path / "keys", "block", ["r1", "r2", "z"])
+    sealers = {name: RecordSealer.of(TlsConfig(folder=folder)) for name, folder in folders.items()}
+    for name in ("r1", "r2"):
+        log = LogId(name)
+        with closing(sqlite3.connect(run / "robots" / name / "store" / "robot.sqlite")) as store, store:
+            plain = store.execute("SELECT number, data FROM records WHERE log = ?", (name,)).fetchall()
+            store.execute("DELETE FROM records")
+            rows = [row("records", name, n, sealers[name].seal(log, n, data)) for n, data in plain]
+            store.executemany(PUT_RECORD, rows)
+    return run, sealers
+
+
+def test_a_map_keeps_signatures_and_is_believed_by_its_own_swarm_only(
+    signed: tuple[Path, dict[str, RecordSealer]], tmp_path: Path
+) -> None:
+    run, sealers = signed
+    manifest = save_map(run, tmp_path / "map")
+    assert manifest.signed
+    opened = MapFolder.open(tmp_path / "map")
+    opened.check_keys(sealers["z"])
+    records = opened.records[LogId("r2")]
+    assert all(sealers["z"].opened(LogId("r2"), n, data) for n, data in enumerate(records))
+    with pytest.raises(BadMap, match="its logs are signed, and this swarm has no keys"):
+        opened.check_keys(None)
+    others = make_keys(tmp_path / "others", "block", ["r1", "r2", "z"])
+    with pytest.raises(BadMap, match="is of a swarm with other keys: log r1"):
+        opened.check_keys(RecordSealer.of(TlsConfig(folder=others["z"])))
+    save_map(run, tmp_path / "again")
+    with pytest.raises(BadMap, match="their logs are signed"):
+        merge_maps(tmp_path / "map", _renamed(tmp_path / "again"), tmp_path / "both")
+
+
+def _renamed(folder: Path) -> Path:
+    """Make a map's logs look like those of other robots."""
+    path = folder / "map.json"
+    manifest = json.loads(path.read_text())
+    for entry in manifest["logs"]:
+        entry["log"] = entry["log"].replace("r", "s")
+    path.write_text(json.dumps(manifest))
+    return folder
+
+
 # The command line
 
 
@@ -430,3 +506,24 @@ def test_commands_say_what_they_did(
     assert (code, "editions of one map" in text) == (2, True)
     code, text = said(capsys, monkeypatch, "simulate", "meeting", "--map-fixed")
     assert (code, text) == (2, "error: --map-fixed says of --map that it does not move; give --map FOLDER")
+
+
+# Sessions
+
+
+def test_sessions_one_after_the_other_make_one_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    given = scenario({**BLOCK, "r3": FAR["r1"]})
+    paths = recordings(given)
+    told: list[tuple[str, bool]] = []
+    manifest = map_of_sessions(
+        given, paths, tmp_path / "map", tmp_path / "runs", tell=lambda s: told.append((s.name, s.left_out is None))
+    )
+    assert told == [("r1", True), ("r2", True), ("r3", False)], "the third was never near"
+    assert (manifest.frame, manifest.edition, manifest.name) == ("map/r1", 2, "map")
+    assert [entry.log for entry in manifest.logs] == ["r1", "r2"]
+    assert MapFolder.open(tmp_path / "map").records == MapFolder.open(tmp_path / "runs" / "02-r2" / "map").records
+    with pytest.raises(BadMap, match="is not empty; choose another --runs"):
+        map_of_sessions(given, paths, tmp_path / "map", tmp_path / "runs")
+    later = map_of_sessions(given, {"r1": paths["r1"]}, tmp_path / "next", tmp_path / "more", begin=tmp_path / "map")
+    assert [entry.log for entry in later.logs] == ["r1", "r2", "r1~1"]

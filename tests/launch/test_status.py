@@ -87,6 +87,7 @@ def test_a_swarm_that_nobody_is_in_is_one_sentence() -> None:
         ([row("r1", "r2"), row("r2", "r1", leader="r2", map_frame="map/r2")], ["two-leaders"]),
         ([row("r1", "r2"), row("r2", "r1", map_frame="map/r2")], ["not-merged-yet"]),
         ([row("r1", "r2"), row("r2", "r1", refused={"refused unknown version": 3})], ["merged", "refused"]),
+        ([row("r1", "r2"), row("r2", "r1", map_frame="map/r2", refused={"x": 1})], ["not-merged-yet", "refused"]),
         ([row("r1")], []),
         (apart(logs={"r1": [9, 1]}, peer_logs={"r2": [9, 1]}), ["no-descriptors"]),
         (apart(best_similarities={"r2": 0.41}), ["low-similarity"]),

@@ -109,5 +109,5 @@ def test_rerun_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytes
         return imported(name, globals, locals, fromlist, level)
 
     monkeypatch.setattr(builtins, "__import__", without_rerun)
-    with pytest.raises(ViewError, match=r"flocc\[view\]"):
+    with pytest.raises(ViewError, match=r"\.\[view\]"):
         view(folder, tmp_path / "run.rrd")

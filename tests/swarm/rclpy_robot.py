@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -23,12 +24,15 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
 
 from flocc_agent.geometry import Float, pose_from_tq, tq_from_pose
 from flocc_agent.runtime.recording import Frame, Recording
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-COVARIANCE = np.diag([1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3])
+COVARIANCE = np.diag([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
+STANDING_PERIOD_NS = 100_000_000
+"""A robot whose recording is over stands, and goes on publishing odometry."""
 
 
 def stamp_of(t_ns: int) -> Time:
@@ -97,6 +101,18 @@ class Drivers:
         mounted.header.frame_id, mounted.child_frame_id = f"{name}/base_link", f"{name}/optical"
         fill(mounted.transform, recording.T_body_camera)
         self._static.publish(TFMessage(transforms=[mounted]))
+        self._grid = self.node.create_publisher(OccupancyGrid, "local_map", LATCHED)
+
+    def publish_grid(self, frame: str, marks_m: dict[tuple[float, float], int], resolution_m: float = 0.1) -> None:
+        """A grid of 6 x 4 m that begins at (-1, -2) of a frame, free but for some marks."""
+        cells = np.zeros((round(4 / resolution_m), round(6 / resolution_m)), dtype=np.int8)
+        for (x_m, y_m), value in marks_m.items():
+            cells[int((y_m + 2) / resolution_m), int((x_m + 1) / resolution_m)] = value
+        grid = OccupancyGrid(data=cells.ravel().tolist())
+        grid.header.frame_id = frame
+        grid.info.resolution, grid.info.height, grid.info.width = resolution_m, *cells.shape
+        grid.info.origin.position.x, grid.info.origin.position.y, grid.info.origin.orientation.w = -1.0, -2.0, 1.0
+        self._grid.publish(grid)
 
     def has_agent(self) -> bool:
         """Whether somebody listens to images and odometry."""
@@ -109,6 +125,8 @@ class Drivers:
             frame = frames[self.played]
             self._publish(frame, start_ns + round((frame.stamp_s - frames[0].stamp_s) * 1e9))
             self.played += 1
+        if self.played == len(frames) and start_ns + since_ns > max(self.odometry_ns) + STANDING_PERIOD_NS:
+            self._place(frames[-1].T_odom_body, start_ns + since_ns)
 
     def _publish(self, frame: Frame, t_ns: int) -> None:
         image = self.recording.load_image(frame)
@@ -118,13 +136,17 @@ class Drivers:
         info.d = [0.0] * 5
         self._infos.publish(self._headed(info, t_ns))
         self._images.publish(self._headed(self._picture(image.pixels), t_ns))
+        self._place(frame.T_odom_body, t_ns)
+        self.images_ns.append(t_ns)
+
+    def _place(self, T_odom_body: Float, t_ns: int) -> None:
+        """Publish odometry whose covariance grows, as that of one that integrates its errors does."""
         odometry = Odometry(child_frame_id=f"{self.name}/base_link")
         odometry.header.stamp, odometry.header.frame_id = stamp_of(t_ns), f"{self.name}/odom"
-        fill(odometry.pose.pose, frame.T_odom_body)
-        odometry.pose.covariance = COVARIANCE.ravel()
+        fill(odometry.pose.pose, T_odom_body)
+        odometry.pose.covariance = (COVARIANCE * (1 + len(self.odometry_ns))).ravel()
         self._odometry.publish(odometry)
-        self.odometry_ns[t_ns] = frame.T_odom_body
-        self.images_ns.append(t_ns)
+        self.odometry_ns[t_ns] = T_odom_body
 
     def _picture(self, pixels: "np.ndarray[Any, np.dtype[np.uint8]]") -> Any:
         if self.compressed:
@@ -156,6 +178,9 @@ class Listener:
             self._hear(Path, f"/{name}/flocc/path", LATCHED)
             self._hear(PoseWithCovarianceStamped, f"/{name}/flocc/pose", 10)
             self._hear(String, f"/{name}/flocc/map_frame", LATCHED)
+            self._hear(OccupancyGrid, f"/{name}/flocc_{name}/merged_map", LATCHED)
+            self._hear(MarkerArray, f"/{name}/flocc/graph", LATCHED)
+        self._hear(DiagnosticArray, "/diagnostics", 10)
 
     def _hear(self, kind: Any, topic: str, qos: Any) -> None:
         self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
@@ -175,6 +200,28 @@ class Listener:
         """The swarm's name of its map, as it came last."""
         told = self.heard[f"/{name}/flocc/map_frame"]
         return told[-1].data if told else None
+
+    def merged_at(self, name: str, place_m: Float) -> int | None:
+        """What an agent's merged map says of a place in it; None before there is one, or beside it."""
+        told = self.heard[f"/{name}/flocc_{name}/merged_map"]
+        if not told:
+            return None
+        info, cells = told[-1].info, np.asarray(told[-1].data)
+        at = (place_m[:2] - [info.origin.position.x, info.origin.position.y]) / info.resolution
+        column, row = np.floor(at).astype(int)
+        if not (0 <= column < info.width and 0 <= row < info.height):
+            return None
+        return int(cells.reshape(info.height, info.width)[row, column])
+
+    def markers(self, name: str) -> dict[tuple[str, int], Marker]:
+        """What an agent last drew, by namespace and number."""
+        return {(marker.ns, marker.id): marker for marker in self.heard[f"/{name}/flocc/graph"][-1].markers}
+
+    def status(self, name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
+        """What an agent last said of itself, and its values by key."""
+        told = [each for array in list(self.heard["/diagnostics"]) for each in array.status]
+        one = [each for each in told if each.hardware_id == name][-1]
+        return one, {value.key: value.value for value in one.values}
 
     def call(self, service: str, timeout_s: float = 10.0) -> Trigger.Response:
         """Call a Trigger service and wait for its answer."""

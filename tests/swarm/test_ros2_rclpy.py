@@ -20,6 +20,7 @@ import pytest
 pytest.importorskip("rclpy", reason="no ROS 2 here; .ci/ros2_environment makes one", exc_type=ImportError)
 pytest.importorskip("tf2_msgs", reason="no tf2_msgs here; .ci/ros2_environment builds it", exc_type=ImportError)
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from tests.agent.runtime.loopback import loopback_configs
 from tests.swarm.rclpy_robot import Drivers, Graph, Listener, SimulatedClock, matrix, ns_of
 
@@ -79,6 +80,7 @@ class Team:
         self.since_ns = 0
         for robot in self.robots:
             robot.played = 0
+            robot.odometry_ns.clear()
 
     def error_m(self) -> float:
         """How far the second robot's odometry, as /tf places it beside the first's, is from the truth."""
@@ -124,6 +126,7 @@ def team(tmp_path: Path, domain_id: int) -> Iterator[Team]:
             ros2 = Ros2Config(
                 namespace=f"/{name}",
                 image_topic="camera/image_raw" if name == "r1" else "camera/image_raw/compressed",
+                grid_topic="local_map",
                 odom_frame=f"{name}/odom",
                 base_frame=f"{name}/base_link",
             )
@@ -145,6 +148,9 @@ def test_two_robots_get_one_map_through_a_pause_and_a_reset(team: Team, tmp_path
     team.wait(2.0)
     check_transforms_and_poses(team)
     check_paths(team)
+    check_markers(team)
+    check_diagnostics(team)
+    check_merged_map(team)
     check_pause(team)
     check_services_after_a_reset(team, tmp_path)
     for name in NAMES:
@@ -193,6 +199,59 @@ def check_paths(team: Team) -> None:
             assert truths[0] is not None
             expected = T_first @ between(truths[0], T_true)
             assert np.linalg.norm(expected[:3, 3] - matrix(told.pose)[:3, 3]) < 1.0
+
+
+def check_markers(team: Team) -> None:
+    """Each agent draws both robots in the one frame, and closures between keyframes that it draws."""
+    for name in NAMES:
+        told = team.listener.markers(name)
+        assert {marker.header.frame_id for marker in told.values()} == {"map"}
+        drawn = {robot: told[f"path/{robot}", 0].points for robot in NAMES}
+        points = np.array([[p.x, p.y, p.z] for robot in NAMES for p in drawn[robot]])
+        assert min(map(len, drawn.values())) > 5
+        ends = np.array([[p.x, p.y, p.z] for p in told["closures", 0].points])
+        assert len(ends) >= 2
+        assert np.linalg.norm(ends[:, None] - points[None], axis=2).min(axis=1).max() < 1e-3
+        assert len(told["closures", 0].colors) == len(ends)
+        texts = {marker.text for marker in told.values() if marker.text}
+        assert {text.split(" ")[0] for text in texts} == set(NAMES)
+        assert sum("(leads)" in text for text in texts) == 1
+
+
+def check_diagnostics(team: Team) -> None:
+    """Each robot says once a second how it is, by simulated time, and what it has heard."""
+    for robot in team.robots:
+        one, values = team.listener.status(robot.name)
+        assert one.level == DiagnosticStatus.OK, one.message
+        assert one.name == f"flocc: {robot.name}"
+        assert ("leads" in one.message) == (values["leader"] == robot.name)
+        assert values["map frame"] == team.listener.map_frame(robot.name)
+        assert values["neighbours"] == ({*NAMES} - {robot.name}).pop()
+        assert int(values["heard: image"]) > 5
+        assert {key: count for key, count in values.items() if "refused: ros2" in key} == {}
+    stamps_ns = [ns_of(array.header.stamp) for array in team.listener.heard["/diagnostics"]]
+    assert all(0 <= t_ns - START_NS <= team.since_ns + 1e9 for t_ns in stamps_ns if t_ns)
+
+
+def check_merged_map(team: Team) -> None:
+    """Each agent merges both robots' grids, where /tf puts them; a grid in another frame is refused, and said."""
+    marks = {"r1": ((4.55, 0.55), 100), "r2": ((4.5, -1.5), 77)}  # centres of cells
+    team.robots[0].publish_grid("r1/odom", {marks["r1"][0]: 100})
+    team.robots[1].publish_grid("r2/odom", {marks["r2"][0]: 77}, resolution_m=0.2)
+
+    def is_there(by: str, name: str) -> bool:
+        """The mark, or a cell beside it: /tf and the map may be of two corrections that differ by millimetres."""
+        T = team.listener.T_map_odom(name)
+        if T is None:
+            return False
+        place = (T @ np.array([*marks[name][0], 0.0, 1.0]))[:3]
+        around = [place + 0.1 * np.array([x, y, 0.0]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+        return marks[name][1] in [team.listener.merged_at(by, each) for each in around]
+
+    for by in NAMES:
+        for name in NAMES:
+            team.until(partial(is_there, by, name))
+        assert team.listener.heard[f"/{by}/flocc_{by}/merged_map"][-1].header.frame_id == "map"
 
 
 def check_pause(team: Team) -> None:

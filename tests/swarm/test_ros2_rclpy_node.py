@@ -27,15 +27,20 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image, NavSatFix
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from tests.agent.runtime.ros2.test_ros2_markers import corrected_log
 from tests.swarm.rclpy_robot import Graph
 
 from flocc_agent.config import ConfigError, Ros2Config
 from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.runtime.ros2 import types
+from flocc_agent.runtime.ros2.diagnostics import diagnostics
+from flocc_agent.runtime.ros2.markers import KnownClosure, Markers
 from flocc_agent.runtime.ros2.node import RosNode, open_node
 from flocc_agent.runtime.ros2.outgoing import Outgoing
 from flocc_agent.runtime.ros2.topics import Offer, Qos
 from flocc_agent.runtime.ros2.types import MessageTypes, Ros2Error
+from flocc_agent.runtime.status import AgentStatus
+from flocc_protocol.ids import KeyframeId, LogId
 
 pytestmark = [pytest.mark.swarm]
 
@@ -90,7 +95,11 @@ def assert_same(ours: Any, ros: Any, where: str = "") -> None:
         assert names == list(ros.get_fields_and_field_types()), where
         for name in names:
             assert_same(getattr(ours, name), getattr(ros, name), f"{where}.{name}")
-    elif isinstance(ours, str | bool | int | float):
+    elif isinstance(ros, bytes):
+        assert ours == ros[0], where
+    elif isinstance(ours, float):
+        assert ours == ros or np.float32(ours) == np.float32(ros), where
+    elif isinstance(ours, str | bool | int):
         assert ours == ros, where
     elif len(ours) and is_dataclass(ours[0]):
         assert len(ours) == len(ros), where
@@ -100,6 +109,16 @@ def assert_same(ours: Any, ros: Any, where: str = "") -> None:
         np.testing.assert_array_equal(np.asarray(ours), np.asarray(ros), err_msg=where)
 
 
+STATUS = AgentStatus(robot="r1", leader="r2", term=3, map_frame="map/r2", keyframes=9, refused={"ros2 x": 2})
+
+
+def markers() -> Any:
+    """A map of two robots with a closure."""
+    logs = {robot: corrected_log(robot, 5) for robot in ("r1", "r2")}
+    closure = KnownClosure(KeyframeId(LogId("r1"), 1), KeyframeId(LogId("r2"), 2), 0.8)
+    return Markers(TYPES, "map").array(logs, [closure], "r2", 7 * 10**9 + 3)
+
+
 def written() -> dict[str, Any]:
     """Each message that flocc writes, with something in every field."""
     outgoing = Outgoing(TYPES, "map", "r1/odom")
@@ -107,6 +126,8 @@ def written() -> dict[str, Any]:
         types.TF: outgoing.transform(T, 1_234_567_890_123_456_789),
         types.PATH: outgoing.path(np.stack([T, np.eye(4)]), [10**9, 2 * 10**9 + 7], 2 * 10**9 + 7),
         types.POSE: outgoing.pose(T, np.diag([1.0, 2, 3, 4, 5, 6]), T, 5 * 10**9),
+        types.MARKERS: markers(),
+        types.DIAGNOSTICS: diagnostics(TYPES, STATUS, ["scale collapsed"], {"image": 3}, True, 10**9 + 5),
         types.TEXT: outgoing.text("map/r1, \u00fcber alles"),
     }
 
@@ -135,6 +156,8 @@ def filled(message: Any, rng: np.random.Generator) -> Any:
             setattr(message, name, rng.normal(size=value.shape))
         elif kind.startswith("sequence<double") or kind.startswith("sequence<uint8") or kind == "sequence<int8>":
             setattr(message, name, [1, 2, 3] if "int8" in kind else [0.5, -0.5, 1.5])
+        elif isinstance(value, bytes):
+            setattr(message, name, bytes([int(rng.integers(0, 3))]))
         elif kind.startswith("sequence<"):
             setattr(message, name, [filled(class_of(kind[9:-1].replace("/", "/msg/"))(), rng) for _ in range(2)])
     return message

@@ -9,28 +9,66 @@ about ten iterations enough at every size (deflation, A-DEF2 of Tang et al. 2009
   solved exactly together with the cluster scales. It carries what the chains cannot: robots against one another.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sparse
 from numpy.typing import NDArray
+from scipy.linalg.blas import dsbmv
 from scipy.sparse.linalg import SuperLU, splu
 
 from flocc_agent.backend import rotations
-from flocc_agent.backend.edges import Edges, Jacobians, Residuals, State
+from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, taken
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+Bordered = tuple[Int, Float]
+"""Indices of edges, and the products (E, 2, 14) of what pulls them and of their scale's derivative with everything."""
 
+BAND = 12
+"""Numbers below each other in the band of a chain: a pose has six, and is joined to the next one's six."""
+CHUNK_EDGES = 4096
+"""Edges whose Jacobians are there at a time: those of 100,000 would be fetched anew from the system in each step."""
 SEGMENT_POSES = 25
 ITERATIONS_LEAST, POSES_PER_ITERATION, ITERATIONS_MOST = 50, 50, 400
 """A system of more poses is worth more iterations, because its elimination costs more than in proportion."""
-TOLERANCE_RATIO = 4e-3
-"""How far the residual falls, in the preconditioner's norm; the step's cost is then right to its square."""
 RIDGE_RATIO = 1e-10
 """Added to the diagonals of both preconditioners, which may be singular where the system is not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockLayout:
+    """Where the blocks of a symmetric matrix's upper triangle are in the whole of it.
+
+    Attributes:
+        nodes: Number of block rows.
+        above: Which of the blocks are above the diagonal.
+        order: (M,) places of the whole matrix's blocks, row by row, in the blocks followed by those above its diagonal.
+        indices: (M,) their block columns.
+        starts: (N + 1,) where each block row begins.
+    """
+
+    nodes: int
+    above: Bool
+    order: Int
+    indices: Int
+    starts: Int
+
+    @classmethod
+    def of(cls, rows: Int, cols: Int, nodes: int) -> "BlockLayout":
+        """Lay out blocks of the upper triangle, at block rows and columns (K,)."""
+        above = rows < cols
+        all_rows, all_cols = np.concatenate([rows, cols[above]]), np.concatenate([cols, rows[above]])
+        order = np.lexsort((all_cols, all_rows))
+        return cls(nodes, above, order, all_cols[order], np.searchsorted(all_rows[order], np.arange(nodes + 1)))
+
+    def whole(self, blocks: Float) -> sparse.bsr_matrix:
+        """The matrix of the blocks (K, 6, 6) of its upper triangle."""
+        data = np.concatenate([blocks, np.swapaxes(blocks[self.above], 1, 2)])[self.order]
+        return sparse.bsr_matrix((data, self.indices, self.starts), shape=(6 * self.nodes,) * 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,26 +76,20 @@ class Pattern:
     """Which 6x6 blocks of the normal equations are not zero; the same for all steps on some edges between nodes.
 
     Attributes:
-        nodes: Number of poses or segments.
         i: (E,) first node of each edge.
         j: (E,) second node of each edge, another one.
         rows: (K,) block row of each block in the upper triangle, diagonal included.
         cols: (K,) its block column.
         gather: (K, 3 E) sums up the edges' products (i, i), (j, j) and (lower, higher) into blocks.
-        order: (M,) places of the whole matrix's blocks, row by row, in `blocks` followed by those above its diagonal.
-        indices: (M,) their block columns.
-        starts: (N + 1,) where each block row begins.
+        nodes: Number of poses or segments.
     """
 
-    nodes: int
     i: Int
     j: Int
     rows: Int
     cols: Int
     gather: sparse.csr_matrix
-    order: Int
-    indices: Int
-    starts: Int
+    nodes: int
 
     @classmethod
     def of(cls, i: Int, j: Int, nodes: int) -> "Pattern":
@@ -66,73 +98,13 @@ class Pattern:
         blocks, place = np.unique(rows * nodes + cols, return_inverse=True)
         products = np.arange(len(place))
         gather = sparse.csr_matrix((np.ones(len(place)), (place, products)), shape=(len(blocks), len(place)))
-        rows, cols = blocks // nodes, blocks % nodes
-        above = rows < cols
-        all_rows, all_cols = np.concatenate([rows, cols[above]]), np.concatenate([cols, rows[above]])
-        order = np.lexsort((all_cols, all_rows))
-        starts = np.searchsorted(all_rows[order], np.arange(nodes + 1))
-        return cls(nodes, i, j, rows, cols, gather, order, all_cols[order], starts)
+        return cls(i, j, blocks // nodes, blocks % nodes, gather, nodes)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NormalEquations:
-    """`[[H, B], [B^T, D]]` of nodes (six unknowns each) and cluster scales.
-
-    Attributes:
-        blocks: (K, 6, 6) blocks of H in the upper triangle, in the pattern's order.
-        H: (6 N, 6 N) of the nodes.
-        B: (6 N, C) between nodes and scales.
-        D: (C,) of the scales.
-    """
-
-    blocks: Float
-    H: sparse.bsr_matrix
-    B: sparse.csr_matrix
-    D: Float
-
-    def times(self, x: Float) -> Float:
-        """The product with a vector (6 N + C,)."""
-        n = self.H.shape[0]
-        if len(self.D) == 0:
-            return np.asarray(self.H @ x)
-        return np.concatenate([self.H @ x[:n] + self.B @ x[n:], self.B.T @ x[:n] + self.D * x[n:]])
-
-
-def normal_equations(
-    pattern: Pattern, A_i: Float, A_j: Float, a_scale: Float, cluster: Int, D: Float, added: Float
-) -> NormalEquations:
-    """Sum up the products of whitened Jacobians (E, 6, 6), and (E, 6) by the scale of an edge's cluster or of none.
-
-    `added` (N, 6, 6) or (6, 6) goes onto the diagonal blocks.
-    """
-    A_i_transposed, A_j_transposed = (np.ascontiguousarray(np.swapaxes(A, 1, 2)) for A in (A_i, A_j))
-    products = np.empty((3, len(A_i), 6, 6))
-    np.matmul(A_i_transposed, A_i, out=products[0])
-    np.matmul(A_j_transposed, A_j, out=products[1])
-    np.matmul(A_i_transposed, A_j, out=products[2])
-    downward = pattern.i > pattern.j
-    products[2, downward] = np.swapaxes(products[2, downward], 1, 2)
-    blocks = np.asarray(pattern.gather @ products.reshape(-1, 36)).reshape(-1, 6, 6)
-    on = pattern.rows == pattern.cols
-    blocks[on] += added[pattern.rows[on]] if added.ndim == 3 else added
-    return NormalEquations(blocks, symmetric(pattern, blocks), _border(pattern, A_i, A_j, a_scale, cluster, len(D)), D)
-
-
-def symmetric(pattern: Pattern, blocks: Float) -> sparse.bsr_matrix:
-    """The whole matrix of the blocks (K, 6, 6) of its upper triangle."""
-    above = np.swapaxes(blocks[pattern.rows < pattern.cols], 1, 2)
-    data = np.concatenate([blocks, above])[pattern.order]
-    return sparse.bsr_matrix((data, pattern.indices, pattern.starts), shape=(6 * pattern.nodes,) * 2)
-
-
-def _border(pattern: Pattern, A_i: Float, A_j: Float, a_scale: Float, cluster: Int, clusters: int) -> sparse.csr_matrix:
-    """Products (6 N, C) of the nodes' Jacobians with those by the scales."""
-    scaled = np.flatnonzero(cluster >= 0)
-    values = np.concatenate([np.einsum("eki,ek->ei", A[scaled], a_scale[scaled]) for A in (A_i, A_j)])
-    nodes = np.concatenate([pattern.i[scaled], pattern.j[scaled]])
-    rows = (6 * nodes[:, None] + np.arange(6)).ravel()
-    cols = np.repeat(np.tile(cluster[scaled], 2), 6)
-    return sparse.csr_matrix((values.ravel(), (rows, cols)), shape=(6 * pattern.nodes, clusters))
+    def summed(self, products: Float) -> Float:
+        """Blocks (K, 6, 6) of the edges' products (3, E, 6, 6): those of i, of j, and of i with j."""
+        downward = self.i > self.j
+        products[2, downward] = np.swapaxes(products[2, downward], 1, 2)
+        return np.asarray(self.gather @ products.reshape(-1, 36)).reshape(-1, 6, 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,25 +112,59 @@ class Structure:
     """What all steps on some edges share.
 
     Attributes:
-        poses: Blocks between poses.
+        steps: Indices of the edges from a pose to the next one, each pair of poses once.
+        others: Indices of all other edges.
+        poses: Blocks between poses of those others.
+        far: BlockLayout of those of the blocks that are in no band.
+        is_far: (K,) which they are.
         segments: Blocks between segments.
+        coarse: Their layout.
         segment: (N,) the segment of each pose.
         between: Indices of the edges between two segments; the others say nothing of how segments move.
     """
 
+    steps: Int
+    others: Int
     poses: Pattern
+    far: BlockLayout
+    is_far: Bool
     segments: Pattern
+    coarse: BlockLayout
     segment: Int
     between: Int
 
     @classmethod
     def of(cls, edges: Edges, poses: int, fixed: int) -> "Structure":
         """Cut the chains into segments and find the blocks."""
+        ahead = np.flatnonzero(edges.j == edges.i + 1)
+        steps = ahead[np.unique(edges.i[ahead], return_index=True)[1]]
+        others = np.setdiff1d(np.arange(len(edges)), steps)
+        pattern = Pattern.of(edges.i[others], edges.j[others], poses)
+        is_far = pattern.cols > pattern.rows + 1
+        far = BlockLayout.of(pattern.rows[is_far], pattern.cols[is_far], poses)
         segment = segments_of(edges, poses, fixed)
         i, j = segment[edges.i], segment[edges.j]
         between = np.flatnonzero(i != j)
-        of_segments = Pattern.of(i[between], j[between], int(segment[-1]) + 1)
-        return cls(Pattern.of(edges.i, edges.j, poses), of_segments, segment, between)
+        segments = Pattern.of(i[between], j[between], int(segment[-1]) + 1)
+        coarse = BlockLayout.of(segments.rows, segments.cols, segments.nodes)
+        return cls(steps, others, pattern, far, is_far, segments, coarse, segment, between)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beside:
+    """What is in the normal equations beside the edges.
+
+    Attributes:
+        fixed: The pose that does not move.
+        damping: Added to the diagonal of the poses.
+        D: (C,) diagonal of the cluster scales: priors, bounds and damping.
+        right: (C,) what priors and bounds pull them by.
+    """
+
+    fixed: int
+    damping: float
+    D: Float
+    right: Float
 
 
 def segments_of(edges: Edges, poses: int, fixed: int) -> Int:
@@ -176,61 +182,135 @@ def segments_of(edges: Edges, poses: int, fixed: int) -> Int:
 
 
 class System:
-    """The normal equations of one step, with both levels of the preconditioner."""
+    """The normal equations of one step, with both levels of the preconditioner.
+
+    They are `[[H, B], [B^T, D]]` of poses and cluster scales; of H, the blocks of each pose and of each with the next
+    one are in bands, as LAPACK takes them, and `far` has the rest.
+    """
 
     def __init__(
-        self,
-        structure: Structure,
-        state: State,
-        jac: Jacobians,
-        cluster: Int,
-        weights: Float,
-        D: Float,
-        fixed: int,
-        damping: float,
+        self, structure: Structure, edges: Edges, state: State, at: Residuals, weights: Float, beside: Beside
     ) -> None:
         """Build and factorise.
 
         Args:
             structure: Of the edges.
-            state: Where the Jacobians were taken.
-            jac: Whitened, not yet weighted.
-            cluster: (E,) cluster of each edge's scale, or -1.
+            edges: What was measured.
+            state: Where the residuals were taken.
+            at: Residuals, not yet weighted.
             weights: (E,) of the edges.
-            D: (C,) of the scales: edges, priors and damping.
-            fixed: The pose that does not move.
-            damping: Added to the diagonal of the poses.
+            beside: Scales, damping, and the pose that does not move.
 
         Raises:
             numpy.linalg.LinAlgError: A level cannot be factorised.
         """
-        self._structure, self._fixed = structure, fixed
-        root = np.sqrt(weights)[:, None, None]
-        A_i, A_j = root * jac.A_i, root * jac.A_j
-        A_i[structure.poses.i == fixed] = 0.0
-        A_j[structure.poses.j == fixed] = 0.0
-        a_scale = root[:, 0] * jac.a_scale
-        self._normal = normal_equations(structure.poses, A_i, A_j, a_scale, cluster, D, damping * np.eye(6))
+        self._structure, self._beside, self._poses = structure, beside, len(state.q)
+        self._edges, self._at, self._root = edges, at, np.sqrt(weights)
+        self._bands = np.zeros((BAND, 6 * self._poses), order="F")
+        self._right = np.zeros((self._poses, 6))
+        self._D, self._right_scales = beside.D.copy(), beside.right.copy()
+        borders = [*self._add_steps(), *self._add_others()]
+        self._B = self._border(borders)
+        self._blocks()[beside.fixed, :, 0] = 1.0
+        self._bands[0] += beside.damping
         self._chains = self._factorised_chains()
-        self._motions = rigid_motions(state, structure.segment)
-        self._motions[fixed] = 0.0
-        damped = damping * self._summed(np.swapaxes(self._motions, 1, 2) @ self._motions)
-        kept, ends = structure.between, (structure.poses.i, structure.poses.j)
-        at_i, at_j = (A[kept] @ self._motions[end[kept]] for A, end in zip((A_i, A_j), ends, strict=True))
-        coarse = normal_equations(structure.segments, at_i, at_j, a_scale[kept], cluster[kept], D, damped)
-        self._segments = factorised(coarse)
+        motions = rigid_motions(state, structure.segment)
+        motions[beside.fixed] = 0.0
+        self._moving, self._collecting = by_segment(motions, structure.segment)
+        self._segments = self._factorised_segments(motions)
 
-    def solve(self, b: Float) -> Float | None:
-        """The step (6 N + C,) for a right side; None where the iterations do not suffice."""
+    def _blocks(self) -> Float:
+        """The bands as (N, 6, 12): of each pose and column, from the diagonal down, the next pose's six last."""
+        return self._bands.T.reshape(self._poses, 6, BAND)
+
+    def _add_steps(self) -> Iterator[Bordered]:
+        """Add the edges from a pose to the next."""
+        blocks = self._blocks()
+        for rows, G in self._products(self._structure.steps):
+            first, second = as_slice(self._edges.i[rows]), as_slice(self._edges.j[rows])
+            for column in range(6):
+                blocks[first, column, : BAND - column] += G[:, column, column:12]
+                blocks[second, column, : 6 - column] += G[:, 6 + column, 6 + column : 12]
+            self._right[first] += G[:, 12, :6]
+            self._right[second] += G[:, 12, 6:12]
+            yield rows, G[:, 12:, :]
+
+    def _add_others(self) -> Iterator[Bordered]:
+        """Add the other edges, some into the bands, some beside them."""
+        others, pattern = self._structure.others, self._structure.poses
+        products, pulls, done = np.empty((3, len(others), 6, 6)), np.empty((len(others), 12)), 0
+        for rows, G in self._products(others):
+            part = slice(done, done + len(rows))
+            products[0, part], products[1, part] = G[:, :6, :6], G[:, 6:12, 6:12]
+            products[2, part] = G[:, :6, 6:12]
+            pulls[part], done = G[:, 12, :12], done + len(rows)
+            yield rows, G[:, 12:, :]
+        for nodes, pulled in ((pattern.i, pulls[:, :6]), (pattern.j, pulls[:, 6:])):
+            self._right += np.stack([np.bincount(nodes, column, self._poses) for column in pulled.T], axis=1)
+        summed, bands = pattern.summed(products), self._blocks()
+        on, beside = pattern.rows == pattern.cols, pattern.cols == pattern.rows + 1
+        for column in range(6):
+            bands[pattern.rows[on], column, : 6 - column] += summed[on, column:, column]
+            bands[pattern.rows[beside], column, 6 - column : BAND - column] += summed[beside, column, :]
+        self._far = self._structure.far.whole(summed[self._structure.is_far])
+
+    def _products(self, of: Int) -> Iterator[tuple[Int, Float]]:
+        """Indices of edges, and the products (E, 14, 14) of their whitened rows with one another.
+
+        A row has both Jacobians, what pulls, and the derivative by the scale of the edge's cluster.
+        """
+        for begin in range(0, len(of), CHUNK_EDGES):
+            indices = of[begin : begin + CHUNK_EDGES]
+            edges, at, root = taken(self._edges, indices), taken(self._at, indices), self._root[indices, None]
+            jac, rows = jacobians(edges, at), np.empty((len(indices), 6, 14))
+            np.multiply(root[:, None], jac.A_i, out=rows[:, :, :6])
+            np.multiply(root[:, None], jac.A_j, out=rows[:, :, 6:12])
+            rows[:, :, 12], rows[:, :, 13] = -root * at.e, root * jac.a_scale
+            rows[edges.i == self._beside.fixed, :, :6] = 0.0
+            rows[edges.j == self._beside.fixed, :, 6:12] = 0.0
+            yield indices, np.swapaxes(rows, 1, 2) @ rows
+
+    def _border(self, parts: Iterable[Bordered]) -> sparse.csr_matrix:
+        """B (6 N, C) of edges and the products of their pull and scale with everything; adds to the scales' own."""
+        clusters = len(self._D)
+        values, rows, cols = [np.zeros(0)], [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        for indices, G in parts:
+            on = np.flatnonzero(self._edges.cluster[indices] >= 0)
+            if len(on) == 0:
+                continue
+            edges, cluster = indices[on], self._edges.cluster[indices[on]]
+            nodes = np.stack([self._edges.i[edges], self._edges.j[edges]], axis=1)
+            values.append(G[on, 1, :12].ravel())
+            rows.append((6 * nodes[:, :, None] + np.arange(6)).ravel())
+            cols.append(np.repeat(cluster, 12))
+            self._D += np.bincount(cluster, G[on, 1, 13], clusters)
+            self._right_scales += np.bincount(cluster, G[on, 1, 12], clusters)
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols)))
+        return sparse.csr_matrix(entries, shape=(6 * self._poses, clusters))
+
+    @property
+    def right(self) -> Float:
+        """Right side (6 N + C,): the negative gradient of half the weighted squares."""
+        return np.concatenate([self._right.ravel(), self._right_scales])
+
+    def units(self, rows: slice) -> Iterator[Float]:
+        """Right sides (6 N + C,) with a one in each of these rows."""
+        for row in range(rows.start, rows.stop):
+            unit = np.zeros(6 * self._poses + len(self._D))
+            unit[row] = 1.0
+            yield unit
+
+    def solve(self, b: Float, tolerance_ratio: float) -> Float | None:
+        """The solution (6 N + C,) of a right side; None where the iterations do not suffice."""
         x = self._by_segments(b)
-        r = b - self._normal.times(x)
+        r = b - self.times(x)
         z = self._preconditioned(r)
         p, rz = z.copy(), float(r @ z)
-        goal = TOLERANCE_RATIO**2 * abs(float(b @ self._preconditioned(b)))
-        for _ in range(iterations_max(self._structure.poses.nodes)):
+        goal = tolerance_ratio**2 * abs(float(b @ self._preconditioned(b)))
+        for _ in range(iterations_max(self._poses)):
             if rz <= goal:
                 return x
-            Ap = self._normal.times(p)
+            Ap = self.times(p)
             alpha = rz / float(p @ Ap)
             x += alpha * p
             r -= alpha * Ap
@@ -238,61 +318,87 @@ class System:
             rz, before = float(r @ z), rz
             if not np.isfinite(rz):
                 break
-            p = z + (rz / before) * p
+            p *= rz / before
+            p += z
         return None
+
+    def times(self, x: Float) -> Float:
+        """The product of the normal equations with a vector (6 N + C,)."""
+        n = 6 * self._poses
+        out = np.empty_like(x)
+        out[:n] = dsbmv(BAND - 1, 1.0, self._bands, x[:n], lower=1)
+        out[:n] += self._far @ x[:n]
+        if len(self._D):
+            out[:n] += self._B @ x[n:]
+            out[n:] = self._B.T @ x[:n] + self._D * x[n:]
+        return out
 
     def _preconditioned(self, r: Float) -> Float:
         """Chains first, then segments on what they leave."""
         z = self._by_chains(r)
-        return z + self._by_segments(r - self._normal.times(z))
+        z += self._by_segments(r - self.times(z))
+        return z
 
     def _by_chains(self, r: Float) -> Float:
-        n = self._normal.H.shape[0]
+        n = 6 * self._poses
         poses = scipy.linalg.cho_solve_banded((self._chains, True), r[:n], check_finite=False)
-        return np.concatenate([poses, r[n:] / self._normal.D])
+        return np.concatenate([poses, r[n:] / self._D])
 
     def _by_segments(self, r: Float) -> Float:
-        n, count = self._normal.H.shape[0], self._structure.segments.nodes
-        forces = self._summed(np.einsum("nki,nk->ni", self._motions, r[:n].reshape(-1, 6)))
-        y = self._segments.solve(np.concatenate([forces.ravel(), r[n:]]))
-        moved = y[: 6 * count].reshape(-1, 6)[self._structure.segment]
-        return np.concatenate([np.einsum("nki,ni->nk", self._motions, moved).ravel(), y[6 * count :]])
-
-    def _summed(self, of_poses: Float) -> Float:
-        """Sums (S, ...) over the poses (N, ...) of each segment."""
-        segment, count = self._structure.segment, self._structure.segments.nodes
-        columns = of_poses.reshape(len(segment), -1).T
-        sums = np.stack([np.bincount(segment, column, count) for column in columns], axis=1)
-        return np.asarray(sums, dtype=np.float64).reshape(count, *of_poses.shape[1:])
+        n, count = 6 * self._poses, 6 * self._structure.segments.nodes
+        y = self._segments.solve(np.concatenate([self._collecting @ r[:n], r[n:]]))
+        return np.concatenate([self._moving @ y[:count], y[count:]])
 
     def _factorised_chains(self) -> Float:
-        """Banded Cholesky factor (12, 6 N) of the diagonal blocks and of those between consecutive poses."""
-        pattern, blocks = self._structure.poses, self._normal.blocks
-        diagonal, below = np.zeros((2, pattern.nodes, 6, 6))
-        on = pattern.rows == pattern.cols
-        diagonal[pattern.rows[on]] = blocks[on]
-        beside = pattern.cols == pattern.rows + 1
-        below[pattern.rows[beside]] = np.swapaxes(blocks[beside], 1, 2)
-        diagonal[self._fixed] = np.eye(6)
-        band = np.zeros((12, 6 * pattern.nodes))
-        for column in range(6):
-            for row in range(column, 6):
-                band[row - column, column::6] = diagonal[:, row, column]
-            for row in range(6):
-                band[6 + row - column, column::6] = below[:, row, column]
-        band[0] *= 1.0 + RIDGE_RATIO
-        return np.asarray(scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False))
+        """Banded Cholesky factor (12, 6 N) of the bands."""
+        bands = self._bands.copy(order="F")
+        bands[0] *= 1.0 + RIDGE_RATIO
+        return np.asarray(scipy.linalg.cholesky_banded(bands, overwrite_ab=True, lower=True, check_finite=False))
+
+    def _factorised_segments(self, motions: Float) -> SuperLU:
+        """Factors of the system of segments that move as a whole by their poses' motions (N, 6, 6), scales included."""
+        kept, pattern, clusters = self._structure.between, self._structure.segments, len(self._D)
+        edges, root = taken(self._edges, kept), self._root[kept, None]
+        jac = jacobians(edges, taken(self._at, kept))
+        ends = [root[:, None] * (A @ motions[end]) for A, end in ((jac.A_i, edges.i), (jac.A_j, edges.j))]
+        pairs = ((ends[0], ends[0]), (ends[1], ends[1]), (ends[0], ends[1]))
+        blocks = pattern.summed(np.stack([np.swapaxes(A, 1, 2) @ B for A, B in pairs]))
+        H = self._structure.coarse.whole(blocks)
+        if self._beside.damping > 0:
+            own = self._beside.damping * (self._collecting @ self._moving)
+            H = H + own
+        slopes, scaled = root * jac.a_scale, np.flatnonzero(edges.cluster >= 0)
+        values = np.concatenate([np.einsum("eki,ek->ei", A[scaled], slopes[scaled]) for A in ends])
+        nodes = np.concatenate([pattern.i[scaled], pattern.j[scaled]])
+        rows, cols = (6 * nodes[:, None] + np.arange(6)).ravel(), np.repeat(np.tile(edges.cluster[scaled], 2), 6)
+        B = sparse.csr_matrix((values.ravel(), (rows, cols)), shape=(6 * pattern.nodes, clusters))
+        return factorised(H, B, self._D)
 
 
-def factorised(normal: NormalEquations) -> SuperLU:
-    """Factors of the segments' system, scales included; a segment that cannot move keeps a one on its diagonal.
+def as_slice(indices: Int) -> Int | slice:
+    """Indices that count on without a gap as a slice, with which numpy is several times as fast."""
+    first, last = int(indices[0]), int(indices[-1])
+    return slice(first, last + 1) if last - first == len(indices) - 1 else indices
+
+
+def by_segment(motions: Float, segment: Int) -> tuple[sparse.bsr_matrix, sparse.bsr_matrix]:
+    """What moves poses (6 N) with their segments (6 S) by motions (N, 6, 6), and its transpose."""
+    poses, segments = len(segment), int(segment[-1]) + 1
+    shape, starts = (6 * poses, 6 * segments), np.searchsorted(segment, np.arange(segments + 1))
+    moving = sparse.bsr_matrix((motions, segment, np.arange(poses + 1)), shape=shape)
+    transposed = np.ascontiguousarray(np.swapaxes(motions, 1, 2))
+    return moving, sparse.bsr_matrix((transposed, np.arange(poses), starts), shape=shape[::-1])
+
+
+def factorised(H: sparse.bsr_matrix, B: sparse.csr_matrix, D: Float) -> SuperLU:
+    """Factors of `[[H, B], [B^T, D]]`; what cannot move keeps a one on its diagonal.
 
     Raises:
         numpy.linalg.LinAlgError: It is singular.
     """
-    diagonal = normal.H.diagonal()
-    H = normal.H.tocsc() + sparse.diags(np.where(diagonal > 0, RIDGE_RATIO * diagonal, 1.0))
-    whole = sparse.bmat([[H, normal.B], [normal.B.T, sparse.diags(normal.D)]]) if len(normal.D) else H
+    diagonal = H.diagonal()
+    H = H.tocsc() + sparse.diags(np.where(diagonal > 0, RIDGE_RATIO * diagonal, 1.0))
+    whole = sparse.bmat([[H, B], [B.T, sparse.diags(D)]]) if len(D) else H
     try:
         return splu(whole.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError as error:
@@ -313,15 +419,3 @@ def rigid_motions(state: State, segment: Int) -> Float:
     out[:, :3, :3] = out[:, 3:, 3:] = R_inverse
     out[:, 3:, :3] = -R_inverse @ rotations.hats(state.t - centre[segment])
     return out
-
-
-def right_side(edges: Edges, at: Residuals, jac: Jacobians, weights: Float, poses: int, of_scales: Float) -> Float:
-    """Negative gradient (6 N + C,) of half the weighted squares; `of_scales` (C,) is what priors and bounds add."""
-    pulled = -weights[:, None] * at.e
-    of_poses = np.zeros((poses, 6))
-    for nodes, A in ((edges.i, jac.A_i), (edges.j, jac.A_j)):
-        per_edge = np.einsum("eki,ek->ei", A, pulled)
-        of_poses += np.stack([np.bincount(nodes, column, poses) for column in per_edge.T], axis=1)
-    scaled = edges.cluster >= 0
-    by_scale = np.einsum("ek,ek->e", jac.a_scale[scaled], pulled[scaled])
-    return np.concatenate([of_poses.ravel(), of_scales + np.bincount(edges.cluster[scaled], by_scale, len(of_scales))])

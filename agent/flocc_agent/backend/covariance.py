@@ -6,16 +6,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flocc_agent.backend.descent import Objective, Solved
-from flocc_agent.backend.edges import jacobians, residuals
+from flocc_agent.backend.edges import residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.problem import Problem
-from flocc_agent.core.pose_graph import Trajectory
+from flocc_agent.core.pose_graph import Component, Trajectory
 from flocc_agent.geometry import Float, adjoint
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
 
 COVARIANCE_MAX = 1e30
+COVARIANCE_ROUNDS = 5
+"""Of a large graph every so many rounds' covariances are computed: they cost as much as a round that adds little."""
 
 
 def covariances_of(
@@ -49,11 +51,25 @@ def covariances_of(
     return of_logs, {keyframe: S for keyframe, S in of_wanted if _usable(S) is not None}
 
 
+def kept_covariances(
+    objective: Objective, problem: Problem, earlier: Component | None, wanted: Sequence[KeyframeId]
+) -> Mapping[LogId, Float | None] | None:
+    """The earlier round's covariances of the same logs, where they stand for this one; None where they are due.
+
+    They do where the solver does not leave them over (large graphs, solved by conjugate gradients), and for
+    `COVARIANCE_ROUNDS` rounds.
+    """
+    if earlier is None or wanted or objective.linear.leaves_covariances:
+        return None
+    stand = earlier.covariance_rounds + 1 < COVARIANCE_ROUNDS and earlier.logs == problem.logs
+    known = all(earlier.covariance_map_odom.get(log) is not None for log in problem.logs)
+    return earlier.covariance_map_odom if stand and known else None
+
+
 def keyframe_covariances(objective: Objective, solved: Solved, indices: Sequence[int]) -> list[Float]:
     """Marginal covariance (6, 6) of poses in their own tangent spaces; zero for the pose that does not move."""
     at = residuals(objective.edges, solved.state)
-    jac = jacobians(objective.edges, at)
-    return objective.linear.marginals(objective.edges, solved.state, at, jac, solved.weights, list(indices))
+    return objective.linear.marginals(objective.edges, solved.state, at, solved.weights, list(indices))
 
 
 def _usable(S: Float) -> Float | None:

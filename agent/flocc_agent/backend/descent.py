@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from flocc_agent.backend.edges import Edges, Jacobians, Residuals, State, jacobians, residuals
+from flocc_agent.backend.edges import Edges, Residuals, State, residuals, taken
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.config import BackendConfig
 
@@ -70,7 +70,7 @@ class Objective:
 
     def closure_residuals(self, state: State) -> Float:
         """Squared residuals (L,) of the closures."""
-        return residuals(self.edges, state, hold=False).squared()[self.closures]
+        return residuals(taken(self.edges, self.closures), state, hold=False).squared()
 
     def weights(self, of_closures: Float | float = 1.0) -> Float:
         """Weights (E,) of all edges, given those of the closures."""
@@ -103,10 +103,9 @@ def descend(
     budget = objective.config.iterations_max if steps_max is None else steps_max
     here, damping, solves = _point(objective, state, weights, hold), 0.0, 0
     while solves < budget:
-        jac = jacobians(objective.edges, here.at)
         while True:
             solves += 1
-            there = _lower(objective, here, jac, weights, damping, hold)
+            there = _lower(objective, here, weights, damping, hold)
             if there.cost <= here.cost:
                 break
             if _is_finished(objective.config, here.cost, there.cost - here.cost):
@@ -126,10 +125,10 @@ def _point(objective: Objective, state: State, weights: Float, hold: bool) -> Po
     return Point(state, at, objective.cost_at(at, state, weights))
 
 
-def _lower(objective: Objective, here: Point, jac: Jacobians, weights: Float, damping: float, hold: bool) -> Point:
+def _lower(objective: Objective, here: Point, weights: Float, damping: float, hold: bool) -> Point:
     """The first of the shortened steps that goes down, or the least bad of them; infinite cost where there is none."""
     try:
-        delta = objective.linear.step(objective.edges, here.state, here.at, jac, weights, damping)
+        delta = objective.linear.step(objective.edges, here.state, here.at, weights, damping)
     except SingularSystem:
         return Point(here.state, here.at, np.inf)
     best = Point(here.state, here.at, np.inf)

@@ -16,7 +16,8 @@ A scale is kept above `GAMMA_MIN`: an edge whose best scale lies below is held t
 Updates are on the right: `R <- R Exp(omega)`, `t <- t + R v`; the tangent order is rotation, translation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +125,10 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Jacobians:
-    """Whitened derivatives of the residuals: `A_i`, `A_j` (E, 6, 6) and `a_scale` (E, 6) by the cluster's scale."""
+    """Whitened derivatives of the residuals: `A_i`, `A_j` (E, 6, 6) and `a_scale` (E, 6) by the cluster's scale.
+
+    Each matrix is column-major.
+    """
 
     A_i: Float
     A_j: Float
@@ -184,13 +188,28 @@ def jacobians(edges: Edges, at: Residuals) -> Jacobians:
     R_hat_inverse = rotations.matrices(rotations.conjugate(edges.q_hat))
     R_error = rotations.matrices(at.q_error)
     J_r = rotations.hats(at.q_error[:, 1:]) + at.q_error[:, 0, None, None] * np.eye(3)
-    J_i, J_j = np.zeros((2, len(edges), 6, 6))
-    J_j[:, :3, :3] = J_r
-    J_j[:, 3:, 3:] = R_error
+    J = np.zeros((len(edges), 6, 12))
     # R_ij^T = R_error^T R_hat^T
-    J_i[:, :3, :3] = -J_r @ np.swapaxes(R_error, 1, 2) @ R_hat_inverse
-    J_i[:, 3:, :3] = R_hat_inverse @ rotations.hats(at.p)
-    J_i[:, 3:, 3:] = -R_hat_inverse
-    a_scale = -np.einsum("eij,ej->ei", at.L, edges.d)
-    a_scale[(edges.cluster < 0) | at.held] = 0.0
-    return Jacobians(at.L @ J_i, at.L @ J_j, a_scale)
+    J[:, :3, :3] = -J_r @ np.swapaxes(R_error, 1, 2) @ R_hat_inverse
+    J[:, 3:, :3] = R_hat_inverse @ rotations.hats(at.p)
+    J[:, 3:, 3:6] = -R_hat_inverse
+    J[:, :3, 6:9] = J_r
+    J[:, 3:, 9:] = R_error
+    A = np.swapaxes(np.swapaxes(J, 1, 2) @ np.swapaxes(at.L, 1, 2), 1, 2)
+    return Jacobians(A[:, :, :6], A[:, :, 6:], scale_slopes(edges, at))
+
+
+def scale_slopes(edges: Edges, at: Residuals) -> Float:
+    """Whitened derivatives (E, 6) of the residuals by the scale of the edge's cluster; zero where it has none."""
+    slopes = np.zeros((len(edges), 6))
+    on = np.flatnonzero((edges.cluster >= 0) & ~at.held)
+    slopes[on] = -np.einsum("eij,ej->ei", at.L[on], edges.d[on])
+    return slopes
+
+
+Record = TypeVar("Record", Edges, Residuals)
+
+
+def taken(record: Record, rows: Int | slice) -> Record:
+    """Some of the edges, or what they say."""
+    return type(record)(*(getattr(record, field.name)[rows] for field in fields(record)))

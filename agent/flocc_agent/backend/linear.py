@@ -5,8 +5,10 @@ C++. Column-major arrays with an explicit unit noise model pass three times as f
 instead of 122 ms for 8,000 factors).
 """
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from itertools import repeat
 
 import gtsam
 import numpy as np
@@ -14,16 +16,25 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from flocc_agent.backend.conjugate_gradients import Structure, System, right_side
-from flocc_agent.backend.edges import Edges, Jacobians, Residuals, State
+from flocc_agent.backend.conjugate_gradients import Beside, Structure, System
+from flocc_agent.backend.edges import Edges, Residuals, State, jacobians
 
 Float = NDArray[np.float64]
 
 SCALE_KEYS_FROM = 1 << 40
 ITERATIVE_LOOPS_MIN = 2500
 """From so many edges beyond a tree on, conjugate gradients are faster than elimination (`flocc bench solver`)."""
-
-
+ITERATIVE_POSES_MIN = 10_000
+"""From so many poses on they are so with few loops, too (`flocc bench solver --keyframes 20000 --closures 2000`)."""
+DISSECTED_POSES_MIN = 10_000
+"""From so many poses on, nested dissection gives the order of elimination."""
+MARGINALS_ELIMINATED_POSES_MAX = 50_000
+"""Above, elimination for the sake of covariances would take most of a gigabyte."""
+TOLERANCE_RATIO = 4e-3
+"""How far conjugate gradients lower the residual, in the preconditioner's norm; the step's cost is then right to its
+square."""
+MARGINALS_TOLERANCE_RATIO = 1e-4
+BESIDE_M, BESIDE_RAD = 0.01, 1e-3
 TETHER = 1.0
 """Information by which a part of the graph that nothing holds stays where it is: any value gives the same step."""
 
@@ -43,125 +54,149 @@ class LinearSolver:
         fixed: Index of the pose that does not move (the anchor's first keyframe).
         scale_prior_sigma: Standard deviation of a cluster's scale around 1.
         iterative_loops_min: Number of edges beyond a tree from which on conjugate gradients are tried first.
+        iterative_poses_min: Number of poses from which on they are, however few the loops.
     """
 
     fixed: int
     scale_prior_sigma: float
     iterative_loops_min: int = ITERATIVE_LOOPS_MIN
+    iterative_poses_min: int = ITERATIVE_POSES_MIN
     _ordering: gtsam.Ordering | None = field(default=None, repr=False)
     _ordered: bytes = field(default=b"", repr=False)
+    _tree: gtsam.GaussianBayesTree | None = field(default=None, repr=False)
+    _tree_at: tuple[State, Float] | None = field(default=None, repr=False)
     _structure: Structure | None = field(default=None, repr=False)
     _gave_up: bool = field(default=False, repr=False)
 
-    def step(
-        self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float, damping: float = 0.0
-    ) -> Float:
+    def step(self, edges: Edges, state: State, at: Residuals, weights: Float, damping: float = 0.0) -> Float:
         """Tangent vector (6 N + C,) that reduces the linearised, weighted cost most.
 
         Raises:
             SingularSystem: Something is not determined.
         """
-        if len(edges) - len(state.q) >= self.iterative_loops_min and not self._gave_up:
-            found = self._iterated(edges, state, at, jac, weights, damping)
+        if self._is_iterated(edges, len(state.q)):
+            found = self._iterated(edges, state, at, weights, damping)
             if found is not None:
                 return found
             self._gave_up = True
-        return self._eliminated(edges, state, at, jac, weights, damping)
+        return self._eliminated(edges, state, at, weights, damping)
 
-    def _iterated(
-        self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float, damping: float
-    ) -> Float | None:
+    @property
+    def leaves_covariances(self) -> bool:
+        """Whether the last step was eliminated, so that covariances cost little more."""
+        return self._tree is not None
+
+    def _is_iterated(self, edges: Edges, poses: int) -> bool:
+        many = len(edges) - poses >= self.iterative_loops_min or poses >= self.iterative_poses_min
+        return many and not self._gave_up
+
+    def _iterated(self, edges: Edges, state: State, at: Residuals, weights: Float, damping: float) -> Float | None:
         """The step by conjugate gradients; None where they do not get there."""
-        if self._structure is None:
-            self._structure = Structure.of(edges, len(state.q), self.fixed)
-        of_scales, D = self._scale_terms(edges, state, at, jac, weights, damping)
-        b = right_side(edges, at, jac, weights, len(state.q), of_scales)
-        b[6 * self.fixed : 6 * self.fixed + 6] = 0.0
         try:
-            system = System(self._structure, state, jac, edges.cluster, weights, D, self.fixed, damping)
+            system = self._system(edges, state, at, weights, damping)
         except np.linalg.LinAlgError:
             return None
-        return system.solve(b)
+        return system.solve(system.right, TOLERANCE_RATIO)
 
-    def _scale_terms(
-        self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float, damping: float
-    ) -> tuple[Float, Float]:
-        """What priors and bounds pull cluster scales by (C,), and the diagonal (C,) of their normal equations."""
+    def _system(self, edges: Edges, state: State, at: Residuals, weights: Float, damping: float) -> System:
+        if self._structure is None:
+            self._structure = Structure.of(edges, len(state.q), self.fixed)
+        beside = self._beside(edges, state, at, weights, damping)
+        return System(self._structure, edges, state, at, weights, beside)
+
+    def _beside(self, edges: Edges, state: State, at: Residuals, weights: Float, damping: float) -> Beside:
+        """What priors and bounds of cluster scales add to the edges."""
         clusters, held = len(state.scale), at.held & (edges.cluster >= 0)
         information = 1.0 / self.scale_prior_sigma**2
         slope = weights[held] / edges.sigma[held]
         pulled = (1.0 - state.scale) * information
         pulled += np.bincount(edges.cluster[held], slope * at.bound[held], clusters)
-        scaled = edges.cluster >= 0
-        squares = weights[scaled] * np.einsum("ek,ek->e", jac.a_scale[scaled], jac.a_scale[scaled])
-        D = damping + information + np.bincount(edges.cluster[scaled], squares, clusters)
-        return pulled, np.asarray(D + np.bincount(edges.cluster[held], slope / edges.sigma[held], clusters))
+        D = damping + information + np.bincount(edges.cluster[held], slope / edges.sigma[held], clusters)
+        return Beside(self.fixed, damping, np.asarray(D), pulled)
 
-    def _eliminated(
-        self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float, damping: float
-    ) -> Float:
+    def _eliminated(self, edges: Edges, state: State, at: Residuals, weights: Float, damping: float) -> Float:
         """The step by elimination."""
-        graph = self.factors(edges, state, at, jac, weights)
+        graph = self.factors(edges, state, at, weights)
         if graph.size() == 0:
             return np.zeros(6 * len(state.q) + len(state.scale))
+        parts = [] if damping > 0 else loose(edges, weights, len(state.q), self.fixed)
         if damping > 0:
             self._damp(graph, range(len(state.q)), range(len(state.scale)), damping)
         else:
-            self._damp(graph, loose(edges, weights, len(state.q), self.fixed), (), TETHER)
+            self._damp(graph, parts, (), TETHER)
         taking_part = (weights > 0.0).tobytes()
         if self._ordering is None or taking_part != self._ordered:
-            self._ordering, self._ordered = gtsam.Ordering.ColamdGaussianFactorGraph(graph), taking_part
+            self._ordering, self._ordered = ordering(graph, len(state.q)), taking_part
+        self._tree = None
         try:
-            moved = graph.optimize(self._ordering).vector()
+            tree = graph.eliminateMultifrontal(self._ordering)
+            moved = tree.optimize().vector()
         except RuntimeError as error:
             raise SingularSystem(str(error).strip().splitlines()[0]) from error
         if not np.all(np.isfinite(moved)):
             raise SingularSystem("the normal equations have no finite solution")
+        if damping == 0 and not parts:
+            self._tree, self._tree_at = tree, (state, weights)
         return np.concatenate([moved[: 6 * self.fixed], np.zeros(6), moved[6 * self.fixed :]])
 
-    def marginals(
-        self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float, poses: list[int]
-    ) -> list[Float]:
+    def marginals(self, edges: Edges, state: State, at: Residuals, weights: Float, poses: list[int]) -> list[Float]:
         """Marginal covariances (6, 6) of poses in their own tangent spaces; zero for the pose that does not move.
+
+        They are those of the last step, where one was eliminated with these weights: it moved next to nothing.
 
         Raises:
             SingularSystem: Something is not determined.
         """
-        graph = self.factors(edges, state, at, jac, weights)
-        if graph.size() == 0:
-            return [np.zeros((6, 6)) for _ in poses]
+        moving = [pose for pose in poses if pose != self.fixed]
         try:
-            tree = graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
-            moving = {pose: np.asarray(tree.marginalCovariance(pose)) for pose in poses if pose != self.fixed}
-        except RuntimeError as error:
+            if len(state.q) > MARGINALS_ELIMINATED_POSES_MAX and self._is_iterated(edges, len(state.q)):
+                found = self._marginals_iterated(edges, state, at, weights, moving)
+            else:
+                tree = self._factorised(edges, state, at, weights)
+                found = {pose: np.asarray(tree.marginalCovariance(pose)) for pose in moving}
+        except (RuntimeError, np.linalg.LinAlgError) as error:
             raise SingularSystem(str(error).strip().splitlines()[0]) from error
-        return [0.5 * (moving[p] + moving[p].T) if p in moving else np.zeros((6, 6)) for p in poses]
+        return [0.5 * (found[p] + found[p].T) if p in found else np.zeros((6, 6)) for p in poses]
 
-    def factors(
-        self, edges: Edges, state: State, at: Residuals, jac: Jacobians, weights: Float
-    ) -> gtsam.GaussianFactorGraph:
+    def _factorised(self, edges: Edges, state: State, at: Residuals, weights: Float) -> gtsam.GaussianBayesTree:
+        if self._tree is None or self._tree_at is None or not _is_beside((state, weights), self._tree_at):
+            graph = self.factors(edges, state, at, weights)
+            return graph.eliminateMultifrontal(ordering(graph, len(state.q)))
+        return self._tree
+
+    def _marginals_iterated(
+        self, edges: Edges, state: State, at: Residuals, weights: Float, poses: list[int]
+    ) -> dict[int, Float]:
+        """The same by conjugate gradients, one column at a time: elimination of many poses takes much memory."""
+        system = self._system(edges, state, at, weights, 0.0)
+        found = {}
+        for pose in poses:
+            rows = slice(6 * pose, 6 * pose + 6)
+            columns = [system.solve(column, MARGINALS_TOLERANCE_RATIO) for column in system.units(rows)]
+            found[pose] = np.array([np.full(6, np.nan) if x is None else x[rows] for x in columns])
+        return found
+
+    def factors(self, edges: Edges, state: State, at: Residuals, weights: Float) -> gtsam.GaussianFactorGraph:
         """Jacobian factors of all edges and of the cluster scales' priors, noise whitened."""
         graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(6)
+        add: Callable[..., None] = graph.add
+        jac = jacobians(edges, at)
         w = np.sqrt(weights)[:, None]
-        plain = bool(np.all(weights == 1.0))
-        A_i, A_j = (column_major(A if plain else w[:, :, None] * A) for A in (jac.A_i, jac.A_j))
+        whole = bool(np.all(weights == 1.0))
+        A_i, A_j = (A if whole else w[:, :, None] * A for A in (jac.A_i, jac.A_j))
         a_scale, b = (w * jac.a_scale)[:, :, None], -w * at.e
-        fixed, add = self.fixed, graph.add
-        scale_keys = np.where(edges.cluster >= 0, SCALE_KEYS_FROM + edges.cluster, -1).tolist()
-        rows = zip(edges.i.tolist(), edges.j.tolist(), scale_keys, A_i, A_j, a_scale, b, weights.tolist(), strict=True)
-        for i, j, key, A_of_i, A_of_j, a, right, weight in rows:
-            if weight == 0.0:
-                continue
-            if fixed in (i, j):
-                moving, A = (j, A_of_j) if i == fixed else (i, A_of_i)
-                if key >= 0:
-                    add(moving, A, key, a, right, unit)
-                else:
-                    add(moving, A, right, unit)
-            elif key >= 0:
-                add(i, A_of_i, j, A_of_j, key, a, right, unit)
-            else:
-                add(i, A_of_i, j, A_of_j, right, unit)
+        plain = (weights > 0.0) & (edges.cluster < 0) & (edges.i != self.fixed) & (edges.j != self.fixed)
+        others = np.flatnonzero((weights > 0.0) & ~plain).tolist()
+        of_plain = (x[plain] for x in (edges.i, A_i, edges.j, A_j, b))
+        keys_i, rows_i, keys_j, rows_j, right = of_plain
+        both = map(add, keys_i.tolist(), rows_i, keys_j.tolist(), rows_j, right, repeat(unit))
+        deque(both, maxlen=0)
+        for k in others:
+            ends = ((int(edges.i[k]), A_i[k]), (int(edges.j[k]), A_j[k]))
+            terms = [term for end in ends if end[0] != self.fixed for term in end]
+            if edges.cluster[k] >= 0:
+                terms += [SCALE_KEYS_FROM + int(edges.cluster[k]), a_scale[k]]
+            add(*terms, b[k], unit)
         self._add_scale_rows(graph, edges, state, at, w[:, 0])
         return graph
 
@@ -190,6 +225,24 @@ class LinearSolver:
             graph.add(SCALE_KEYS_FROM + c, np.full((1, 1), root), np.zeros(1), one)
 
 
+def _is_beside(here: tuple[State, Float], there: tuple[State, Float]) -> bool:
+    """Whether two states with weights are so alike that so are their covariances."""
+    (a, weights_a), (b, weights_b) = here, there
+    same = a.t.shape == b.t.shape and np.array_equal(weights_a, weights_b)
+    return same and bool(np.abs(a.t - b.t).max() <= BESIDE_M and np.abs(a.q - b.q).max() <= BESIDE_RAD)
+
+
+def ordering(graph: gtsam.GaussianFactorGraph, poses: int) -> gtsam.Ordering:
+    """An order of elimination that fills in little.
+
+    Nested dissection (METIS) takes longer to find, and makes a flat tree: at 100,000 poses four covariances take 0.1 s
+    in it, and 15 s in that of COLAMD.
+    """
+    if poses < DISSECTED_POSES_MIN:
+        return gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+    return gtsam.Ordering.MetisGaussianFactorGraph(graph)
+
+
 def loose(edges: Edges, weights: Float, poses: int, fixed: int) -> list[int]:
     """The first pose of each part of the graph that no edge with a weight joins to the fixed pose."""
     on = weights > 0.0
@@ -197,8 +250,3 @@ def loose(edges: Edges, weights: Float, poses: int, fixed: int) -> list[int]:
     labels = connected_components(joined, directed=False)[1]
     _, first = np.unique(labels, return_index=True)
     return [int(pose) for pose in first if labels[pose] != labels[fixed]]
-
-
-def column_major(A: Float) -> Float:
-    """The same matrices (E, n, n), each of them column-major, as Eigen wants them."""
-    return np.swapaxes(np.ascontiguousarray(np.swapaxes(A, 1, 2)), 1, 2)

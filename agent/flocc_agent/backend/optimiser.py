@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import votes
-from flocc_agent.backend.descent import Objective
+from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, state_of
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import Aligned, initial_poses, trusted_closures
+from flocc_agent.backend.initial import Aligned, component_with, initial_poses, trusted_closures
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
@@ -25,7 +25,7 @@ from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import solve
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     ClosureState,
@@ -195,7 +195,8 @@ def _solve_connected(
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())
-    solution = Solution(posed.problem, posed.objective, posed.start, solved, kept.trajectories, kept.left)
+    earlier = component_with(kept.trajectories, initial) if is_confirmed(posed, solved) else None
+    solution = Solution(posed.problem, posed.objective, posed.start, solved, kept.trajectories, kept.left, earlier)
     outcome = collect(solution, wanted)
     times.append(time.perf_counter())
     spans_s = np.diff(times).tolist()
@@ -219,6 +220,12 @@ class Posed:
     start: State
     trusted: NDArray[np.bool_] | None
     places: Places
+
+
+def is_confirmed(posed: Posed, solved: Solved) -> bool:
+    """Whether a solution rests on the closures that the one before it trusted."""
+    chosen = solved.weights[posed.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
+    return posed.trusted is not None and np.array_equal(chosen, posed.trusted)
 
 
 def _posed(kept: Filtered, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None) -> Posed:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flocc_agent.backend.covariance import covariances_of
+from flocc_agent.backend.covariance import covariances_of, kept_covariances
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, residuals, scales_at
 from flocc_agent.backend.problem import Problem
@@ -30,7 +30,10 @@ class SolvedLogs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """A solved component, still in arrays, with where it started and what it was made of."""
+    """A solved component, still in arrays, with where it started and what it was made of.
+
+    `earlier` is the component of the round before, where all of its closures stand.
+    """
 
     problem: Problem
     objective: Objective
@@ -38,6 +41,7 @@ class Solution:
     solved: Solved
     trajectories: Mapping[LogId, Trajectory]
     closures: Mapping[int, LoopClosure]
+    earlier: Component | None = None
 
 
 def excluded(closure: LoopClosure, reason: str) -> ClosureResult:
@@ -98,7 +102,11 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         log: T_map_all @ T_all[problem.offsets[log] : problem.offsets[log] + len(trajectories[log])]
         for log in problem.logs
     }
-    of_logs, of_keyframes = covariances_of(problem, objective, solution.solved, trajectories, wanted)
+    kept = kept_covariances(objective, problem, solution.earlier, wanted)
+    if kept is None:
+        of_logs, of_keyframes = covariances_of(problem, objective, solution.solved, trajectories, wanted)
+    else:
+        of_logs, of_keyframes = dict(kept), {}
     return Component(
         logs=problem.logs,
         T_map_keyframe=T_map_keyframe,
@@ -107,6 +115,7 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         cost=solution.solved.cost,
         cost_initial=objective.cost(solution.start, solution.solved.weights, hold=True),
         covariance_keyframe=of_keyframes,
+        covariance_rounds=0 if kept is None or solution.earlier is None else solution.earlier.covariance_rounds + 1,
     )
 
 

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -64,7 +64,7 @@ class TransportConfig(Section):
     """How a robot reaches others over zenoh. Latents have their own session, so that they never delay heartbeats."""
 
     control_listen: tuple[Endpoint, ...] = ("tcp/0.0.0.0:0",)
-    """Where this robot listens for control; port 0 takes a free one, for which scouting must be on."""
+    """Where this robot listens for control; port 0 takes a free one, for which scouting must be on. With tls: tls/."""
     bulk_listen: tuple[Endpoint, ...] = ("tcp/0.0.0.0:0",)
     """Where this robot listens for latents."""
     roster: dict[str, PeerEndpoints] = Field(default_factory=dict)
@@ -104,6 +104,14 @@ class TransportConfig(Section):
         """Where control sessions, or bulk sessions, find each other."""
         group, _, port = self.multicast_address.rpartition(":")
         return self.multicast_address if control else f"{group}:{int(port) + 1}"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _listens_as_tls_asks(cls, given: Any) -> Any:
+        """Where tls is asked for and no endpoint is named, the usual ones are of tls."""
+        if not isinstance(given, dict) or given.get("tls") is None:
+            return given
+        return {"control_listen": ("tls/0.0.0.0:0",), "bulk_listen": ("tls/0.0.0.0:0",), **given}
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "TransportConfig":

@@ -113,6 +113,6 @@ REMOVED: dict[str, str] = {
     "ros2.tf_period_s": "always 0.05",
     "ros2.path_period_s": "always 1.0",
     "ros2.odometry_gap_max_s": "always 0.5",
-    "ros2.images_max": "always 8",
+    "ros2.images_max": "always 64, and 64 MiB",
     "ros2.path_poses_max": "always 1000",
 }

@@ -52,6 +52,9 @@ class Ros2Config(Section):
     """nav_msgs/Odometry, of base_frame in odom_frame; empty where a program or a recording feeds the agent."""
     fix_topic: RosName = ""
     """sensor_msgs/NavSatFix of a GNSS receiver, whose fixes tie the map to the Earth; empty: there is none."""
+    grid_topic: RosName = ""
+    """nav_msgs/OccupancyGrid of the robot's own mapping, in odom_frame; with those of the others (the same topic in the
+    namespace that is their name) it becomes ~/merged_map. Empty: there is none."""
     map_frame: str = Field("map", min_length=1)
     """Frame that odom_frame is placed in, on /tf (REP 105)."""
     odom_frame: str = Field("odom", min_length=1)
@@ -92,6 +95,8 @@ class Ros2Config(Section):
         missing = [name for name in outputs if not getattr(self, name)]
         if missing:
             raise ValueError(f"{missing[0]} must not be empty")
+        if self.grid_topic.startswith("/"):
+            raise ValueError("grid_topic must be relative: it is the same in each robot's namespace")
         if self.map_frame == self.odom_frame:
             raise ValueError("map_frame and odom_frame must differ")
         q = self.camera_mounting[3:] if self.camera_mounting else (1.0,)

@@ -6,6 +6,7 @@ A complaint is one sentence that names the file and the key.
 import dataclasses
 import difflib
 import json
+import re
 import tomllib
 import typing
 from collections.abc import Mapping
@@ -105,6 +106,11 @@ def _keys(kind: Any, sections: list[str]) -> list[str]:
     return _keys(below[sections[0]], sections[1:]) if sections[0] in below else []
 
 
+KEY_PARTS_MAX = 64
+LONG_KEY = re.compile(rf"^\s*\[*(?:[\w-]+\s*\.\s*){{{KEY_PARTS_MAX},}}[\w-]", re.MULTILINE | re.ASCII)
+"""The parser's time grows with the square of a key's parts: 50,000 of them take minutes."""
+
+
 def read_toml(path: Path) -> dict[str, object]:
     """Read a TOML file.
 
@@ -112,7 +118,12 @@ def read_toml(path: Path) -> dict[str, object]:
         ConfigError: It is missing, unreadable or not TOML; the message names the file (and line).
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        if LONG_KEY.search(text):
+            raise ConfigError(f"{path}: has a key of more than {KEY_PARTS_MAX} parts")
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise ConfigError(f"{path}: is nested too deeply") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except tomllib.TOMLDecodeError as error:
@@ -127,6 +138,8 @@ def read_json(path: Path) -> dict[str, object]:
     """
     try:
         content = json.loads(path.read_bytes())
+    except RecursionError as error:
+        raise ConfigError(f"{path}: is nested too deeply") from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if not isinstance(content, dict):

@@ -72,6 +72,16 @@ class CorrectedLog:
     def __len__(self) -> int:
         return len(self._odometry.poses())
 
+    @property
+    def log(self) -> LogId:
+        """Which log it is."""
+        return self._correction.log
+
+    @property
+    def T_map_odom(self) -> Float:
+        """(4, 4) of the odom frame that the newest keyframes are in."""
+        return pose_from_tq(np.array(self._correction.T_map_odom))
+
     def pose_of(self, index: int) -> Float | None:
         """Corrected pose (4, 4) at a keyframe, by its number; None where no such keyframe is known."""
         poses = self._odometry.poses()
@@ -166,6 +176,17 @@ class Corrector:
             own=self._corrected(applied, inverse(T_body_camera)),
             others=self._others(applied),
         )
+
+    def now(self, T_body_camera: Float) -> dict[str, CorrectedLog]:
+        """All robots in this robot's map, itself among them, by the newest corrections; none before its first.
+
+        They share nothing with what programs were given, so another thread may read them.
+        """
+        own = self._robot.corrections.of(self._robot.log)
+        if own is None:
+            return {}
+        fresh = Corrector(self._robot)
+        return {own.log.robot: fresh._corrected(own, inverse(T_body_camera)), **fresh._others(own)}
 
     def _others(self, applied: LogCorrection) -> dict[str, CorrectedLog]:
         """The newest life of every other robot that has a correction in this frame."""

@@ -67,7 +67,11 @@ class _Wanted:
 
 
 class Corrections:
-    """The newest correction of every log, as one robot knows them, and those knots that it needs."""
+    """The newest correction of every log, as one robot knows them, and those knots that it needs.
+
+    Attributes:
+        failed_signers: Leaders who did not sign what stands under their names, until somebody clears it.
+    """
 
     def __init__(
         self,
@@ -88,6 +92,7 @@ class Corrections:
             near: Whether a robot of this name is in range.
             towards: Robots in range, those that are nearest to the leader of a term first.
         """
+        self.failed_signers: set[str] = set()
         self._own = own
         self._gossip = gossip
         self._sealer = sealer
@@ -255,6 +260,7 @@ class Corrections:
         try:
             self._sealer.check_correction(message.term.leader, encode_correction(message), message.signature)
         except DecodeError:
+            self.failed_signers.add(message.term.leader.robot)
             return False
         return True
 

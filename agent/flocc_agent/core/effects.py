@@ -12,10 +12,17 @@ from flocc_protocol.messages import CandidatePair, LogCorrection, Message
 
 @dataclass(frozen=True, slots=True)
 class Encode:
-    """Describe and encode an image; answer KeyframeEncoded or KeyframeEncodingFailed."""
+    """Describe and encode an image; answer KeyframeEncoded or KeyframeEncodingFailed.
+
+    Attributes:
+        keyframe: Whose image.
+        image: Number under which the driver holds the pixels.
+        T_odom_camera: Where odometry says that it was taken, metric.
+    """
 
     keyframe: KeyframeId
     image: int
+    T_odom_camera: Pose7
 
 
 @dataclass(frozen=True, slots=True)

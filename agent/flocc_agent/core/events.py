@@ -6,6 +6,7 @@ from flocc_agent.core.blocks import BlockStep
 from flocc_agent.core.measurements import Measurement
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import CameraDoubted
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, Term
@@ -32,18 +33,32 @@ class KeyframeCaptured:
 
 @dataclass(frozen=True, slots=True)
 class KeyframeEncoded:
-    """The latent is stored and the descriptor computed."""
+    """The latent is stored and the descriptor computed.
+
+    Attributes:
+        keyframe: Which.
+        descriptor: For place recognition.
+        doubts: What its image says against the camera, told for the first time.
+    """
 
     keyframe: KeyframeId
     descriptor: Array
+    doubts: tuple[CameraDoubted, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeEncodingFailed:
-    """No descriptor and no latent; the keyframe still carries odometry."""
+    """No descriptor and no latent; the keyframe still carries odometry.
+
+    Attributes:
+        keyframe: Which.
+        reason: Why.
+        doubts: What its image says against the camera, told for the first time.
+    """
 
     keyframe: KeyframeId
     reason: str
+    doubts: tuple[CameraDoubted, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

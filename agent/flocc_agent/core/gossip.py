@@ -118,7 +118,12 @@ class NewRecord(NamedTuple):
 
 
 class Gossip:
-    """All logs that one robot holds."""
+    """All logs that one robot holds.
+
+    Attributes:
+        logs: Its copies, and its own.
+        failed_signers: Robots whose records the swarm's keys did not open, until somebody clears it.
+    """
 
     def __init__(
         self,
@@ -138,6 +143,7 @@ class Gossip:
         self._own = own
         self._parameters = parameters
         self._sealer = sealer
+        self.failed_signers: set[str] = set()
         self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
         self._pulls = Pulls(self._held, near, parameters)
         self._forked: dict[tuple[LogId, str], None] = {}
@@ -261,8 +267,9 @@ class Gossip:
             new += news
             effects += more
         gap = any(batch.first > self._held(batch.log) for batch in message.batches)
-        if gap or (new and _is_full(message)):
-            effects += self._pulls.ask_on(sender.robot, now)
+        left_out = bool(new) and _is_full(message)
+        if gap or left_out:
+            effects += self._pulls.ask_on(sender.robot, now, left_out)
         return new, effects
 
     def _on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
@@ -311,7 +318,13 @@ class Gossip:
         self._announcer.put(log, LogDigest(log, len(copy), copy.checksums[-1]))
 
     def _opened(self, log: LogId, number: int, data: bytes) -> bytes:
-        return data if self._sealer is None else self._sealer.opened(log, number, data)
+        if self._sealer is None:
+            return data
+        try:
+            return self._sealer.opened(log, number, data)
+        except DecodeError:
+            self.failed_signers.add(log.robot)
+            raise
 
     def _doubt(self, peer: str, end: int, now: float) -> list[Effect]:
         """Ask for a peer's copy of the own log before this number, which it says is another one."""

@@ -1,6 +1,6 @@
 """What a robot tells of the map that it opened: that it did, when it found itself in it, and who writes its logs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from flocc_agent.core.effects import Deliver, Effect, Report
 from flocc_agent.core.pose_graph import map_frame
@@ -49,6 +49,25 @@ class InMap:
             return []
         self._writers.add(sender)
         return [Report(MapLogWritten(peer=sender.robot, log=sender))]
+
+    def state(self, best_similarities: Mapping[str, float], similarity_threshold: float) -> str:
+        """Whether the robot is in the map, for people, and if not, how near it is to that.
+
+        Args:
+            best_similarities: Robot -> best similarity of its keyframes with one of this robot's.
+            similarity_threshold: From which on two keyframes are registered.
+        """
+        frame = map_frame(self.saved.anchor)
+        if self.found:
+            return f"in {frame}"
+        robots = {log.robot for log in self.saved.closed} | {str(log) for log in self.saved.closed}
+        seen = [(best, robot) for robot, best in best_similarities.items() if robot in robots]
+        if not seen:
+            return f"not in {frame} yet: nothing compared so far"
+        best, robot = max(seen)
+        if best < similarity_threshold:
+            return f"not in {frame} yet: best similarity {best:.3f}, with {robot}; {similarity_threshold:g} is needed"
+        return f"not in {frame} yet: looks like {robot} ({best:.3f}); waits for closures that agree"
 
     def _opened(self) -> MapOpened:
         saved = self.saved

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed
+from flocc_agent.core.reports import CameraDoubted
 from flocc_protocol.arrays import Array
 from flocc_protocol.records import checked_descriptor
 
@@ -43,13 +44,22 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """Pixels (H, W, 3) uint8 in RGB order, with the camera that took them."""
+    """What a camera saw.
+
+    Attributes:
+        pixels: (H, W, 3) uint8 in RGB order.
+        camera: That took them.
+        hidden: (H, W) pixels that move with the camera and show no scene; None: there are none.
+    """
 
     pixels: NDArray[np.uint8]
     camera: Camera
+    hidden: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width, 3)
+        if self.hidden is not None and (self.hidden.shape != expected[:2] or self.hidden.dtype != np.bool_):
+            raise ValueError(f"hidden is {self.hidden.shape} {self.hidden.dtype}, its camera says {expected[:2]} bool")
         if self.pixels.shape != expected or self.pixels.dtype != np.uint8:
             raise ValueError(f"image is {self.pixels.shape} {self.pixels.dtype}, its camera says {expected} uint8")
 
@@ -211,3 +221,28 @@ class Perception:
     def encode_s(self) -> float | None:
         """Tell how long encoding a received picture takes, seconds; None where pictures are not wanted."""
         return self.encoder.encode_s if isinstance(self.encoder, PictureEncoder) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeLook:
+    """What became of a keyframe's image.
+
+    Attributes:
+        descriptor: None where it was not encoded.
+        latent: The same.
+        fault: Why it was not.
+        doubts: What is odd about the camera, told for the first time.
+    """
+
+    descriptor: Array | None
+    latent: bytes | None
+    fault: str = ""
+    doubts: tuple[CameraDoubted, ...] = ()
+
+
+class ImageWatch(Protocol):
+    """Looks at one robot's images, in the order in which they were taken."""
+
+    def look(self, perception: Perception, image: Image, T_odom_camera: Float) -> KeyframeLook:
+        """Describe and encode an image, and tell what is odd about the camera."""
+        ...

@@ -20,7 +20,8 @@ INTEREST_S = 5.0
 """Knots that come later than this are not passed on to who asked for them."""
 PEERS_MAX = 16
 ASKED_MAX = 6
-"""Times that one version is asked for; the next correction calls for a new question."""
+"""Times that one version is asked for quickly; a robot that needs it goes on every `RARELY_S`: no other may come."""
+RARELY_S = 8.0
 
 
 @dataclass(slots=True)
@@ -29,6 +30,7 @@ class _Question:
 
     version: CorrectionVersion
     next_s: float
+    own: bool = False
     asked: int = 0
     peers: dict[str, float] = field(default_factory=dict)
 
@@ -55,14 +57,16 @@ class KnotRequests:
         question = self._open.get(version.log)
         if question is None or question.version < version:
             peers = {} if question is None else question.peers
-            remember(self._open, version.log, _Question(version, not_before_s, peers=peers))
+            remember(self._open, version.log, _Question(version, not_before_s, own=True, peers=peers))
+        else:
+            question.own = True
 
     def on_interest(self, peer: str, version: CorrectionVersion, now: float) -> None:
         """Another robot needs them."""
         question = self._open.get(version.log)
         if question is None or question.version < version:
             peers = {} if question is None else question.peers
-            question = _Question(version, now, peers=peers)
+            question = _Question(version, now, own=question is not None and question.own, peers=peers)
             remember(self._open, version.log, question)
         if question.asked >= ASKED_MAX and question.next_s <= now:
             question.asked = 0
@@ -86,7 +90,7 @@ class KnotRequests:
         """Ask for what is due, each of one robot in range; other robots in turn."""
         questions: dict[str, list[CorrectionVersion]] = {}
         for question in self._open.values():
-            if question.next_s > now or question.asked >= ASKED_MAX:
+            if question.next_s > now or (question.asked >= ASKED_MAX and not question.own):
                 continue
             on_the_way = [peer for peer in self._towards(question.version.term) if peer not in question.peers]
             if not on_the_way:
@@ -95,5 +99,5 @@ class KnotRequests:
             if len(asked) < KNOT_REQUESTS_MAX:
                 asked.append(question.version)
                 question.asked += 1
-                question.next_s = now + REQUEST_TIMEOUT_S
+                question.next_s = now + (REQUEST_TIMEOUT_S if question.asked < ASKED_MAX else RARELY_S)
         return [Unicast(peer, KnotRequest(tuple(versions))) for peer, versions in questions.items()]

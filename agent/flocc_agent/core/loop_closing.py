@@ -16,6 +16,7 @@ from collections.abc import Iterable
 
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
+from flocc_agent.core.front_ends import FrontEnds
 from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -69,6 +70,7 @@ class LoopClosing:
         self._work = WorkTable(own, self.latents, lambda k: None if k.log in closed else odometry_pair(k))
         self._offers = Offers(self.latents)
         self._spectral = spectral
+        self._front_ends = FrontEnds()
         self._chosen: list[CandidatePair] | None = None
         self._resolved: set[CandidatePair] = set()
         self._undecided: dict[CandidatePair, Candidate] = {}
@@ -103,7 +105,7 @@ class LoopClosing:
         """Pairs that place recognition found here."""
         effects: list[Effect] = []
         for candidate in candidates:
-            if self._knows(candidate.pair):
+            if self._knows(candidate.pair) or self._front_ends.are_apart(candidate.pair):
                 continue
             similarity = round(candidate.similarity, 4)
             fact = CandidateFound(query=candidate.pair.low, match=candidate.pair.high, similarity=similarity)
@@ -139,7 +141,20 @@ class LoopClosing:
         """A record of this pair is in a log, and it is a closure."""
         if self._spectral is not None:
             self._spectral.on_closure(pair)
+        self._front_ends.on_closure(pair)
         self.on_resolved(pair)
+
+    def on_rejection(self, pair: CandidatePair, reason: str) -> bool:
+        """A record of this pair is in a log, and it is none; whether its logs' front ends turned out to differ."""
+        self.on_resolved(pair)
+        if not self._front_ends.on_rejection(pair, reason):
+            return False
+        for other in filter(self._front_ends.are_apart, self.open_pairs()):
+            self._undecided.pop(other, None)
+            self._work.remove(other)
+            self._offers.remove(other)
+        self._chosen, self._changed = None, True
+        return True
 
     def on_keyframe(self, log: LogId) -> None:
         """A log grew: a keyframe may have got the neighbour that it lacked."""
@@ -168,6 +183,11 @@ class LoopClosing:
         """A latent exists no more: the pairs that need it, which are to be rejected; relays pass it on."""
         self.latents.on_gone(keyframe, now)
         return self._using(keyframe)
+
+    def own_lost(self) -> list[KeyframeId]:
+        """Own latents that a pair needs and that the disk did not bring back; nobody else has them."""
+        of_own = self._work.lacking.get(self._own.robot)
+        return sorted(k for k in of_own if k.log == self._own) if of_own else []
 
     def on_lost_elsewhere(self, lost: Iterable[KeyframeId], now: float) -> list[tuple[KeyframeId, CandidatePair]]:
         """A neighbour knows of latents that exist no more; believed where nobody in range has them. Pairs to reject."""
@@ -227,9 +247,9 @@ class LoopClosing:
         self._give_up(now)
         if self._undecided and self._listens_until_s <= now:
             self._decide(now)
-        effects = self._offers.tell(self._reach, now)
         for candidate in self._offers.taken_over(self._reach, now):
-            self._add(candidate)
+            self._hand_on_or_add(candidate, now)
+        effects = self._offers.tell(self._reach, now)
         if self.latents.free() > 0:
             effects += self.latents.fetch(self._fetchable(), self._reach, now)
         effects += self._register(now)
@@ -262,6 +282,10 @@ class LoopClosing:
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
             self._offer(candidate, Recipient(owner.robot, owner), now)
             return
+        self._hand_on_or_add(candidate, now)
+
+    def _hand_on_or_add(self, candidate: Candidate, now: float) -> None:
+        """A pair that is this robot's goes to a stronger one, where one is in range."""
         stronger = self._reach.stronger(self._compute_class)
         if stronger is not None:
             self._offer(candidate, Recipient(stronger, None), now)

@@ -75,6 +75,11 @@ class PlaceRecognition:
         self.refused = 0
         self.best_similarities: dict[str, float] = {}
 
+    @property
+    def similarity_threshold(self) -> float:
+        """From which on two keyframes are candidates."""
+        return self._parameters.similarity_threshold
+
     def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
         """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
         found: list[Found] = []

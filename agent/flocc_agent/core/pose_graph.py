@@ -173,6 +173,7 @@ class Component:
         covariance_keyframe: (6, 6) marginal covariance of keyframes that were asked for, in their own tangent spaces.
         T_map_world: (4, 4) pose of the fixes' world frame, or None without fixes.
         T_map_landmark: (4, 4) pose of each landmark, by name: `tag/NAME`, `world`, `earth` (east, north, up).
+        covariance_rounds: How many rounds ago `covariance_map_odom` was computed; 0 for this one.
     """
 
     logs: tuple[LogId, ...]
@@ -184,6 +185,7 @@ class Component:
     covariance_keyframe: Mapping[KeyframeId, Float] = field(default_factory=dict)
     T_map_world: Float | None = None
     T_map_landmark: Mapping[str, Float] = field(default_factory=dict)
+    covariance_rounds: int = 0
 
     @property
     def anchor(self) -> LogId:

@@ -35,10 +35,11 @@ REQUEST_TIMEOUT_S = 1.0
 
 @dataclass(slots=True)
 class _Asked:
-    """An open request for a log's missing records."""
+    """An open request for a log's missing records, from a number on."""
 
     peer: str
     until_s: float
+    first: int
 
 
 class Pulls:
@@ -113,11 +114,15 @@ class Pulls:
             self._next_s = now + REQUEST_PERIOD_S
         return effects
 
-    def ask_on(self, peer: str, now: float) -> list[Effect]:
-        """A peer's answer was as long as a message may be, or shows a gap: ask at once for what it left out."""
-        return self._request(peer, now, again=True)
+    def ask_on(self, peer: str, now: float, left_out: bool) -> list[Effect]:
+        """A peer's answer was as long as a message may be, or shows a gap: ask at once for what lacks.
 
-    def _request(self, peer: str, now: float, again: bool) -> list[Effect]:
+        What was asked of it already is asked again only where the answer left logs out, so that many records behind
+        one gap call for one request.
+        """
+        return self._request(peer, now, again=True, repeats=left_out)
+
+    def _request(self, peer: str, now: float, again: bool, repeats: bool = False) -> list[Effect]:
         positions: list[LogPosition] = []
         for log, count in sorted(self._ahead.get(peer, {}).items()):
             held = self._held(log)
@@ -125,8 +130,8 @@ class Pulls:
                 self.on_level(peer, log)
             elif not again and self._is_on_its_way(log, held, count, now):
                 continue
-            elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again):
-                remember(self._asked, log, _Asked(peer, now + REQUEST_TIMEOUT_S))
+            elif len(positions) < BATCHES_MAX and self._may_ask(peer, log, now, again, repeats):
+                remember(self._asked, log, _Asked(peer, now + REQUEST_TIMEOUT_S, held))
                 positions.append(LogPosition(log, held))
         return [Unicast(peer, RecordRequest(tuple(positions)))] if positions else []
 
@@ -140,12 +145,12 @@ class Pulls:
             remember(self._noticed, log, noticed)
         return noticed[1] + BROADCAST_S > now
 
-    def _may_ask(self, peer: str, log: LogId, now: float, again: bool) -> bool:
+    def _may_ask(self, peer: str, log: LogId, now: float, again: bool, repeats: bool) -> bool:
         """Whether nobody else is to send the log, and the peer did not disappoint just now."""
         asked = self._asked.get(log)
         if asked is not None:
             if asked.until_s > now:
-                return again and asked.peer == peer
+                return again and asked.peer == peer and (repeats or self._held(log) > asked.first)
             self._did_not_deliver(log, asked.peer, now)
         return self._not_before_s.get((log, peer), now) <= now
 

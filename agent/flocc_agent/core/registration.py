@@ -83,6 +83,7 @@ class RegistrationFailure(Enum):
     DEGENERATE = "the correspondences do not fix a relative pose"
     UNCONVINCING = "less evidence than the front end's wrong pairs may have"
     BAD_LATENT = "a latent is damaged or of another model"
+    OTHER_FRONT_END = "the latents are of different front ends"
     OUT_OF_MEMORY = "out of memory"
     CRASHED = "the registration failed with an internal error"
 

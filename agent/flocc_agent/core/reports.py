@@ -80,6 +80,25 @@ class EncodingFailed:
     reason: str
 
 
+@fact("camera_doubted")
+class CameraDoubted:
+    """A robot's own pictures contradict its odometry, its calibration, or each other.
+
+    Attributes:
+        doubt: "focal length", "mounting", "focal length and mounting", "mirrored", "inverted poses", "mixed frames",
+            "overlay" (what moves with the camera) or "frozen" (pictures that were taken before).
+        amount: True focal length over the configured one; degrees of a mounting; share of an overlay in the picture;
+            number of frozen pictures; 1 elsewhere.
+        where: An overlay's place in the picture, or the turn about the camera's axes; else empty.
+        pairs: Of consecutive keyframes that say so.
+    """
+
+    doubt: str
+    amount: float
+    where: str
+    pairs: int
+
+
 @fact("candidate")
 class CandidateFound:
     """Two keyframes look alike."""
@@ -233,6 +252,13 @@ class PeerRefused:
 
     peer: str
     reason: str
+
+
+@fact("front_ends_differ")
+class FrontEndsDiffer:
+    """Another robot's latents cannot be registered with this one's; they are fetched no more."""
+
+    peer: str
 
 
 @fact("duplicate_name")

@@ -49,10 +49,12 @@ from flocc_agent.core.measurements import (
 )
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
+from flocc_agent.core.peer_budgets import AnswerBudget, Muted
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
     EncodingFailed,
+    FrontEndsDiffer,
     KeyframeTaken,
     LatentArrived,
     LatentFailed,
@@ -173,6 +175,8 @@ class Robot:
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
+        self._answers = AnswerBudget()
+        self._muted = Muted()
         self.assembly = GraphAssembly(restored.saved)
         closed = restored.closed()
         self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
@@ -243,6 +247,8 @@ class Robot:
             **self.closing.sizes(),
             **self.corrections.sizes(),
             **self.election.sizes(),
+            **self._answers.sizes(),
+            **self._muted.sizes(),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
 
@@ -254,12 +260,12 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor):
+            case KeyframeEncoded(keyframe, descriptor, doubts):
                 self.closing.on_held(keyframe)
-                return self._on_encoded(keyframe, descriptor, now)
-            case KeyframeEncodingFailed(keyframe, reason):
-                report = Report(EncodingFailed(keyframe=keyframe, reason=reason))
-                return [report, *self._on_encoded(keyframe, None, now)]
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
+                return [*reports, *self._on_encoded(keyframe, None, now)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_held(keyframe)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
@@ -302,18 +308,16 @@ class Robot:
                 return self.election.on_coordinator(sender, message, now)
             case Handover():
                 return self.election.on_handover(sender, message, now)
-            case Records():
-                new, effects = self.gossip.on_records(sender, message, now)
-                return effects + self._take(new, now)
+            case Records() | CorrectionBatch():
+                return self._on_signed(sender, message, now)
             case RecordRequest():
-                return self.gossip.on_request(sender, message)
-            case CorrectionBatch(corrections):
-                return [effect for correction in corrections for effect in self._on_correction(sender, correction, now)]
+                return self._answers.within(sender.robot, self.gossip.on_request(sender, message), now)
             case CorrectionRequest():
-                return self.corrections.on_request(sender.robot, message)
+                return self._answers.within(sender.robot, self.corrections.on_request(sender.robot, message), now)
             case KnotRequest():
                 near = sender.robot in self.neighbours
-                return self.corrections.on_knot_request(sender.robot, message, now) if near else []
+                answers = self.corrections.on_knot_request(sender.robot, message, now) if near else []
+                return self._answers.within(sender.robot, answers, now)
             case CandidateOffer():
                 self.closing.on_offer(message, now)
                 return []
@@ -321,6 +325,22 @@ class Robot:
                 if self.distributed is not None:
                     self.distributed.on_separators(sender, message)
                 return []
+
+    def _on_signed(self, sender: LogId, message: Records | CorrectionBatch, now: float) -> list[Effect]:
+        """Take in what is signed, but for what of this sender failed lately."""
+        peer, muted = sender.robot, self._muted
+        if isinstance(message, Records):
+            batches = tuple(b for b in message.batches if not muted.is_muted(peer, b.log.robot, now))
+            new, effects = self.gossip.on_records(sender, Records(batches), now)
+            effects += self._take(new, now)
+        else:
+            heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
+            effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
+        for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
+            for signer in failed:
+                muted.on_failed(peer, signer, now)
+            failed.clear()
+        return effects
 
     def _on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         known = sender.robot in self.neighbours
@@ -389,7 +409,7 @@ class Robot:
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
-        return [Encode(KeyframeId(self.log, index), event.image)]
+        return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
@@ -458,6 +478,7 @@ class Robot:
     def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records; places are recognised at the end."""
         described: list[tuple[KeyframeId, Array]] = []
+        effects: list[Effect] = []
         for new in new_records:
             self.assembly.add(new)
             record = new.record
@@ -470,11 +491,12 @@ class Robot:
                         described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match))
-                case RejectionRecord(query, match):
-                    self.closing.on_resolved(CandidatePair.of(query, match))
+                case RejectionRecord(query, match, reason):
+                    if self.closing.on_rejection(CandidatePair.of(query, match), reason):
+                        effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     assert_never(record)
-        return self._recognise(described, now) if described else []
+        return effects + (self._recognise(described, now) if described else [])
 
     def _may_match(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe can be registered; of a pruned map not all have a latent."""
@@ -482,16 +504,25 @@ class Robot:
         return saved is None or keyframe.log not in saved.closed or keyframe in self._served
 
     def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
-        """Look for keyframes' candidates; after a restart not between a keyframe and a log where it had a partner."""
+        """Look for keyframes' candidates; after a restart not where both already had a partner in the other's log."""
         found = self.recognition.on_keyframes(keyframes)
         if self._partnered:
-            found = [(k, c) for k, c in found if (k, c.pair.other(k).log) not in self._partnered]
+            found = [(k, c) for k, c in found if not self._had_partners(k, c.pair.other(k))]
         return self.closing.on_candidates([candidate for _, candidate in found], now) if found else []
+
+    def _had_partners(self, one: KeyframeId, other: KeyframeId) -> bool:
+        """Whether each of two keyframes was registered with one of the other's log; else their pair waits still."""
+        return (one, other.log) in self._partnered and (other, one.log) in self._partnered
 
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
         iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
         return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, iteration)
+
+    def _front_ends_differ(self, first: LogId, second: LogId) -> list[Effect]:
+        """Tell, where it concerns this robot."""
+        others = [log.robot for log in (first, second) if log != self.log]
+        return [Report(FrontEndsDiffer(peer=others[0]))] if len(others) == 1 else []
 
     def _restore(self, restored: Restored, now: float) -> None:
         """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
@@ -566,10 +597,13 @@ class Robot:
 
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
+        effects = self.closing.tick(now)
+        for keyframe in self.closing.own_lost():
+            effects += self._reject_lost(self.closing.on_latent_lost(keyframe, now), keyframe, now)
         if self.distributed is not None:
-            return [*self.closing.tick(now), *self._optimise_together(self.distributed, now)]
+            return [*effects, *self._optimise_together(self.distributed, now)]
         self.rounds.on_term(self.election.term if self.election.leading else None)
-        return [*self.closing.tick(now), *self.rounds.tick(now)]
+        return [*effects, *self.rounds.tick(now)]
 
     def _optimise_together(self, distributed: DistributedOptimisation, now: float) -> list[Effect]:
         """Iterate on the own block, and correct itself."""

@@ -15,6 +15,8 @@ PERIOD_PER_KEYFRAME_S = 1e-3
 correction costs everybody something."""
 KEYFRAMES_PER_ROUND = 20
 """New keyframes that call for a round even without a new closure, so that a trajectory's end is corrected, too."""
+PATIENCE_S = 5.0
+"""Fewer new keyframes wait this long for a round: the last ones of a trajectory are corrected, too."""
 HURRIED_PERIOD_S = 0.5
 """Least pause between rounds while groups meet."""
 HURRY_MAX_S = 2.0
@@ -82,7 +84,7 @@ class Rounds:
         if self._running_until_s is not None and self._running_until_s <= now:
             self._try_again(now)
             effects.append(Report(RoundTimedOut(term=self._term, round=self._round)))
-        if self._running_until_s is not None or self._next_s > now or not self._stale():
+        if self._running_until_s is not None or self._next_s > now or not self._is_due(now):
             return effects
         return [*effects, self._start(self._term, now)]
 
@@ -92,7 +94,9 @@ class Rounds:
             return float("inf")
         if self._running_until_s is not None:
             return self._running_until_s
-        return self._next_s if self._stale() else float("inf")
+        if self._stale():
+            return self._next_s
+        return max(self._next_s, self._started_s + PATIENCE_S) if self._grown() else float("inf")
 
     def _start(self, term: Term, now: float) -> Effect:
         self._round += 1
@@ -117,9 +121,15 @@ class Rounds:
             return False
         if self._started is None:
             return True
-        revision, keyframes = self._started
-        grown = self._assembly.keyframes - keyframes
-        return revision != self._assembly.revision or grown >= KEYFRAMES_PER_ROUND
+        return self._started[0] != self._assembly.revision or self._grown() >= KEYFRAMES_PER_ROUND
+
+    def _is_due(self, now: float) -> bool:
+        """Whether a round is wanted at once, or was for long enough."""
+        return self._stale() or (self._grown() > 0 and self._started_s + PATIENCE_S <= now)
+
+    def _grown(self) -> int:
+        """Keyframes since the last started round of this term; 0 before the first."""
+        return 0 if self._started is None else self._assembly.keyframes - self._started[1]
 
 
 def solution_report(term: Term, round_number: int, solution: GraphSolution) -> Report:

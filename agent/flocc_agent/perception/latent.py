@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
 from flocc_protocol.errors import FloccError
 
 MAGIC = b"FLL1"
@@ -26,6 +27,17 @@ DTYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<f2", "<f4", "<f8")
 
 class BadLatent(FloccError):
     """Bytes that are not a latent of the kind asked for; the message says why."""
+
+
+class OtherFrontEnd(BadLatent):
+    """A latent of another method, model or weights."""
+
+
+def failed_by(error: BadLatent) -> RegistrationFailed:
+    """What comes of a registration whose latents cannot be read together."""
+    is_other = isinstance(error, OtherFrontEnd)
+    failure = RegistrationFailure.OTHER_FRONT_END if is_other else RegistrationFailure.BAD_LATENT
+    return RegistrationFailed(failure, str(error))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +72,7 @@ def unpack(data: bytes, kind: str) -> Latent:
     """
     description, offset = _description(data)
     if description.get("kind") != kind:
-        raise BadLatent(f"the latent is of kind {str(description.get('kind'))[:64]!r}, not {kind!r}")
+        raise OtherFrontEnd(f"the latent is of kind {str(description.get('kind'))[:64]!r}, not {kind!r}")
     header, described = description.get("header"), description.get("arrays")
     if not isinstance(header, dict) or not isinstance(described, list) or len(described) > ARRAYS_MAX:
         raise BadLatent("the latent's description lacks its header or its list of arrays")

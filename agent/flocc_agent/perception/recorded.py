@@ -20,7 +20,7 @@ from flocc_agent.config import RecordedConfig
 from flocc_agent.core.interfaces import Camera, Image, OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import hat, inverse, is_rigid, pose_from_tq, symmetric
-from flocc_agent.perception.latent import BadLatent
+from flocc_agent.perception.latent import BadLatent, failed_by
 from flocc_protocol.errors import FloccError
 
 Float = NDArray[np.float64]
@@ -113,7 +113,7 @@ class RecordedPerception:
         try:
             names = name_of(query), name_of(match)
         except BadLatent as error:
-            return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
+            return failed_by(error)
         found = self._pairs.get(names)
         if found is None and (backwards := self._pairs.get((names[1], names[0]))) is not None:
             found = backwards.reversed()

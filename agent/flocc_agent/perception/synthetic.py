@@ -21,7 +21,7 @@ from flocc_agent.core.registration import (
     odometry_scale,
 )
 from flocc_agent.geometry import inverse, pose, so3_exp
-from flocc_agent.perception.latent import BadLatent
+from flocc_agent.perception.latent import BadLatent, failed_by
 
 Float = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ class SyntheticPerception:
             T_world_match, match_key = _unpacked(match)
             neighbour = None if odometry is None else _unpacked(odometry.latent)
         except BadLatent as error:
-            return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
+            return failed_by(error)
         T_query_match = inverse(T_world_query) @ T_world_match
         odometry_count, T_query_neighbour = 0, None
         if neighbour is not None:

@@ -13,7 +13,7 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.corrected import Correction, Corrector
+from flocc_agent.core.corrected import CorrectedLog, Correction, Corrector
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -29,7 +29,15 @@ from flocc_agent.core.effects import (
     Report,
     Unicast,
 )
-from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Leaving, Measured, MessageReceived
+from flocc_agent.core.events import (
+    Event,
+    GraphOptimised,
+    KeyframeCaptured,
+    LatentFetched,
+    Leaving,
+    Measured,
+    MessageReceived,
+)
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement, belongs_to, record_of
 from flocc_agent.core.pose_graph import GraphSolution
@@ -43,7 +51,7 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.admission import Refusal, admitted
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes, checked_keyframe
-from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, job_of
+from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, fetch, job_of
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import DiskQueue, Persist
 from flocc_agent.runtime.punctuality import LongestGap
@@ -136,6 +144,12 @@ class Driver:
         """
         return KeyframeId(self.robot.log, self._given.at("closure", stamp_s))
 
+    async def fetch_latent(self, keyframe: KeyframeId, deadline_s: float) -> bool:
+        """Bring a latent from its owner into the store; whether it came."""
+        event = await fetch(FetchLatent(keyframe, keyframe.log.robot, deadline_s), self._tools)
+        self.put(event)
+        return isinstance(event, LatentFetched)
+
     def subscribe(self) -> "asyncio.Queue[Correction | None]":
         """A queue of corrections, newest kept when it is full; None ends it."""
         queue: asyncio.Queue[Correction | None] = asyncio.Queue(CORRECTIONS_MAX)
@@ -161,6 +175,10 @@ class Driver:
     def corrected_bodies(self) -> tuple[list[float], Float]:
         """Stamps (s) and (N, 4, 4) corrected body poses of all keyframes; may be called off the loop's thread."""
         return corrected_bodies(self.robot, self._T_body_camera)
+
+    def corrected_logs(self) -> dict[str, CorrectedLog]:
+        """All robots in this robot's map as of now; what it gives may be read off the loop's thread."""
+        return self._corrector.now(self._T_body_camera)
 
     @property
     def _T_body_camera(self) -> Float:

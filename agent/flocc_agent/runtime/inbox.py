@@ -9,7 +9,7 @@ repairs the rest.
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from flocc_agent.runtime.transport import TrafficCounter
@@ -45,6 +45,7 @@ class Inbox:
         counter: TrafficCounter,
         messages_max: int,
         bytes_max: int,
+        urgent_first: Sequence[str] = URGENT_FIRST,
     ) -> None:
         self._loop = loop
         self._deliver = deliver
@@ -53,8 +54,8 @@ class Inbox:
         self._bytes_max = bytes_max
         self._lock = threading.Lock()
         self._awake = False
-        self._waiting_bytes: dict[str, int] = dict.fromkeys(URGENT_FIRST, 0)
-        self._queues: dict[str, deque[Incoming]] = {kind: deque() for kind in URGENT_FIRST}
+        self._waiting_bytes: dict[str, int] = dict.fromkeys(urgent_first, 0)
+        self._queues: dict[str, deque[Incoming]] = {kind: deque() for kind in urgent_first}
 
     def put(self, message: Incoming) -> None:
         """Append a message; the oldest of its kind give way. Any thread may call."""

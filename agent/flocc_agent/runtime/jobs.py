@@ -27,15 +27,13 @@ from flocc_agent.core.events import (
     LatentMissing,
     PairRegistered,
 )
-from flocc_agent.core.interfaces import Image, OdometryPair, Perception
+from flocc_agent.core.interfaces import Image, ImageWatch, OdometryPair, Perception
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, Transport
 from flocc_agent.runtime.workers import Workers, WorkFailed
-from flocc_agent.stages import stage
-from flocc_protocol.arrays import Array
 
 IMAGES_MAX = 8
 
@@ -77,6 +75,7 @@ class Tools:
 
     Attributes:
         perception: What images are seen with.
+        watch: Looks at the robot's own images, one after the other.
         optimise: Pose graph and last solution to a solution; must be importable by a worker process.
         iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
         workers: Pools off the loop.
@@ -87,6 +86,7 @@ class Tools:
     """
 
     perception: Perception
+    watch: ImageWatch
     optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
     iterate: Callable[[BlockProblem], BlockStep | OptimisationFailed]
     workers: Workers
@@ -113,21 +113,16 @@ def job_of(effect: Job, tools: Tools) -> Coroutine[Any, Any, Event]:
 
 async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEncodingFailed:
     """Describe and encode an image; its latent is in the store before the core hears of it."""
+    T_odom_camera = pose_from_tq(np.array(effect.T_odom_camera))
     with tools.images.taken(effect.image) as image:
-        result = await tools.workers.run("encode", _described_and_encoded, tools.perception, image)
+        result = await tools.workers.run("encode", tools.watch.look, tools.perception, image, T_odom_camera)
     if isinstance(result, WorkFailed):
         return KeyframeEncodingFailed(effect.keyframe, result.reason)
-    descriptor, latent = result.value
-    await asyncio.to_thread(tools.store.put_latent, effect.keyframe, latent)
-    return KeyframeEncoded(effect.keyframe, descriptor)
-
-
-def _described_and_encoded(perception: Perception, image: Image) -> tuple[Array, bytes]:
-    """An image's descriptor and latent; the worker counts the time of both."""
-    with stage("describe"):
-        descriptor = perception.describe(image)
-    with stage("encode"):
-        return descriptor, perception.encode(image)
+    looked = result.value
+    if looked.descriptor is None or looked.latent is None:
+        return KeyframeEncodingFailed(effect.keyframe, looked.fault, looked.doubts)
+    await asyncio.to_thread(tools.store.put_latent, effect.keyframe, looked.latent)
+    return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts)
 
 
 async def fetch(effect: FetchLatent, tools: Tools) -> LatentFetched | LatentFetchFailed:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.config import PerceptionConfig
+from flocc_agent.config import BackendConfig, PerceptionConfig
 from flocc_agent.core.interfaces import Camera, Perception
 from flocc_agent.geometry import pose7
 from flocc_agent.runtime.map_folder import LensModel, MapFolder, MapFrontEnd, MapPart
@@ -14,7 +14,7 @@ from flocc_agent.runtime.store import Store
 
 Float = NDArray[np.float64]
 
-FRONT_END_FACT, CAMERA_FACT, MAP_FACT = "front_end", "camera", "map"
+FRONT_END_FACT, BACK_END_FACT, CAMERA_FACT, MAP_FACT = "front_end", "back_end", "camera", "map"
 """Names of facts; of the camera's, the log follows after a space."""
 
 
@@ -35,6 +35,11 @@ def keep_front_end(store: Store, method: str | None, config: PerceptionConfig, p
         settings=config.model_dump(mode="json"),
     )
     store.put_fact(FRONT_END_FACT, front_end.model_dump_json().encode())
+
+
+def keep_back_end(store: Store, config: BackendConfig) -> None:
+    """Keep how the robot solves, so that its map is solved alike."""
+    store.put_fact(BACK_END_FACT, config.model_dump_json().encode())
 
 
 def keep_camera(store: Store, camera: Camera, T_body_camera: Float) -> None:

@@ -114,6 +114,7 @@ class MapManifest(MapPart):
         swarm: Name of the swarm that made it, as far as it is known.
         signed: Records carry their writers' signatures.
         front_end: What made descriptors and latents.
+        back_end: Configuration by which its solution was made.
         logs: In the order of the file of records; those with poses first, the anchor at the head.
         poses: How many of the logs have poses.
         latents: How many keyframes have a latent.
@@ -134,6 +135,7 @@ class MapManifest(MapPart):
     swarm: str | None = None
     signed: bool = False
     front_end: MapFrontEnd = MapFrontEnd()
+    back_end: dict[str, Any] = Field(default_factory=dict)
     logs: tuple[SavedLogEntry, ...]
     poses: int
     latents: int = 0

@@ -5,6 +5,7 @@
     RECORDING/odometry.tum      T_odom_body at the images' stamps or denser
     RECORDING/groundtruth.tum   T_world_body, optional
     RECORDING/camera.toml       [camera] width height fx fy cx cy distortion T_body_camera
+    RECORDING/mask.png          black where pictures show what moves with the camera, optional
     RECORDING/measurements.jsonl  what else was measured, optional (`measurement_file`)
 
 Odometry is interpolated to the images' stamps. Images outside of the odometry's time are left out. Pixels are read
@@ -34,6 +35,10 @@ logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
 
+MASK = "mask.png"
+MASK_LEVEL = 128
+"""Darker pixels of a mask are left out."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
@@ -62,6 +67,7 @@ class Recording:
         truth: Ground truth `T_world_body` where the recording has one.
         levels: How images of 16 bits are brought to 8.
         measurements: What else was measured.
+        hidden: (H, W) pixels that move with the camera; None where the recording does not say.
     """
 
     path: Path
@@ -71,6 +77,7 @@ class Recording:
     truth: Trajectory | None
     levels: Levels = FULL
     measurements: RecordedMeasurements = NOTHING
+    hidden: NDArray[np.bool_] | None = None
 
     @classmethod
     def open(cls, path: Path) -> "Recording":
@@ -94,7 +101,8 @@ class Recording:
             logger.warning("%s", looked.fault)
         good = tuple(frames[k] for k in looked.good)
         measurements = read_measurements(path / MEASUREMENTS, [frame.stamp_s for frame in good])
-        return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements)
+        hidden = read_mask(path / MASK, camera)
+        return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements, hidden)
 
     def ground_truth(self, stamp_s: float) -> Float | None:
         """True (4, 4) pose `T_world_body` at a time, or None where there is none."""
@@ -114,6 +122,26 @@ class Recording:
         except PictureError as error:
             raise RecordingError(f"{frame.image_path}: {error}") from error
         return Image(pixels, self.camera)
+
+
+def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_] | None:
+    """Read which pixels (H, W) move with the camera: the black ones; None where there is no such file.
+
+    Raises:
+        RecordingError: It cannot be read, is of another size than the images, or leaves nothing of them.
+    """
+    if not path.exists():
+        return None
+    try:
+        pixels = read_picture(path.read_bytes(), (camera.width, camera.height), FULL)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except PictureError as error:
+        raise RecordingError(f"{path}: {error}; a mask is as large as the images") from error
+    hidden = np.asarray(pixels.max(axis=2) < MASK_LEVEL)
+    if hidden.all():
+        raise RecordingError(f"{path}: is black all over and leaves nothing of the images: black is what is left out")
+    return hidden
 
 
 def read_image_list(path: Path) -> list[tuple[float, Path]]:

@@ -47,6 +47,7 @@ class AgentStatus(BaseModel):
         busy: Images, fetches, registrations or rounds are under way, or its recording goes on.
         playing: Its recording goes on.
         disk_failure: Why it can no longer write to its disk, None while it can.
+        in_map: Whether it has found itself in the map that it opened, a sentence; None where it opened none.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -76,6 +77,7 @@ class AgentStatus(BaseModel):
     busy: bool = False
     playing: bool = False
     disk_failure: str | None = None
+    in_map: str | None = None
 
 
 class PairStatus(BaseModel):

@@ -139,10 +139,14 @@ class Store:
         return self._records.failure or self._latents.failure
 
     def end_log(self) -> None:
-        """The robot's own log cannot be continued: the next start begins another one; this one stays valid."""
+        """The robot's own log cannot be continued, since others hold another one: the next start begins a new one.
+
+        What the disk has of it is set aside, and what comes is not kept: gossip brings back what others hold.
+        """
         with self._lock:
             self._intact_is_kept = False
             self._intact.remove()
+            self._move_aside(self.identity.log)
 
     def begin_journey(self) -> None:
         """Write another log from now on, unless nothing was written yet; the earlier one stays, and its latents."""
@@ -152,13 +156,16 @@ class Store:
 
     def set_aside(self, log: LogId) -> None:
         """Keep a log's records for a person only; where it is the robot's own, begin another one."""
+        self._move_aside(log)
+        if log == self.identity.log:
+            self._be(StoreIdentity(LogId(log.robot, self._incarnation_after_loss), 1))
+        self._measure()
+
+    def _move_aside(self, log: LogId) -> None:
         name = str(log)
         self._records.write(f"INSERT INTO aside SELECT {COLUMNS['records']} FROM records WHERE log = ?", [(name,)])
         self._records.write("DELETE FROM records WHERE log = ?", [(name,)])
         self._records.write("DELETE FROM aside WHERE rowid <= (SELECT MAX(rowid) FROM aside) - ?", [(ASIDE_MAX,)])
-        if log == self.identity.log:
-            self._be(StoreIdentity(LogId(log.robot, self._incarnation_after_loss), 1))
-        self._measure()
 
     def close(self) -> None:
         """Close the files; safe to call twice."""
@@ -179,7 +186,7 @@ class Store:
         """Keep records in one transaction; others' only as far as the configured size allows."""
         own = self.identity.log
         with self._lock:
-            kept = [record for record in records if record.log == own or self._is_room_for(record)]
+            kept = [r for r in records if (self._intact_is_kept if r.log == own else self._is_room_for(r))]
             rows = [row("records", str(record.log), record.number, record.data) for record in kept]
             own_numbers = [record.number for record in kept if record.log == own]
             self._records.write(PUT_RECORD, rows, durable=bool(own_numbers))

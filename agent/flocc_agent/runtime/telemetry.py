@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.reports import (
+    CameraDoubted,
     ClosureAccepted,
     CorrectionApplied,
     Fact,
+    FrontEndsDiffer,
     LatentLost,
     LeaderFollowed,
     LeaderLost,
@@ -117,7 +119,12 @@ class Telemetry:
             stages={name: StageBrief.model_validate(brief) for name, brief in stages.items()},
             refused=self.refused(),
             busy=busy,
+            in_map=self._in_map(),
         )
+
+    def _in_map(self) -> str | None:
+        recognition, in_map = self._robot.recognition, self._robot.in_map
+        return None if in_map is None else in_map.state(recognition.best_similarities, recognition.similarity_threshold)
 
     def look(self) -> Look:
         """What a scrape of the metrics sees."""
@@ -201,7 +208,7 @@ class Telemetry:
         return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = (PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_WARNINGS = (CameraDoubted, FrontEndsDiffer, PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
 _INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 

@@ -21,6 +21,8 @@ KEYFRAME_SPACING_M = 1.0
 AREA_PER_KEYFRAME_M2 = 6.0
 CLOSURE_RANGE_M = 6.0
 CLOSURE_DISTANCE_MIN_M = 0.3
+OWN_KEYFRAMES_APART_MIN = 100
+"""A robot alone closes loops with keyframes that are so many back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,7 @@ def generate(
 
     Args:
         rng: Source of all chance.
-        robots: Number of robots.
+        robots: Number of robots; one alone closes loops with itself.
         keyframes: Keyframes of each robot, one metre apart.
         closures: Wanted number; fewer where the robots do not come near enough to one another.
         outlier_ratio: Part of the closures that is wrong: a pose that has nothing to do with the keyframes.
@@ -124,12 +126,17 @@ def tangent_noise(rng: np.random.Generator, count: int, sigma: tuple[float, floa
 
 
 def meetings(rng: np.random.Generator, truth: list[Float], count: int) -> Int:
-    """Pairs (M, 2) of global keyframe numbers of different robots that come near, drawn without repetition."""
+    """Pairs (M, 2) of global keyframe numbers of different robots that come near, drawn without repetition.
+
+    Of one robot alone they are keyframes of its own.
+    """
     points = np.concatenate([T[:, :3, 3] for T in truth])
     robot = np.repeat(np.arange(len(truth)), [len(T) for T in truth])
     near = cKDTree(points).query_pairs(CLOSURE_RANGE_M, output_type="ndarray")
     apart = np.linalg.norm(points[near[:, 0]] - points[near[:, 1]], axis=1) > CLOSURE_DISTANCE_MIN_M
-    near = near[apart & (robot[near[:, 0]] != robot[near[:, 1]])]
+    others = robot[near[:, 0]] != robot[near[:, 1]]
+    again = np.abs(near[:, 0] - near[:, 1]) >= OWN_KEYFRAMES_APART_MIN
+    near = near[apart & (others if len(truth) > 1 else again)]
     near = near[np.lexsort((near[:, 1], near[:, 0]))]
     chosen = rng.choice(len(near), size=min(count, len(near)), replace=False)
     return np.asarray(near[np.sort(chosen)], dtype=np.int64)

@@ -1,9 +1,8 @@
 """Tables of the back end for docs/back-end.md: outliers, growth with the number of closures, the scale task's time.
 
-`python -m flocc_lab.bench.solver_tables outliers|growth|scale [FILE]` prints one as Markdown.
+`python -m flocc_lab.bench.solver_tables outliers|growth|scale|lm [FILE]` prints one as Markdown.
 """
 
-import resource
 import statistics
 import subprocess
 import sys
@@ -12,14 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
+from flocc_agent.backend.descent import Objective
+from flocc_agent.backend.edges import state_of
 from flocc_agent.backend.initial import initial_poses
+from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import build
 from flocc_agent.backend.screening import screen
+from flocc_agent.backend.solvers import solve
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_lab.bench.generated_graph import GeneratedGraph, generate
-from flocc_lab.bench.solver_ratios import between_factors, gnc_with
+from flocc_lab.bench.solver_ratios import between_factors, gnc_with, gtsam_lm
+from flocc_lab.bench.solver_sizes import peak_mb
 from flocc_launch.graph_files import GraphFile, read_graph_file
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_launch.graph_files.optimise import positions
@@ -59,7 +63,7 @@ def growth_row(closures: int) -> str:
     """Time and peak memory of one whole solve (smoothed, LM), in a process of its own."""
     keyframes = int(closures * KEYFRAMES_PER_CLOSURE / ROBOTS)
     generated = generate(np.random.default_rng(1), ROBOTS, keyframes, closures)
-    before_mb = _peak_mb()
+    before_mb = peak_mb()
     config = BackendConfig(
         formulation=Formulation.SMOOTHED, solver=Solver.LM, weight_by_probability=False, covariances=False
     )
@@ -70,12 +74,8 @@ def growth_row(closures: int) -> str:
     found = len(generated.graph.closures)
     return (
         f"| {found} | {ROBOTS * keyframes} | {solution.iterations} | {wall_s:.2f} | {cpu_s:.2f} "
-        f"| {1e6 * cpu_s / found:.0f} | {_peak_mb():.0f} | {1e3 * (_peak_mb() - before_mb) / found:.0f} |"
+        f"| {1e6 * cpu_s / found:.0f} | {peak_mb():.0f} | {1e3 * (peak_mb() - before_mb) / found:.0f} |"
     )
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def growth_table() -> str:
@@ -105,6 +105,40 @@ def scale_row(path: Path) -> str:
     )
 
 
+def lm_row(path: Path, repeats: int = 3) -> str:
+    """LM of one file, least CPU of some runs: GTSAM's on its own between factors, and ours; both from odometry.
+
+    Both stop by GTSAM's rule, a relative decrease of 1e-5; the graph is built beforehand on both sides.
+    """
+    file = read_graph_file(path)
+    config = BackendConfig(
+        formulation=Formulation.BASE, solver=Solver.LM, weight_by_probability=False, covariances=False
+    )
+    excluded = screen(file.graph).excluded
+    closures = {k: c for k, c in enumerate(file.graph.closures) if k not in excluded}
+    T_start, _ = initial_poses(file.graph.trajectories, closures, config.steepness, None)
+    problem = build(file.graph.trajectories, closures, config)
+    factors, values = between_factors(problem, T_start)
+    state = state_of(np.concatenate([T_start[log] for log in problem.logs]))
+
+    def ours() -> int:
+        linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
+        return solve(Objective(problem.edges, problem.closure_rows, linear, config), state).iterations
+
+    theirs_s, ours_s = [], []
+    for _ in range(repeats):
+        began = time.process_time()
+        their_steps = gtsam_lm(factors, values)
+        between = time.process_time()
+        our_steps = ours()
+        theirs_s.append(between - began)
+        ours_s.append(time.process_time() - between)
+    return (
+        f"| {path.stem} | {problem.poses} | {len(problem.edges)} | {1e3 * min(theirs_s):.0f} ({their_steps}) "
+        f"| {1e3 * min(ours_s):.0f} ({our_steps}) | {min(ours_s) / min(theirs_s):.2f} |"
+    )
+
+
 def _gtsam_scale_task(file: GraphFile, config: BackendConfig) -> float:
     """ATE of GTSAM's GNC, where an independent scale is a between factor with a wider covariance."""
     graph = file.graph
@@ -130,6 +164,8 @@ def main() -> None:
         text = growth_row(int(rest[0]))
     elif what == "scale":
         text = "\n".join(scale_row(Path(path)) for path in rest)
+    elif what == "lm":
+        text = "\n".join(lm_row(Path(path)) for path in rest)
     else:
         text = tables[what]()
     sys.stdout.write(text + "\n")

@@ -6,14 +6,31 @@ from typing import Annotated, Any
 
 import typer
 
+from flocc_launch.commands.offline import chosen
+
 bench = typer.Typer(help="Benchmarks: ratios measured in one run.", rich_markup_mode=None)
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 @bench.command()
-def solver(json_out: JsonOption = False) -> None:
-    """The back end against GTSAM's own C++ factors and solvers."""
+def solver(
+    keyframes: Annotated[int | None, typer.Option(min=100, help="One graph of so many keyframes, by itself.")] = None,
+    closures: Annotated[int, typer.Option(min=20, help="Closures of that graph.")] = 1000,
+    robots: Annotated[int, typer.Option(min=1, help="Robots of that graph.")] = 1,
+    formulation: Annotated[str | None, typer.Option(help="The default is the agent's.")] = None,
+    method: Annotated[str | None, typer.Option(help="Solver; the default is the agent's.")] = None,
+    json_out: JsonOption = False,
+) -> None:
+    """The back end against GTSAM's own C++ factors and solvers; or what one graph of a size costs, and ten closures."""
+    if keyframes is not None:
+        from flocc_agent.config import Formulation, Solver
+        from flocc_lab.bench import solver_sizes
+
+        kind = chosen(Formulation, formulation, "--formulation")
+        result = solver_sizes.run(robots, keyframes, closures, kind, chosen(Solver, method, "--method"))
+        typer.echo(json.dumps(result, indent=1) if json_out else solver_sizes.text(result))
+        return
     from flocc_lab.bench.solver_ratios import run
 
     _print_bench(run(), json_out)

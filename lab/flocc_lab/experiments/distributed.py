@@ -109,7 +109,7 @@ def measure(settings: DistributedSettings, cell: Cell, seed: int) -> Row:
 
 def cut(settings: DistributedSettings, name: str) -> PoseGraph:
     """A set with SE-Sync's noise, among the robots."""
-    file = read_g2o(settings.data / f"{name}.g2o").with_isotropic_noise()
+    file = read_g2o(settings.data / f"{name}.g2o", isotropic=True)
     return cut_by_time(file.graph, 2 if name == "tinyGrid3D" else settings.robots)
 
 

@@ -236,7 +236,7 @@ def agent(
     import time
 
     from flocc_agent.config import AgentConfig, MetricsConfig
-    from flocc_launch.swarm.agent_process import Beginning, run_agent
+    from flocc_launch.swarm.agent_process import Beginning, ToldOfMap, run_agent
 
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
@@ -253,7 +253,7 @@ def agent(
             run_agent(
                 read,
                 time.monotonic(),
-                lambda _: None,
+                ToldOfMap(read.name).tell,
                 dashboard=dashboard,
                 beginning=beginning,
                 ros_args=ros_args or (),
@@ -347,14 +347,14 @@ def _launch(
     from flocc_launch.swarm.launching import launch as run
 
     with progress_bar("preparing data") as progress:
-        recordings(scenario, progress)
+        paths = recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)
     with (
         LiveTable(console) as table,
         _dashboard(out, dashboard, table.show, speech) as show,
         _foxglove(out, foxglove, speech),
     ):
-        report = run(scenario, out, show, secure=secure, metrics=metrics, use=use)
+        report = run(scenario, out, show, secure=secure, metrics=metrics, paths=paths, use=use)
     _record(out, mcap)
     show_report(report, out, speech)
 

@@ -1,9 +1,14 @@
 """`flocc map`: save, look at, merge, prune and export maps. `add_maps` puts them into the command line."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from flocc_launch.commands.common import Json, facts
+
+if TYPE_CHECKING:
+    from flocc_agent.runtime.map_folder import MapManifest
 
 maps = typer.Typer(help="Save a map, look at it, merge, prune and export it.", rich_markup_mode=None)
 
@@ -22,13 +27,15 @@ def save(
     run: Annotated[Path | None, typer.Argument(help="Run folder, or the folder of one agent.")] = None,
     name: Annotated[str | None, typer.Option(help="What the map is called; the folder's name otherwise.")] = None,
     frame: Annotated[str | None, typer.Option(help="Of several maps the one of this frame, such as map/r1.")] = None,
+    swarm: Annotated[str | None, typer.Option(help="Instead: a running swarm, found by scouting.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="... or reached and seen as this agent's configuration says.")
+    ] = None,
 ) -> None:
-    """Save the map of a run: its logs, latents and solution, in one step."""
-    from flocc_launch.maps.map_saving import save_map
-
-    if run is None:
-        raise typer.BadParameter("give a run folder or an agent's folder", param_hint="RUN")
-    manifest = save_map(run, out, name, frame)
+    """Save the map of a run, or of a running swarm: its logs, latents and solution, in one step."""
+    if (run is None) == (swarm is None and config is None):
+        raise typer.BadParameter("give a run folder, or --swarm NAME, or --config of an agent", param_hint="RUN")
+    manifest = _saved_swarm(swarm, config, out, name, frame) if run is None else _saved_run(run, out, name, frame)
     for log, reason in manifest.left_out.items():
         typer.echo(f"left out: {log} {reason}")
     keyframes = sum(entry.keyframes for entry in manifest.logs)
@@ -36,13 +43,37 @@ def save(
     typer.echo(f"map: {out.resolve()}")
 
 
+def _saved_run(run: Path, out: Path, name: str | None, frame: str | None) -> "MapManifest":
+    from flocc_launch.maps.map_saving import save_map
+
+    return save_map(run, out, name, frame)
+
+
+def _saved_swarm(
+    swarm: str | None, config: Path | None, out: Path, name: str | None, frame: str | None
+) -> "MapManifest":
+    from flocc_agent.config import AgentConfig
+    from flocc_launch.commands.common import progress_bar
+    from flocc_launch.swarm.harvest import HARVESTER, save_swarm
+
+    read = AgentConfig(name=HARVESTER) if config is None else AgentConfig.read(config)
+    if swarm is not None:
+        read = read.model_copy(update={"swarm": swarm})
+    with progress_bar("copying", "latent") as progress:
+        return save_swarm(read, out, name, frame, progress, sees_alike=config is not None)
+
+
 @maps.command()
-def info(folder: MapArgument) -> None:
+def info(folder: MapArgument, json_out: Json = False) -> None:
     """Say what a map holds, and check that it is whole."""
     from flocc_agent.runtime.map_folder import MapFolder
     from flocc_launch.maps.map_info import map_lines
 
-    for name, value in map_lines(MapFolder.open(folder)):
+    lines = list(map_lines(MapFolder.open(folder)))
+    if json_out:
+        facts(dict(lines))
+        return
+    for name, value in lines:
         typer.echo(f"{name:14} {value}")
 
 
@@ -89,4 +120,35 @@ def prune(
     after = prune_map(folder, out, place_m, place_deg)
     sizes = f"{before.latent_file.bytes / 1e6:.1f} to {after.latent_file.bytes / 1e6:.1f} MB"
     typer.echo(f"{before.latents} to {after.latents} latents, {sizes}")
+    typer.echo(f"map: {out.resolve()}")
+
+
+@maps.command()
+def sessions(
+    recordings_of: Annotated[
+        str, typer.Argument(metavar="DATA", help="Folder of one recording per session, or a scenario.")
+    ],
+    out: MapOut,
+    runs: Annotated[Path, typer.Option(help="Folder for the run and the map of each session.")] = Path("runs/sessions"),
+    begin: Annotated[Path | None, typer.Option("--map", help="A map to begin with.")] = None,
+    sets: Annotated[list[str] | None, typer.Option("--set", help="Another value for a key.")] = None,
+) -> None:
+    """Make one map of recordings of different times, one after the other, in the order of their names."""
+    from flocc_agent.config import parsed_change
+    from flocc_launch.commands.common import progress_bar
+    from flocc_launch.scenarios.recordings import recordings
+    from flocc_launch.scenarios.shipped import read_scenario
+    from flocc_launch.setup.cache import cache_folder
+    from flocc_launch.simulation.sessions import Session, map_of_sessions
+
+    def tell(session: Session) -> None:
+        closures = session.report.closures.accepted
+        typer.echo(f"{session.name}: {session.left_out or f'in {session.report.map_frames[0]}, {closures} closures'}")
+
+    changes = dict(parsed_change(text) for text in sets or ())
+    scenario = read_scenario(recordings_of, changes, None, typer.echo)
+    with progress_bar("preparing data") as progress:
+        paths = recordings(scenario, progress)
+    manifest = map_of_sessions(scenario, paths, out, runs, begin, cache_folder() / "perception", tell)
+    typer.echo(f"{manifest.frame}: edition {manifest.edition}, {manifest.poses} logs, {manifest.closures} closures")
     typer.echo(f"map: {out.resolve()}")

@@ -49,14 +49,14 @@ def optimise(
     result = optimise_file(
         file,
         out,
-        formulation=_chosen(Formulation, formulation, "--formulation"),
-        solver=_chosen(Solver, solver, "--solver"),
-        scale_initial=_chosen(ScaleInitial, scale_initial, "--scale-initial"),
+        formulation=chosen(Formulation, formulation, "--formulation"),
+        solver=chosen(Solver, solver, "--solver"),
+        scale_initial=chosen(ScaleInitial, scale_initial, "--scale-initial"),
         pairwise_consistency=consistency,
         unit_scale=unit_scale,
         drop_labelled_outliers=drop_outliers,
         from_file_initialisation=from_file,
-        noise=_chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
+        noise=chosen(NoiseModel, noise, "--noise") or NoiseModel.GAUSSIAN,
         seed=seed,
     )
     if json_out:
@@ -96,7 +96,7 @@ def run_campaign(seeds: int, first: int, shrink: bool, out: Path, speech: Speech
         sys.exit(EXIT_MISSED)
 
 
-def _chosen(choices: type[E], text: str | None, option: str) -> E | None:
+def chosen(choices: type[E], text: str | None, option: str) -> E | None:
     """One of an enumeration's values.
 
     Raises:

@@ -20,6 +20,10 @@ W = TypeVar("W")
 
 PORT = 8642
 PORT_MAX = 65535
+CONNECTIONS_MAX = 32
+"""Open at one time; a further one is closed at once, so that idle ones cannot use up the agent's threads and files."""
+IDLE_S = 10.0
+"""A connection that says nothing, or takes nothing, for so long is closed."""
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -30,6 +34,34 @@ HEADERS = {
 
 class DashboardError(FloccError):
     """The page cannot be served; one sentence says why."""
+
+
+class _Server(ThreadingHTTPServer):
+    """Answers each connection from a thread of its own, a bounded number of them."""
+
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        super().__init__(address, BaseHTTPRequestHandler)
+        self._free = threading.BoundedSemaphore(CONNECTIONS_MAX)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Give a connection a thread, or close it."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer one connection, then make room for another."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
+        """Whoever hangs up or is silent is no news."""
+        logger.debug("a connection from %s ended early", client_address, exc_info=True)
 
 
 class Dashboard:
@@ -51,11 +83,10 @@ class Dashboard:
         """
         self._source = source
         try:
-            self._server = ThreadingHTTPServer((host, port), BaseHTTPRequestHandler)
+            self._server = _Server((host, port))
         except OSError as error:
             why = error.strerror or str(error)
             raise DashboardError(f"dashboard: port {port} on {host}: {why}; choose another") from error
-        self._server.daemon_threads = True
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._server.serve_forever, name="dashboard", daemon=True)
@@ -142,6 +173,8 @@ def handler_of(source: SnapshotSource) -> type[BaseHTTPRequestHandler]:
 
     class Handler(BaseHTTPRequestHandler):
         """GET / and /state.json."""
+
+        timeout = IDLE_S
 
         def do_GET(self) -> None:
             """Answer."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.pictures import PictureError
-from flocc_agent.runtime.recording import write_camera
+from flocc_agent.runtime.recording import MASK, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.datasets.pixels import ImageWriter, read_bytes
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -241,12 +241,30 @@ def write_source(
     with RecordingWriter(out, identity) as writer:
         writer.write_lens(images.lens)
         writer.write_trajectories(odometry, source.truth)
+        _carry_mask(source, images.lens, out)
         done_s = writer.last_stamp_s
         for number, (stamp_s, file) in enumerate(source.images, start=1):
             if done_s is None or stamp_s > done_s + 1e-9:
                 writer.add(stamp_s, *_written(images, file))
             if progress is not None:
                 progress(number, len(source.images))
+
+
+def _carry_mask(source: Source, lens: Lens, out: Path) -> None:
+    """Copy the folder's mask; pictures that are straightened no longer lie under it.
+
+    Raises:
+        DatasetError: There is a mask, and the pictures are straightened.
+    """
+    mask = source.path / MASK
+    if not mask.is_file():
+        return
+    if source.lens is not None and lens.camera != source.lens.camera:
+        raise DatasetError(
+            f"{mask}: is of the pictures as they were taken, and these are straightened; leave it out, convert, and "
+            f"put one of the straightened pictures into {out}"
+        )
+    shutil.copyfile(mask, out / MASK)
 
 
 def _written(images: ImageWriter, file: Path) -> tuple[bytes, str]:

@@ -5,9 +5,10 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from flocc_agent.core.reports import EncodingFailed, NameTaken, RoundSolved
+from flocc_agent.core.reports import EncodingFailed, FrontEndsDiffer, NameTaken, RoundSolved
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.doctor.cameras import doubted_cameras
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
@@ -144,6 +145,21 @@ def shared_names(loaded: LoadedRun) -> list[Finding]:
     ]
 
 
+def front_ends(loaded: LoadedRun) -> list[Finding]:
+    """Robots that see with different methods, models or weights."""
+    told = of_kind(loaded.events, FrontEndsDiffer)
+    return [
+        Finding(
+            "front-ends-differ",
+            Severity.HINDERS,
+            f"{first} and {second} run different front ends, so their latents cannot be registered with each other.",
+            "Give all robots one perception.method with one model and the same weights.",
+            (first, second),
+        )
+        for first, second in sorted({(min(e.robot, e.fact.peer), max(e.robot, e.fact.peer)) for e in told})
+    ]
+
+
 def weak_links(loaded: LoadedRun) -> list[Finding]:
     """Robots that hang on their common map by so few closures that one false one misplaces them."""
     used = [robots_of(pair) for pair in loaded.pairs if pair.used]
@@ -183,6 +199,8 @@ GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     deaths,
     shared_names,
     weak_links,
+    front_ends,
+    doubted_cameras,
     solver_warnings,
     solver_refusals,
     encoding_failures,

@@ -27,7 +27,7 @@ def late(silent: Sequence[str]) -> list[Finding]:
 def _answered(rows: Sequence[RobotStatus]) -> list[Finding]:
     checks = (lonely, unheard, without_keyframes, leaderless, refusing)
     found = [finding for check in checks for finding in check(rows)]
-    first = merging(rows, bool(found))
+    first = merging(rows, any(finding.cause != "refused" for finding in found))
     if any(finding.cause == "merged" for finding in first):
         found = [replace(finding, severity=Severity.HINDERS) for finding in found]
     return [*first, *found]

@@ -10,7 +10,7 @@ __all__ = ["GraphFile", "GraphFileError", "read_g2o", "read_graph_file", "read_j
 
 
 def read_graph_file(path: Path, isotropic: bool = False) -> GraphFile:
-    """Read a .g2o file, a folder with one .g2o file per robot, or a .jrl file.
+    """Read a .g2o file, a folder with one .g2o file per robot, or a .jrl file; with `isotropic` noise as in SE-Sync.
 
     Raises:
         GraphFileError: It is missing, of another kind or damaged; the message names the file and the line or key.
@@ -18,5 +18,5 @@ def read_graph_file(path: Path, isotropic: bool = False) -> GraphFile:
     if path.is_dir() or path.suffix == ".g2o":
         return read_g2o(path, isotropic)
     if path.suffix == ".jrl":
-        return read_jrl(path)
+        return read_jrl(path).with_isotropic_noise() if isotropic else read_jrl(path)
     raise GraphFileError(f"{path}: is neither a .g2o nor a .jrl file nor a folder of .g2o files")

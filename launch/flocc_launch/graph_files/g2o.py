@@ -22,6 +22,7 @@ from flocc_launch.graph_files.graph_file import (
     GraphFileError,
     Measurement,
     distinct,
+    isotropic_noise,
     isotropic_of,
     log_of,
     pose_graph,
@@ -45,7 +46,9 @@ def read_g2o(path: Path, isotropic: bool = False) -> GraphFile:
     """
     files = _robot_files(path) if path.is_dir() else [path]
     lines = [line for file in files for line in _lines(file)]
-    measurements = distinct((m for line in lines if (m := _measurement(line, isotropic)) is not None), add_up=True)
+    planar = all(line.words[0] != "EDGE_SE3:QUAT" for line in lines)
+    read = (_measurement(line, isotropic, planar) for line in lines)
+    measurements = distinct((m for m in read if m is not None), add_up=True)
     if not measurements:
         raise GraphFileError(f"{path}: has no edges")
     graph = pose_graph(measurements, str(path))
@@ -54,7 +57,7 @@ def read_g2o(path: Path, isotropic: bool = False) -> GraphFile:
         graph,
         _truth(path, graph) if path.is_dir() else {},
         T_initial=_initial(vertices, graph),
-        planar=all(line.words[0] != "EDGE_SE3:QUAT" for line in lines),
+        planar=planar,
         left_out=Counter(line.words[0] for line in lines if line.words[0] not in KNOWN),
         fixed=_fixed(lines, vertices),
     )
@@ -87,15 +90,27 @@ def _lines(path: Path) -> Iterable[Line]:
             yield Line(path, number, words)
 
 
-def _measurement(line: Line, isotropic: bool) -> Measurement | None:
+def _measurement(line: Line, isotropic: bool, planar: bool) -> Measurement | None:
     """The edge of a line; None where it has none."""
     kind, *numbers = line.words
     if kind not in EDGES:
         return None
     try:
-        return _se3(numbers, isotropic) if kind == "EDGE_SE3:QUAT" else _se2(numbers)
+        return _se3(numbers, isotropic) if kind == "EDGE_SE3:QUAT" else _se2(numbers, isotropic, planar)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
+
+
+def _key(word: str) -> int:
+    """A vertex's key.
+
+    Raises:
+        ValueError: It is none.
+    """
+    key = int(word)
+    if not 0 <= key < 2**64:
+        raise ValueError(f"{key} is no key of a vertex")
+    return key
 
 
 def _vertex(line: Line) -> tuple[int, Float] | None:
@@ -104,7 +119,7 @@ def _vertex(line: Line) -> tuple[int, Float] | None:
     if kind not in VERTICES:
         return None
     try:
-        key, *v = int(numbers[0]), *(float(number) for number in numbers[1:])
+        key, *v = _key(numbers[0]), *(float(number) for number in numbers[1:])
         if len(v) != VERTICES[kind] or not np.all(np.isfinite(v)):
             raise ValueError(f"a vertex has {len(v)} finite numbers, expected {VERTICES[kind]}")
         if kind == "VERTEX_SE2":
@@ -137,7 +152,7 @@ def _numbers(words: list[str], count: int) -> tuple[int, int, Float]:
     values = np.array([float(word) for word in words[2:]])
     if not np.all(np.isfinite(values)):
         raise ValueError("an edge has a value that is not finite")
-    return int(words[0]), int(words[1]), values
+    return _key(words[0]), _key(words[1]), values
 
 
 def _symmetric(upper: Float, size: int) -> Float:
@@ -165,13 +180,13 @@ def _covariance(information: Float) -> Float:
     return np.asarray(np.linalg.inv(information))
 
 
-def _se2(words: list[str]) -> Measurement:
+def _se2(words: list[str], isotropic: bool, planar: bool) -> Measurement:
     first, second, v = _numbers(words, SE2_NUMBERS)
     T = pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
     covariance = np.eye(6)
-    planar = np.ix_([3, 4, 2], [3, 4, 2])
-    covariance[planar] = _covariance(_symmetric(v[3:], 3))
-    return Measurement(first, second, T, covariance)
+    in_plane = np.ix_([3, 4, 2], [3, 4, 2])
+    covariance[in_plane] = _covariance(_symmetric(v[3:], 3))
+    return Measurement(first, second, T, isotropic_noise(covariance, planar) if isotropic else covariance)
 
 
 def _truth(folder: Path, graph: PoseGraph) -> dict[LogId, Float]:

@@ -1,13 +1,15 @@
 """What every graph file becomes: a pose graph, and what the file knows beyond it."""
 
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import inverse, umeyama
+from flocc_agent.geometry import adjoint, inverse, umeyama
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -15,6 +17,8 @@ Float = NDArray[np.float64]
 
 INDEX_BITS = 56
 INDEX_MASK = (1 << INDEX_BITS) - 1
+OPEN_SIGMA_RAD, OPEN_SIGMA_M = 1e4, 1e6
+"""Standard deviations of a step that nothing measured: it says where the next keyframe starts, and no more."""
 
 
 class GraphFileError(FloccError):
@@ -98,13 +102,13 @@ class GraphFile:
             for log, trajectory in self.graph.trajectories.items()
         }
         closures = tuple(
-            c if c.covariance is None else replace(c, covariance=isotropic(c.covariance, self.planar))
+            c if c.covariance is None else replace(c, covariance=isotropic_noise(c.covariance, self.planar))
             for c in self.graph.closures
         )
         return replace(self, graph=replace(self.graph, trajectories=trajectories, closures=closures))
 
 
-def isotropic(covariance: Float, planar: bool = False) -> Float:
+def isotropic_noise(covariance: Float, planar: bool = False) -> Float:
     """SE-Sync's isotropic noise (6, 6): `kappa = 3 / (2 tr)`, `tau = 3 / tr` of the inverse information blocks.
 
     An edge of a planar file takes `kappa` of its one angle and
@@ -130,7 +134,9 @@ def isotropic_of(information: Float, planar: bool = False) -> Float:
 
 
 def _isotropic_all(covariances: Float | None, planar: bool) -> Float | None:
-    return None if covariances is None else np.array([isotropic(S, planar) for S in covariances]).reshape(-1, 6, 6)
+    return (
+        None if covariances is None else np.array([isotropic_noise(S, planar) for S in covariances]).reshape(-1, 6, 6)
+    )
 
 
 def unit_length(closure: LoopClosure) -> LoopClosure:
@@ -166,22 +172,77 @@ def distinct(measurements: Iterable[Measurement], add_up: bool) -> list[Measurem
 
 
 def pose_graph(measurements: Sequence[Measurement], path: str) -> PoseGraph:
-    """Sort measurements into odometry (consecutive keys of one robot, the first such) and closures.
+    """Sort measurements into odometry (from a key of a robot to its next, the first such) and closures.
+
+    The order of keys is not the order of time: between a key and the next, odometry may run backwards, and is
+    inverted then. Where nothing joins the two, the way round by other measurements says where the next one starts; its
+    covariance says nothing.
 
     Raises:
-        GraphFileError: A robot's keys have a gap that no measurement bridges.
+        GraphFileError: There is no such way.
     """
-    odometry: dict[int, Measurement] = {}
-    closures: list[Measurement] = []
-    for m in measurements:
-        if m.second == m.first + 1 and m.first not in odometry:
-            odometry[m.first] = m
-        else:
-            closures.append(m)
     keys = sorted({key for m in measurements for key in (m.first, m.second)})
-    trajectories = _trajectories(keys, odometry, path)
-    numbers = _numbers(keys)
-    return PoseGraph(trajectories, [_closure(m, numbers) for m in closures])
+    following = {a: b for a, b in pairwise(keys) if log_of(a) == log_of(b)}
+    odometry: dict[int, int] = {}
+    for forward in (True, False):
+        for k, m in enumerate(measurements):
+            first, second = (m.first, m.second) if forward else (m.second, m.first)
+            if following.get(first) == second:
+                odometry.setdefault(first, k)
+    steps = {key: measurements[k] for key, k in odometry.items()}
+    steps = {key: m if m.first == key else inverted(m) for key, m in steps.items()}
+    gaps = {a: b for a, b in following.items() if a not in steps}
+    if gaps:
+        steps |= _bridged(gaps, measurements, path)
+    taken, numbers = set(odometry.values()), _numbers(keys)
+    closures = [_closure(m, numbers) for k, m in enumerate(measurements) if k not in taken]
+    return PoseGraph(_trajectories(keys, steps), closures)
+
+
+def inverted(m: Measurement) -> Measurement:
+    """The same measurement from its other end, to first order of its noise."""
+    Ad = adjoint(m.T_first_second)
+    return Measurement(m.second, m.first, inverse(m.T_first_second), Ad @ m.covariance @ Ad.T)
+
+
+def _bridged(gaps: Mapping[int, int], measurements: Sequence[Measurement], path: str) -> dict[int, Measurement]:
+    """Steps over gaps that no measurement joins, along a tree of measurements; they hold nothing."""
+    ways: dict[int, list[tuple[int, Float]]] = {}
+    for m in measurements:
+        ways.setdefault(m.first, []).append((m.second, m.T_first_second))
+        ways.setdefault(m.second, []).append((m.first, inverse(m.T_first_second)))
+    T: dict[int, Float] = {}
+    root: dict[int, int] = {}
+    open_ = np.diag([OPEN_SIGMA_RAD**2] * 3 + [OPEN_SIGMA_M**2] * 3)
+    found = {}
+    for a, b in gaps.items():
+        if a not in root:
+            _reach(a, ways, T, root)
+        if root.get(b) != root[a]:
+            where = f"robot {log_of(a)} has no odometry from keyframe {a & INDEX_MASK} to {b & INDEX_MASK}"
+            raise GraphFileError(f"{path}: {where}, and nothing else joins them")
+        found[a] = Measurement(a, b, inverse(T[a]) @ T[b], open_)
+    return found
+
+
+def _reach(
+    start: int, ways: Mapping[int, Sequence[tuple[int, Float]]], T: dict[int, Float], root: dict[int, int]
+) -> None:
+    """Pose and root of every key that measurements join to one, by the fewest of them."""
+    T[start], root[start] = np.eye(4), start
+    queue = deque([start])
+    while queue:
+        key = queue.popleft()
+        for other, T_key_other in ways[key]:
+            if other not in root:
+                T[other], root[other] = T[key] @ T_key_other, start
+                queue.append(other)
+
+
+def unmeasured_steps(trajectory: Trajectory) -> int:
+    """How many steps of a robot no measurement of the file joins."""
+    covariances = trajectory.edge_covariances
+    return 0 if covariances is None else int(np.count_nonzero(covariances[:, 5, 5] >= OPEN_SIGMA_M**2))
 
 
 def _numbers(keys: Sequence[int]) -> dict[int, KeyframeId]:
@@ -195,23 +256,20 @@ def _numbers(keys: Sequence[int]) -> dict[int, KeyframeId]:
     return numbers
 
 
-def _trajectories(keys: Sequence[int], odometry: Mapping[int, Measurement], path: str) -> dict[LogId, Trajectory]:
+def _trajectories(keys: Sequence[int], steps: Mapping[int, Measurement]) -> dict[LogId, Trajectory]:
     by_log: dict[LogId, list[int]] = {}
     for key in keys:
         by_log.setdefault(log_of(key), []).append(key)
-    return {log: _trajectory(log, own, odometry, path) for log, own in by_log.items()}
+    return {log: _trajectory(own, steps) for log, own in by_log.items()}
 
 
-def _trajectory(log: LogId, keys: Sequence[int], odometry: Mapping[int, Measurement], path: str) -> Trajectory:
+def _trajectory(keys: Sequence[int], steps: Mapping[int, Measurement]) -> Trajectory:
     T = np.empty((len(keys), 4, 4))
     T[0] = np.eye(4)
     covariances = np.empty((len(keys) - 1, 6, 6))
     for n, key in enumerate(keys[:-1]):
-        if key not in odometry or keys[n + 1] != key + 1:
-            index = key & INDEX_MASK
-            raise GraphFileError(f"{path}: robot {log} has no odometry from keyframe {index} to {index + 1}")
-        T[n + 1] = T[n] @ odometry[key].T_first_second
-        covariances[n] = odometry[key].covariance
+        T[n + 1] = T[n] @ steps[key].T_first_second
+        covariances[n] = steps[key].covariance
     return Trajectory(T, covariances)
 
 

@@ -38,6 +38,8 @@ def read_jrl(path: Path) -> GraphFile:
         raise GraphFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except json.JSONDecodeError as error:
         raise GraphFileError(f"{path}: is not JSON: {error}") from error
+    except RecursionError as error:
+        raise GraphFileError(f"{path}: is nested too deeply") from error
     try:
         return _graph_file(data, path)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:

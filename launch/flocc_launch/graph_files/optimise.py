@@ -26,7 +26,7 @@ from flocc_agent.core.pose_graph import (
 )
 from flocc_agent.geometry import inverse
 from flocc_launch.graph_files import GraphFile, read_graph_file, write_g2o
-from flocc_launch.graph_files.graph_file import GraphFileError, ate_m, first_poses_at
+from flocc_launch.graph_files.graph_file import GraphFileError, ate_m, first_poses_at, unmeasured_steps
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -83,7 +83,6 @@ def optimise_file(
         OptimiseError: There is no solution, or the folder cannot be written.
     """
     file = read_graph_file(path, isotropic=noise is NoiseModel.ISOTROPIC)
-    file = file.with_isotropic_noise() if noise is NoiseModel.ISOTROPIC else file
     file = prepared(file, path, unit_scale, drop_labelled_outliers, scale_initial)
     config = file_config(formulation, solver, scale_initial, pairwise_consistency)
     initial = initialisation(file, path) if from_file_initialisation else None
@@ -178,7 +177,13 @@ def report(file: GraphFile, config: BackendConfig, solution: GraphSolution) -> d
 
 
 def _unread(file: GraphFile) -> list[str]:
-    return [f"{count} lines of kind {kind} are left out" for kind, count in sorted(file.left_out.items())]
+    lines = [f"{count} lines of kind {kind} are left out" for kind, count in sorted(file.left_out.items())]
+    unmeasured = {log: unmeasured_steps(t) for log, t in sorted(file.graph.trajectories.items())}
+    return lines + [
+        f"{count} steps of robot {log} are not measured: they start along other measurements, and hold nothing"
+        for log, count in unmeasured.items()
+        if count
+    ]
 
 
 def label_counts(file: GraphFile, solution: GraphSolution) -> dict[str, int | None]:

@@ -16,7 +16,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from flocc_agent.runtime.kept_for_maps import CAMERA_FACT, FRONT_END_FACT, MAP_FACT, UsedMap
+from flocc_agent.config import BackendConfig
+from flocc_agent.runtime.kept_for_maps import BACK_END_FACT, CAMERA_FACT, FRONT_END_FACT, MAP_FACT, UsedMap
 from flocc_agent.runtime.map_folder import BadMap, LensModel, MapFrontEnd
 from flocc_agent.runtime.record_tables import COLUMNS, is_sound
 from flocc_protocol.codec import Pose7
@@ -47,6 +48,7 @@ class Gathered:
         optics: Of each log, as far as its robot kept it.
         stores: Folders of the stores, for latents.
         recordings: Log -> its recording, where a run names one; for thumbnails.
+        back_end: How its robots solved; None where their stores do not say.
         used: The map in which the robots worked, None where there was none.
         swarm: Its name, as far as it is known.
     """
@@ -57,6 +59,7 @@ class Gathered:
     optics: Mapping[LogId, Optics]
     stores: tuple[Path, ...]
     recordings: Mapping[LogId, Path] = field(default_factory=dict)
+    back_end: BackendConfig | None = None
     used: UsedMap | None = None
     swarm: str | None = None
 
@@ -96,6 +99,7 @@ def gathered(where: Path, recordings: Mapping[str, Path] | None = None) -> Gathe
     optics: dict[LogId, Optics] = {}
     of_robots: dict[LogId, Path] = {}
     front_ends: list[MapFrontEnd] = []
+    back_ends: list[BackendConfig] = []
     used: list[UsedMap] = []
     for store in stores:
         facts, records = _small(store)
@@ -103,6 +107,7 @@ def gathered(where: Path, recordings: Mapping[str, Path] | None = None) -> Gathe
             logs[log] = _longer(where, log, logs.get(log, ()), copy)
         optics |= _optics(facts)
         front_ends += _parsed(facts, FRONT_END_FACT, MapFrontEnd)
+        back_ends += _parsed(facts, BACK_END_FACT, BackendConfig)
         used += _parsed(facts, MAP_FACT, UsedMap)
         own = facts.get("log", b"").decode()
         if own and (recording := (recordings or {}).get(LogId.parse(own).robot)) is not None:
@@ -114,6 +119,7 @@ def gathered(where: Path, recordings: Mapping[str, Path] | None = None) -> Gathe
         optics,
         tuple(stores),
         of_robots,
+        back_ends[0] if back_ends else None,
         _one_map(where, used),
     )
 

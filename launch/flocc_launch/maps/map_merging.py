@@ -26,7 +26,7 @@ from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapManifest
 from flocc_launch.maps.gathering import opened_record
 from flocc_launch.maps.map_page import map_page
-from flocc_launch.maps.map_saving import latents_of, optics_of
+from flocc_launch.maps.map_saving import back_end_of, latents_of, optics_of
 from flocc_launch.maps.solving import SolvedMap, solved_map
 from flocc_launch.maps.writing import MapContent, check_target, write_map
 from flocc_protocol.ids import KeyframeId, LogId
@@ -87,7 +87,8 @@ def merge_maps(
     joining = LogId(MERGER, clock_ms())
     records = tuple(encode_record(closure) for closure in closures)
     logs = {**a.records, **b.records, **({joining: records} if records else {})}
-    solved = solved_map(f"{first} and {second}", logs, a.saved())
+    back_end = back_end_of(a)
+    solved = solved_map(f"{first} and {second}", logs, a.saved(), config=back_end)
     _check_joined(solved, b, pairs, registered, closures)
     content = MapContent(
         name=out.name,
@@ -96,6 +97,7 @@ def merge_maps(
         front_end=a.manifest.front_end,
         optics={**optics_of(b), **optics_of(a)},
         latents=chain(latents_of(a), latents_of(b)),
+        back_end=back_end,
         edition=max(a.manifest.edition, b.manifest.edition) + 1,
         swarm=a.manifest.swarm,
         pruned=a.manifest.pruned or b.manifest.pruned,

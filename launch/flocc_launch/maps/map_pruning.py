@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flocc_agent.runtime.map_folder import MapFolder, MapManifest
 from flocc_launch.maps.map_merging import described
 from flocc_launch.maps.map_page import map_page
-from flocc_launch.maps.map_saving import latents_of, optics_of
+from flocc_launch.maps.map_saving import back_end_of, latents_of, optics_of
 from flocc_launch.maps.solving import SolvedMap
 from flocc_launch.maps.writing import MapContent, check_target, write_map
 from flocc_protocol.ids import KeyframeId
@@ -50,6 +50,7 @@ def prune_map(folder: Path, out: Path, place_m: float, place_deg: float) -> MapM
         front_end=manifest.front_end,
         optics=optics_of(opened),
         latents=(each for each in latents_of(opened) if each[0] in kept),
+        back_end=back_end_of(opened),
         edition=manifest.edition + 1,
         swarm=manifest.swarm,
         pruned=True,

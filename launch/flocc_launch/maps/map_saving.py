@@ -8,17 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapManifest
+from flocc_agent.config import BackendConfig, validated
+from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapFrontEnd, MapManifest
 from flocc_launch.maps.gathering import Gathered, Logs, Optics, gathered
 from flocc_launch.maps.map_page import map_page
 from flocc_launch.maps.solving import NotSolved, SolvedMap, solved_map
 from flocc_launch.maps.thumbnails import thumbnails
-from flocc_launch.maps.writing import MapContent, check_target, write_map
+from flocc_launch.maps.writing import PAGE, MapContent, check_target, write_map
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.ids import KeyframeId, LogId
 
 
-def save_map(where: Path, out: Path, name: str | None = None, frame: str | None = None) -> MapManifest:
+def save_map(
+    where: Path, out: Path, name: str | None = None, frame: str | None = None, sees_alike: bool = True
+) -> MapManifest:
     """Save the map of a run, or of one agent's folder.
 
     Args:
@@ -26,16 +29,19 @@ def save_map(where: Path, out: Path, name: str | None = None, frame: str | None 
         out: Folder of the map; a map that stands there is replaced in one step.
         name: For people; None: that of the folder.
         frame: Which frame of several to keep, such as `map/r1`; None: the largest, or the opened map's.
+        sees_alike: The front end that the stores name made what is in them.
 
     Raises:
         FloccError: There are no stores, they contradict each other, nothing can be solved, or `out` cannot be written.
     """
     check_target(out)
     found = gathered(where, _recordings(where))
+    found = found if sees_alike else replace(found, front_end=MapFrontEnd())
     earlier = None if found.used is None else _earlier(found, out)
     logs = found.logs if earlier is None else _with(earlier, found.logs)
     saved = None if earlier is None or found.used is None else earlier.saved(found.used.is_fixed)
-    solved = solved_map(str(where), logs, saved, frame)
+    back_end = found.back_end if earlier is None else back_end_of(earlier)
+    solved = solved_map(str(where), logs, saved, frame, back_end)
     if earlier is not None:
         solved = _kept_covariances(_checked_news(solved, earlier, where), earlier)
     content = MapContent(
@@ -45,12 +51,46 @@ def save_map(where: Path, out: Path, name: str | None = None, frame: str | None 
         front_end=found.front_end if earlier is None else earlier.manifest.front_end,
         optics={**({} if earlier is None else optics_of(earlier)), **found.optics},
         latents=chain(() if earlier is None else latents_of(earlier), found.latents()),
+        back_end=back_end,
         edition=1 if earlier is None else earlier.manifest.edition + 1,
         swarm=_swarm(where),
         pruned=earlier is not None and earlier.manifest.pruned,
         page=lambda manifest: map_page(manifest, solved, thumbnails(found.recordings, logs)),
     )
     return write_map(out, content)
+
+
+def copy_map(opened: MapFolder, out: Path) -> MapManifest:
+    """Write a map once more elsewhere, in one step; its page and thumbnails are those that it has.
+
+    Raises:
+        BadMap: It is damaged, or `out` cannot be written.
+    """
+    manifest = opened.manifest
+    page = opened.path / PAGE
+    content = MapContent(
+        name=manifest.name,
+        logs=opened.records,
+        solved=SolvedMap(opened.saved(), opened.covariances(), {}),
+        front_end=manifest.front_end,
+        optics=optics_of(opened),
+        latents=latents_of(opened),
+        back_end=back_end_of(opened),
+        edition=manifest.edition,
+        swarm=manifest.swarm,
+        pruned=manifest.pruned,
+        page=(lambda _: page.read_text(encoding="utf-8")) if page.is_file() else None,
+    )
+    return write_map(out, content)
+
+
+def back_end_of(opened: MapFolder) -> BackendConfig:
+    """How a map was solved.
+
+    Raises:
+        ConfigError: This version does not know one of its settings.
+    """
+    return validated(BackendConfig, opened.manifest.back_end, f"{opened.path}: back end")
 
 
 def optics_of(opened: MapFolder) -> dict[LogId, Optics]:

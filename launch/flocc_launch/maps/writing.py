@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.geometry import tq_from_poses
 from flocc_agent.runtime.map_folder import (
@@ -52,6 +53,7 @@ class MapContent:
         front_end: What made descriptors and latents.
         optics: Camera of each log, as far as it is known.
         latents: (keyframe, SHA-256, latent).
+        back_end: How it was solved; None: as agents do by default.
         edition: See `MapManifest`.
         swarm: See `MapManifest`.
         pruned: See `MapManifest`.
@@ -64,6 +66,7 @@ class MapContent:
     front_end: MapFrontEnd
     optics: Mapping[LogId, Optics]
     latents: Iterable[tuple[KeyframeId, bytes, bytes]]
+    back_end: BackendConfig | None = None
     edition: int = 1
     swarm: str | None = None
     pruned: bool = False
@@ -114,6 +117,7 @@ def _write(out: Path, content: MapContent) -> MapManifest:
         swarm=content.swarm,
         signed=any(opened_record(content.logs[log][0])[1] for log in order if content.logs[log]),
         front_end=content.front_end,
+        back_end=(content.back_end or BackendConfig()).model_dump(mode="json"),
         logs=tuple(entries),
         poses=len(saved.logs),
         latents=latents,

@@ -23,6 +23,7 @@ from flocc_launch.report.model import (
     RunReport,
     TrackError,
 )
+from flocc_launch.runs.camera_doubts import camera_doubts
 from flocc_launch.runs.ground_truth import frame_sentences, in_separate_frames, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.moments import mean_errors, moments_of
@@ -99,6 +100,7 @@ def build(loaded: LoadedRun) -> RunReport:
         expectations=[],
         robot_details=robots,
         deaths_unasked=deaths_unasked(loaded.events),
+        doubted_cameras=sorted({doubt.robot for doubt in camera_doubts(loaded.events) if doubt.matters}),
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})
@@ -256,6 +258,7 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
         if robot not in loaded.results:
             found.append(f"{robot} left no result; its trajectory is odometry only.")
     found += [*other_clocks(loaded.tracks), *frame_sentences(loaded.tracks)]
+    found += [f"{doubt.sentence} {doubt.advice}" for doubt in camera_doubts(events)]
     unknown = Counter(event.fact.name for event in of_kind(events, UnknownFact))
     for name, count in sorted(unknown.items()):
         found.append(f"This version does not know events of the kind {name} ({count} in this run).")

@@ -205,4 +205,6 @@ class RunReport(Record):
     robot_details: list[RobotReport]
     deaths_unasked: list[str] = Field(default_factory=list)
     """Robots whose agents died without a fault of the scenario or an operator's order, once for each death."""
+    doubted_cameras: list[str] = Field(default_factory=list)
+    """Robots whose pictures contradict their odometry or calibration, or are frozen; the warnings say how."""
     warnings: list[str]

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from flocc_launch.doctor import Severity, diagnose_loaded
+from flocc_launch.doctor.cameras import CAUSES
 from flocc_launch.report.album import Album
 from flocc_launch.report.figure_charts import error_figure, ratio_figure
 from flocc_launch.report.figure_map import colour, map_figure, scenes, view_of
@@ -89,7 +90,7 @@ def warnings(report: RunReport) -> str:
     return element("div", element("h3", "Worth knowing"), element("ul", items), class_="callout")
 
 
-UNDER_WARNINGS = ("agent-died", "agent-killed", "solver-warning", "truth-clock", "truth-frames")
+UNDER_WARNINGS = (*CAUSES.values(), "agent-died", "agent-killed", "solver-warning", "truth-clock", "truth-frames")
 """Findings that the report's warnings say already."""
 
 

@@ -10,7 +10,19 @@ def verdict(report: RunReport) -> str:
     """Whether the maps merged, when, and what it did to the error."""
     if len(report.robots) == 1:
         return alone(report)
-    return " ".join(sentence for sentence in (map_sentence(report), error_sentence(report)) if sentence)
+    parts = (map_sentence(report), error_sentence(report), camera_sentence(report))
+    return " ".join(sentence for sentence in parts if sentence)
+
+
+def camera_sentence(report: RunReport) -> str:
+    """Whose camera is not what its configuration says."""
+    robots = report.doubted_cameras
+    if not robots:
+        return ""
+    whose = listed([f"{robot}'s" for robot in robots])
+    if len(robots) == 1:
+        return f"Look at {whose} camera: its pictures and odometry do not fit."
+    return f"Look at {whose} cameras: their pictures and odometry do not fit."
 
 
 def alone(report: RunReport) -> str:

@@ -5,7 +5,7 @@ ends early. A seed that fails replays exactly; `shrink` looks for fewer faults t
 """
 
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -13,11 +13,13 @@ from pathlib import Path
 
 from flocc_agent.config import KeyframeConfig
 from flocc_agent.perception.backends import build_perception
+from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.runs.run_folder import write_json
 from flocc_launch.scenarios.scenario import FaultKind, Scenario, SensorsScenario, TracksScenario
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
 from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
+from flocc_launch.simulation.hardships import Hardship, HardshipKind, drawn_hardships, endure
 from flocc_launch.simulation.invariants import Invariant, InvariantWatch, Violation
 from flocc_launch.simulation.rigid_alignment import Alignment
 from flocc_launch.simulation.safety import all_invariants
@@ -29,6 +31,14 @@ LIVENESS_S = 60.0
 LOOK_S = 2.5
 SEEDS_PER_TASK = 8
 SEPARATING = {FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.LOSS, FaultKind.MUTE, FaultKind.LEAVE}
+
+
+NO_DRIFT = DriftSpec(
+    scale_sigma_ratio=0,
+    translation_sigma_m_per_sqrt_m=0,
+    heading_rate_sigma_rad_per_m=0,
+    heading_sigma_rad_per_sqrt_m=0,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +99,14 @@ def _outcomes(seeds: list[int], processes: int) -> Iterator[SeedOutcome]:
 
 def run_seed(seed: int) -> SeedOutcome:
     """One seed of the default campaign."""
-    return run_checked(drawn_scenario(seed))
+    scenario = drawn_scenario(seed)
+    return run_checked(scenario, drawn_hardships(seed, scenario.names(), FAULTS_END_S))
 
 
-def run_checked(scenario: Scenario) -> SeedOutcome:
+def run_checked(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> SeedOutcome:
     """Run a scenario under all checkers; a crash of the core is a violation like any other."""
-    swarm = prepared(scenario)
-    watch = InvariantWatch(swarm, invariants_of(scenario))
+    swarm = prepared(scenario, hardships)
+    watch = InvariantWatch(swarm, invariants_of(scenario, hardships))
     try:
         settled_after_s = _run(swarm, watch)
     except Exception:  # noqa: BLE001 - whatever the core throws is what the campaign looks for
@@ -107,18 +118,33 @@ def run_checked(scenario: Scenario) -> SeedOutcome:
     return SeedOutcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s)
 
 
-def invariants_of(scenario: Scenario) -> list[Invariant]:
-    """All invariants; two robots may register one pair only where they could not hear each other for a while."""
+def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> list[Invariant]:
+    """All invariants; two robots may register one pair only where they could not hear each other for a while.
+
+    Nobody counts on a name under which two robots run. A robot that an older disk makes number keyframes twice has
+    others register images of one with the place of the other, until it is told: then the truth is not asked for.
+    """
     separating = any(fault.kind in SEPARATING for fault in scenario.faults)
     links = [scenario.radio, *scenario.radio.overrides]
     lossy = any(link.loss_ratio or link.burst_ratio or link.bandwidth_bytes_s for link in links)
-    return all_invariants(separating or lossy or scenario.radio.range_m is not None)
+    separated = separating or lossy or scenario.radio.range_m is not None or bool(hardships)
+    doubles = {hardship.robot for hardship in hardships if hardship.kind is HardshipKind.TWIN}
+    classes = {name: -1 if name in doubles else scenario.robot(name).compute_class for name in scenario.names()}
+    told_twice = any(hardship.kind is HardshipKind.OLDER for hardship in hardships)
+    return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes)
 
 
-def prepared(scenario: Scenario) -> Swarm:
+def is_noiseless(scenario: Scenario) -> bool:
+    """Whether registrations are without noise; then odometry is, too."""
+    synthetic = scenario.perception.synthetic
+    return synthetic.rotation_sigma_rad == synthetic.scale_drift_sigma_ratio == 0.0
+
+
+def prepared(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> Swarm:
     """A swarm with quick stand-ins for perception and back end, and its faults to come."""
     eyes = ImageEyes(build_perception(scenario.perception, scenario.seed), scenario.perception, None)
     swarm = Swarm(scenario, _playbacks(scenario), Equipment(eyes, Alignment()), scenario.seed)
+    endure(swarm, hardships)
     schedule(swarm, scenario.faults)
     return swarm
 
@@ -127,19 +153,19 @@ def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     assert scenario.tracks is not None
     tracks = scenario.tracks.model_copy(update={"robots": ROBOTS_MAX})
     sensors = None if scenario.sensors is None else scenario.sensors.model_dump_json()
-    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json(), sensors)
+    drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json(), sensors, is_noiseless(scenario))
     return {name: drawn[name] for name in scenario.names()}
 
 
 @lru_cache(maxsize=64)
-def _walked(tracks: str, keyframes: str, sensors: str | None) -> dict[str, Playback]:
+def _walked(tracks: str, keyframes: str, sensors: str | None, noiseless: bool) -> dict[str, Playback]:
     """Playbacks of walks, drawn once for all seeds that share them; the parameters are JSON."""
     scenario = Scenario(
         tracks=TracksScenario.model_validate_json(tracks),
         keyframes=KeyframeConfig.model_validate_json(keyframes),
         sensors=None if sensors is None else SensorsScenario.model_validate_json(sensors),
     )
-    return playbacks_of(scenario, {})
+    return playbacks_of(scenario, {}, NO_DRIFT if noiseless else None)
 
 
 def shrink(scenario: Scenario, fails: Callable[[Scenario], bool] | None = None) -> Scenario:
@@ -160,7 +186,7 @@ def _run(swarm: Swarm, watch: InvariantWatch) -> float | None:
     """Let the faults happen, then wait for peace."""
     swarm.run_until(FAULTS_END_S + LOOK_S)
     while swarm.agenda.now_s <= FAULTS_END_S + LIVENESS_S:
-        if not watch.lacking():
+        if watch.is_settled():
             return swarm.agenda.now_s - FAULTS_END_S
         swarm.run_until(swarm.agenda.now_s + LOOK_S)
     return None

@@ -15,16 +15,19 @@ from numpy.typing import NDArray
 
 from flocc_agent import perception as perception_package
 from flocc_agent.config import PerceptionConfig
-from flocc_agent.core.interfaces import OdometryPair, Perception
+from flocc_agent.core.interfaces import ImageWatch, KeyframeLook, OdometryPair, Perception
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
+from flocc_agent.core.reports import CameraDoubted
 from flocc_agent.perception.backends import OWN
+from flocc_agent.perception.watch.camera_watch import CameraWatch
 from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
-CACHE_FORM = b"2"
+CACHE_FORM = b"3"
 """Changes with what a file of the cache holds."""
 
 
@@ -33,44 +36,82 @@ class ImageEyes:
 
     def __init__(self, perception: Perception, config: PerceptionConfig, cache: Path | None) -> None:
         self._perception = perception
-        self._cache = cache if config.method in OWN else None  # of a stranger's code nobody knows what it depends on
-        self._config_key = b"" if self._cache is None else CACHE_FORM + repr(config).encode() + _code_hash()
+        self.cache = cache if config.method in OWN else None  # of a stranger's code nobody knows what it depends on
+        self._config_key = b"" if self.cache is None else CACHE_FORM + repr(config).encode() + _code_hash()
 
-    def encode(self, capture: Capture) -> tuple[Array, bytes]:
-        """Descriptor and latent of a keyframe."""
-        if self._cache is None or capture.source is None:
-            image = capture.load()
-            return self._perception.describe(image), self._perception.encode(image)
-        path = self._path(b"image", capture.source.read_bytes(), capture.camera_key)
-        if path.exists():
-            dtype, shape, data, scale, latent = msgpack.unpackb(path.read_bytes())
-            return Array(dtype, tuple(shape), data, scale), latent
-        image = capture.load()
-        d, latent = self._perception.describe(image), self._perception.encode(image)
-        _write(path, [d.dtype, list(d.shape), d.data, d.scale, latent])
-        return d, latent
+    def watch(self, hidden: Mask | None) -> "CachedWatch":
+        """What looks at one robot's captures."""
+        return CachedWatch(self, hidden)
+
+    def looked(self, watch: ImageWatch, capture: Capture, T_odom_camera: Float) -> KeyframeLook:
+        """Look at a capture's image."""
+        return watch.look(self._perception, capture.load(), T_odom_camera)
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's."""
-        if self._cache is None:
+        if self.cache is None:
             return self._perception.register(query, match, odometry)
         neighbour = (odometry.latent, odometry.T_neighbour_query.tobytes()) if odometry else ()
-        path = self._path(b"pair", query, match, *neighbour)
+        path = self.path(b"pair", query, match, *neighbour)
         if path.exists():
             return _result(msgpack.unpackb(path.read_bytes()))
         result = self._perception.register(query, match, odometry)
         _write(path, _packed(result))
         return result
 
-    def _path(self, *parts: bytes) -> Path:
+    def path(self, *parts: bytes) -> Path:
         """Where something is kept that depends on the configuration and these parts."""
-        assert self._cache is not None
+        assert self.cache is not None
         digest = hashlib.blake2b(digest_size=20)
         for part in (self._config_key, *parts):
             digest.update(len(part).to_bytes(8, "little"))
             digest.update(part)
         name = digest.hexdigest()
-        return self._cache / name[:2] / name[2:]
+        return self.cache / name[:2] / name[2:]
+
+
+class CachedWatch:
+    """Looks at one robot's captures in order; what it saw is kept under the hash of all captures so far.
+
+    A watch remembers. Where the cache knows the answer the image is only noted, and looked at once a later one is not
+    known.
+    """
+
+    def __init__(self, eyes: ImageEyes, hidden: Mask | None) -> None:
+        self._eyes = eyes
+        self._watch = CameraWatch(hidden)
+        self._history = hashlib.blake2b(b"" if hidden is None else hidden.tobytes(), digest_size=20)
+        self._unseen: list[tuple[Capture, Float]] = []
+
+    def look(self, capture: Capture, T_odom_camera: Float) -> KeyframeLook:
+        """Describe and encode a keyframe, and tell what is odd about the camera."""
+        if self._eyes.cache is None or capture.source is None:
+            return self._eyes.looked(self._watch, capture, T_odom_camera)
+        for part in (capture.source.read_bytes(), capture.camera_key, T_odom_camera.tobytes()):
+            self._history.update(hashlib.blake2b(part).digest())
+        path = self._eyes.path(b"image", self._history.digest())
+        if path.exists():
+            self._unseen.append((capture, T_odom_camera))
+            return _looked(msgpack.unpackb(path.read_bytes()))
+        for unseen, T in self._unseen:
+            self._eyes.looked(self._watch, unseen, T)
+        self._unseen.clear()
+        looked = self._eyes.looked(self._watch, capture, T_odom_camera)
+        _write(path, _packed_look(looked))
+        return looked
+
+
+def _packed_look(looked: KeyframeLook) -> list[Any]:
+    d = looked.descriptor
+    descriptor = None if d is None else [d.dtype, list(d.shape), d.data, d.scale]
+    return [descriptor, looked.latent, looked.fault, [[d.doubt, d.amount, d.where, d.pairs] for d in looked.doubts]]
+
+
+def _looked(packed: list[Any]) -> KeyframeLook:
+    descriptor, latent, fault, doubts = packed
+    array = None if descriptor is None else Array(descriptor[0], tuple(descriptor[1]), *descriptor[2:])
+    told = (CameraDoubted(doubt=doubt, amount=amount, where=where, pairs=n) for doubt, amount, where, n in doubts)
+    return KeyframeLook(array, latent, fault, tuple(told))
 
 
 def _code_hash() -> bytes:

@@ -19,6 +19,14 @@ FAULTS_MAX = 6
 WALKS = 8
 LENGTHS_M = (8.0, 14.0, 20.0)
 """Few walks, so that a process draws each once; faults differ from seed to seed."""
+NOISELESS_RATIO = 0.5
+NOISY = SyntheticConfig(dimension=16, outlier_probability=0.0, alias_probability=0.0)
+NOISELESS = NOISY.model_copy(
+    update=dict.fromkeys(
+        ("rotation_sigma_rad", "translation_sigma_ratio", "scale_sigma_ratio", "scale_drift_sigma_ratio"), 0.0
+    )
+)
+"""Half of the swarms see and measure without noise, so that what comes out can be held against the truth."""
 SENSING_RATIO = 0.25
 SENSORS = SensorsScenario(
     tags={"7": (6.0, 6.0, 1.5)},
@@ -51,11 +59,16 @@ def drawn_scenario(seed: int) -> Scenario:
         core=CoreParameters(place_recognition=PlaceRecognitionParameters(similarity_threshold=0.5)),
         keyframes=KeyframeConfig(distance_m=1.5, rotation_rad=1.2),
         perception=PerceptionConfig(
-            method="synthetic", synthetic=SyntheticConfig(dimension=16, outlier_probability=0.0, alias_probability=0.0)
+            method="synthetic", synthetic=NOISELESS if _draws(seed, 2, NOISELESS_RATIO) else NOISY
         ),
         faults=_faults(rng, names),
-        sensors=SENSORS if np.random.default_rng([seed, 1]).uniform() < SENSING_RATIO else None,
+        sensors=SENSORS if _draws(seed, 1, SENSING_RATIO) else None,
     )
+
+
+def _draws(seed: int, purpose: int, ratio: float) -> bool:
+    """Whether a seed has something that a share of all seeds has; one more purpose changes no other draw."""
+    return bool(np.random.default_rng([seed, purpose]).uniform() < ratio)
 
 
 def _robot(rng: np.random.Generator) -> RobotScenario:

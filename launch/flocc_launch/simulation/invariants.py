@@ -39,11 +39,13 @@ class Invariant:
         name: Its name in reports.
         step: What is wrong with a step, a sentence each.
         lacking: What is not yet as it must be, a sentence each.
+        wants: Types of the events and effects that `step` looks at; None: it looks at every step.
     """
 
     name: str
     step: Callable[[Step], Iterable[str]] | None = None
     lacking: Callable[[Swarm], Iterable[str]] | None = None
+    wants: frozenset[type] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +73,13 @@ class InvariantWatch:
     def __init__(self, swarm: Swarm, invariants: Iterable[Invariant]) -> None:
         self.violations: list[Violation] = []
         self._swarm = swarm
-        self._steps = [(i.name, i.step) for i in invariants if i.step is not None]
+        self._steps = [(i.name, i.step, i.wants) for i in invariants if i.step is not None]
         self._goals = [(i.name, i.lacking) for i in invariants if i.lacking is not None]
         swarm.observers.append(self._step)
+
+    def is_settled(self) -> bool:
+        """Whether everything is as it must be."""
+        return not any(True for _, lacking in self._goals for _ in lacking(self._swarm))
 
     def lacking(self) -> list[Violation]:
         """What is not yet as it must be."""
@@ -82,7 +88,10 @@ class InvariantWatch:
 
     def _step(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
         step = Step(self._swarm.agenda.now_s, station, event, effects)
-        for name, check in self._steps:
+        kinds = {type(event), *map(type, effects)}
+        for name, check, wants in self._steps:
+            if wants is not None and wants.isdisjoint(kinds):
+                continue
             for detail in check(step):
                 if all(violation.invariant != name for violation in self.violations):
                     self.violations.append(Violation(name, step.at_s, detail))

@@ -60,9 +60,13 @@ def in_other_frames(swarm: Swarm) -> Iterator[str]:
 
 
 def not_everywhere(swarm: Swarm) -> Iterator[str]:
-    """Nothing lost: copies of logs that differ, and closures that the leader's graph lacks."""
+    """Nothing lost: copies of logs that differ, and closures that the leader's graph lacks.
+
+    Of a log that a rolled-back disk made two versions of, everybody keeps the one that he heard first.
+    """
     for group in groups(swarm):
-        digests = {station.name: core(station).gossip.digests() for station in group}
+        held_by = {station.name: core(station).gossip.digests() for station in group}
+        digests = {name: tuple(d for d in held if d.log not in swarm.forked) for name, held in held_by.items()}
         if len(set(digests.values())) > 1:
             counts = {name: [f"{d.log}:{d.count}" for d in held] for name, held in digests.items()}
             yield f"logs differ: {counts}"

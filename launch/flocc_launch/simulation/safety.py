@@ -7,44 +7,85 @@ from dataclasses import dataclass, field
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
+    FetchLatent,
     Optimise,
     PersistRecord,
     Register,
     Report,
     Unicast,
 )
+from flocc_agent.core.events import (
+    GraphOptimised,
+    KeyframeCaptured,
+    LatentFetched,
+    LatentFetchFailed,
+    MessageReceived,
+    PairRegistered,
+)
 from flocc_agent.core.gossip import decoded
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.reports import NeighbourDown, NeighbourUp
 from flocc_launch.simulation import liveness
+from flocc_launch.simulation.completeness import Complete
+from flocc_launch.simulation.costs import Balanced, Cheap
 from flocc_launch.simulation.invariants import Invariant, Step, core
+from flocc_launch.simulation.leadership import Doubles, Led, badly_led
+from flocc_launch.simulation.rightness import Right, unlike_the_solution, untrue
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import CandidatePair, Coordinator, CorrectionBatch, LogCorrection, Records
-from flocc_protocol.records import ClosureRecord, Record, RejectionRecord
+from flocc_protocol.records import ClosureRecord, RejectionRecord
 
 SIZES_EVERY = 25
 TICKS_PER_S_MAX = 200
+STEPS_PER_S_MAX = 20_000
+"""Of a whole swarm; more than that is an answer to an answer without end."""
 APART_S = FAR_TAKEOVERS * TAKEOVER_S + 10.0
 """So long after two robots lost or found each other a pair may be taken over, and its latents be fetched."""
 
 
-def all_invariants(separated: bool) -> list[Invariant]:
-    """DESIGN.md, section 5, and that memory is bounded.
+def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int]) -> list[Invariant]:
+    """DESIGN.md, section 5, that memory is bounded, and that what comes out is right, complete and cheap.
 
     Args:
         separated: At times robots cannot hear each other; then, and only then, may two of them take one pair.
+        noiseless: Odometry and registrations are without noise, so that the truth can be asked for.
+        classes: Compute class by robot name.
     """
+    complete = Complete()
+    sent = frozenset({Broadcast, Unicast})
+    told = frozenset({Report, Register, FetchLatent, MessageReceived})
     return [
         Invariant("agreement", lacking=liveness.without_one_leader),
-        Invariant("fencing", step=Fencing().step),
-        Invariant("one claim", step=OneClaim().step),
+        Invariant("led", step=Led().step, lacking=badly_led),
+        Invariant("fencing", step=Fencing().step, wants=frozenset({Deliver})),
+        Invariant("one claim", step=OneClaim().step, wants=sent | {Optimise}),
         Invariant("no starvation", lacking=liveness.uncorrected),
-        Invariant("registered once", step=Once(separated).step, lacking=liveness.unregistered),
+        Invariant(
+            "registered once",
+            step=Once(separated).step,
+            lacking=liveness.unregistered,
+            wants=frozenset({PersistRecord, Report, Register}),
+        ),
         Invariant("one frame", lacking=liveness.in_other_frames),
         Invariant("nothing lost", step=Published().step, lacking=liveness.not_everywhere),
         Invariant("bounded", step=Bounded().step),
+        Invariant("reported", step=Doubles().step, wants=sent | told),
+        Invariant("cheap", step=Cheap().step, wants=sent | told | {LatentFetched, LatentFetchFailed}),
+        Invariant("balanced", step=Balanced(classes).step, wants=told),
+        Invariant(
+            "complete",
+            step=complete.step,
+            lacking=complete.lacking,
+            wants=frozenset({KeyframeCaptured, PersistRecord}),
+        ),
+        Invariant(
+            "right",
+            step=Right().step,
+            lacking=untrue if noiseless else unlike_the_solution,
+            wants=frozenset({GraphOptimised, PairRegistered, Register, Deliver}),
+        ),
     ]
 
 
@@ -61,8 +102,13 @@ class Fencing:
                 yield from self._delivered(step.station, effect.correction, effect.frame_changed)
 
     def _delivered(self, station: Station, correction: LogCorrection, told: bool) -> Iterator[str]:
-        """A robot that died in the middle of a jump may tell of it once more when it is back."""
+        """A robot that died in the middle of a jump may tell of it once more when it is back.
+
+        One whose disk went back in time knows nothing of what it applied, nor do its consumers, who started with it.
+        """
         last, life = self._last.get(station.log, (None, 0))
+        if station.disk.went_back and station.life != life:
+            last = None
         self._last[station.log] = (correction, station.life)
         if last is None:
             return
@@ -85,10 +131,12 @@ class OneClaim:
         station = step.station
         for effect in step.effects:
             match effect:
-                case Broadcast(Coordinator(advert)):
+                case Broadcast(Coordinator(advert)) if not station.disk.went_back:
                     claimer = (station.name, station.life)
                     if advert.term.leader != station.log or self._claims.setdefault(advert.term, claimer) != claimer:
                         yield f"{station.name} claims {advert.term}, which is another's"
+                case Broadcast(Coordinator(advert)):
+                    self._claims[advert.term] = station.name, station.life
                 case Optimise(term=term) if term.leader != station.log:
                     yield f"{station.name} optimises in {term}"
                 case Broadcast(CorrectionBatch(corrections)):
@@ -122,7 +170,7 @@ class Once:
     pairs: int = 0
     again: int = 0
     _begun: dict[CandidatePair, list[_Registered]] = field(default_factory=lambda: defaultdict(list))
-    _records: dict[CandidatePair, set[tuple[LogId, int]]] = field(default_factory=lambda: defaultdict(set))
+    _records: dict[CandidatePair, set[tuple[LogId, int, bytes]]] = field(default_factory=lambda: defaultdict(set))
     _changed_s: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
@@ -130,20 +178,24 @@ class Once:
         for effect in step.effects:
             match effect:
                 case PersistRecord(log, number, data):
-                    self._note_record(log, number, decoded(data)[0])
+                    self._note_record(log, number, data)
                 case Report(NeighbourUp() | NeighbourDown() as changed):
                     self._changed_s[step.station.name, changed.peer] = step.at_s
                 case Register(pair):
                     yield from self._registers(step, pair)
 
-    def _note_record(self, log: LogId, number: int, record: Record) -> None:
+    def _note_record(self, log: LogId, number: int, data: bytes) -> None:
+        record = decoded(data)[0]
         if isinstance(record, ClosureRecord | RejectionRecord):
-            self._records[CandidatePair.of(record.query, record.match)].add((log, number))
+            self._records[CandidatePair.of(record.query, record.match)].add((log, number, data))
 
     def _registers(self, step: Step, pair: CandidatePair) -> Iterator[str]:
         station, logs = step.station, core(step.station).gossip.logs
         name = f"{station.name} registers {pair.low} {pair.high}"
-        if any(log in logs and number < len(logs[log]) for log, number in self._records[pair]):
+        if any(
+            log in logs and logs[log].encoded[number : number + 1] == [data]
+            for log, number, data in self._records[pair]
+        ):
             yield f"{name}, of which it holds a record"
         earlier = self._begun[pair]
         self.pairs += not earlier
@@ -174,14 +226,19 @@ class Published:
     _published: dict[LogId, int] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
-        """A robot whose own log is shorter than what it once sent."""
+        """A robot whose own log is shorter than what it once sent; one whose disk went back must first be told.
+
+        What a robot on a slow disk wants to send may never leave it, so that does not count.
+        """
         log = step.station.log
-        for effect in step.effects:
+        for effect in step.effects if step.station.disk.slow_s == 0.0 else ():
             match effect:
                 case Broadcast(Records(batches)) | Unicast(_, Records(batches)):
                     ends = [batch.first + len(batch.records) for batch in batches if batch.log == log]
                     self._published[log] = max([*ends, self._published.get(log, 0)])
         held = len(core(step.station).gossip.logs[log])
+        if step.station.disk.went_back:
+            self._published[log] = held
         if held < self._published.get(log, 0):
             yield f"{log} holds {held} of its {self._published[log]} published records"
 
@@ -191,11 +248,16 @@ class Bounded:
     """Every queue, table and cache stays within its stated maximum, and no robot spins."""
 
     _steps: int = 0
+    _second: tuple[int, int] = (0, 0)
     _ticks: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
         """Sizes beyond their maximum; more ticks in one second than any timer explains."""
         self._steps += 1
+        second, first = self._second
+        if second != int(step.at_s):
+            self._second = (int(step.at_s), self._steps)
+        assert self._steps - first < STEPS_PER_S_MAX, f"{STEPS_PER_S_MAX} steps in second {second}"
         if self._steps % SIZES_EVERY == 0:
             for name, (size, size_max) in core(step.station).sizes().items():
                 if size > size_max:

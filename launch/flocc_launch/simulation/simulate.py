@@ -21,6 +21,7 @@ from flocc_agent.runtime.measurement_file import rows_of
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.reporting import result_of
 from flocc_agent.stages import counts_of
+from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.maps.opening import MapUse, opened_for
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
@@ -104,9 +105,11 @@ def swarm_of(
     return swarm
 
 
-def playbacks_of(scenario: Scenario, recordings: Mapping[str, Path]) -> dict[str, Playback]:
-    """What each robot of a scenario sees."""
-    drawn = walks(scenario.tracks) if scenario.tracks else []
+def playbacks_of(
+    scenario: Scenario, recordings: Mapping[str, Path], drift: DriftSpec | None = None
+) -> dict[str, Playback]:
+    """What each robot of a scenario sees; walks drift as given, or as usual."""
+    drawn = walks(scenario.tracks, drift) if scenario.tracks else []
     walked = {f"r{k + 1}": walk for k, walk in enumerate(drawn)}
     measured = sense(scenario.sensors, {name: walk.truth for name, walk in walked.items()}) if scenario.sensors else {}
     playbacks = {}

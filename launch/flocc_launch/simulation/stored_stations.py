@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from flocc_agent.core.interfaces import Perception
-from flocc_agent.runtime.kept_for_maps import keep_camera, keep_front_end, keep_map
+from flocc_agent.runtime.kept_for_maps import keep_back_end, keep_camera, keep_front_end, keep_map
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_launch.scenarios.scenario import Scenario
@@ -33,6 +33,7 @@ def write_store(
             if keyframe.log.robot == log.robot:
                 store.put_latent(keyframe, latent)
         keep_front_end(store, scenario.perception.method, scenario.perception, perception)
+        keep_back_end(store, scenario.backend)
         if source is not None:
             recording = Recording.open(source)
             keep_camera(store, recording.camera, recording.T_body_camera)

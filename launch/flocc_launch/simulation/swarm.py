@@ -10,7 +10,7 @@ from flocc_agent.backend import build_iterator
 from flocc_agent.config import BackendMode
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
-from flocc_agent.core.reports import Fact
+from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.radio import Radio
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied, AgentStopped
@@ -54,9 +54,9 @@ class Equipment:
     map_fixed: bool = False
     lives: Mapping[str, int] = field(default_factory=dict)
 
-    def disk(self, latent_bytes_max: int) -> Disk:
+    def disk(self, own: LogId, latent_bytes_max: int) -> Disk:
         """A new disk, and the map beside it."""
-        return Disk(latent_bytes_max, opened=self.opened, map_fixed=self.map_fixed)
+        return Disk(own, latent_bytes_max, opened=self.opened, map_fixed=self.map_fixed)
 
 
 class Swarm:
@@ -68,6 +68,7 @@ class Swarm:
         stations: By name.
         told: What was reported, in the order in which it happened.
         observers: Told of every step of every station.
+        forked: Logs of which two versions were seen; everybody keeps the one that he heard first.
     """
 
     def __init__(self, scenario: Scenario, playbacks: Mapping[str, Playback], equipment: Equipment, seed: int) -> None:
@@ -83,6 +84,8 @@ class Swarm:
         self._seed = seed
         self._fetcher = LatentFetcher(self.agenda, self.network, self._running, scenario.bandwidth_bytes_s)
         self._reporters: dict[str, Reporter] = {}
+        self.forked: set[LogId] = set()
+        self._lives = dict(equipment.lives)
         self._near: dict[tuple[str, float | None], list[str]] = {}
         self._around = Surroundings(
             self._broadcast, self._unicast, self._fetcher.fetch, self._observe, lambda station: self.kill(station.name)
@@ -98,6 +101,9 @@ class Swarm:
     def start(self, name: str) -> None:
         """Switch a robot on."""
         station = self.stations[name]
+        if not station.disk.whole:
+            self._begin_log(station)
+        station.log = station.disk.own
         boot = int(np.random.default_rng([self._seed, BOOTS, *name.encode(), station.life]).integers(2**52))
         core = self.scenario.core.under(self.scenario.bandwidth_bytes_s)
         station.start(boot, core, self.scenario.backend.mode is BackendMode.DISTRIBUTED)
@@ -123,16 +129,57 @@ class Swarm:
         """Somebody switches on a second robot under a name that is taken, with a disk of its own."""
         twin = f"{name}-twin"
         self._add(twin, len(self.stations), self.stations[name].playback)
-        self.stations[twin].log = LogId(name, 1)
         self._named[name] += self._named.pop(twin)
+        self.stations[twin].log = LogId(name)
+        self._begin_log(self.stations[twin])
         self._near.clear()
 
     def lose_disk(self, name: str) -> None:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
         station = self.stations[name]
         assert not station.running
-        station.disk = self._equipment.disk(self.scenario.store.latent_bytes_max)
-        station.log = LogId(station.log.robot, station.log.incarnation + 1)
+        station.disk = self._equipment.disk(station.log, self.scenario.store.latent_bytes_max)
+        self._begin_log(station)
+
+    def copy_disk(self, name: str, until_s: float) -> None:
+        """Copy a robot's disk; at a later time the copy takes its place, and the robot starts with it."""
+        content = self.stations[name].disk.content()
+
+        def go_back() -> None:
+            self.kill(name)
+            self.stations[name].disk.restore(content)
+            self.stations[name].disk.went_back = True
+            self.start(name)
+
+        self.agenda.at(until_s, go_back)
+
+    def flip_bit(self, name: str, number: int) -> None:
+        """Damage a robot's disk while it is switched off for a moment."""
+        self.kill(name)
+        self.stations[name].disk.flip(number)
+        self.start(name)
+
+    def cut_power(self, name: str) -> None:
+        """The power goes for a moment: the correction that was applied last is not safe on the disk."""
+        disk = self.stations[name].disk
+        self.kill(name)
+        disk.correction, disk.frame_changed, disk.went_back = None, False, True
+        self.start(name)
+
+    def _begin_log(self, station: Station) -> None:
+        """Another log, that no earlier life of this name had."""
+        name = station.log.robot
+        self._lives[name] = self._lives.get(name, 0) + 1
+        station.disk.begin(LogId(name, self._lives[name]))
+        station.log = station.disk.own
+
+    def _end_log(self, station: Station) -> None:
+        """As `flocc agent`: stop in order, put the log aside, whose true records others have, and begin another one."""
+        if station.running:
+            self.leave(station.name)
+            station.disk.records.pop(station.log, None)
+            station.disk.whole = False
+            self.start(station.name)
 
     def report(self, name: str, fact: Fact) -> None:
         """Add a fact that is not the core's."""
@@ -145,9 +192,10 @@ class Swarm:
     def _add(self, name: str, number: int, playback: Playback) -> None:
         robot = self.scenario.robot(name)
         rng = np.random.default_rng([self._seed, WORK, number])
+        log = LogId(name, self._equipment.lives.get(name, 0))
         self.stations[name] = Station(
             name,
-            LogId(name, self._equipment.lives.get(name, 0)),
+            log,
             robot.compute_class,
             playback,
             VirtualWorkers(
@@ -156,8 +204,9 @@ class Swarm:
                 build_iterator(self.scenario.backend),
                 self._equipment.times,
                 rng,
+                playback.hidden,
             ),
-            self._equipment.disk(self.scenario.store.latent_bytes_max),
+            self._equipment.disk(log, self.scenario.store.latent_bytes_max),
             Clock(robot.clock_offset_s, robot.clock_drift_ratio),
             self.agenda,
             self._around,
@@ -221,6 +270,10 @@ class Swarm:
     def _observe(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, Report):
+                if isinstance(effect.fact, LogForked):
+                    self.forked.add(effect.fact.log)
+                    if effect.fact.log == station.log:
+                        self.agenda.after(0.0, lambda: self._end_log(station))
                 self.told.append(self._reporters[station.name].reported(effect.fact, self.agenda.now_s))
         for observer in self.observers:
             observer(station, event, effects)

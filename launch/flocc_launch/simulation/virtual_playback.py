@@ -49,12 +49,14 @@ class Playback:
         T_body_camera: (4, 4) where the camera sits.
         truth: `T_world_body`, None where it is not known.
         first_stamp_s: Stamp of the recording's first frame, which is played at the robot's start.
+        hidden: (H, W) pixels that move with the camera.
     """
 
     captures: tuple[Capture, ...]
     T_body_camera: Float
     truth: Trajectory | None
     first_stamp_s: float = 0.0
+    hidden: NDArray[np.bool_] | None = None
 
     def position_m(self, since_start_s: float) -> Float | None:
         """Where the robot truly is, (3,); before its first and after its last frame it stands."""
@@ -97,7 +99,7 @@ def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
         )
         for k in chosen
     )
-    return Playback(captures, recording.T_body_camera, recording.truth, frames[0].stamp_s)
+    return Playback(captures, recording.T_body_camera, recording.truth, frames[0].stamp_s, hidden=recording.hidden)
 
 
 def select(

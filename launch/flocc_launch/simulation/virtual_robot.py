@@ -79,6 +79,7 @@ class Station:
 
     Attributes:
         name: Unique in the simulation; the robot's name, but for a second robot that took the same name.
+        compute_class: 0 (small) to 9.
         core: The robot's behaviour, None while it is switched off.
         life: Counts starts.
         solution: The last solution it made as a leader.
@@ -107,13 +108,14 @@ class Station:
         self.life = 0
         self.solution: GraphSolution | None = None
         self.dies_after: int | None = None
-        self._compute_class = compute_class
+        self.compute_class = compute_class
         self._agenda = agenda
         self._around = around
         self._images: dict[int, Capture] = {}
         self._given = GivenKeyframes()
         self._tick_s = float("inf")
         self._due_s = float("inf")
+        self._blocked_until_s = float("-inf")
 
     @property
     def running(self) -> bool:
@@ -131,7 +133,7 @@ class Station:
         self.workers.restart()
         restored = self.disk.restored()
         self.core = Robot(
-            self.log, self._compute_class, boot, parameters, self.now_s(), restored, distributed=distributed
+            self.log, self.compute_class, boot, parameters, self.now_s(), restored, distributed=distributed
         )
         self._given = GivenKeyframes.of(self.core)
         self._tick_s = self._due_s = float("inf")
@@ -141,13 +143,15 @@ class Station:
         """The core at the end; of a dead robot as its disk would bring it back, None where the disk holds nothing."""
         if self.core is not None or not self.disk.records.get(self.log):
             return self.core
-        return Robot(self.log, self._compute_class, 0, parameters, self.now_s(), self.disk.restored())
+        return Robot(self.log, self.compute_class, 0, parameters, self.now_s(), self.disk.restored())
 
     def kill(self) -> None:
         """Lose everything but the disk."""
         self.core = None
         self.dies_after = None
         self.life += 1
+        self.disk.lose_unwritten()
+        self._blocked_until_s = float("-inf")
         self._images.clear()
 
     def capture(self, number: int) -> None:
@@ -180,8 +184,11 @@ class Station:
         return True
 
     def handle(self, event: Event) -> None:
-        """Let the core know, and carry out what it wants."""
+        """Let the core know, and carry out what it wants; while it waits for its disk, later."""
         assert self.core is not None
+        if self._agenda.now_s < self._blocked_until_s:
+            self.later(self._blocked_until_s, lambda: event)
+            return
         if isinstance(event, GraphOptimised):
             self.solution = event.solution
         self._carry_out(event, self.core.handle(event, self.now_s()))
@@ -200,6 +207,9 @@ class Station:
         """Wake up; deadlines that moved on since are waited for again."""
         self._tick_s = self._due_s = float("inf")
         if self.core is None:
+            return
+        if self._agenda.now_s < self._blocked_until_s:
+            self._agenda.at(self._blocked_until_s, self._tick)
             return
         now_s = self.now_s()
         if self.core.deadline() <= now_s:
@@ -235,26 +245,52 @@ class Station:
         dies = self.dies_after is not None and len(effects) > self.dies_after
         done = effects[: self.dies_after] if dies else effects
         self._around.observe(self, event, done)
-        for effect in done:
+        written = self._written(done)
+        for effect in done[:written]:
             self._do(effect)
+        if written < len(done):
+            self._wait_for_disk(done[written:])
         if dies:
             self._around.died(self)
         else:
             self._arm()
 
+    def _written(self, effects: list[Effect]) -> int:
+        """How many of the effects are done at once: on a slow disk those up to the first own thing that is written."""
+        if self.disk.slow_s == 0.0:
+            return len(effects)
+        own = (k for k, effect in enumerate(effects) if self._is_own_write(effect))
+        return next((k + 1 for k in own), len(effects))
+
+    def _is_own_write(self, effect: Effect) -> bool:
+        if isinstance(effect, PersistRecord):
+            return effect.log == self.log
+        return isinstance(effect, PersistTerm | PersistCorrection)
+
+    def _wait_for_disk(self, effects: list[Effect]) -> None:
+        """What follows a write happens when it is done, and so does whatever else comes meanwhile."""
+        life, self._blocked_until_s = self.life, self._agenda.now_s + self.disk.slow_s
+
+        def go_on() -> None:
+            if self.life == life:
+                for effect in effects:
+                    self._do(effect)
+
+        self._agenda.at(self._blocked_until_s, go_on)
+
     def _do(self, effect: Effect) -> None:
         now_s = self._agenda.now_s
         match effect:
             case PersistRecord(log, number, data):
-                self.disk.put_record(log, number, data)
+                self.disk.put_record(log, number, data, now_s)
             case Broadcast(message):
                 self._around.broadcast(self, message)
             case Unicast(to, message):
                 self._around.unicast(self, to, message)
-            case Encode(keyframe, image):
+            case Encode(keyframe, image, T_odom_camera):
                 capture = self._images.pop(image)
                 done_s = self.workers.encoded_at_s(now_s)
-                self.later(done_s, lambda: self.workers.encode(keyframe, capture, self.disk))
+                self.later(done_s, lambda: self.workers.encode(keyframe, capture, T_odom_camera, self.disk))
             case FetchLatent():
                 self._around.fetch(self, effect)
             case Register():

@@ -25,29 +25,38 @@ from flocc_agent.core.events import (
     LatentMissing,
     PairRegistered,
 )
-from flocc_agent.core.interfaces import OdometryPair
+from flocc_agent.core.interfaces import KeyframeLook, OdometryPair
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.stages import StageTimes
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture
-from flocc_protocol.arrays import Array
+from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
 
 logger = logging.getLogger(__name__)
 
 Float = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
 Iterator = Callable[[BlockProblem], BlockStep | OptimisationFailed]
+
+
+class CaptureWatch(Protocol):
+    """Looks at one robot's captures, in the order in which they were taken."""
+
+    def look(self, capture: Capture, T_odom_camera: Float) -> KeyframeLook:
+        """Describe and encode a keyframe, and tell what is odd about the camera."""
+        ...
 
 
 class Eyes(Protocol):
     """Perception as the simulation needs it."""
 
-    def encode(self, capture: Capture) -> tuple[Array, bytes]:
-        """Descriptor and latent of a keyframe."""
+    def watch(self, hidden: Mask | None) -> CaptureWatch:
+        """What looks at one robot's captures; `hidden` are (H, W) pixels that move with its camera."""
         ...
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
@@ -74,11 +83,19 @@ class VirtualWorkers:
     """
 
     def __init__(
-        self, eyes: Eyes, optimiser: Optimiser, iterator: Iterator, times: WorkTimes, rng: np.random.Generator
+        self,
+        eyes: Eyes,
+        optimiser: Optimiser,
+        iterator: Iterator,
+        times: WorkTimes,
+        rng: np.random.Generator,
+        hidden: Mask | None = None,
     ) -> None:
         self.slowness = 1.0
         self.stages = StageTimes()
         self._eyes = eyes
+        self._hidden = hidden
+        self._watch = eyes.watch(hidden)
         self._optimiser = optimiser
         self._iterator = iterator
         self._times = times
@@ -104,17 +121,20 @@ class VirtualWorkers:
         return now_s + self._lasts("iterate", self._times.iterate_s)
 
     def restart(self) -> None:
-        """Forget the queue."""
+        """Forget the queue, and what the camera was like."""
         self._encoder_free_s = 0.0
+        self._watch = self._eyes.watch(self._hidden)
 
-    def encode(self, keyframe: KeyframeId, capture: Capture, disk: Disk) -> Event:
+    def encode(self, keyframe: KeyframeId, capture: Capture, T_odom_camera: Pose7, disk: Disk) -> Event:
         """Describe and encode an image, and store the latent."""
         try:
-            descriptor, latent = self._eyes.encode(capture)
+            looked = self._watch.look(capture, pose_from_tq(np.array(T_odom_camera)))
         except FloccError as error:
             return KeyframeEncodingFailed(keyframe, str(error))
-        disk.put_latent(keyframe, latent)
-        return KeyframeEncoded(keyframe, descriptor)
+        if looked.descriptor is None or looked.latent is None:
+            return KeyframeEncodingFailed(keyframe, looked.fault, looked.doubts)
+        disk.put_latent(keyframe, looked.latent)
+        return KeyframeEncoded(keyframe, looked.descriptor, looked.doubts)
 
     def register(self, job: Register, disk: Disk) -> Event:
         """Register a pair, or say which latent is missing."""

@@ -53,6 +53,20 @@ class Beginning:
     new_journey: bool = False
 
 
+class ToldOfMap:
+    """Logs whether a robot has found itself in the map that it opened, whenever that changes."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._said: str | None = None
+
+    def tell(self, status: AgentStatus) -> None:
+        """Look at a state."""
+        if status.in_map not in (None, self._said):
+            self._said = status.in_map
+            logger.info("%s: %s", self._robot, status.in_map)
+
+
 class Lines:
     """The agent's own `events.jsonl`, written line by line so that a kill loses nothing that was reported.
 

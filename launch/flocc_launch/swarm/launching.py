@@ -72,6 +72,7 @@ def launch(
     progress: Callable[[int, int], None] | None = None,
     secure: bool = False,
     metrics: str | None = None,
+    paths: dict[str, Path] | None = None,
     use: MapUse | None = None,
 ) -> RunReport:
     """Run a scenario and write its run folder.
@@ -82,6 +83,7 @@ def launch(
         on_watch: Called four times a second.
         progress: Called while data is generated, with (done, all).
         secure: Make keys for this run, and let agents trust those who have them only.
+        paths: Recordings by robot, where they were made already.
         metrics: [HOST:]PORT of the first robot's metrics, by name; each further robot has the next port.
         use: The map in which the robots are to find themselves; None: there is none.
 
@@ -93,7 +95,7 @@ def launch(
     names = scenario.names()
     lives = {} if use is None else use.checked(scenario)
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
-    paths = recordings(scenario, progress)
+    paths = recordings(scenario, progress) if paths is None else paths
     check_measurable(scenario, paths)
     folder = fresh_folder(out)
     given = on_watch or (lambda _: None)

@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from flocc_agent.backend import conjugate_gradients
+from flocc_agent.backend import conjugate_gradients, linear
 from flocc_agent.backend.conjugate_gradients import SEGMENT_POSES, segments_of
-from flocc_agent.backend.edges import Edges, State, jacobians, residuals, state_of
+from flocc_agent.backend.edges import Edges, State, residuals, state_of
 from flocc_agent.backend.initial import initial_poses
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
@@ -34,15 +34,14 @@ def problem_of(graph: GeneratedGraph, formulation: Formulation) -> tuple[Problem
 
 def steps(problem: Problem, state: State, weights: np.ndarray, hold: bool, damping: float) -> list[np.ndarray]:
     at = residuals(problem.edges, state, hold)
-    jac = jacobians(problem.edges, at)
     solvers = (LinearSolver(0, 20.0, iterative_loops_min=least) for least in (1, 10**9))
-    return [solver.step(problem.edges, state, at, jac, weights, damping) for solver in solvers]
+    return [solver.step(problem.edges, state, at, weights, damping) for solver in solvers]
 
 
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Iterate until nothing is left."""
-    monkeypatch.setattr(conjugate_gradients, "TOLERANCE_RATIO", 1e-9)
+    monkeypatch.setattr(linear, "TOLERANCE_RATIO", 1e-9)
     monkeypatch.setattr(conjugate_gradients, "ITERATIONS_LEAST", 400)
 
 
@@ -107,3 +106,53 @@ def _edges(i: np.ndarray, j: np.ndarray) -> Edges:
     n = len(i)
     L = np.zeros((n, 6, 6))
     return Edges(i, j, np.zeros((n, 4)), np.zeros((n, 6)), L, L, np.zeros(n), np.full(n, -1))
+
+
+@pytest.mark.parametrize("formulation", [Formulation.INDEPENDENT, Formulation.SMOOTHED])
+def test_covariances_of_large_graphs_are_those_of_elimination(
+    formulation: Formulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linear, "MARGINALS_ELIMINATED_POSES_MAX", 0)
+    problem, state = problem_of(generated(), formulation)
+    at, weights = residuals(problem.edges, state, hold=False), np.ones(len(problem.edges))
+    poses = [0, 119, problem.poses - 1]
+    solvers = [LinearSolver(0, 20.0, iterative_loops_min=least) for least in (1, 10**9)]
+    iterated, eliminated = (s.marginals(problem.edges, state, at, weights, poses) for s in solvers)
+    for ours, theirs in zip(iterated, eliminated, strict=True):
+        sigmas = np.sqrt(np.diag(theirs))
+        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-3 * np.outer(sigmas, sigmas).max())
+        np.testing.assert_allclose(np.sqrt(np.diag(ours)), sigmas, rtol=1e-3)
+    assert not np.array_equal(iterated[1], eliminated[1]), "both were eliminated"
+
+
+def covariances(solution: GraphSolution) -> list[np.ndarray]:
+    (component,) = solution.components
+    found = [component.covariance_map_odom[log] for log in component.logs]
+    return [S for S in found if S is not None]
+
+
+def test_covariances_that_the_solver_leaves_over_are_those_of_the_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, config = generated().graph, BackendConfig(weight_by_probability=False)
+    left_over = optimise(graph, config)
+    monkeypatch.setattr(LinearSolver, "leaves_covariances", property(lambda _: False))
+    monkeypatch.setattr(linear, "BESIDE_M", -1.0)
+    anew = optimise(graph, config)
+    assert isinstance(left_over, GraphSolution)
+    assert isinstance(anew, GraphSolution)
+    for ours, theirs in zip(covariances(left_over), covariances(anew), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0.02, atol=0.02 * np.abs(theirs).max())
+
+
+def test_a_large_graph_s_covariances_stand_for_five_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    large = partial(LinearSolver, iterative_loops_min=1)
+    monkeypatch.setattr("flocc_agent.backend.optimiser.LinearSolver", large)
+    graph, config = generated().graph, BackendConfig(weight_by_probability=False)
+    earlier: GraphSolution | None = None
+    ages = []
+    for _ in range(7):
+        solution = optimise(graph, config, earlier)
+        assert isinstance(solution, GraphSolution)
+        ages.append(solution.components[0].covariance_rounds)
+        assert len(covariances(solution)) == 3
+        earlier = solution
+    assert ages == [0, 1, 2, 3, 4, 0, 1]

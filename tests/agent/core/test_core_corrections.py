@@ -14,6 +14,7 @@ from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.gossip import LIVES_MAX, Sealer
 from flocc_agent.core.knot_requests import GRACE_S
 from flocc_agent.core.parameters import CoreParameters, GossipParameters
+from flocc_agent.core.peer_budgets import MUTED_FIRST_S
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused
@@ -226,7 +227,7 @@ def test_a_forged_correction_raises_no_counter() -> None:
     robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((forged,)))), 0.1)
     assert robot.election.counter_max == 0
     genuine = replace(forged, signature=Seals("r2").sign_correction(b""))
-    effects = robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((genuine,)))), 0.2)
+    effects = robot.handle(MessageReceived(Envelope(R3, CorrectionBatch((genuine,)))), 0.1 + MUTED_FIRST_S)
     assert robot.election.counter_max == 900
     assert delivered(effects) == [(900, 1, False)]
 

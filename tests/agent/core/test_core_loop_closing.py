@@ -148,6 +148,18 @@ def test_a_transferred_pair_is_taken_over_when_the_stronger_robot_is_gone() -> N
     assert [type(e) for e in machine.tick(machine.deadline())] == [Register]
 
 
+def test_a_pair_that_is_taken_over_goes_to_another_stronger_robot() -> None:
+    machine = closing()
+    pair = pair_of(R1)
+    hold_all(machine, pair)
+    machine.on_peer("r8", Peer(9))
+    found(machine, pair)
+    machine.tick(0.0)
+    machine.on_lost("r8", 1.0)
+    machine.on_peer("r9", Peer(9))
+    assert offers(machine.tick(1.0 + TAKEOVER_S)) == [("r9", True)]
+
+
 def test_a_registrar_that_comes_back_in_time_keeps_its_pair() -> None:
     machine, pair = closing(), pair_of(R2)
     machine.on_peer("r2", Peer(0))
@@ -410,6 +422,15 @@ def test_an_own_latent_that_the_store_evicted_rejects_its_pair() -> None:
     meet(robots, "r1", "r2")
     robots.run(30.0)
     assert all(core.closing.open_pairs() == [] for core in robots.cores.values())
+
+
+def test_an_own_latent_that_the_disk_did_not_bring_back_rejects_its_pairs() -> None:
+    machine = closing()
+    pair = pair_of(R1)
+    machine.on_held(pair.high)
+    found(machine, pair)
+    assert machine.own_lost() == [KeyframeId(R1, pair.low.index - 1), pair.low]
+    assert machine.on_latent_lost(pair.low, 0.0) == [pair]
 
 
 def test_an_evicted_latent_of_another_robot_is_fetched_again() -> None:

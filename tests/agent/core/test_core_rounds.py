@@ -9,7 +9,7 @@ from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.parameters import RoundParameters
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.reports import RoundTimedOut
-from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PERIOD_PER_KEYFRAME_S, TIMEOUT_S, Rounds
+from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S, PERIOD_PER_KEYFRAME_S, TIMEOUT_S, Rounds
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.records import ClosureRecord, KeyframeRecord
 
@@ -84,9 +84,18 @@ def test_many_new_keyframes_call_for_a_round() -> None:
     rounds.tick(0.0)
     rounds.on_solution(TERM, 1, SOLUTION, 0.0)
     add_keyframes(assembly, R1, 1, KEYFRAMES_PER_ROUND)
-    assert rounds.tick(10.0) == []
+    assert rounds.tick(PARAMETERS.period_s) == []
     add_keyframes(assembly, R1, KEYFRAMES_PER_ROUND, KEYFRAMES_PER_ROUND + 1)
-    assert started(rounds.tick(10.0)) == [2]
+    assert started(rounds.tick(PARAMETERS.period_s)) == [2]
+
+
+def test_the_last_keyframes_of_a_trajectory_call_for_a_round_after_a_while() -> None:
+    rounds, assembly = leading()
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, SOLUTION, 0.0)
+    add_keyframes(assembly, R1, 1, 2)
+    assert rounds.deadline() == PATIENCE_S
+    assert started(rounds.tick(PATIENCE_S)) == [2]
 
 
 def test_a_solution_of_another_term_or_of_an_earlier_round_counts_for_nothing() -> None:

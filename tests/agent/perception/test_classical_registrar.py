@@ -181,7 +181,6 @@ def test_odometry_pairs_are_kept_by_key_up_to_a_limit(monkeypatch: pytest.Monkey
     [
         b"",
         b"\x80\x04pickle",
-        pack("mast3r/1", {}, {}),
         pack(MODEL, {"focal_px": 500.0}, {}),
         pack(MODEL, {"focal_px": 0}, {"points": np.zeros((9, 2), "f4"), "descriptors": np.zeros((9, 128), "u1")}),
         pack(MODEL, {"focal_px": 9.0}, {"points": np.zeros((8, 2), "f4"), "descriptors": np.zeros((9, 128), "u1")}),

@@ -105,7 +105,7 @@ def test_a_latent_of_the_other_model_is_refused() -> None:
     result = registrar.register(latent, latent, None)
 
     assert isinstance(result, RegistrationFailed)
-    assert result.failure is RegistrationFailure.BAD_LATENT
+    assert result.failure is RegistrationFailure.OTHER_FRONT_END
     assert MODELS[0] in result.detail
 
 

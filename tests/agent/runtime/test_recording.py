@@ -97,6 +97,25 @@ def test_a_long_gap_is_not_bridged() -> None:
     assert sparse.at(-1.0) is None
 
 
+def test_a_mask_says_what_moves_with_the_camera(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "r")
+    assert Recording.open(path).hidden is None
+    camera = Recording.open(path).camera
+    mask = np.full((camera.height, camera.width), 255, np.uint8)
+    mask[:2] = 0
+    cv2.imwrite(str(path / "mask.png"), mask)
+    hidden = Recording.open(path).hidden
+    assert hidden is not None
+    assert hidden[:2].all()
+    assert not hidden[2:].any()
+    cv2.imwrite(str(path / "mask.png"), mask[:-1])
+    with pytest.raises(RecordingError, match=r"mask\.png.*as large as the images"):
+        Recording.open(path)
+    cv2.imwrite(str(path / "mask.png"), 0 * mask)
+    with pytest.raises(RecordingError, match=r"mask\.png: is black all over"):
+        Recording.open(path)
+
+
 def test_ground_truth_is_optional_and_read(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "r")
     write_tum(path / "groundtruth.tum", motion())

@@ -53,6 +53,17 @@ def test_what_was_never_put_is_none(store: Store) -> None:
     assert (store.correction("r1"), store.term_counter(), store.fact("anchor")) == (None, 0, None)
 
 
+def test_of_a_log_that_others_continued_nothing_stands_in_the_way_of_what_they_bring(tmp_path: Path) -> None:
+    store = Store.open(tmp_path, "r1", CONFIG)
+    store.put_record(OWN, 0, b"mine")
+    store.end_log()
+    store.put_record(OWN, 1, b"mine, too late")
+    store = reopened(store, tmp_path)
+    assert (store.identity.log, store.logs()) == (LogId("r1", 99), [])
+    store.put_records([StoredRecord(OWN, 0, b"theirs"), StoredRecord(OWN, 1, b"theirs, too")])
+    assert [record.data for record in store.records(OWN)] == [b"theirs", b"theirs, too"]
+
+
 def test_a_record_that_is_there_stays_as_it_is(store: Store) -> None:
     store.put_record(OTHER, 0, b"first")
     store.put_record(OTHER, 0, b"second")

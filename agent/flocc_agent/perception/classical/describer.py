@@ -26,4 +26,4 @@ class ClassicalDescriber:
     def describe(self, image: Image) -> NDArray[np.float32]:
         """Compute a (D,) float32 descriptor of unit length; all images without texture share one."""
         grey = cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY)
-        return self._codebook.describe(dense_patches(np.asarray(grey, np.uint8)))
+        return self._codebook.describe(dense_patches(np.asarray(grey, np.uint8), image.hidden))

@@ -3,7 +3,9 @@
 OpenCV's SIFT with RootSIFT normalisation (Arandjelovic and Zisserman 2012), quantised to one byte per component.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,18 +45,32 @@ class FeatureExtractor:
         self._features_max = config.features_max
         self._pixels_max = config.pixels_max
         self._sift = cv2.SIFT.create(nfeatures=config.features_max, contrastThreshold=CONTRAST_THRESHOLD)
+        self._sift_all = cv2.SIFT.create(contrastThreshold=CONTRAST_THRESHOLD)
 
     def extract(self, image: Image) -> Features:
         """Find and describe the features of an image; an image of one colour has none."""
         grey = np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
         reduced = reduced_to(grey, self._pixels_max)
-        keypoints, sift = self._sift.detectAndCompute(reduced, None)
+        keypoints, sift = self._found(reduced, image.hidden)
         count = min(len(keypoints), self._features_max)
         pixels = np.array([keypoint.pt for keypoint in keypoints[:count]], np.float64).reshape(-1, 2)
         height, width = reduced.shape
         points, focal_px = rays_of(pixels, (width, height), image.camera)
         found = np.zeros((0, DESCRIPTOR_LENGTH)) if sift is None else sift[:count]
         return Features(points.astype(np.float32), root_sift(np.asarray(found, np.float32)), focal_px)
+
+    def _found(
+        self, picture: NDArray[np.uint8], hidden: NDArray[np.bool_] | None
+    ) -> tuple[Sequence[cv2.KeyPoint], Any]:
+        """Keypoints and their descriptors; what is hidden has none and takes none of the others' places."""
+        if hidden is None:
+            keypoints, sift = self._sift.detectAndCompute(picture, None)
+            return keypoints, sift
+        height, width = picture.shape
+        shown = cv2.resize((~hidden).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        strongest = sorted(self._sift_all.detect(picture, shown), key=lambda point: -point.response)
+        keypoints, sift = self._sift_all.compute(picture, strongest[: self._features_max])
+        return keypoints, sift
 
 
 def root_sift(sift: NDArray[np.float32]) -> NDArray[np.uint8]:

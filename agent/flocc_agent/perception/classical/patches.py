@@ -21,15 +21,20 @@ CONTRAST_MIN = 60.0
 ORIENTATIONS = 8
 
 
-def dense_patches(grey: NDArray[np.uint8]) -> Float32:
-    """Describe an image (H, W) uint8 by its patches (N, 128), each of unit length; none for a flat image."""
-    patches = np.concatenate([_patches_at(grey, side_px) for side_px in SIDES_PX])
+def dense_patches(grey: NDArray[np.uint8], hidden: NDArray[np.bool_] | None = None) -> Float32:
+    """Describe an image by its patches (N, 128), each of unit length; none for a flat image.
+
+    Args:
+        grey: (H, W).
+        hidden: (H, W) pixels that no patch may touch.
+    """
+    patches = np.concatenate([_patches_at(grey, hidden, side_px) for side_px in SIDES_PX])
     total = patches.sum(axis=1, keepdims=True)
     textured = total[:, 0] > CONTRAST_MIN
     return np.asarray(np.sqrt(patches[textured] / total[textured]))
 
 
-def _patches_at(grey: NDArray[np.uint8], side_px: int) -> Float32:
+def _patches_at(grey: NDArray[np.uint8], hidden: NDArray[np.bool_] | None, side_px: int) -> Float32:
     """Cells of gradient orientations around the points of a grid, of the image brought to a size."""
     height, width = (max(round(size * side_px / max(grey.shape)), 1) for size in grey.shape)
     reduced = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
@@ -39,7 +44,14 @@ def _patches_at(grey: NDArray[np.uint8], side_px: int) -> Float32:
     offsets = ((np.arange(4) - 1.5) * CELL_PX).astype(np.intp)
     y = rows[:, None, None, None] + offsets[None, None, :, None]
     x = columns[None, :, None, None] + offsets[None, None, None, :]
-    return np.asarray(maps[y, x].reshape(-1, PATCH_LENGTH))
+    patches = np.asarray(maps[y, x].reshape(-1, PATCH_LENGTH))
+    return patches if hidden is None else patches[_shown(hidden, (width, height))[np.ix_(rows, columns)].ravel()]
+
+
+def _shown(hidden: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where (H, W) a patch around a pixel touches nothing hidden."""
+    reduced = cv2.resize(hidden.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.dilate(reduced, np.ones((4 * CELL_PX, 4 * CELL_PX), np.uint8)) == 0)
 
 
 def _orientation_maps(grey: Float32) -> Float32:

@@ -4,6 +4,8 @@ VLAD over the learned features recognises fewer places than the classical descri
 pairs of views (docs/learned.md has the figures); it would cost no less on the wire.
 """
 
+import cv2
+import numpy as np
 import torch
 
 from flocc_agent.config import ClassicalConfig, LearnedConfig
@@ -18,6 +20,11 @@ from flocc_agent.perception.multiview.registrar import PairRegistrar
 
 PIXELS_MAX = 307_200
 """Larger images are shrunk to 640x480: what the networks were made for, and what bounds their time and memory."""
+
+
+GREY = 127
+EDGE_PX = 9
+"""What is hidden is painted over; the edge of the paint has features that are none."""
 
 
 class LearnedEncoder:
@@ -35,7 +42,15 @@ class LearnedEncoder:
         """Compute the latent of an image."""
         picture = reduced_to(image.pixels, PIXELS_MAX, SIDE_MAX_PX)
         height, width = picture.shape[:2]
+        if image.hidden is not None:
+            hidden = cv2.resize(image.hidden.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+            picture = np.where(hidden[..., None], np.uint8(GREY), picture)
         pixels, descriptors = self._networks.detect(picture)
+        if image.hidden is not None:
+            near = cv2.dilate(hidden.astype(np.uint8), np.ones((EDGE_PX, EDGE_PX), np.uint8)) > 0
+            columns, rows = np.clip(np.rint(pixels).astype(int), 0, [width - 1, height - 1]).T
+            shown = ~near[rows, columns]
+            pixels, descriptors = pixels[shown], descriptors[shown]
         return write_features(self.model, pixels, descriptors, (width, height), image.camera)
 
 

@@ -18,7 +18,7 @@ from flocc_agent.core.registration import (
     RegistrationFailure,
     odometry_scale,
 )
-from flocc_agent.perception.latent import BadLatent
+from flocc_agent.perception.latent import BadLatent, failed_by
 from flocc_agent.perception.mast3r.cosplace import CosPlace
 from flocc_agent.perception.mast3r.device import (
     Compute,
@@ -180,7 +180,7 @@ class Mast3rRegistrar:
         try:
             return self._register(query, match, odometry)
         except BadLatent as error:
-            return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
+            return failed_by(error)
         except (NotEnoughMemory, MemoryError) as error:
             return RegistrationFailed(RegistrationFailure.OUT_OF_MEMORY, str(error))
 

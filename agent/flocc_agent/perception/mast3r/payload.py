@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.perception.latent import BadLatent, Latent, pack, unpack
+from flocc_agent.perception.latent import BadLatent, Latent, OtherFrontEnd, pack, unpack
 from flocc_agent.perception.mast3r.preprocess import Crop
 from flocc_agent.perception.mast3r.sizes import PATCH_PX
 
@@ -167,7 +167,9 @@ def read_payload(data: bytes, model: str, channels: int) -> Payload:
     if content.header.get("version") != VERSION:
         raise BadLatent(f"the latent has format version {str(content.header.get('version'))[:16]}, not {VERSION}")
     if content.header.get("model") != model:
-        raise BadLatent(f"the latent is of model {str(content.header.get('model'))[:64]!r}, this robot runs {model!r}")
+        raise OtherFrontEnd(
+            f"the latent is of model {str(content.header.get('model'))[:64]!r}, this robot runs {model!r}"
+        )
     geometry = PixelGeometry(_crop(content.header.get("crop")), _calibration(content.header.get("K")))
     jpeg = content.arrays.get("jpeg")
     if "latent" in content.arrays:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import OdometryPair, SeenMatches
 from flocc_agent.core.registration import (
@@ -22,14 +23,15 @@ from flocc_agent.core.registration import (
     RegistrationFailure,
     odometry_scale,
 )
-from flocc_agent.geometry import inverse
-from flocc_agent.perception.latent import BadLatent
+from flocc_agent.geometry import angle_rad, inverse
+from flocc_agent.perception.latent import BadLatent, failed_by
 from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, evidence_of, evidence_of_neighbour
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
 from flocc_agent.perception.multiview.three_view import three_view
 from flocc_agent.perception.multiview.two_view import TwoView, two_view
 from flocc_agent.perception.multiview.view_parameters import Geometry, LocalFeatures, Matched
+from flocc_agent.perception.watch.seen_motion import STAYS_MAX_PX, TURN_MIN_PX, Flow, flow_of
 from flocc_agent.stages import stage
 
 BASELINE_MIN_M = 1e-3
@@ -42,6 +44,7 @@ LENGTH_MIN = 0.1
 ODOMETRY_PAIRS_MAX = 256
 """Odometry-pair results kept in memory, some 30 kB each."""
 
+Float = NDArray[np.float64]
 F = TypeVar("F", bound=LocalFeatures)
 Result = Registration | RegistrationFailed
 
@@ -75,7 +78,7 @@ class PairRegistrar(Generic[F]):
         try:
             return self.examined(query, match, odometry)[0]
         except BadLatent as error:
-            return RegistrationFailed(RegistrationFailure.BAD_LATENT, str(error))
+            return failed_by(error)
 
     def examined(
         self, query: bytes, match: bytes, odometry: OdometryPair | None, always: bool = False
@@ -108,6 +111,19 @@ class PairRegistrar(Generic[F]):
             evidence = evidence_of_neighbour(evidence, neighbour_pair, result, odometry.T_neighbour_query)
         return (result if rule is None else rule.judged(result, evidence)), evidence
 
+    def flow(self, before: bytes, now: bytes, T_odom_before: Float, T_odom_now: Float) -> Flow | None:
+        """Verified matches of two of the robot's own latents, or None where they are few.
+
+        Args:
+            before: Latent of a keyframe.
+            now: Latent of the next one.
+            T_odom_before: (4, 4) camera pose by odometry, metres.
+            T_odom_now: The same of the next one.
+        """
+        features_before, features_now = self._read(before), self._read(now)
+        matched = self._match(features_now, features_before)
+        return flow_of(features_before, features_now, matched, T_odom_before, T_odom_now)
+
     def matches(self, query: bytes, match: bytes) -> SeenMatches:
         """Tell which points of two images look alike, and which of those agree with one relative pose.
 
@@ -124,7 +140,10 @@ class PairRegistrar(Generic[F]):
         return SeenMatches(points[0].astype(np.float64), points[1].astype(np.float64), agree)
 
     def _pair(self, first: F, second: F, prior: DirectionPrior | None = None) -> TwoView | int:
-        return two_view(first, second, self._match(first, second), self._geometry, prior)
+        matched = self._match(first, second)
+        if prior is None or angle_rad(prior.T_view_query[:3, :3]) * first.focal_px > TURN_MIN_PX:
+            matched = without_overlay(first, second, matched)
+        return two_view(first, second, matched, self._geometry, prior)
 
     def _posed(
         self, query: F, loop_pair: TwoView | int, odometry_pair: TwoView | int, odometry: OdometryPair | None
@@ -167,6 +186,13 @@ class PairRegistrar(Generic[F]):
             while len(self._odometry_pairs) > ODOMETRY_PAIRS_MAX:
                 self._odometry_pairs.popitem(last=False)
         return pair
+
+
+def without_overlay(first: LocalFeatures, second: LocalFeatures, matched: Matched) -> Matched:
+    """Matches that do not stay at their pixel: what does, in pictures from two places, is on both cameras' lenses."""
+    moved = first.points[matched[0]] - second.points[matched[1]]
+    moves = np.linalg.norm(moved, axis=1) * first.focal_px > STAYS_MAX_PX
+    return matched[0][moves], matched[1][moves]
 
 
 def registration(refined: Refined, k: int, counts: tuple[int, int], scale_initial: float | None) -> Registration:

@@ -6,7 +6,7 @@ once and counted; the agent goes on.
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,15 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.core.corrected import Correction
+from flocc_agent.core.corrected import CorrectedLog, Correction
 from flocc_agent.core.interfaces import Image
-from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.measurements import BadMeasurement, Measurement
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.facts import RouterConnected
 from flocc_agent.runtime.given_keyframes import BadKeyframe
 from flocc_agent.runtime.inbox import Inbox, Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.ros2.hearing import Hearing
+from flocc_agent.runtime.ros2.hearing import KINDS, Hearing
+from flocc_agent.runtime.ros2.markers import KnownClosure
+from flocc_agent.runtime.ros2.merged_maps import MergedMaps
 from flocc_agent.runtime.ros2.node import RosNode, open_node
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes
@@ -30,6 +32,7 @@ from flocc_agent.runtime.ros2.synchroniser import PosedImage
 from flocc_agent.runtime.ros2.telling import Teller
 from flocc_agent.runtime.ros2.topics import Offer
 from flocc_agent.runtime.ros2.types import BadMessage, MessageTypes
+from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.transport import TrafficCounter
 
 logger = logging.getLogger(__name__)
@@ -55,6 +58,9 @@ class Host:
         report: Takes facts for people.
         save_map: Writes what the robot knows, and says where; raises OSError.
         begin_anew: Ends this journey and begins another one, of odometry that has nothing to do with this one's.
+        closures: Accepted closures of all logs; called off the loop's thread.
+        state: Status of the robot, and what its last own solution warned of.
+        logs: All robots in this robot's map as of now; read off the loop's thread.
     """
 
     add_keyframe: Callable[[Image, Float, float], Awaitable[None]]
@@ -64,6 +70,9 @@ class Host:
     report: Callable[[Fact], None]
     save_map: Callable[[], str]
     begin_anew: Callable[[], None]
+    closures: Callable[[], Sequence[KnownClosure]]
+    state: Callable[[], tuple[AgentStatus, Sequence[str]]]
+    logs: Callable[[], Mapping[str, CorrectedLog]]
 
 
 class Ros2Adapter:
@@ -117,13 +126,15 @@ class Ros2Adapter:
             Ros2Error: ROS does not start.
         """
         loop = asyncio.get_running_loop()
-        inbox = Inbox(loop, self._arrived, self._counter, INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
+        limits = (INBOX_MESSAGES_MAX, INBOX_BYTES_MAX)
+        inbox = Inbox(loop, self._arrived, self._counter, *limits, urgent_first=KINDS)
         try:
             node, hearing, teller = await asyncio.to_thread(self._open, inbox, loop)
             for note in node.notes:
                 hearing.complain("node", note)
             async with asyncio.TaskGroup() as tasks:
-                works = (self._feed(hearing), self._watch(node, hearing), teller.draw(), teller.beat(node))
+                telling = (teller.draw(), teller.beat(), teller.diagnose(lambda: (*self._host.state(), hearing.heard)))
+                works = (self._feed(hearing), self._watch(node, hearing), *telling)
                 others = [tasks.create_task(work) for work in works]
                 await teller.listen(corrections)
                 for other in others:
@@ -139,7 +150,8 @@ class Ros2Adapter:
         node = self._node = open_node(self._config, name, self._ros_args, self._types)
         config = self._config = node.config
         hearing = self._hearing = self._heard(config)
-        teller = self._teller = Teller(config, self._types, node, self._bodies)
+        grids = MergedMaps(config, self._robot, self._types, node, self._problems)
+        teller = self._teller = Teller(config, self._types, node, self._bodies, self._host, grids)
         for kind, (topic, type_name, qos) in hearing.wanted().items():
             hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind))
         node.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))
@@ -184,7 +196,7 @@ class Ros2Adapter:
             while (posed := hearing.synchroniser.next()) is not None:
                 try:
                     await self._consider(hearing, posed)
-                except (BadMessage, BadKeyframe) as error:
+                except (BadMessage, BadKeyframe, BadMeasurement) as error:
                     hearing.refuse("image", str(error))
 
     async def _consider(self, hearing: Hearing, posed: PosedImage) -> None:
@@ -202,6 +214,9 @@ class Ros2Adapter:
         image = await asyncio.to_thread(eye.image, message)
         self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
+        step = hearing.covariances.of_keyframe(posed.stamp_ns, posed.T_odom_body)
+        if step is not None:
+            self._host.add_measurement(step.in_camera(T_body_camera), posed.stamp_ns * 1e-9)
         if self._config.fix_topic:
             self._fixes.add_keyframe(posed.stamp_ns * 1e-9)
         if self._teller is not None:

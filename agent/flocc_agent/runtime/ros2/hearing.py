@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import Ros2Config
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, step_fault
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
+from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
@@ -32,7 +33,10 @@ from flocc_agent.runtime.ros2.types import (
 
 Float = NDArray[np.float64]
 
-IMAGES_MAX = 8
+KINDS = ("tf_static", "camera_info", "odometry", "fix", "image")
+"""What is taken in first where much has come at once: images last, since they need all the others."""
+IMAGES_MAX = 64
+IMAGES_BYTES_MAX = 64 * 1024 * 1024
 """Images that wait for odometry or for the encoder; the oldest gives way."""
 ODOMETRY_GAP_MAX_S = 0.5
 """Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
@@ -71,7 +75,10 @@ class Hearing:
         self._fixes = fixes
         self._mount_camera = mount_camera
         self._static = StaticFrames()
-        self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S)
+        self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
+        self._compared_ns: int | None = None
+        self._were_apart = False
+        self.covariances = StepCovariances()
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
         self.eye: Eye | None = None
@@ -84,7 +91,7 @@ class Hearing:
         config = self._config
         wanted: dict[str, tuple[str, str, Qos]] = {}
         if config.odometry_topic:
-            wanted["odometry"] = (config.odometry_topic, ODOMETRY, Qos(50))
+            wanted["odometry"] = (config.odometry_topic, ODOMETRY, Qos(200))
         if config.image_topic:
             wanted["image"] = (config.image_topic, self.image_type(), SENSOR)
             wanted["camera_info"] = (config.camera_info_topic, CAMERA_INFO, SENSOR)
@@ -125,11 +132,13 @@ class Hearing:
 
     def _take_odometry(self, payload: bytes) -> bool:
         config = self._config
-        sample = odometry_of(self._types.read(payload, ODOMETRY), config.odom_frame, config.base_frame)
+        message = self._types.read(payload, ODOMETRY)
+        sample = odometry_of(message, config.odom_frame, config.base_frame)
         self._check_step(*sample)
         if not self.synchroniser.add_odometry(*sample):
             self.complain("odometry", BACK_IN_TIME)
             return False
+        self.covariances.add(sample[0], np.reshape(message.pose.covariance, (6, 6)))
         return True
 
     def _check_step(self, stamp_ns: int, T_odom_body: Float) -> None:
@@ -191,16 +200,18 @@ class Hearing:
             self.complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
 
     def compare_clocks(self, now_ns: int) -> None:
-        """Say when odometry is stamped by another clock than the node's: tf2 finds no transform then.
+        """Say when odometry that still comes is stamped by another clock than the node's: tf2 finds nothing then.
 
         Args:
             now_ns: The node's time; 0 while simulated time has not begun.
         """
         if now_ns == 0:
             self.complain("clock", "use_sim_time is set, but no /clock has come")
-        elif self.synchroniser.latest is not None:
+        elif self.synchroniser.latest is not None and self.synchroniser.latest[0] != self._compared_ns:
+            self._compared_ns = self.synchroniser.latest[0]
             behind_s = (now_ns - self.synchroniser.latest[0]) * 1e-9
-            if abs(behind_s) > CLOCKS_APART_MAX_S:
+            was_apart, self._were_apart = self._were_apart, abs(behind_s) > CLOCKS_APART_MAX_S
+            if was_apart and self._were_apart:  # twice: a clock that begins anew is apart for a moment
                 aside = "behind" if behind_s > 0 else "ahead of"
                 self.complain(
                     "odometry",

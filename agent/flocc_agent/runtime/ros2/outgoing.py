@@ -30,7 +30,7 @@ class Outgoing:
         t_x, t_y, t_z = (float(t) for t in T_map_odom[:3, 3])
         moved = new(
             "geometry_msgs/msg/TransformStamped",
-            header=self._header(stamp_ns),
+            header=self.header(stamp_ns),
             child_frame_id=self._odom_frame,
             transform=new(
                 "geometry_msgs/msg/Transform",
@@ -44,10 +44,10 @@ class Outgoing:
         """Path of (N, 4, 4) body poses, each with its own time."""
         new = self._types.new
         posed = [
-            new("geometry_msgs/msg/PoseStamped", header=self._header(each_ns), pose=self._pose(T))
+            new("geometry_msgs/msg/PoseStamped", header=self.header(each_ns), pose=self.placed(T))
             for each_ns, T in zip(stamps_ns, T_map_body, strict=True)
         ]
-        return new(PATH, header=self._header(stamp_ns), poses=posed)
+        return new(PATH, header=self.header(stamp_ns), poses=posed)
 
     def pose(self, T_map_odom: Float, covariance: Float | None, T_odom_body: Float, stamp_ns: int) -> Any:
         """PoseWithCovarianceStamped of the body in the map; an unknown covariance is all zeros, as in sensor_msgs.
@@ -60,20 +60,22 @@ class Outgoing:
         """
         known = np.zeros((6, 6)) if covariance is None else ros_covariance(T_map_odom, covariance, T_odom_body[:3, 3])
         posed = self._types.new(
-            "geometry_msgs/msg/PoseWithCovariance", pose=self._pose(T_map_odom @ T_odom_body), covariance=known.ravel()
+            "geometry_msgs/msg/PoseWithCovariance", pose=self.placed(T_map_odom @ T_odom_body), covariance=known.ravel()
         )
-        return self._types.new(POSE, header=self._header(stamp_ns), pose=posed)
+        return self._types.new(POSE, header=self.header(stamp_ns), pose=posed)
 
     def text(self, words: str) -> Any:
         """String."""
         return self._types.new(TEXT, data=words)
 
-    def _header(self, stamp_ns: int) -> Any:
+    def header(self, stamp_ns: int) -> Any:
+        """Header in the map frame."""
         sec, nanosec = divmod(stamp_ns, 10**9)
         stamp = self._types.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         return self._types.new("std_msgs/msg/Header", stamp=stamp, frame_id=self._map_frame)
 
-    def _pose(self, T: Float) -> Any:
+    def placed(self, T: Float) -> Any:
+        """Pose of a (4, 4) matrix."""
         new = self._types.new
         q_w, q_x, q_y, q_z = (float(q) for q in q_wxyz_from_R(T[:3, :3]))
         x, y, z = (float(t) for t in T[:3, 3])

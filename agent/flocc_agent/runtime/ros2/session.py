@@ -167,7 +167,8 @@ class Ros2Session:
         self._session.close()
 
     def _topic(self, topic: str, type_name: str, qos: Qos) -> Topic:
-        return Topic(full_name(self._node.namespace, topic), type_name, self._types.hash(type_name), qos)
+        inside = topic.replace("~", self._node.name, 1) if topic.startswith("~/") else topic
+        return Topic(full_name(self._node.namespace, inside), type_name, self._types.hash(type_name), qos)
 
     def _token(self, role: EntityRole, topic: Topic) -> str:
         self._numbers += 1

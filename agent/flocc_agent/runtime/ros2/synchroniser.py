@@ -28,13 +28,16 @@ class PosedImage:
 class Synchroniser:
     """Puts a stream of images and a stream of odometry together."""
 
-    def __init__(self, images_max: int, gap_max_s: float) -> None:
+    def __init__(self, images_max: int, gap_max_s: float, bytes_max: int = 2**62) -> None:
         """Prepare.
 
         Args:
             images_max: Images that wait; the oldest gives way.
             gap_max_s: Longer pauses of odometry are not bridged.
+            bytes_max: Of the images that wait; one may always.
         """
+        self._bytes_max = bytes_max
+        self._waiting_bytes = 0
         self.dropped = Counter[str]()
         self._images_max = images_max
         self._gap_max_s = gap_max_s
@@ -62,9 +65,10 @@ class Synchroniser:
             return False
         self._image_last_ns = stamp_ns
         self._images.append((stamp_ns, payload))
-        if len(self._images) > self._images_max:
+        self._waiting_bytes += len(payload)
+        while len(self._images) > self._images_max or (self._waiting_bytes > self._bytes_max and len(self._images) > 1):
             self.dropped["image without odometry" if self._starved() else "image not taken in time"] += 1
-            self._images.popleft()
+            self._take_oldest()
         return True
 
     def next(self) -> PosedImage | None:
@@ -73,12 +77,16 @@ class Synchroniser:
             stamp_ns, payload = self._images[0]
             if not self._odometry or self._odometry[-1][0] < stamp_ns:
                 return None
-            self._images.popleft()
+            self._take_oldest()
             T_odom_body = self._at(stamp_ns)
             if T_odom_body is not None:
                 return PosedImage(stamp_ns, payload, T_odom_body)
             self.dropped["image without odometry"] += 1
         return None
+
+    def _take_oldest(self) -> None:
+        _, payload = self._images.popleft()
+        self._waiting_bytes -= len(payload)
 
     def _starved(self) -> bool:
         """Whether images wait for odometry rather than for whoever takes them."""

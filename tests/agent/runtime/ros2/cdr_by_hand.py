@@ -97,9 +97,11 @@ class Stamped:
     covariance: tuple[float, ...] = ()
 
 
-def odometry(sample: Stamped) -> bytes:
+def odometry(sample: Stamped, variance: float = 0.0) -> bytes:
+    """`variance` is that of each of the six numbers of the pose."""
+    covariance = [variance * (k % 7 == 0) for k in range(36)]
     writer = Writer().header(sample.stamp, sample.frame).text(sample.child)
-    writer.put("d", *sample.position, *sample.quaternion, *[0.0] * 36)
+    writer.put("d", *sample.position, *sample.quaternion, *covariance)
     return writer.put("d", *[0.0] * 6, *[0.0] * 36).message()
 
 

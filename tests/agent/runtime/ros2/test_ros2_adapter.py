@@ -18,7 +18,7 @@ from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.corrected import CorrectedLog, Correction, RecordedOdometry
 from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.interfaces import Image
-from flocc_agent.core.measurements import GeodeticFix, Measurement
+from flocc_agent.core.measurements import GeodeticFix, Measurement, OdometryCovariance
 from flocc_agent.core.reports import Fact
 from flocc_agent.geometry import Float, pose, pose7, so3_exp, tq_from_pose
 from flocc_agent.runtime.facts import RosProblem, RouterConnected
@@ -26,6 +26,7 @@ from flocc_agent.runtime.inbox import Incoming
 from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
 from flocc_agent.runtime.ros2.types import BadMessage, Ros2Error
+from flocc_agent.runtime.status import AgentStatus
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import LogCorrection
 
@@ -107,6 +108,9 @@ class Agent:
             self.facts.append,
             lambda: "r1/result.json",
             lambda: self.resets.append(None),
+            lambda: [],
+            lambda: (AgentStatus(robot="r-1"), ()),
+            dict,
         )
 
     def problems(self) -> list[str]:
@@ -204,6 +208,27 @@ async def test_fixes_are_interpolated_to_the_stamps_of_keyframes() -> None:
     assert agent.problems() == []
 
 
+async def test_what_the_covariance_of_odometry_grew_by_becomes_that_of_the_steps() -> None:
+    agent = Agent()
+    config = Ros2Config(camera_mounting=MOUNTING)
+    adapter = Ros2Adapter(config, "r1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
+    hearing = adapter._hearing = adapter._heard(config)
+    K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
+    hearing.take("camera_info", cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P))
+    for t_ms in range(0, 400, 100):
+        sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        hearing.take("odometry", cdr_by_hand.odometry(sample, variance=1e-6 * t_ms))
+        hearing.take("image", cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "mono8", bytes(24), 6))
+        while (posed := hearing.synchroniser.next()) is not None:
+            await adapter._consider(hearing, posed)
+    assert len(agent.keyframes) == 4
+    assert [round(1000 * (stamp_s - EPOCH_S)) for _, stamp_s in agent.measured] == [100, 200, 300]
+    for measured, _ in agent.measured:
+        assert isinstance(measured, OdometryCovariance)
+        seen = OdometryCovariance(1e-4 * np.eye(6)).in_camera(T_BODY_CAMERA).covariance
+        np.testing.assert_allclose(measured.covariance, seen, atol=3e-5)
+
+
 async def test_a_correction_goes_out_as_transform_pose_path_and_frame() -> None:
     (port,) = free_ports(1)
     with ros(port, domain_id=9) as robot:
@@ -260,7 +285,7 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
     (port,) = free_ports(1)
     with ros(port) as robot:
         async with adapted(port):
-            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 11)
+            await until(lambda: len([token for token in robot.node.tokens if "flocc_r_1" in token]) == 13)
             ours = [token.split("/") for token in robot.node.tokens if "flocc_r_1" in token]
     assert {chunks[2] for chunks in ours} != {str(robot.node.session.zid())}
     assert {tuple(chunks[6:9]) for chunks in ours} == {("%", "%r1", "flocc_r_1")}
@@ -269,14 +294,16 @@ async def test_the_graph_shows_the_node_and_its_endpoints() -> None:
         ("MP", "%r1%flocc%path", ":1:,1:,:,:,,"),
         ("MP", "%r1%flocc%pose", "::,10:,:,:,,"),
         ("MP", "%r1%flocc%map_frame", ":1:,1:,:,:,,"),
-        ("MS", "%r1%odom", "::,50:,:,:,,"),
+        ("MP", "%r1%flocc%graph", ":1:,1:,:,:,,"),
+        ("MP", "%diagnostics", "::,10:,:,:,,"),
+        ("MS", "%r1%odom", "::,200:,:,:,,"),
         ("MS", "%r1%camera%image_raw", "2::,5:,:,:,,"),
         ("MS", "%r1%camera%camera_info", "2::,5:,:,:,,"),
         ("MS", "%tf_static", ":1:,100:,:,:,,"),
         ("SS", "%r1%flocc_r_1%save_map", "::,10:,:,:,,"),
         ("SS", "%r1%flocc_r_1%reset_odometry", "::,10:,:,:,,"),
     }
-    assert len({chunks[4] for chunks in ours}) == 11
+    assert len({chunks[4] for chunks in ours}) == 13
 
 
 async def test_a_topic_of_another_type_is_said() -> None:

@@ -127,3 +127,18 @@ def test_each_command_of_the_launch_file_is_one_that_flocc_takes(
     assert given["ros_args"] == [
         "-p", "odom_frame:=r2/odom", "-p", "base_frame:=r2/base_link", "-p", "use_sim_time:=true",
     ]  # fmt: skip
+
+
+def test_the_files_for_rviz_and_nav2_name_topics_that_an_agent_publishes() -> None:
+    from ruamel.yaml import YAML
+
+    rviz = YAML(typ="safe").load((ROOT / "examples/ros2/swarm.rviz").read_text())
+    shown = {display["Topic"]["Value"] for display in rviz["Visualization Manager"]["Displays"] if "Topic" in display}
+    topics = {"flocc/graph", "flocc/path", "flocc/pose", "flocc_r1/merged_map"}
+    published = {f"/{robot}/{topic}" for robot in ("r1", "r2") for topic in topics}
+    assert shown <= published
+    assert {topic.split("/", 2)[2] for topic in shown} == topics
+    nav2 = YAML(typ="safe").load((ROOT / "examples/ros2/nav2_team.yaml").read_text())["/r1"]
+    static = nav2["global_costmap"]["global_costmap"]["ros__parameters"]["static_layer"]
+    assert static["map_topic"] in published
+    assert nav2["local_mapper"]["ros__parameters"]["global_frame"] == "r1/odom"

@@ -85,3 +85,30 @@ def test_odometry_without_images_stays_bounded() -> None:
     synchroniser.add_image(50 * MS, b"old")
     assert synchroniser.next() is None
     assert synchroniser.dropped == {"image without odometry": 1}
+
+
+def test_large_images_wait_only_within_their_bytes_and_one_always_may() -> None:
+    synchroniser = Synchroniser(64, 0.5, bytes_max=100)
+    for t in (1, 2, 3):
+        synchroniser.add_image(t, bytes(60))
+    assert synchroniser.dropped == {"image without odometry": 2}
+    synchroniser.add_odometry(0, np.eye(4))
+    synchroniser.add_odometry(5, np.eye(4))
+    posed = synchroniser.next()
+    assert posed is not None
+    assert (posed.stamp_ns, synchroniser.next()) == (3, None)
+    synchroniser.add_image(6, bytes(500))
+    synchroniser.add_odometry(7, np.eye(4))
+    assert synchroniser.next() is not None
+
+
+def test_bytes_of_images_that_were_taken_make_room() -> None:
+    synchroniser = Synchroniser(64, 0.5, bytes_max=100)
+    synchroniser.add_odometry(0, np.eye(4))
+    for t in range(10, 100, 20):
+        synchroniser.add_image(t, bytes(50))
+        synchroniser.add_image(t + 1, bytes(50))
+        synchroniser.add_odometry(t + 2, np.eye(4))
+        assert synchroniser.next() is not None
+        assert synchroniser.next() is not None
+    assert synchroniser.dropped == {}

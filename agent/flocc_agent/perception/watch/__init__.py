@@ -1,0 +1,1 @@
+"""What a robot's own consecutive pictures say of its camera: focal length, mounting, overlays, frozen pictures."""

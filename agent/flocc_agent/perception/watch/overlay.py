@@ -1,0 +1,177 @@
+"""What moves with the camera is not the scene: parts of the picture that stay at their pixel while the robot turns.
+
+The picture is looked at in small cells. A cell is tested against an earlier picture where the turn between the two, by
+odometry, must have moved whatever is out there by several pixels, however far it is; it stays where the two cells
+look the same without any shift. Only cells with corners are tested: along an edge, such as a horizon, a shift does not
+show. A robot that only drives straight shows nothing, and nothing is hidden.
+
+Two pictures whose cells all stay are one picture: the camera is frozen.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.interfaces import Camera
+from flocc_agent.geometry import angle_rad, between
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+SIDE_PX = 320
+"""Longer side that pictures are brought to."""
+CELL_PX = 8
+WINDOW_PX = 15
+"""Side of what is compared around a cell's centre."""
+CONTRAST_MIN = 3.0
+"""Standard deviation, of 256 grey levels, below which a window is flat."""
+CORNER_MIN = 2.0
+"""Smaller eigenvalue of a window's gradients: with less it is an edge at best."""
+SHIFT_MIN_PX = 4.0
+"""A turn that moves a cell by less tests nothing."""
+STAYS_NCC = 0.85
+MOVED_MIN_M = 0.05
+SAME_NCC = 0.97
+SAME_SHARE = 0.95
+CELLS_MIN = 12
+"""With fewer cells with corners nobody can say that two pictures are the same."""
+EARLIER_MAX = 6
+"""Earlier pictures kept to compare with."""
+TESTS_MIN = 6
+STAYED_SHARE = 0.75
+SUPPORT_MIN = 2.0
+"""Cells that stay, of the nine around one, itself among them: a single one is chance."""
+TESTS_MAX = 40
+"""Old tests fade beyond this: dirt may be wiped off."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Picture:
+    """A reduced picture, what its windows have, and how the camera stood."""
+
+    grey: Float32
+    mean: Float32
+    deviation: Float32
+    has_corners: Mask
+    T_odom_camera: Float
+
+
+class OverlayFinder:
+    """Cells of one camera's pictures that stay."""
+
+    def __init__(self, camera: Camera) -> None:
+        factor = SIDE_PX / max(camera.width, camera.height)
+        self._size = max(round(camera.width * factor), WINDOW_PX), max(round(camera.height * factor), WINDOW_PX)
+        self._centres = _centres(self._size)
+        columns, rows = self._centres
+        x = (columns / factor - camera.cx) / camera.fx
+        y = (rows / factor - camera.cy) / camera.fy
+        grid_x, grid_y = np.meshgrid(x, y)
+        self._rays = np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
+        self._focal_px = camera.fx * factor
+        self._earlier: deque[_Picture] = deque(maxlen=EARLIER_MAX)
+        self._tests = np.zeros(grid_x.shape)
+        self._stayed = np.zeros(grid_x.shape)
+
+    def add(self, grey: NDArray[np.uint8], T_odom_camera: Float) -> bool:
+        """Look at the next picture; whether it is one that was seen before, pixel by pixel.
+
+        Args:
+            grey: (H, W) of the whole picture.
+            T_odom_camera: (4, 4) where the camera was, by odometry, metres.
+        """
+        now = self._picture(grey, T_odom_camera)
+        repeats = any(self._is_same(now, earlier) for earlier in self._earlier)
+        if not repeats:
+            for earlier in self._earlier:
+                self._test(now, earlier)
+            self._earlier.append(now)
+        return repeats
+
+    def mask(self, size_px: tuple[int, int]) -> Mask:
+        """(H, W) pixels of a picture of this width and height that move with the camera."""
+        cells = self.cells().astype(np.uint8)
+        whole = np.kron(cells, np.ones((CELL_PX, CELL_PX), np.uint8))[: self._size[1], : self._size[0]]
+        return np.asarray(cv2.resize(whole, size_px, interpolation=cv2.INTER_NEAREST) > 0)
+
+    def cells(self) -> Mask:
+        """(rows, columns) cells that stay, with those around them."""
+        stays = (self._tests >= TESTS_MIN) & (self._stayed >= STAYED_SHARE * self._tests)
+        near = cv2.filter2D(stays.astype(np.float32), -1, np.ones((3, 3), np.float32), borderType=cv2.BORDER_CONSTANT)
+        stays &= near >= SUPPORT_MIN
+        return np.asarray(cv2.dilate(stays.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+    def _picture(self, grey: NDArray[np.uint8], T_odom_camera: Float) -> _Picture:
+        reduced = cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        mean = self._averaged(reduced)
+        deviation = np.sqrt(np.maximum(self._averaged(reduced * reduced) - mean * mean, 0.0))
+        corners = self._at(np.asarray(cv2.cornerMinEigenVal(reduced, WINDOW_PX)))
+        has_corners = (deviation > CONTRAST_MIN) & (corners > CORNER_MIN)
+        return _Picture(reduced, mean, deviation, has_corners, T_odom_camera)
+
+    def _test(self, now: _Picture, earlier: _Picture) -> None:
+        """Count which cells stay between two pictures, of those that the turn must have moved."""
+        rays = self._rays @ between(now.T_odom_camera, earlier.T_odom_camera)[:3, :3].T
+        depth = np.maximum(rays[..., 2], 1e-3)
+        shift = (rays[..., :2] / depth[..., None] - self._rays[..., :2]) * self._focal_px
+        tested = (np.linalg.norm(shift, axis=-1) > SHIFT_MIN_PX) & (now.has_corners | earlier.has_corners)
+        stays = self._similarity(now, earlier) > STAYS_NCC
+        self._tests += tested
+        self._stayed += tested & stays
+        fades = self._tests > TESTS_MAX
+        self._tests[fades] *= 0.5
+        self._stayed[fades] *= 0.5
+
+    def _is_same(self, now: _Picture, earlier: _Picture) -> bool:
+        if not self._moved(between(now.T_odom_camera, earlier.T_odom_camera)):
+            return False
+        corners = now.has_corners & earlier.has_corners
+        either = now.has_corners | earlier.has_corners
+        if int(corners.sum()) < CELLS_MIN or corners.sum() < SAME_SHARE * either.sum():
+            return False
+        return float(np.mean(self._similarity(now, earlier)[corners] > SAME_NCC)) > SAME_SHARE
+
+    def _moved(self, T: Float) -> bool:
+        """Whether the robot did move, so that two pictures cannot be the same."""
+        return float(np.linalg.norm(T[:3, 3])) > MOVED_MIN_M or angle_rad(T[:3, :3]) * self._focal_px > SHIFT_MIN_PX
+
+    def _similarity(self, now: _Picture, earlier: _Picture) -> Float32:
+        """Normalised cross-correlation of the windows at the same pixels."""
+        covariance = self._averaged(now.grey * earlier.grey) - now.mean * earlier.mean
+        return np.asarray(covariance / np.maximum(now.deviation * earlier.deviation, CONTRAST_MIN**2))
+
+    def _averaged(self, values: Float32) -> Float32:
+        return self._at(np.asarray(cv2.boxFilter(values, -1, (WINDOW_PX, WINDOW_PX))))
+
+    def _at(self, values: NDArray[np.generic]) -> Float32:
+        columns, rows = self._centres
+        return np.asarray(values[np.ix_(rows, columns)], np.float32)
+
+
+def _centres(size: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Columns and rows of the cells' centres."""
+    columns, rows = (np.arange(CELL_PX // 2, side, CELL_PX, dtype=np.intp) for side in size)
+    return columns, rows
+
+
+def place_of(cells: Mask) -> str:
+    """Where in the picture cells lie, in words: the parts of a third of its height or width that hold most of them."""
+    rows, columns = np.nonzero(cells)
+    if not len(rows):
+        return "nowhere"
+    vertical = _part(rows / len(cells), ("top", "middle", "bottom"))
+    horizontal = _part(columns / cells.shape[1], ("left", "middle", "right"))
+    if vertical and horizontal:
+        return f"{vertical} {horizontal}" if vertical != horizontal else "middle"
+    return vertical or horizontal or "several places"
+
+
+def _part(shares: Float, names: tuple[str, str, str]) -> str:
+    """The third of a side in which nearly all lie; empty where there is none."""
+    inside = [np.mean((shares >= k / 3.0 - 0.05) & (shares < (k + 1) / 3.0 + 0.05)) for k in range(3)]
+    best = int(np.argmax(inside))
+    return names[best] if inside[best] > 0.85 else ""

@@ -1,0 +1,122 @@
+"""Complete: nothing that should be found, registered or solved is left out."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.effects import PersistRecord
+from flocc_agent.core.events import KeyframeCaptured
+from flocc_agent.core.gossip import LogCopy, decoded
+from flocc_launch.simulation.invariants import Step, core, groups
+from flocc_launch.simulation.rightness import component_of
+from flocc_launch.simulation.swarm import Swarm
+from flocc_launch.simulation.virtual_robot import Station
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import CandidatePair
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord
+
+MARGIN = 1e-4
+"""Similarities that differ by less may be ordered either way."""
+
+
+@dataclass(slots=True)
+class Complete:
+    """Every keyframe is recorded and solved; of each two logs, keyframes that look most alike are registered."""
+
+    _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
+    _captured: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _recorded: Counter[tuple[str, int]] = field(default_factory=Counter)
+
+    def step(self, step: Step) -> Iterator[str]:
+        """Note keyframes that were taken and recorded; nothing is wrong yet."""
+        life = step.station.name, step.station.life
+        self._captured[life] += isinstance(step.event, KeyframeCaptured)
+        for effect in step.effects:
+            if isinstance(effect, PersistRecord) and effect.log == step.station.log:
+                record = decoded(effect.data)[0]
+                if isinstance(record, KeyframeRecord):
+                    self._recorded[life] += 1
+                    self._describe(effect.data, record)
+        yield from ()
+
+    def _describe(self, data: bytes, record: KeyframeRecord) -> None:
+        if record.descriptor is not None:
+            values = record.descriptor.numpy().astype(np.float32)
+            self._descriptors[data] = values / np.linalg.norm(values)
+
+    def lacking(self, swarm: Swarm) -> Iterator[str]:
+        """Keyframes without a record or a place in the leader's solution, and pairs that nobody registered."""
+        for group in groups(swarm):
+            for station in group:
+                life = station.name, station.life
+                if self._captured[life] > self._recorded[life]:
+                    yield f"{station.name} recorded {self._recorded[life]} of {self._captured[life]} keyframes"
+                if core(station).election.leading:
+                    yield from _unsolved(station)
+            yield from self._unregistered(swarm, group)
+
+    def _unregistered(self, swarm: Swarm, group: list[Station]) -> Iterator[str]:
+        threshold = swarm.scenario.core.place_recognition.similarity_threshold + MARGIN
+        writers = {station.log for station in group}
+        robots = {log.robot for log in writers}
+        logs = core(group[0]).gossip.logs
+        known = {
+            log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
+        }
+        resolved = resolved_pairs(logs)
+        for one, other in combinations(known, 2):
+            apart = one.robot != other.robot and (one in writers or other in writers)
+            if not apart or max(logs[one].keyframes, logs[other].keyframes) < 2:
+                continue
+            for pair in _alike((one, known[one]), (other, known[other]), threshold):
+                if pair not in resolved:
+                    yield f"nobody registered {pair.low} {pair.high}, which look alike"
+
+    def _described(self, copy: LogCopy) -> dict[int, NDArray[np.float32]]:
+        """Descriptors of a log's keyframes, as the swarm holds them."""
+        both = zip(copy.records, copy.encoded, strict=True)
+        return {
+            record.index: self._descriptors[data]
+            for record, data in both
+            if isinstance(record, KeyframeRecord) and data in self._descriptors
+        }
+
+
+Described = tuple[LogId, dict[int, NDArray[np.float32]]]
+
+
+def _alike(one: Described, other: Described, threshold: float) -> Iterator[CandidatePair]:
+    """Pairs of keyframes each of which is the other's best: whichever came later, they were a candidate then."""
+    (low, rows), (high, columns) = one, other
+    if not rows or not columns:
+        return
+    similarities = np.array(list(rows.values())) @ np.array(list(columns.values())).T
+    lefts, rights = list(rows), list(columns)
+    for i, j in zip(*np.nonzero(similarities >= threshold), strict=True):
+        rivals = max(_second(similarities[i], j), _second(similarities[:, j], i))
+        if similarities[i, j] > rivals + MARGIN:
+            yield CandidatePair.of(KeyframeId(low, lefts[i]), KeyframeId(high, rights[j]))
+
+
+def resolved_pairs(logs: dict[LogId, LogCopy]) -> set[CandidatePair]:
+    """Pairs of which some log has a record."""
+    records = (record for copy in logs.values() for record in copy.records)
+    return {CandidatePair.of(r.query, r.match) for r in records if isinstance(r, ClosureRecord | RejectionRecord)}
+
+
+def _second(values: NDArray[np.float32], but: int) -> float:
+    """The highest value at another place."""
+    return float(np.delete(values, but).max(initial=-1.0))
+
+
+def _unsolved(leader: Station) -> Iterator[str]:
+    """Keyframes that a leader's last solution has no place for."""
+    for log, copy in core(leader).gossip.logs.items():
+        component = None if leader.solution is None else component_of(leader.solution, log)
+        solved = 0 if component is None else len(component.T_map_keyframe[log])
+        if solved < copy.keyframes:
+            yield f"{leader.name} solved {solved} of {copy.keyframes} keyframes of {log}"

@@ -1,0 +1,33 @@
+"""Questions for knots: a robot that needs them does not stop asking, one that asks for others does."""
+
+from flocc_agent.core.effects import Unicast
+from flocc_agent.core.knot_requests import ASKED_MAX, RARELY_S, KnotRequests
+from flocc_protocol.ids import LogId, Term
+from flocc_protocol.messages import CorrectionVersion
+
+VERSION = CorrectionVersion(LogId("r1"), Term(1, LogId("r4")), 10)
+
+
+def asked_at_s(requests: KnotRequests, until_s: int) -> list[int]:
+    return [t for t in range(until_s) if any(isinstance(e, Unicast) for e in requests.ask(float(t)))]
+
+
+def test_knots_that_a_robot_needs_are_asked_for_on_and_on() -> None:
+    requests = KnotRequests(lambda _: ["r2"])
+    requests.want(VERSION, 0.0)
+    times_s = asked_at_s(requests, 60)
+    assert len(times_s) > ASKED_MAX
+    assert times_s[-1] - times_s[-2] == RARELY_S
+
+
+def test_knots_that_another_robot_needed_are_given_up() -> None:
+    requests = KnotRequests(lambda _: ["r2"])
+    requests.on_interest("r3", VERSION, 0.0)
+    assert len(asked_at_s(requests, 60)) == ASKED_MAX
+
+
+def test_an_own_need_outlives_a_newer_version_that_another_robot_asks_for() -> None:
+    requests = KnotRequests(lambda _: ["r2"])
+    requests.want(VERSION, 0.0)
+    requests.on_interest("r3", VERSION._replace(round=11), 1.0)
+    assert len(asked_at_s(requests, 600)) > 2 * ASKED_MAX

@@ -1,0 +1,278 @@
+"""A camera that does not fit is found from its own keyframes, and one that fits is left in peace."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.agent.perception.classical_scenes import camera_at, seen_from, wall
+
+from flocc_agent.config import ClassicalConfig, PerceptionConfig
+from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.core.reports import CameraDoubted
+from flocc_agent.geometry import angle_rad, inverse, pose, so3_exp
+from flocc_agent.perception.backends import build_perception
+from flocc_agent.perception.classical.features import FeatureExtractor
+from flocc_agent.perception.classical.patches import dense_patches
+from flocc_agent.perception.multiview.registrar import without_overlay
+from flocc_agent.perception.watch.camera_verdict import CameraFault, CameraVerdict, WatchedPair, camera_verdict
+from flocc_agent.perception.watch.camera_watch import CameraWatch
+from flocc_agent.perception.watch.overlay import OverlayFinder, place_of
+from flocc_agent.perception.watch.seen_motion import Flow, moves_with_the_scene
+
+Float = NDArray[np.float64]
+
+FOCAL_PX = 400.0
+CAMERA = Camera(320, 240, 280.0, 280.0, 159.5, 119.5)
+TURNED_RAD = float(np.radians(5.0))
+
+
+def drive(rng: np.random.Generator, count: int, turn_rad: float = 0.1) -> list[Float]:
+    """True camera poses of a robot that drives forward and turns left and right."""
+    T = np.eye(4)
+    poses = [T]
+    for k in range(count):
+        turn = turn_rad * np.sin(0.9 * k) + rng.normal(0.0, 0.2 * turn_rad)
+        step = pose(so3_exp(np.array([rng.normal(0, 0.004), turn, rng.normal(0, 0.004)])), np.array([0.05, 0.0, 0.6]))
+        T = T @ step
+        poses.append(T)
+    return poses
+
+
+def odometry_of(poses: list[Float], rng: np.random.Generator, heading_rad: float = 0.002) -> list[Float]:
+    """The same poses as a robot with drift knows them."""
+    T = np.eye(4)
+    known = [T]
+    scale, bias = 1.0 + rng.normal(0.0, 0.02), rng.normal(0.0, heading_rad)
+    for before, now in pairwise(poses):
+        step = inverse(before) @ now
+        noise = so3_exp(np.array([0.0, bias, 0.0]) + rng.normal(0.0, heading_rad, 3))
+        T = T @ pose(step[:3, :3] @ noise, scale * step[:3, 3] + rng.normal(0.0, 0.005, 3))
+        known.append(T)
+    return known
+
+
+def flows(
+    rng: np.random.Generator,
+    count: int = 20,
+    factor: float = 1.0,
+    mirrored: bool = False,
+    turn_rad: float = 0.1,
+    odometry: Callable[[list[Float]], list[Float]] = lambda poses: poses,
+) -> list[WatchedPair]:
+    """Pairs of a drive as a camera sees them whose configured focal length is `factor` times the true one."""
+    poses = drive(rng, count, turn_rad)
+    known = odometry(odometry_of(poses, rng))
+    stretch = np.array([-1.0 if mirrored else 1.0, 1.0]) / factor
+    pairs = []
+    for k in range(count):
+        before, now = _rays(poses[k], poses[k + 1], rng)
+        flow = Flow(before * stretch, now * stretch, FOCAL_PX * factor, known[k], known[k + 1])
+        pairs.append(WatchedPair(flow))
+    return pairs
+
+
+def turned_by(T_body_camera: Float) -> Callable[[list[Float]], list[Float]]:
+    """Odometry that knows the camera without this turn."""
+    return lambda poses: [T @ inverse(T_body_camera) for T in poses]
+
+
+def _rays(T_world_before: Float, T_world_now: Float, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Matches of points before both cameras, half a pixel wrong."""
+    points = np.column_stack([rng.uniform(-6, 6, 400), rng.uniform(-3, 3, 400), rng.uniform(3, 25, 400)])
+    in_world = points @ T_world_before[:3, :3].T + T_world_before[:3, 3]
+    seen = []
+    for T in (T_world_before, T_world_now):
+        p = (in_world - T[:3, 3]) @ T[:3, :3]
+        seen.append(np.column_stack([p[:, :2] / np.maximum(p[:, 2:], 0.1), p[:, 2]]))
+    good = np.all([(s[:, 2] > 0.5) & (np.abs(s[:, :2]).max(axis=1) < 0.8) for s in seen], axis=0)
+    noise = 0.5 / FOCAL_PX
+    return tuple(s[good][:120, :2] + rng.normal(0, noise, (min(int(good.sum()), 120), 2)) for s in seen)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.8, 0.9, 1.1, 1.25])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_wrong_focal_length_is_named_with_its_factor_within_20_keyframes(factor: float, seed: int) -> None:
+    verdict = camera_verdict(flows(np.random.default_rng(seed), 19, factor, turn_rad=0.12))
+    assert verdict is not None
+    assert verdict.fault is CameraFault.FOCAL_LENGTH
+    assert verdict.focal_factor == pytest.approx(1.0 / factor, rel=0.04)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_camera_turned_by_five_degrees_is_named_with_its_turn(axis: int, seed: int) -> None:
+    T_camera_true = pose(so3_exp(TURNED_RAD * np.eye(3)[axis]), np.zeros(3))
+    verdict = camera_verdict(flows(np.random.default_rng(seed), 19, odometry=turned_by(T_camera_true)))
+    assert verdict is not None
+    assert verdict.fault is CameraFault.MOUNTING
+    assert angle_rad(verdict.X.T @ T_camera_true[:3, :3]) < np.radians(1.5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_camera_that_fits_is_left_in_peace_at_every_number_of_pairs(seed: int) -> None:
+    pairs = flows(np.random.default_rng(seed), 20, turn_rad=0.03 + 0.04 * seed)
+    assert [camera_verdict(pairs[:count]) for count in (5, 8, 20)] == [None] * 3
+
+
+def test_odometry_of_another_convention_is_told_by_what_fits() -> None:
+    R_body_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    found: dict[str, CameraVerdict | None] = {
+        "body": camera_verdict(flows(np.random.default_rng(1), odometry=turned_by(pose(R_body_camera, np.zeros(3))))),
+        "inverted": camera_verdict(flows(np.random.default_rng(2), odometry=lambda p: [inverse(T) for T in p])),
+        "mixed": camera_verdict(
+            flows(
+                np.random.default_rng(3),
+                odometry=lambda p: [pose(T[:3, :3], np.array([T[1, 3], T[2, 3], T[0, 3]])) for T in p],
+            )
+        ),
+    }
+    assert {name: verdict.fault if verdict else None for name, verdict in found.items()} == {
+        "body": CameraFault.MOUNTING,
+        "inverted": CameraFault.INVERTED_POSES,
+        "mixed": CameraFault.MIXED_FRAMES,
+    }
+
+
+def test_mirrored_pictures_are_named() -> None:
+    verdict = camera_verdict(flows(np.random.default_rng(4), mirrored=True))
+    assert verdict is not None
+    assert verdict.fault is CameraFault.MIRRORED
+
+
+def test_a_robot_that_only_drives_straight_shows_no_focal_length() -> None:
+    assert camera_verdict(flows(np.random.default_rng(5), factor=0.5, turn_rad=0.001)) is None
+
+
+# What moves with the camera
+
+
+def picture(T: Float, texture: NDArray[np.uint8], overlay: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
+    """What a camera sees that turns at one place, with an overlay on its lens."""
+    K = CAMERA.K()
+    shift = np.array([[1.0, 0.0, 340.0], [0.0, 1.0, 240.0], [0.0, 0.0, 1.0]])
+    H = np.linalg.inv(shift @ K @ T[:3, :3] @ np.linalg.inv(K))
+    seen = cv2.warpPerspective(texture, H, (320, 240), borderMode=cv2.BORDER_WRAP)
+    if overlay is not None:
+        seen = np.where(overlay, _texture(99)[:240, :320], seen)
+    return np.asarray(seen, np.uint8)
+
+
+def _texture(seed: int) -> NDArray[np.uint8]:
+    small = np.random.default_rng(seed).integers(0, 256, (90, 125), dtype=np.uint8)
+    return np.asarray(cv2.resize(small, (1000, 720), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def turning(count: int) -> list[Float]:
+    """Camera poses of a robot that turns by two degrees for each keyframe and moves a bit."""
+    angles = np.radians(-20.0 + 2.0 * np.arange(count))
+    return [pose(so3_exp(np.array([0.1 * a, a, 0.0])), np.array([0.2 * k, 0.0, 0.0])) for k, a in enumerate(angles)]
+
+
+def bumper(share: float) -> NDArray[np.bool_]:
+    hidden = np.zeros((240, 320), np.bool_)
+    hidden[round(240 * (1.0 - share)) :] = True
+    return hidden
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
+def test_a_bumper_is_found_and_little_else(share: float) -> None:
+    finder = OverlayFinder(CAMERA)
+    texture, hidden = _texture(1), bumper(share)
+    assert not any(finder.add(picture(T, texture, hidden), T) for T in turning(12))
+    mask = finder.mask((320, 240))
+    assert np.mean(mask[hidden]) > 0.95
+    assert np.mean(mask[~hidden]) < 0.12
+    assert place_of(finder.cells()) == "bottom" or share > 0.3
+
+
+def test_nothing_stays_where_nothing_is_on_the_lens() -> None:
+    finder = OverlayFinder(CAMERA)
+    assert not any(finder.add(picture(T, _texture(2)), T) for T in turning(20))
+    assert not finder.cells().any()
+
+
+def test_a_frozen_picture_is_not_encoded_and_told_at_the_second_one() -> None:
+    perception = build_perception(PerceptionConfig())
+    watch = CameraWatch()
+    poses = turning(6)
+    looks = [watch.look(perception, image_of(picture(poses[min(k, 3)], _texture(3))), T) for k, T in enumerate(poses)]
+    assert [look.latent is None for look in looks] == [False, False, False, False, True, True]
+    assert [doubt.doubt for look in looks for doubt in look.doubts] == ["frozen"]
+    assert "taken before" in looks[4].fault
+
+
+def test_a_standing_robot_may_see_the_same_twice() -> None:
+    finder = OverlayFinder(CAMERA)
+    T = turning(1)[0]
+    assert not any(finder.add(picture(T, _texture(3)), T) for _ in range(3))
+
+
+def test_an_overlay_is_told_once_and_left_out_from_then_on() -> None:
+    perception = build_perception(PerceptionConfig())
+    watch = CameraWatch()
+    looks = [watch.look(perception, image_of(picture(T, _texture(4), bumper(0.3))), T) for T in turning(10)]
+    doubts = [doubt for look in looks for doubt in look.doubts if doubt.doubt == "overlay"]
+    assert len(doubts) == 1
+    assert isinstance(doubts[0], CameraDoubted)
+    assert doubts[0].where == "bottom"
+    assert 0.25 < doubts[0].amount < 0.45
+    assert looks[-1].latent is not None
+    from flocc_agent.perception.classical.encoder import decode_features
+
+    rows = decode_features(looks[-1].latent).points[:, 1] * CAMERA.fy + CAMERA.cy
+    assert float(rows.max()) < 240 * 0.7
+
+
+def image_of(grey: NDArray[np.uint8], hidden: NDArray[np.bool_] | None = None) -> Image:
+    return Image(np.repeat(grey[..., None], 3, axis=2), CAMERA, hidden)
+
+
+def test_hidden_pixels_give_no_feature_no_patch_and_take_nobodys_place() -> None:
+    seen, hidden = picture(np.eye(4), _texture(5)), bumper(0.5)
+    extractor = FeatureExtractor(ClassicalConfig(features_max=100))
+    whole, shown = extractor.extract(image_of(seen)), extractor.extract(image_of(seen, hidden))
+    assert len(whole.points) == len(shown.points) == 100
+    assert float((shown.points[:, 1] * CAMERA.fy + CAMERA.cy).max()) < 120
+    assert 0 < len(dense_patches(seen, hidden)) < 0.5 * len(dense_patches(seen))
+
+
+def test_what_stays_at_its_pixel_is_no_match_of_two_places() -> None:
+    rng = np.random.default_rng(6)
+    scene = wall(rng)
+    first, second = seen_from(scene, camera_at((0, 0, 0)), rng), seen_from(scene, camera_at((0.5, 0, 0)), rng)
+    count = min(len(first.points), len(second.points))
+    second.points[:10] = first.points[:10]
+    same = np.arange(count)
+    kept, _ = without_overlay(first, second, (same, same))
+    assert not set(range(10)) & set(kept.tolist())
+    assert len(kept) > 0.8 * (count - 10)
+
+
+def test_a_robot_that_does_not_turn_keeps_matches_that_stay() -> None:
+    points = np.random.default_rng(7).uniform(-0.5, 0.5, (20, 2))
+    straight, turned = pose(np.eye(3), np.array([0, 0, 1.0])), pose(so3_exp(np.array([0, 0.1, 0])), np.zeros(3))
+    assert moves_with_the_scene(points, points, FOCAL_PX, straight).all()
+    assert not moves_with_the_scene(points, points, FOCAL_PX, turned).any()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+def test_street_names_a_wrong_focal_length_within_20_keyframes(shared: Path, factor: float) -> None:
+    from flocc_lab.bench.registration_scenes import robots_beside
+
+    views = [view for view in robots_beside(shared / "data" / "street", 1.0).views if view.robot == "r1"][:20]
+    perception, watch = build_perception(PerceptionConfig()), CameraWatch()
+    told: list[CameraDoubted] = []
+    for view in views:
+        c = view.camera
+        wrong = Camera(c.width, c.height, c.fx * factor, c.fy * factor, c.cx, c.cy, c.distortion)
+        told += watch.look(perception, Image(view.image().pixels, wrong), view.T_odom_camera).doubts
+    if factor == 1.0:
+        assert told == []
+    else:
+        assert {doubt.doubt for doubt in told} == {"focal length"}
+        assert told[-1].amount == pytest.approx(1.0 / factor, rel=0.06)
