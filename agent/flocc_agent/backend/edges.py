@@ -30,6 +30,9 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 GAMMA_MIN = 1e-3
+HALF_TURN_COSINE = 1e-4
+"""Cosine of half a rotation error below which that error is a half turn, where its square has no slope."""
+NUDGE_RAD = 3e-3
 NO_CLUSTER = -1
 
 
@@ -167,6 +170,20 @@ def residuals(edges: Edges, state: State, hold: bool = True) -> Residuals:
         e[held] = np.einsum("eij,ej->ei", L[held], e0[held] - GAMMA_MIN * edges.d[held])
         bound[held] = (GAMMA_MIN - c[held]) / edges.sigma[held]
     return Residuals(e, held, bound, q_error, p, L)
+
+
+def off_half_turns(edges: Edges, state: State) -> State:
+    """Turn poses a little whose edges are wrong by half a turn: `2 vec(q)` is stationary there, at its worst."""
+    _, q_error, _ = _unscaled(edges, state)
+    delta = np.zeros(6 * len(state.q) + len(state.scale))
+    for k in np.flatnonzero(q_error[:, 0] < HALF_TURN_COSINE).tolist():
+        axis = q_error[k, 1:] / np.linalg.norm(q_error[k, 1:])
+        later = max(int(edges.i[k]), int(edges.j[k]))
+        if later == edges.i[k]:
+            q_ij = rotations.multiply(rotations.conjugate(state.q[edges.i[k]][None]), state.q[edges.j[k]][None])
+            axis = -rotations.matrices(q_ij)[0] @ axis
+        delta[6 * later : 6 * later + 3] = NUDGE_RAD * axis
+    return state.retract(delta) if delta.any() else state
 
 
 def own_scales(edges: Edges, e_wide: Float, c: Float) -> Float:

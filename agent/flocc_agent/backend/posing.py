@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import votes
 from flocc_agent.backend.descent import Objective, Solved
-from flocc_agent.backend.edges import State, state_of
+from flocc_agent.backend.edges import State, off_half_turns, state_of
 from flocc_agent.backend.initial import Aligned, trusted_closures
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.placing import Places
@@ -74,10 +74,11 @@ def posed(
     in_order = [closures[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     says = votes(in_order, config.cluster_keyframes_max)
+    aligned_state = state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters)
     return Posed(
         problem,
         Objective(problem.edges, problem.closure_rows, linear, config),
-        state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters),
+        off_half_turns(problem.edges, aligned_state),
         trusted_closures(in_order, initial) if aligned.is_warm and initial is not None else None,
         Places(problem, trajectories, closures, says, config.steepness),
     )

@@ -11,6 +11,7 @@ from flocc_agent.backend.edges import State, residuals, scales_at
 from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.scale_report import odometry_warnings, scale_warnings
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
+from flocc_agent.backend.ties import tie_warnings
 from flocc_agent.config import Solver
 from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, OdometryScale, Trajectory
 from flocc_agent.geometry import Float, inverse
@@ -66,10 +67,26 @@ def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> SolvedLogs:
     results = closure_results(solution)
     component = _component(solution, wanted)
     warnings = scale_warnings(solution.problem, solution.solved, solution.closures)
-    warnings = (*warnings, *odometry_warnings(solution.odometry_scales))
+    warnings = (*warnings, *odometry_warnings(solution.odometry_scales), *_ties(solution, results))
     if not solution.solved.converged:
         warnings = (*warnings, f"{component.map_frame}: the solver stopped before it converged")
     return SolvedLogs((component,), results, warnings, solution.solved.iterations)
+
+
+def _ties(solution: Solution, results: Mapping[int, ClosureResult]) -> tuple[str, ...]:
+    problem, config = solution.problem, solution.objective.config
+    T = solution.solved.state.poses()
+    T_keyframes = {log: T[start : start + len(solution.trajectories[log])] for log, start in problem.offsets.items()}
+    used = np.array([results[k].state is ClosureState.USED for k in problem.closure_ids], dtype=bool)
+    return tie_warnings(
+        problem,
+        T_keyframes,
+        used,
+        solution.trajectories,
+        solution.closures,
+        config.steepness,
+        config.cluster_keyframes_max,
+    )
 
 
 def closure_results(solution: Solution) -> dict[int, ClosureResult]:

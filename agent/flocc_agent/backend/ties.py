@@ -1,0 +1,80 @@
+"""Robots whose rejected closures would put them elsewhere with nearly as many votes: said, because it is a guess.
+
+Two halves of a symmetrical hall look the same. Four closures then say that a robot is in one half, four that it is in
+the other; one of the two is taken, and which of them depends on next to nothing.
+"""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend.alignment import align_pair, rays_from, travelled_m
+from flocc_agent.backend.clusters import votes
+from flocc_agent.backend.problem import Problem
+from flocc_agent.core.pose_graph import LoopClosure, Trajectory
+from flocc_agent.geometry import angle_rad
+from flocc_protocol.ids import LogId
+
+Bool = NDArray[np.bool_]
+Float = NDArray[np.float64]
+
+REJECTED_MIN = 2
+"""A single closure puts a robot nowhere that another one confirms."""
+NEARLY_RATIO = 0.75
+"""So large a part of the votes that were followed is nearly as many."""
+
+
+def tie_warnings(
+    problem: Problem,
+    T_keyframes: Mapping[LogId, Float],
+    used: Bool,
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    steepness: float,
+    cluster_keyframes_max: int,
+) -> tuple[str, ...]:
+    """One sentence for each pair of robots whose rejected closures agree on another place.
+
+    Args:
+        problem: The component.
+        T_keyframes: (N, 4, 4) solved poses of each log, all in one frame.
+        used: (L,) which closures the solution follows.
+        trajectories: Odometry of the component's logs.
+        closures: Its closures, by their index in the graph.
+        steepness: k of Eq. (2).
+        cluster_keyframes_max: Closures so near to each other count as one place (`clusters.votes`).
+    """
+    says = votes([closures[k] for k in problem.closure_ids], cluster_keyframes_max)
+    by_pair: dict[tuple[LogId, LogId], list[int]] = {}
+    for n, k in enumerate(problem.closure_ids):
+        a, b = sorted((closures[k].query.log, closures[k].match.log))
+        if a != b:
+            by_pair.setdefault((a, b), []).append(n)
+    path_m = {log: travelled_m(trajectory) for log, trajectory in trajectories.items()}
+
+    def sentences() -> Iterator[str]:
+        for (a, b), rows in sorted(by_pair.items()):
+            followed, rejected = [n for n in rows if used[n]], [n for n in rows if not used[n]]
+            enough = NEARLY_RATIO * says[followed].sum()
+            if not followed or len(rejected) < REJECTED_MIN or says[rejected].sum() < enough:
+                continue
+            ids = [problem.closure_ids[n] for n in rejected]
+            ends = {}
+            for k in ids:
+                query, match = closures[k].query, closures[k].match
+                ends[k] = (query, match) if query.log == a else (match, query)
+            found = align_pair(rays_from(ids, closures, ends, T_keyframes, path_m, steepness))
+            agreeing = [n for n in rejected if problem.closure_ids[n] in found.agreeing]
+            if len(agreeing) < REJECTED_MIN or says[agreeing].sum() < enough:
+                continue
+            middle = T_keyframes[b][:, :3, 3].mean(axis=0)
+            moved_m = float(np.linalg.norm(found.T_a_b[:3, :3] @ middle + found.T_a_b[:3, 3] - middle))
+            turned_deg = float(np.degrees(angle_rad(found.T_a_b[:3, :3])))
+            yield (
+                f"robots {a.robot} and {b.robot}: {len(followed)} closures agree on the place that was taken, and "
+                f"{len(agreeing)} others on another one, {moved_m:.1f} m and {turned_deg:.0f} degrees away; places "
+                "that look the same do this, and nothing here tells which is right"
+            )
+
+    return tuple(sentences())

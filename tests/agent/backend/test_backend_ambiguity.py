@@ -1,0 +1,103 @@
+"""What data cannot decide is said: two places with as many votes. Half turns, where a cost has no slope, are left."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flocc_agent.backend.optimiser import optimise
+from flocc_agent.config import BackendConfig, Formulation, Solver
+from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.geometry import inverse, pose, so3_exp, so3_log
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+A, B = LogId("a"), LogId("b")
+KEYFRAMES = 9
+COVARIANCE = np.diag([1e-3] * 3 + [1e-2] * 3)
+
+
+def turned(yaw_rad: float, x_m: float = 0.0, y_m: float = 0.0) -> Float:
+    return pose(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.0]))
+
+
+def bend() -> Float:
+    """A way (9, 4, 4) that bends more and more, so that no motion maps it onto itself."""
+    T = [np.eye(4)]
+    for k in range(KEYFRAMES - 1):
+        T.append(T[-1] @ turned(0.05, 1.0, 0.1 * k))
+    return np.array(T)
+
+
+WAY = bend()
+
+
+def saying(T_a_b: Float, pairs: list[tuple[int, int]]) -> list[LoopClosure]:
+    """Metric closures that agree that robot b's way begins at a pose in robot a's."""
+    return [
+        LoopClosure(
+            KeyframeId(A, i), KeyframeId(B, j), inverse(WAY[i]) @ T_a_b @ WAY[j], covariance=COVARIANCE, metric=True
+        )
+        for i, j in pairs
+    ]
+
+
+def solved(closures: list[LoopClosure]) -> GraphSolution:
+    edges = np.broadcast_to(COVARIANCE, (KEYFRAMES - 1, 6, 6)).copy()
+    graph = PoseGraph({log: Trajectory(WAY, edges) for log in (A, B)}, closures)
+    solution = optimise(graph, BackendConfig())
+    assert isinstance(solution, GraphSolution)
+    return solution
+
+
+IN_FRONT = saying(turned(0.0, 5.0), [(k, k + 1) for k in range(4)])
+BEHIND = saying(turned(np.pi, -5.0), [(k + 1, k) for k in range(4)])
+SCATTERED = [
+    c for k in range(3) for c in saying(turned(1.0 + k, 3.0 * k, -7.0 + 9.0 * k), [(2 * k + 1, (5 * k + 2) % 8)])
+]
+
+
+@pytest.mark.parametrize("closures", [IN_FRONT + BEHIND, BEHIND + IN_FRONT])
+def test_two_places_with_as_many_closures_are_named(closures: list[LoopClosure]) -> None:
+    (sentence,) = [w for w in solved(closures).warnings if "look the same" in w]
+    assert sentence.startswith("robots a and b: 4 closures agree on the place that was taken, and 4 others on another")
+    assert "180 degrees away" in sentence
+
+
+@pytest.mark.parametrize("closures", [IN_FRONT, IN_FRONT + BEHIND[:1], IN_FRONT + SCATTERED])
+def test_closures_that_agree_on_no_other_place_are_no_tie(closures: list[LoopClosure]) -> None:
+    assert [w for w in solved(closures).warnings if "look the same" in w] == []
+
+
+@pytest.mark.parametrize("drift_deg", [170.0, 179.9, 180.0, -180.0, 180.0 - 1e-7])
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_heading_that_is_off_by_half_a_turn_is_shared_by_all_steps(drift_deg: float, backwards: bool) -> None:
+    """By hand: 25 equal edges on the spot, each takes a 25th of the error."""
+    steps = 24
+    T_odom = np.array([turned(k * np.radians(drift_deg) / steps) for k in range(steps + 1)])
+    covariance = np.diag([1.0] * 3 + [1e-6] * 3)
+    ends = KeyframeId(A, 0), KeyframeId(A, steps)
+    query, match = reversed(ends) if backwards else ends
+    closure = LoopClosure(query, match, np.eye(4), covariance=covariance, metric=True)
+    graph = PoseGraph({A: Trajectory(T_odom, np.broadcast_to(covariance, (steps, 6, 6)).copy())}, [closure])
+    solution = optimise(
+        graph, BackendConfig(formulation=Formulation.BASE, solver=Solver.LM, weight_by_probability=False)
+    )
+    assert isinstance(solution, GraphSolution)
+    last = solution.components[0].T_map_keyframe[A][-1]
+    assert abs(so3_log(last[:3, :3])[2]) == pytest.approx(np.radians(abs(drift_deg)) / 25, rel=0.01)
+
+
+def test_coordinates_in_utm_lose_nothing() -> None:
+    """Odometry whose origin is far away: shapes are those without the offset, to a tenth of a millimetre."""
+    edges = np.broadcast_to(COVARIANCE, (KEYFRAMES - 1, 6, 6)).copy()
+    far = {A: turned(0.3, 4.5e5, 5.4e6), B: turned(-1.0, 4.51e5, 5.39e6)}
+    wrong_m = saying(turned(0.1, 5.3), [(7, 1)])
+    shapes = []
+    for offsets in ({A: np.eye(4), B: np.eye(4)}, far):
+        trajectories = {log: Trajectory(offsets[log] @ WAY, edges) for log in (A, B)}
+        solution = optimise(PoseGraph(trajectories, IN_FRONT + wrong_m), BackendConfig())
+        assert isinstance(solution, GraphSolution)
+        (component,) = solution.components
+        first = component.T_map_keyframe[A][0]
+        shapes.append(inverse(first) @ np.concatenate([component.T_map_keyframe[log] for log in (A, B)]))
+    assert np.abs(shapes[0] - shapes[1]).max() < 1e-4
