@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import os
 import socket
 import subprocess
 import sys
@@ -214,6 +215,24 @@ def test_a_run_without_images_is_written_and_images_are_bounded(
     monkeypatch.setattr(scene_drawing, "IMAGES_BYTES_MAX", 1)
     told = Counter(topic for topic, *_ in messages(write_mcap(run, tmp_path / "b.mcap")))
     assert sum(count for topic, count in told.items() if topic.endswith("/keyframes")) == 1
+
+
+def test_nothing_but_an_earlier_mcap_file_is_replaced(run: RunFolder, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    for _ in range(2):
+        write_mcap(run, path)
+    path.write_bytes(b"")
+    write_mcap(run, path)
+    notes = tmp_path / "notes.txt"
+    notes.write_text("mine")
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for taken in (notes, pipe, tmp_path, run.path / "run.json", Path("/dev/null")):
+        with pytest.raises(McapError, match=r"cannot be written \(it is "):
+            write_mcap(run, taken)
+    assert notes.read_text() == "mine"
+    assert pipe.is_fifo()
+    assert Path("/dev/null").is_char_device()
 
 
 def test_what_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path: Path, run: RunFolder) -> None:

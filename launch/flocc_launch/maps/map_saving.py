@@ -66,6 +66,7 @@ def copy_map(opened: MapFolder, out: Path) -> MapManifest:
     Raises:
         BadMap: It is damaged, or `out` cannot be written.
     """
+    opened.check_whole()
     manifest = opened.manifest
     page = opened.path / PAGE
     content = MapContent(
@@ -114,6 +115,7 @@ def _earlier(found: Gathered, out: Path) -> MapFolder:
     path = Path(found.used.path)
     check_target(out, path)
     opened = MapFolder.open(path)
+    opened.check_whole()
     if opened.manifest.frame != found.used.frame:
         raise BadMap(f"{path}: is of {opened.manifest.frame}, and {found.where} worked in {found.used.frame}")
     return opened

@@ -14,6 +14,7 @@ from flocc_launch.view.scene_drawing import SceneDrawing, foxglove_module, layou
 from flocc_protocol.errors import FloccError
 
 MCAP_NAME = "run.mcap"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 LAYOUT_SUFFIX = ".layout.json"
 LIVE_PERIOD_S = 0.25
 BACKLOG_MAX = 4096
@@ -28,14 +29,15 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
 
     Args:
         folder: The run.
-        path: The file; one that is there is replaced.
+        path: The file; an earlier MCAP file is replaced, anything else is left alone.
 
     Raises:
         FoxgloveMissing: foxglove-sdk is not installed.
-        McapError: The file cannot be written.
+        McapError: The file cannot be written, or something else stands there.
         RunFolderError: The run cannot be read.
     """
     foxglove = foxglove_module()
+    check_mcap_target(path)
     loaded = load(folder)
     context = foxglove.Context()
     partial = path.with_name(f"{path.name}.partial")
@@ -54,6 +56,22 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
     return path
+
+
+def check_mcap_target(path: Path) -> None:
+    """Refuse to replace what is no MCAP file: a device, a folder, a part of the run.
+
+    Raises:
+        McapError: Such a thing stands there.
+    """
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise McapError(f"{path}: cannot be written (it is no file)")
+    with path.open("rb") as file:
+        first = file.read(len(MCAP_MAGIC))
+    if first and first != MCAP_MAGIC:
+        raise McapError(f"{path}: cannot be written (it is a file of something else than MCAP)")
 
 
 def epoch_ns(folder: RunFolder) -> int:
