@@ -498,6 +498,22 @@ def test_a_map_without_latents_is_pruned_and_merged_in_a_sentence(first: Path, b
     assert like_pairs(MapFolder.open(tmp_path / "blind"), MapFolder.open(block), 3) == []
 
 
+def test_what_is_missing_from_a_run_is_said_when_it_is_saved(
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(first, tmp_path / "run"))
+    shutil.rmtree(run / "robots" / "r2" / "store")
+    (run / "robots" / "r1" / "store" / "latents.sqlite").unlink()
+    code, text = said(capsys, monkeypatch, "map", "save", str(run), "--out", str(tmp_path / "map"))
+    assert code == 0
+    assert "left out: r2 left no log in any store" in text
+    keyframes = MapFolder.open(tmp_path / "map").manifest.logs[0].keyframes
+    assert f"without latents: {keyframes} keyframes" in text
+    _, whole = said(capsys, monkeypatch, "map", "save", str(first), "--out", str(tmp_path / "whole"))
+    assert "left out" not in whole
+    assert "without latents" not in whole
+
+
 def test_a_run_is_not_replaced_for_a_map_that_cannot_be_used(
     first: Path, block: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

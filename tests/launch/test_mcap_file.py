@@ -4,6 +4,8 @@ import base64
 import json
 import math
 import os
+import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -233,6 +235,20 @@ def test_nothing_but_an_earlier_mcap_file_is_replaced(run: RunFolder, tmp_path: 
     assert notes.read_text() == "mine"
     assert pipe.is_fifo()
     assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("at_s", ["-5.0", "1e30"])
+def test_a_time_that_is_none_is_one_sentence(run: RunFolder, tmp_path: Path, at_s: str) -> None:
+    other = Path(shutil.copytree(run.path, tmp_path / "run"))
+    lines = (other / "events.jsonl").read_text()
+    (other / "events.jsonl").write_text(re.sub(r'"t": ?[0-9.e-]+', f'"t": {at_s}', lines))
+    with pytest.raises(McapError, match="holds a time that MCAP cannot"):
+        write_mcap(RunFolder.open(other), tmp_path / "run.mcap")
+    fields = json.loads((other / "run.json").read_text())
+    (other / "run.json").write_text(json.dumps(fields | {"start": "yesterday"}))
+    with pytest.raises(McapError, match="start: 'yesterday' is no date"):
+        write_mcap(RunFolder.open(other), tmp_path / "run.mcap")
+    assert not list(tmp_path.glob("run.mcap*"))
 
 
 def test_what_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path: Path, run: RunFolder) -> None:

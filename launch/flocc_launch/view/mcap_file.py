@@ -33,7 +33,7 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
 
     Raises:
         FoxgloveMissing: foxglove-sdk is not installed.
-        McapError: The file cannot be written, or something else stands there.
+        McapError: The file cannot be written, something else stands there, or the run has a time that is none.
         RunFolderError: The run cannot be read.
     """
     foxglove = foxglove_module()
@@ -52,6 +52,8 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
         path.with_suffix(LAYOUT_SUFFIX).write_text(layout(list(loaded.robots)), encoding="utf-8")
     except OSError as error:
         raise McapError(f"{path}: cannot be written ({error.strerror or error})") from error
+    except OverflowError as error:
+        raise McapError(f"{folder.path}: holds a time that MCAP cannot (1970 to 2106)") from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -75,9 +77,18 @@ def check_mcap_target(path: Path) -> None:
 
 
 def epoch_ns(folder: RunFolder) -> int:
-    """Start of a run, nanoseconds since 1970; 0 on virtual time."""
+    """Start of a run, nanoseconds since 1970; 0 on virtual time.
+
+    Raises:
+        McapError: The run says no date.
+    """
     start = folder.run().start
-    return round(datetime.fromisoformat(start).timestamp()) * 10**9 if isinstance(start, str) else 0
+    if not isinstance(start, str):
+        return 0
+    try:
+        return round(datetime.fromisoformat(start).timestamp()) * 10**9
+    except (ValueError, OverflowError) as error:
+        raise McapError(f"{folder.path / 'run.json'}: start: {start[:40]!r} is no date") from error
 
 
 @contextmanager
