@@ -498,6 +498,30 @@ def test_a_map_without_latents_is_pruned_and_merged_in_a_sentence(first: Path, b
     assert like_pairs(MapFolder.open(tmp_path / "blind"), MapFolder.open(block), 3) == []
 
 
+def test_a_map_whose_name_is_no_text_is_saved(first: Path, tmp_path: Path) -> None:
+    out = tmp_path / os.fsdecode(b"t\xf6wn")
+    try:
+        out.mkdir()
+    except OSError:
+        pytest.skip("this file system takes UTF-8 only")
+    assert save_map(first, out).name == MapFolder.open(out).manifest.name == "t\ufffdwn"
+    assert save_map(first, out, name="one\x1b[31m\ntwo").name == "one\ufffd[31m\ufffdtwo"
+
+
+def test_a_run_in_a_map_whose_folder_is_no_text_ends_in_a_sentence(
+    block: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / os.fsdecode(b"t\xf6wn")
+    try:
+        shutil.copytree(block, folder)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 only")
+    out = str(tmp_path / "run")
+    words = ("simulate", "meeting", "--set", "duration_s=1", "--map", str(folder), "--out", out)
+    code, text = said(capsys, monkeypatch, *words)
+    assert (code, "is not UTF-8" in text) == (2, True), text
+
+
 def test_what_is_missing_from_a_run_is_said_when_it_is_saved(
     first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -535,11 +559,11 @@ def content_of_files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_campaign_takes_no_map(
-    block: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    code, text = said(capsys, monkeypatch, "simulate", "--seeds", "1", "--map", str(block))
-    assert (code, "--map without --seeds" in text) == (2, True)
+def test_a_map_is_not_exported_into_itself(block: Path) -> None:
+    before = content_of_files(block)
+    with pytest.raises(BadMap, match="is the map itself"):
+        export_map(MapFolder.open(block), block / ".." / block.name)
+    assert content_of_files(block) == before
 
 
 def test_a_manifest_that_names_a_file_elsewhere_is_refused(block: Path, tmp_path: Path) -> None:

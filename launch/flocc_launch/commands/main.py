@@ -196,8 +196,13 @@ def simulate(
     speech = Speech(json_out, quiet, verbose)
     if seeds is not None and sets:
         fail("a campaign draws its scenarios; --set changes one, without --seeds")
-    if seeds is not None and map_folder is not None:
-        fail("a campaign draws its scenarios, and none of them knows the map; give --map without --seeds")
+    ignored = {
+        "SCENARIO": scenario, "--agents": agents, "--loss": loss, "--latency": latency, "--bandwidth": bandwidth,
+        "--range": range_m, "--duration": duration, "--map": map_folder, "--map-fixed": map_fixed or None,
+    }  # fmt: skip
+    given = [name for name, value in ignored.items() if value is not None]
+    if seeds is not None and given:
+        fail(f"a campaign draws its scenarios; {given[0]} is for one of your own, without --seeds")
     if seeds is not None:
         run_campaign(seeds, seed or 0, shrink, out, speech)
         return
@@ -399,7 +404,7 @@ def _foxglove(out: Path, where: str | None, speech: Speech) -> "Iterator[None]":
     from flocc_launch.runs.run_folder import RunFolder
     from flocc_launch.view.mcap_file import foxglove_server
 
-    with foxglove_server(RunFolder(out), *address(where)) as url:
+    with foxglove_server(RunFolder(out), *address(where, "foxglove")) as url:
         speech.tell(f"foxglove: {url}")
         yield
 
