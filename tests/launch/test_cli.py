@@ -109,6 +109,10 @@ def test_a_change_reaches_the_scenario(command: str, tmp_path: Path, monkeypatch
 def test_a_campaign_takes_no_changes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, "simulate", "--seeds", "1", "--set", "rate=2") == 2
     assert "--set" in sentence(capsys)
+    for words in (("meeting",), ("--agents", "2"), ("--loss", "0"), ("--range", "5"), ("--map", "m"), ("--map-fixed",)):
+        assert run(monkeypatch, "simulate", "--seeds", "1", *words) == 2
+        named = words[0] if words[0].startswith("--") else "SCENARIO"
+        assert f"{named} is for one of your own, without --seeds" in sentence(capsys)
 
 
 def test_a_missing_scenario_names_the_shipped_ones(

@@ -1,6 +1,7 @@
 """Maps: saved whole or not at all, never changed by reading, opened by teams, merged, pruned, exported."""
 
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -29,7 +30,7 @@ from flocc_launch.commands.main import main
 from flocc_launch.graph_files.g2o import read_g2o
 from flocc_launch.maps.gathering import gathered
 from flocc_launch.maps.map_export import export_map
-from flocc_launch.maps.map_merging import MERGER, merge_maps
+from flocc_launch.maps.map_merging import MERGER, like_pairs, merge_maps
 from flocc_launch.maps.map_pruning import prune_map
 from flocc_launch.maps.map_saving import save_map
 from flocc_launch.maps.opening import MapUse
@@ -372,6 +373,199 @@ def test_an_altered_byte_is_found(block: Path, tmp_path: Path) -> None:
         opened.saved()
 
 
+def altered(block: Path, tmp_path: Path, pattern: str) -> Path:
+    """A copy of a map in which one byte of a file is another one."""
+    folder = Path(shutil.copytree(block, tmp_path / f"altered-{pattern[:3]}"))
+    (file,) = folder.glob(pattern)
+    data = bytearray(file.read_bytes())
+    data[-20] ^= 1
+    file.write_bytes(data)
+    return folder
+
+
+@pytest.mark.parametrize("pattern", ["records-*", "solution-*", "latents-*"])
+def test_every_command_of_maps_refuses_an_altered_byte(
+    block: Path,
+    tmp_path: Path,
+    pattern: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder, out = str(altered(block, tmp_path, pattern)), str(tmp_path / "out")
+    for words in (
+        ("map", "info", folder),
+        ("map", "info", folder, "--json"),
+        ("map", "prune", folder, "--out", out),
+        ("map", "merge", folder, str(block), "--out", out),
+        ("simulate", "meeting", "--map", folder, "--out", out),
+    ):
+        code, text = said(capsys, monkeypatch, *words)
+        assert (code, "its checksum is another one" in text) == (2, True), words
+        assert text.startswith("error: ")
+    assert not Path(out).exists()
+
+
+def rewritten(block: Path, tmp_path: Path, what: str, data: bytes, suffix: str) -> Path:
+    """A copy of a map with another file, whose checksum fits."""
+    name = f"{what}-other.{suffix}"
+    key = {"latents": "latent_file"}.get(what, what)
+    folder = spoilt(
+        block,
+        tmp_path,
+        **{key: {"name": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}},
+    )
+    (folder / name).write_bytes(data)
+    return folder
+
+
+@pytest.mark.parametrize("what", ["records", "solution", "latents"])
+@pytest.mark.parametrize("data", [b"", b"hello", bytes(5000)])
+def test_files_of_something_else_are_named_even_where_checksums_fit(
+    block: Path, tmp_path: Path, what: str, data: bytes
+) -> None:
+    folder = rewritten(block, tmp_path, what, data, "bin")
+    with pytest.raises(BadMap, match=f"{what}-other.bin: "):
+        MapFolder.open(folder).check_whole()
+
+
+def turned(name: str, change: Any) -> Any:
+    """A change of one array of a solution; None takes it away."""
+
+    def of(arrays: dict[str, Any]) -> None:
+        array = arrays.pop(name)
+        if change is not None:
+            arrays[name] = change(array)
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        (name, change)
+        for name, changes in {
+            "poses0": (lambda x: x[:0], lambda x: x * np.nan, lambda x: x * 0, lambda x: x[0], lambda x: x.astype(str)),
+            "covariances0": (lambda x: x[:, :5], lambda x: x[:-1], lambda x: x.astype(int)),
+            "closures": (lambda x: x + 1000, lambda x: -1 - x, lambda x: x[:-1], lambda x: x + 0.5, lambda x: x[0]),
+            "closure_values": (lambda x: x * np.nan, lambda x: x[:, :1]),
+        }.items()
+        for change in (None, *changes)
+    ],
+)
+def test_a_solution_that_does_not_fit_is_named(block: Path, tmp_path: Path, name: str, change: Any) -> None:
+    arrays = dict(MapFolder.open(block).solution)
+    turned(name, change)(arrays)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    folder = rewritten(block, tmp_path, "solution", buffer.getvalue(), "npz")
+    for reading in (MapFolder.poses, MapFolder.saved, MapFolder.used_closures, MapFolder.check_whole):
+        with pytest.raises(BadMap, match=r"solution-other\.npz: does not fit the map"):
+            reading(MapFolder.open(folder))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"fx": 0.0}, {"width": -1}, {"T_body_camera": [0.0] * 7}, {"records": -3}, {"records": 3}, {"records": 9999}],
+)
+def test_a_log_that_cannot_be_is_named(block: Path, tmp_path: Path, change: dict[str, Any]) -> None:
+    logs = json.loads((block / "map.json").read_text())["logs"]
+    lens = {"width": 640, "height": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
+    logs[0] |= {"camera": lens | change} if set(change) <= set(lens) else change
+    with pytest.raises(BadMap, match=r"map\.json"):
+        MapFolder.open(spoilt(block, tmp_path, logs=logs)).check_whole()
+
+
+@pytest.mark.parametrize(
+    "change", [{"frame": "map/zz"}, {"edition": 0}, {"name": "\ud800"}, {"latents": 1}, {"poses": 1}]
+)
+def test_a_manifest_that_contradicts_its_files_is_refused(block: Path, tmp_path: Path, change: dict[str, Any]) -> None:
+    with pytest.raises(BadMap):
+        MapFolder.open(spoilt(block, tmp_path, **change)).check_whole()
+
+
+def test_a_manifest_of_brackets_is_refused(block: Path, tmp_path: Path) -> None:
+    (Path(shutil.copytree(block, tmp_path / "deep")) / "map.json").write_text("[" * 100_000)
+    with pytest.raises(BadMap, match="is cut off or not JSON"):
+        MapFolder.open(tmp_path / "deep")
+
+
+def test_a_map_without_latents_is_pruned_and_merged_in_a_sentence(first: Path, block: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(first, tmp_path / "run"))
+    for file in run.glob("robots/*/store/latents.sqlite"):
+        file.unlink()
+    save_map(run, tmp_path / "blind")
+    assert prune_map(tmp_path / "blind", tmp_path / "small", 2.0, 30.0).latents == 0
+    assert like_pairs(MapFolder.open(tmp_path / "blind"), MapFolder.open(block), 3) == []
+
+
+def test_a_map_whose_name_is_no_text_is_saved(first: Path, tmp_path: Path) -> None:
+    out = tmp_path / os.fsdecode(b"t\xf6wn")
+    try:
+        out.mkdir()
+    except OSError:
+        pytest.skip("this file system takes UTF-8 only")
+    assert save_map(first, out).name == MapFolder.open(out).manifest.name == "t\ufffdwn"
+    assert save_map(first, out, name="one\x1b[31m\ntwo").name == "one\ufffd[31m\ufffdtwo"
+
+
+def test_a_run_in_a_map_whose_folder_is_no_text_ends_in_a_sentence(
+    block: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / os.fsdecode(b"t\xf6wn")
+    try:
+        shutil.copytree(block, folder)
+    except OSError:
+        pytest.skip("this file system takes UTF-8 only")
+    out = str(tmp_path / "run")
+    words = ("simulate", "meeting", "--set", "duration_s=1", "--map", str(folder), "--out", out)
+    code, text = said(capsys, monkeypatch, *words)
+    assert (code, "is not UTF-8" in text) == (2, True), text
+
+
+def test_what_is_missing_from_a_run_is_said_when_it_is_saved(
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(first, tmp_path / "run"))
+    shutil.rmtree(run / "robots" / "r2" / "store")
+    (run / "robots" / "r1" / "store" / "latents.sqlite").unlink()
+    code, text = said(capsys, monkeypatch, "map", "save", str(run), "--out", str(tmp_path / "map"))
+    assert code == 0
+    assert "left out: r2 left no log in any store" in text
+    keyframes = MapFolder.open(tmp_path / "map").manifest.logs[0].keyframes
+    assert f"without latents: {keyframes} keyframes" in text
+    _, whole = said(capsys, monkeypatch, "map", "save", str(first), "--out", str(tmp_path / "whole"))
+    assert "left out" not in whole
+    assert "without latents" not in whole
+
+
+def test_a_run_is_not_replaced_for_a_map_that_cannot_be_used(
+    first: Path, block: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(first, tmp_path / "run"))
+    inside = Path(shutil.copytree(block, run / "map"))
+    before = content_of_files(run)
+    for command in ("simulate", "launch"):
+        for folder, sentence in (
+            (tmp_path / "nowhere", "is not a folder"),
+            (altered(block, tmp_path / command, "latents-*"), "its checksum is another one"),
+            (inside, "holds the map"),
+        ):
+            code, text = said(capsys, monkeypatch, command, "meeting", "--map", str(folder), "--out", str(run))
+            assert (code, sentence in text) == (2, True), text
+    assert content_of_files(run) == before
+
+
+def content_of_files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_map_is_not_exported_into_itself(block: Path) -> None:
+    before = content_of_files(block)
+    with pytest.raises(BadMap, match="is the map itself"):
+        export_map(MapFolder.open(block), block / ".." / block.name)
+    assert content_of_files(block) == before
+
+
 def test_a_manifest_that_names_a_file_elsewhere_is_refused(block: Path, tmp_path: Path) -> None:
     wrong = {"name": "../records.bin", "bytes": 1, "sha256": ""}
     with pytest.raises(BadMap, match="names a file elsewhere"):
@@ -482,6 +676,7 @@ def _renamed(folder: Path) -> Path:
     manifest = json.loads(path.read_text())
     for entry in manifest["logs"]:
         entry["log"] = entry["log"].replace("r", "s")
+    manifest["frame"] = "map/" + manifest["logs"][0]["log"]
     path.write_text(json.dumps(manifest))
     return folder
 

@@ -3,6 +3,9 @@
 import base64
 import json
 import math
+import os
+import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -214,6 +217,38 @@ def test_a_run_without_images_is_written_and_images_are_bounded(
     monkeypatch.setattr(scene_drawing, "IMAGES_BYTES_MAX", 1)
     told = Counter(topic for topic, *_ in messages(write_mcap(run, tmp_path / "b.mcap")))
     assert sum(count for topic, count in told.items() if topic.endswith("/keyframes")) == 1
+
+
+def test_nothing_but_an_earlier_mcap_file_is_replaced(run: RunFolder, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    for _ in range(2):
+        write_mcap(run, path)
+    path.write_bytes(b"")
+    write_mcap(run, path)
+    notes = tmp_path / "notes.txt"
+    notes.write_text("mine")
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for taken in (notes, pipe, tmp_path, run.path / "run.json", Path("/dev/null")):
+        with pytest.raises(McapError, match=r"cannot be written \(it is "):
+            write_mcap(run, taken)
+    assert notes.read_text() == "mine"
+    assert pipe.is_fifo()
+    assert Path("/dev/null").is_char_device()
+
+
+@pytest.mark.parametrize("at_s", ["-5.0", "1e30"])
+def test_a_time_that_is_none_is_one_sentence(run: RunFolder, tmp_path: Path, at_s: str) -> None:
+    other = Path(shutil.copytree(run.path, tmp_path / "run"))
+    lines = (other / "events.jsonl").read_text()
+    (other / "events.jsonl").write_text(re.sub(r'"t": ?[0-9.e-]+', f'"t": {at_s}', lines))
+    with pytest.raises(McapError, match="holds a time that MCAP cannot"):
+        write_mcap(RunFolder.open(other), tmp_path / "run.mcap")
+    fields = json.loads((other / "run.json").read_text())
+    (other / "run.json").write_text(json.dumps(fields | {"start": "yesterday"}))
+    with pytest.raises(McapError, match="start: 'yesterday' is no date"):
+        write_mcap(RunFolder.open(other), tmp_path / "run.mcap")
+    assert not list(tmp_path.glob("run.mcap*"))
 
 
 def test_what_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path: Path, run: RunFolder) -> None:

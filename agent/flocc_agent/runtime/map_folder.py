@@ -23,9 +23,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from flocc_agent.core.gossip import Sealer
+from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.saved_map import SavedClosure, SavedMap
 from flocc_agent.geometry import poses_from_tq
 from flocc_protocol.codec import Pose7
@@ -39,6 +40,9 @@ MAP_FORMAT = 1
 MANIFEST = "map.json"
 LENGTH = struct.Struct("<I")
 LATENT_TABLE = "CREATE TABLE latents(keyframe TEXT PRIMARY KEY, sha256 BLOB NOT NULL, data BLOB NOT NULL) WITHOUT ROWID"
+UPPER = 21
+"""Numbers in the upper triangle of a pose's covariance."""
+QUATERNION_MIN = 1e-6
 OTHER_VIEW_RATIO = 1.5
 """A lens that sees so much more or less than those of the map finds fewer places in it."""
 
@@ -64,10 +68,10 @@ class FileSum(MapPart):
 class LensModel(MapPart):
     """Intrinsics of a log's camera, pixels."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0.0, allow_inf_nan=False)
+    fy: float = Field(gt=0.0, allow_inf_nan=False)
     cx: float
     cy: float
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -81,11 +85,18 @@ class SavedLogEntry(MapPart):
     """One log."""
 
     log: str
-    records: int
-    bytes: int
-    keyframes: int = 0
+    records: int = Field(ge=0)
+    bytes: int = Field(ge=0)
+    keyframes: int = Field(default=0, ge=0)
     camera: LensModel | None = None
     T_body_camera: Pose7 | None = None
+
+    @field_validator("T_body_camera")
+    @classmethod
+    def _is_pose(cls, given: Pose7 | None) -> Pose7 | None:
+        if given is not None and not _are_poses(np.array([given])):
+            raise ValueError("T_body_camera is no pose")
+        return given
 
     @property
     def id(self) -> LogId:
@@ -129,7 +140,7 @@ class MapManifest(MapPart):
     format: int
     kind: Literal["flocc map"] = "flocc map"
     name: str
-    edition: int = 1
+    edition: int = Field(default=1, ge=1)
     frame: str
     made_by: str = ""
     swarm: str | None = None
@@ -175,6 +186,19 @@ class MapFolder:
                 self._latents.close()
                 self._latents = None
 
+    def check_whole(self) -> None:
+        """Read all of it, latents too, and see that it is what was saved.
+
+        Raises:
+            BadMap: A file was altered, or does not fit the others.
+        """
+        _ = self.records, self.solution
+        _check_sum(self.path, self.manifest.latent_file)
+        count = len(self.latent_keyframes())
+        if count != self.manifest.latents:
+            file = self.path / self.manifest.latent_file.name
+            raise BadMap(f"{file}: holds {count} latents, and {self.manifest.latents} were saved")
+
     # Logs
 
     @cached_property
@@ -182,20 +206,25 @@ class MapFolder:
         """The records of every log, as their writers signed them.
 
         Raises:
-            BadMap: The file was altered.
+            BadMap: The file was altered, or is not as long as the manifest says.
         """
+        file = self.path / self.manifest.records.name
         data = _checked(self.path, self.manifest.records)
         found: dict[LogId, tuple[bytes, ...]] = {}
         offset = 0
         for entry in self.manifest.logs:
             records = []
             for _ in range(entry.records):
+                if offset + LENGTH.size > len(data):
+                    raise BadMap(f"{file}: ends within log {entry.log}; it does not fit {MANIFEST}")
                 (length,) = LENGTH.unpack_from(data, offset)
                 if length > SEALED_RECORD_BYTES_MAX:
-                    raise BadMap(f"{self.path / self.manifest.records.name}: holds a record that no robot wrote")
+                    raise BadMap(f"{file}: holds a record that no robot wrote")
                 records.append(data[offset + LENGTH.size : offset + LENGTH.size + length])
                 offset += LENGTH.size + length
             found[entry.id] = tuple(records)
+        if offset != len(data):
+            raise BadMap(f"{file}: does not end where its last log does; it does not fit {MANIFEST}")
         return found
 
     def closed(self) -> frozenset[LogId]:
@@ -248,13 +277,20 @@ class MapFolder:
     def latent(self, keyframe: KeyframeId) -> bytes | None:
         """A latent; None where the map has none, or a damaged one."""
         for sha256, data in self._read("SELECT sha256, data FROM latents WHERE keyframe = ?", (str(keyframe),)):
-            if hashlib.sha256(data).digest() == sha256:
-                return bytes(data)
+            if isinstance(data, bytes) and hashlib.sha256(data).digest() == sha256:
+                return data
         return None
 
     def latent_keyframes(self) -> list[KeyframeId]:
-        """Keyframes that have one, sorted."""
-        return sorted(KeyframeId.parse(name) for (name,) in self._read("SELECT keyframe FROM latents"))
+        """Keyframes that have one, sorted.
+
+        Raises:
+            BadMap: The file was altered.
+        """
+        try:
+            return sorted(KeyframeId.parse(name) for (name,) in self._read("SELECT keyframe FROM latents"))
+        except (ValueError, TypeError) as error:
+            raise BadMap(f"{self.path / self.manifest.latent_file.name}: names a keyframe: {error}") from error
 
     def _read(self, query: str, parameters: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         path = self.path / self.manifest.latent_file.name
@@ -274,14 +310,19 @@ class MapFolder:
         """Arrays of the solution, by name.
 
         Raises:
-            BadMap: The file was altered.
+            BadMap: The file was altered, or does not fit the manifest.
         """
+        file = self.path / self.manifest.solution.name
         data = _checked(self.path, self.manifest.solution)
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
-        except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-            raise BadMap(f"{self.path / self.manifest.solution.name}: cannot be read: {error}") from error
+                found = {name: arrays[name] for name in arrays.files}
+        except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+            raise BadMap(f"{file}: cannot be read: {error}") from error
+        unfit = _unfit(found, self.manifest.poses)
+        if unfit is not None:
+            raise BadMap(f"{file}: does not fit the map: its {unfit} are not what a map has")
+        return found
 
     def poses(self) -> dict[LogId, Float]:
         """Camera poses (N, 4, 4) of each log that has some, the anchor first."""
@@ -328,7 +369,7 @@ def read_manifest(path: Path) -> MapManifest:
         raise BadMap(f"{path}: has no {MANIFEST}: it is no map, or saving it did not end")
     try:
         fields = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadMap(f"{file}: is cut off or not JSON: {error}") from error
     if not isinstance(fields, dict) or fields.get("kind") != "flocc map":
         raise BadMap(f"{file}: is not of a flocc map")
@@ -337,11 +378,14 @@ def read_manifest(path: Path) -> MapManifest:
     try:
         manifest = MapManifest.model_validate(fields)
         ids = [entry.id for entry in manifest.logs]
+        manifest.model_dump_json()  # a text that could not be written again
     except (ValidationError, ValueError) as error:
         said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise BadMap(f"{file}: cannot be used: {said}") from error
     if not 1 <= manifest.poses <= len(ids) or len(set(ids)) != len(ids):
         raise BadMap(f"{file}: lists its logs twice, or none with poses")
+    if manifest.frame != map_frame(ids[0]):
+        raise BadMap(f"{file}: is of frame {manifest.frame!r}, and its first log is of {map_frame(ids[0])!r}")
     for each in (manifest.records, manifest.solution, manifest.latent_file):
         if Path(each.name).name != each.name:
             raise BadMap(f"{file}: names a file elsewhere: {each.name[:80]!r}")
@@ -354,6 +398,44 @@ def _check_size(path: Path, of: FileSum) -> None:
         raise BadMap(f"{file}: is missing; the map is not whole")
     if file.stat().st_size != of.bytes:
         raise BadMap(f"{file}: has {file.stat().st_size} bytes, and {of.bytes} were saved: it is cut off or altered")
+
+
+def _are_poses(rows: NDArray[Any]) -> bool:
+    """Whether rows (N, 7) are finite positions and quaternions that have a direction."""
+    finite = rows.ndim == 2 and rows.shape[1] == 7 and rows.dtype.kind == "f" and bool(np.isfinite(rows).all())
+    return finite and bool((np.abs(rows[:, 3:]).max(axis=1, initial=0.0) > QUATERNION_MIN).all())
+
+
+def _unfit(arrays: Mapping[str, NDArray[Any]], logs: int) -> str | None:
+    """Name of the first array of a solution that is missing or of another shape; None where all fit."""
+    lengths = []
+    for k in range(logs):
+        poses, covariances = arrays.get(f"poses{k}"), arrays.get(f"covariances{k}")
+        if poses is None or not _are_poses(poses):
+            return f"poses{k}"
+        if covariances is None or covariances.shape != (len(poses), UPPER) or covariances.dtype.kind != "f":
+            return f"covariances{k}"
+        lengths.append(len(poses))
+    ends, values = arrays.get("closures"), arrays.get("closure_values")
+    if ends is None or ends.ndim != 2 or ends.shape[1] != 4 or ends.dtype.kind != "i":
+        return "closures"
+    of, at = ends[:, [0, 2]], ends[:, [1, 3]]
+    if bool(((of < 0) | (of >= logs)).any()) or bool(((at < 0) | (at >= np.array(lengths)[of])).any()):
+        return "closures"
+    if values is None or values.shape != (len(ends), 2) or not bool(np.isfinite(values).all()):
+        return "closure_values"
+    return None
+
+
+def _check_sum(path: Path, of: FileSum) -> None:
+    """Whether a file that is too large to hold is what was saved."""
+    try:
+        with (path / of.name).open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256")
+    except OSError as error:
+        raise BadMap(f"{path / of.name}: cannot be read: {error.strerror}") from error
+    if digest.hexdigest() != of.sha256:
+        raise BadMap(f"{path / of.name}: is not what was saved: its checksum is another one")
 
 
 def _checked(path: Path, of: FileSum) -> bytes:

@@ -163,6 +163,10 @@ def launch(
         from flocc_launch.view.scene_drawing import foxglove_module
 
         foxglove_module()  # a missing package is said before the run, not after it
+    if mcap is not None:
+        from flocc_launch.view.mcap_file import check_mcap_target
+
+        check_mcap_target(mcap)
     use = _map_use(map_folder, map_fixed)
     speech = Speech(json_out, quiet, verbose)
     _launch(_read(scenario, changes, agents, speech), out, speech, secure, dashboard, metrics, mcap, foxglove, use)
@@ -192,6 +196,13 @@ def simulate(
     speech = Speech(json_out, quiet, verbose)
     if seeds is not None and sets:
         fail("a campaign draws its scenarios; --set changes one, without --seeds")
+    ignored = {
+        "SCENARIO": scenario, "--agents": agents, "--loss": loss, "--latency": latency, "--bandwidth": bandwidth,
+        "--range": range_m, "--duration": duration, "--map": map_folder, "--map-fixed": map_fixed or None,
+    }  # fmt: skip
+    given = [name for name, value in ignored.items() if value is not None]
+    if seeds is not None and given:
+        fail(f"a campaign draws its scenarios; {given[0]} is for one of your own, without --seeds")
     if seeds is not None:
         run_campaign(seeds, seed or 0, shrink, out, speech)
         return
@@ -209,7 +220,9 @@ def simulate(
     with progress_bar("preparing data") as progress:
         paths = recordings(read, progress)
     check_measurable(read, paths)
-    fresh_folder(out)
+    if use is not None:
+        use.checked(read)  # before the earlier run goes
+    fresh_folder(out, use)
     show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 
 
@@ -355,14 +368,19 @@ def _launch(
         _foxglove(out, foxglove, speech),
     ):
         report = run(scenario, out, show, secure=secure, metrics=metrics, paths=paths, use=use)
-    _record(out, mcap)
+    failed = _record(out, mcap)
     show_report(report, out, speech)
+    if failed and mcap is not None:
+        sys.exit(EXIT_BAD_INPUT)
 
 
-def _record(out: Path, mcap: Path | None) -> None:
-    """Write the run as MCAP; without the package only where somebody asked for it."""
+def _record(out: Path, mcap: Path | None) -> bool:
+    """Write the run as MCAP, without the package only where somebody asked for it; True where it failed.
+
+    The run is over by then: what came of it is said all the same.
+    """
     from flocc_launch.runs.run_folder import RunFolder
-    from flocc_launch.view.mcap_file import MCAP_NAME, write_mcap
+    from flocc_launch.view.mcap_file import MCAP_NAME, McapError, write_mcap
     from flocc_launch.view.scene_drawing import FoxgloveMissing
 
     try:
@@ -370,6 +388,10 @@ def _record(out: Path, mcap: Path | None) -> None:
     except FoxgloveMissing:
         if mcap is not None:
             raise
+    except McapError as error:
+        typer.echo(f"error: {error}", err=True)
+        return True
+    return False
 
 
 @contextmanager
@@ -382,7 +404,7 @@ def _foxglove(out: Path, where: str | None, speech: Speech) -> "Iterator[None]":
     from flocc_launch.runs.run_folder import RunFolder
     from flocc_launch.view.mcap_file import foxglove_server
 
-    with foxglove_server(RunFolder(out), *address(where)) as url:
+    with foxglove_server(RunFolder(out), *address(where, "foxglove")) as url:
         speech.tell(f"foxglove: {url}")
         yield
 

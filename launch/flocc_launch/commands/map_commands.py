@@ -39,6 +39,8 @@ def save(
     for log, reason in manifest.left_out.items():
         typer.echo(f"left out: {log} {reason}")
     keyframes = sum(entry.keyframes for entry in manifest.logs)
+    if not manifest.pruned and manifest.latents < keyframes:
+        typer.echo(f"without latents: {keyframes - manifest.latents} keyframes, where no robot can be found")
     typer.echo(f"{manifest.frame}: {len(manifest.logs)} logs, {keyframes} keyframes, {manifest.closures} closures")
     typer.echo(f"map: {out.resolve()}")
 

@@ -151,15 +151,15 @@ def live_dashboard(
         dashboard.close()
 
 
-def address(text: str) -> tuple[str, int]:
-    """Read [HOST:]PORT; without a host, this machine only.
+def address(text: str, what: str = "dashboard") -> tuple[str, int]:
+    """Read [HOST:]PORT of `what`; without a host, this machine only.
 
     Raises:
         DashboardError: It is not that.
     """
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > PORT_MAX:
-        raise DashboardError(f"dashboard: {text!r} is not [HOST:]PORT, such as 8642 or 0.0.0.0:8642")
+        raise DashboardError(f"{what}: {text!r} is not [HOST:]PORT, such as 8642 or 0.0.0.0:8642")
     return host.strip("[]") or "127.0.0.1", int(port)
 
 

@@ -40,8 +40,10 @@ def export_map(opened: MapFolder, out: Path) -> list[Path]:
     Trajectories are of the body where it is known how the camera sits on it, else of the camera.
 
     Raises:
-        FloccError: The map is damaged, or a file cannot be written.
+        FloccError: The map is damaged, `out` is its own folder, or a file cannot be written.
     """
+    if out.resolve() == opened.path.resolve():
+        raise BadMap(f"{out}: is the map itself; its files go to another folder (--out)")
     try:
         out.mkdir(parents=True, exist_ok=True)
         poses = opened.poses()

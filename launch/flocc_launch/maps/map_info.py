@@ -7,7 +7,12 @@ from flocc_agent.runtime.map_folder import LensModel, MapFolder, MapManifest
 
 
 def map_lines(opened: MapFolder) -> list[tuple[str, str]]:
-    """Names and values, for `flocc map info`."""
+    """Names and values, for `flocc map info`.
+
+    Raises:
+        BadMap: It is not whole.
+    """
+    opened.check_whole()
     manifest = opened.manifest
     return [*manifest_lines(manifest), ("uncertainty", _uncertainty(opened)), ("size", _size(manifest))]
 

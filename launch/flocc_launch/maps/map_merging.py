@@ -77,6 +77,8 @@ def merge_maps(
     """
     check_target(out, first, second)
     a, b = MapFolder.open(first), MapFolder.open(second)
+    a.check_whole()
+    b.check_whole()
     _check_pair(a, b)
     limits = parameters or CoreParameters()
     pairs = like_pairs(a, b, limits.place_recognition.best_matches)
@@ -163,7 +165,7 @@ def described(opened: MapFolder) -> tuple[list[KeyframeId], Descriptors]:
                 rows.append(row)
     if len({len(row) for row in rows}) > 1:
         raise BadMap(f"{opened.path}: its descriptors have different lengths")
-    return keyframes, np.array(rows, dtype=np.float32).reshape(len(rows), -1)
+    return keyframes, np.array(rows, dtype=np.float32).reshape(len(rows), -1 if rows else 0)
 
 
 def like_pairs(a: MapFolder, b: MapFolder, best_matches: int) -> list[LikePair]:

@@ -40,6 +40,7 @@ def prune_map(folder: Path, out: Path, place_m: float, place_deg: float) -> MapM
     """
     check_target(out, folder)
     opened = MapFolder.open(folder)
+    opened.check_whole()
     kept = set(kept_keyframes(opened, place_m, np.radians(place_deg)))
     manifest = opened.manifest
     solved = SolvedMap(opened.saved(), opened.covariances(), {})

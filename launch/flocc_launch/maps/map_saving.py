@@ -44,6 +44,7 @@ def save_map(
     solved = solved_map(str(where), logs, saved, frame, back_end)
     if earlier is not None:
         solved = _kept_covariances(_checked_news(solved, earlier, where), earlier)
+    solved = replace(solved, left_out={**solved.left_out, **_without_log(where, logs)})
     content = MapContent(
         name=name or (out.name if earlier is None else earlier.manifest.name),
         logs=logs,
@@ -66,6 +67,7 @@ def copy_map(opened: MapFolder, out: Path) -> MapManifest:
     Raises:
         BadMap: It is damaged, or `out` cannot be written.
     """
+    opened.check_whole()
     manifest = opened.manifest
     page = opened.path / PAGE
     content = MapContent(
@@ -114,6 +116,7 @@ def _earlier(found: Gathered, out: Path) -> MapFolder:
     path = Path(found.used.path)
     check_target(out, path)
     opened = MapFolder.open(path)
+    opened.check_whole()
     if opened.manifest.frame != found.used.frame:
         raise BadMap(f"{path}: is of {opened.manifest.frame}, and {found.where} worked in {found.used.frame}")
     return opened
@@ -154,6 +157,15 @@ def _recordings(where: Path) -> Mapping[str, Path]:
     folder = RunFolder.open(where)
     found = {robot: folder.recording(robot) for robot in folder.run().robots}
     return {robot: path for robot, path in found.items() if path is not None}
+
+
+def _without_log(where: Path, logs: Logs) -> dict[LogId, str]:
+    """Robots of a run of which no store holds a log: their folders are gone, or they never began."""
+    if not (where / "run.json").is_file():
+        return {}
+    run = RunFolder.open(where).run()
+    known = {log.robot for log in logs}
+    return {LogId(name): "left no log in any store" for name in run.robots if name not in {*known, *run.servers}}
 
 
 def _swarm(where: Path) -> str | None:

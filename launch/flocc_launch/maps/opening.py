@@ -31,6 +31,7 @@ class MapUse:
             BadMap: It is no map, or the scenario's back end or front end cannot work in it.
         """
         opened = MapFolder.open(self.folder)
+        opened.check_whole()
         if scenario.backend.mode is BackendMode.DISTRIBUTED:
             raise BadMap(f"{self.folder}: {NO_MAPS}")
         if scenario.simulation.optimiser == "quick":

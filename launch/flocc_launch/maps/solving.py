@@ -13,6 +13,7 @@ from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.pose_graph import ClosureState, Component, OptimisationFailed, map_frame
 from flocc_agent.core.saved_map import SavedClosure, SavedMap
 from flocc_agent.geometry import upper_triangle
+from flocc_agent.runtime.map_folder import UPPER
 from flocc_launch.maps.gathering import Logs, opened_record
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import KeyframeId, LogId
@@ -21,7 +22,6 @@ Float = NDArray[np.float64]
 
 COVARIANCES_MAX = 2000
 """Keyframes whose covariance is computed; of more, so many evenly spread ones."""
-UPPER = 21
 
 
 class NotSolved(FloccError):

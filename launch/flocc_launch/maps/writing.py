@@ -110,7 +110,7 @@ def _write(out: Path, content: MapContent) -> MapManifest:
     entries = [_entry(log, content) for log in order]
     manifest = MapManifest(
         format=MAP_FORMAT,
-        name=content.name,
+        name=_readable(content.name),
         edition=content.edition,
         frame=map_frame(saved.anchor),
         made_by=flocc_version(),
@@ -133,6 +133,12 @@ def _write(out: Path, content: MapContent) -> MapManifest:
         _replace(out / PAGE, content.page(manifest).encode())
     _sweep(out, manifest)
     return manifest
+
+
+def _readable(name: str) -> str:
+    """A name for people: what is no UTF-8, or no letter that can be printed, is replaced."""
+    text = os.fsencode(name).decode("utf-8", "replace")
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def _entry(log: LogId, content: MapContent) -> SavedLogEntry:

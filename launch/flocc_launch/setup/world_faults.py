@@ -49,6 +49,8 @@ def sentence_of(error: BaseException) -> str | None:
         return _os_sentence(error)
     if isinstance(error, UnicodeError):
         return f"a text cannot be read or written: {error}"
+    if type(error).__name__ == "PydanticSerializationError" and "UnicodeEncodeError" in str(error):
+        return "a name on the command line or in a configuration is not UTF-8: rename that file or folder"
     if isinstance(error, sqlite3.Error):
         return f"a store cannot be used: {error}"
     return None

@@ -9,6 +9,7 @@ from flocc_agent.agent import Agent
 from flocc_agent.config import AgentConfig, SourceConfig
 from flocc_agent.runtime.map_folder import MapManifest
 from flocc_launch.maps.map_saving import save_map
+from flocc_launch.maps.writing import check_target
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.records import KeyframeRecord
@@ -52,6 +53,7 @@ def save_swarm(
     Raises:
         FloccError: Nobody is there, or there is no map of what they know.
     """
+    check_target(out)
     with tempfile.TemporaryDirectory(prefix="flocc-map-", dir=out.resolve().parent) as scratch:
         secured = config.transport.tls is not None
         given = {"folder": Path(scratch), "compute_class": 0, "ros2": None, "map": None, "source": SourceConfig()}

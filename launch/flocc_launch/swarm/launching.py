@@ -97,17 +97,19 @@ def launch(
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
     paths = recordings(scenario, progress) if paths is None else paths
     check_measurable(scenario, paths)
-    folder = fresh_folder(out)
+    folder = fresh_folder(out, use)
     given = on_watch or (lambda _: None)
     return asyncio.run(_Launch(scenario, folder, paths, given, secure, served, use, lives).run())
 
 
-def fresh_folder(out: Path) -> RunFolder:
-    """An empty run folder; only an earlier run folder is ever replaced.
+def fresh_folder(out: Path, use: MapUse | None = None) -> RunFolder:
+    """An empty run folder; only an earlier run folder is ever replaced, and never one that holds the map in use.
 
     Raises:
-        LaunchError: Something else stands there.
+        LaunchError: Something else stands there, or the map does.
     """
+    if use is not None and use.folder.resolve().is_relative_to(out.resolve()):
+        raise LaunchError(f"{out}: holds the map {use.folder}, which is only read; choose another --out")
     if out.exists() and any(out.iterdir()):
         if not (out / "run.json").exists():
             raise LaunchError(f"{out}: is not empty and not an earlier run; choose another --out")

@@ -14,6 +14,7 @@ from flocc_launch.view.scene_drawing import SceneDrawing, foxglove_module, layou
 from flocc_protocol.errors import FloccError
 
 MCAP_NAME = "run.mcap"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 LAYOUT_SUFFIX = ".layout.json"
 LIVE_PERIOD_S = 0.25
 BACKLOG_MAX = 4096
@@ -28,14 +29,15 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
 
     Args:
         folder: The run.
-        path: The file; one that is there is replaced.
+        path: The file; an earlier MCAP file is replaced, anything else is left alone.
 
     Raises:
         FoxgloveMissing: foxglove-sdk is not installed.
-        McapError: The file cannot be written.
+        McapError: The file cannot be written, something else stands there, or the run has a time that is none.
         RunFolderError: The run cannot be read.
     """
     foxglove = foxglove_module()
+    check_mcap_target(path)
     loaded = load(folder)
     context = foxglove.Context()
     partial = path.with_name(f"{path.name}.partial")
@@ -50,16 +52,43 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
         path.with_suffix(LAYOUT_SUFFIX).write_text(layout(list(loaded.robots)), encoding="utf-8")
     except OSError as error:
         raise McapError(f"{path}: cannot be written ({error.strerror or error})") from error
+    except OverflowError as error:
+        raise McapError(f"{folder.path}: holds a time that MCAP cannot (1970 to 2106)") from error
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
     return path
 
 
+def check_mcap_target(path: Path) -> None:
+    """Refuse to replace what is no MCAP file: a device, a folder, a part of the run.
+
+    Raises:
+        McapError: Such a thing stands there.
+    """
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise McapError(f"{path}: cannot be written (it is no file)")
+    with path.open("rb") as file:
+        first = file.read(len(MCAP_MAGIC))
+    if first and first != MCAP_MAGIC:
+        raise McapError(f"{path}: cannot be written (it is a file of something else than MCAP)")
+
+
 def epoch_ns(folder: RunFolder) -> int:
-    """Start of a run, nanoseconds since 1970; 0 on virtual time."""
+    """Start of a run, nanoseconds since 1970; 0 on virtual time.
+
+    Raises:
+        McapError: The run says no date.
+    """
     start = folder.run().start
-    return round(datetime.fromisoformat(start).timestamp()) * 10**9 if isinstance(start, str) else 0
+    if not isinstance(start, str):
+        return 0
+    try:
+        return round(datetime.fromisoformat(start).timestamp()) * 10**9
+    except (ValueError, OverflowError) as error:
+        raise McapError(f"{folder.path / 'run.json'}: start: {start[:40]!r} is no date") from error
 
 
 @contextmanager
