@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.pictures import PictureError
-from flocc_agent.runtime.recording import MASK, write_camera
+from flocc_agent.runtime.recording import MASK, read_mask, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.datasets.pixels import ImageWriter, read_bytes
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -255,15 +255,19 @@ def _carry_mask(source: Source, lens: Lens, out: Path) -> None:
 
     Raises:
         DatasetError: There is a mask, and the pictures are straightened.
+        RecordingError: It is no mask of these images.
     """
     mask = source.path / MASK
-    if not mask.is_file():
+    if not mask.exists():
         return
     if source.lens is not None and lens.camera != source.lens.camera:
         raise DatasetError(
             f"{mask}: is of the pictures as they were taken, and these are straightened; leave it out, convert, and "
             f"put one of the straightened pictures into {out}"
         )
+    camera = lens.camera.agent_camera()
+    if camera is not None:
+        read_mask(mask, camera)
     shutil.copyfile(mask, out / MASK)
 
 
