@@ -376,3 +376,11 @@ def test_what_was_left_out_is_said_without_json_too(tmp_path: Path, capfd: pytes
     said = capfd.readouterr().err.splitlines()
     assert "warning: 1 lines of kind KIND_0 are left out" in said
     assert said[-1] == "warning: 2 more in result.json"
+
+
+@pytest.mark.parametrize("text", ["a,b,c\n", "1\n2\n", "1,2,3\n1,2\n"])
+def test_ground_truth_that_is_no_table_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    (tmp_path / "0.g2o").write_text(plane(0, 1, 1.0))
+    (tmp_path / "x_groundTruth.txt").write_text(text)
+    with pytest.raises(GraphFileError, match=r"x_groundTruth\.txt: is no table x,y,theta"):
+        read_g2o(tmp_path)

@@ -277,7 +277,12 @@ def _truth(folder: Path, graph: PoseGraph) -> dict[LogId, Float]:
     file = next(iter(sorted(folder.glob("*_groundTruth.txt"))), None)
     if file is None:
         return {}
-    rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    try:
+        rows = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise GraphFileError(f"{file}: is no table x,y,theta: {getattr(error, 'strerror', None) or error}") from error
+    if rows.shape[1] < 2:
+        raise GraphFileError(f"{file}: is no table x,y,theta: a row has {rows.shape[1]} numbers")
     positions = np.column_stack([rows[:, 0], rows[:, 1], np.zeros(len(rows))])
     truth, start = {}, 0
     for log in sorted(graph.trajectories):
