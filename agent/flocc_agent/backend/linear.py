@@ -52,13 +52,13 @@ class LinearSolver:
 
     Attributes:
         fixed: Index of the pose that does not move (the anchor's first keyframe).
-        scale_prior_sigma: Standard deviation of a cluster's scale around 1.
+        scale_prior_sigma: Standard deviation around 1 of all scales, or (C,) of each.
         iterative_loops_min: Number of edges beyond a tree from which on conjugate gradients are tried first.
         iterative_poses_min: Number of poses from which on they are, however few the loops.
     """
 
     fixed: int
-    scale_prior_sigma: float
+    scale_prior_sigma: float | Float
     iterative_loops_min: int = ITERATIVE_LOOPS_MIN
     iterative_poses_min: int = ITERATIVE_POSES_MIN
     _ordering: gtsam.Ordering | None = field(default=None, repr=False)
@@ -158,6 +158,31 @@ class LinearSolver:
             raise SingularSystem(str(error).strip().splitlines()[0]) from error
         return [0.5 * (found[p] + found[p].T) if p in found else np.zeros((6, 6)) for p in poses]
 
+    def scales_alone(
+        self, edges: Edges, state: State, at: Residuals, weights: Float, first: int
+    ) -> tuple[Float, Float]:
+        """What is left of the normal equations when everything but the scales from `first` on is eliminated.
+
+        Returns:
+            Information matrix (K, K) of these scales, and its right side (K,).
+
+        Raises:
+            SingularSystem: Something else is not determined.
+        """
+        graph = self.factors(edges, state, at, weights)
+        self._damp(graph, loose(edges, weights, len(state.q), self.fixed), (), TETHER)
+        keys = [SCALE_KEYS_FROM + c for c in range(first, len(state.scale))]
+        ordered = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, keys)
+        others = gtsam.Ordering()
+        for n in range(ordered.size() - len(keys)):
+            others.push_back(ordered.at(n))
+        try:
+            _, left = graph.eliminatePartialMultifrontal(others)
+            information, right = left.hessian(gtsam.Ordering(keys))
+        except RuntimeError as error:
+            raise SingularSystem(str(error).strip().splitlines()[0]) from error
+        return np.asarray(information), np.asarray(right)
+
     def _factorised(self, edges: Edges, state: State, at: Residuals, weights: Float) -> gtsam.GaussianBayesTree:
         if self._tree is None or self._tree_at is None or not _is_beside((state, weights), self._tree_at):
             graph = self.factors(edges, state, at, weights)
@@ -204,9 +229,9 @@ class LinearSolver:
         self, graph: gtsam.GaussianFactorGraph, edges: Edges, state: State, at: Residuals, sqrt_weights: Float
     ) -> None:
         unit = gtsam.noiseModel.Unit.Create(1)
-        one = np.full((1, 1), 1.0 / self.scale_prior_sigma)
-        for c, scale in enumerate(state.scale.tolist()):
-            graph.add(SCALE_KEYS_FROM + c, one, np.array([(1.0 - scale) / self.scale_prior_sigma]), unit)
+        slopes = 1.0 / np.broadcast_to(self.scale_prior_sigma, state.scale.shape)
+        for c, (scale, prior) in enumerate(zip(state.scale.tolist(), slopes.tolist(), strict=True)):
+            graph.add(SCALE_KEYS_FROM + c, np.full((1, 1), prior), np.array([(1.0 - scale) * prior]), unit)
         for k in np.flatnonzero(at.held & (edges.cluster >= 0)).tolist():
             slope = np.full((1, 1), -sqrt_weights[k] / edges.sigma[k])
             right = np.array([-sqrt_weights[k] * at.bound[k]])

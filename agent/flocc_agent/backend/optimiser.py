@@ -8,24 +8,21 @@ exclusions with a reason; what cannot be solved keeps its odometry. Deterministi
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flocc_agent.backend.clusters import votes
-from flocc_agent.backend.descent import Objective, Solved
-from flocc_agent.backend.edges import State, state_of
+from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import Aligned, component_with, initial_poses, trusted_closures
-from flocc_agent.backend.linear import LinearSolver, SingularSystem
+from flocc_agent.backend.initial import component_with, initial_poses
+from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
-from flocc_agent.backend.placing import Places
-from flocc_agent.backend.problem import Problem, build
+from flocc_agent.backend.odometry_scale import solve_with_scales
+from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, solve
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     ClosureState,
@@ -35,6 +32,7 @@ from flocc_agent.core.pose_graph import (
     PoseGraph,
     Trajectory,
     components_of,
+    stretched,
 )
 from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
@@ -87,6 +85,9 @@ def _optimise(
     """Optimise a graph of odometry and closures."""
     began = time.perf_counter()
     screened = screen(graph)
+    left = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    held = held_closures(screened.trajectories, left, config)
+    screened = replace(screened, excluded={**screened.excluded, **held})
     if not screened.trajectories:
         return OptimisationFailed("; ".join(screened.warnings) or "the pose graph has no odometry")
     usable = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
@@ -183,6 +184,13 @@ def summed_timings(outcomes: Sequence[SolvedLogs]) -> dict[str, float]:
     return {name: sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes) for name in names}
 
 
+def _posed_anew(kept: Filtered, config: BackendConfig, scales: Mapping[LogId, float]) -> Posed:
+    """The component, begun with the ways of logs made longer or shorter."""
+    longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
+    aligned = initial_poses(longer, kept.left, config.steepness, None)
+    return posed(kept.trajectories, kept.left, aligned, config, None)
+
+
 def _solve_connected(
     kept: Filtered, config: BackendConfig, initial: GraphSolution | None, wanted: Sequence[KeyframeId]
 ) -> SolvedLogs:
@@ -190,55 +198,18 @@ def _solve_connected(
     times = [time.perf_counter()]
     aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
     times.append(time.perf_counter())
-    posed = _posed(kept, aligned, config, initial)
-    solved = solve(posed.objective, posed.start, posed.trusted, posed.places)
+    begun = posed(kept.trajectories, kept.left, aligned, config, initial)
+    found = solve_with_scales(begun, initial, partial(_posed_anew, kept, config))
+    solved = found.solved
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())
-    earlier = component_with(kept.trajectories, initial) if is_confirmed(posed, solved) else None
-    solution = Solution(posed.problem, posed.objective, posed.start, solved, kept.trajectories, kept.left, earlier)
+    at = found.posed
+    earlier = component_with(kept.trajectories, initial) if at.is_confirmed(solved) else None
+    solution = Solution(
+        at.problem, at.objective, at.start, solved, kept.trajectories, kept.left, earlier, found.odometry_scales
+    )
     outcome = collect(solution, wanted)
     times.append(time.perf_counter())
     spans_s = np.diff(times).tolist()
     return replace(outcome, timings_s=dict(zip(("alignment", "solver", "results"), spans_s, strict=True)))
-
-
-@dataclass(frozen=True, slots=True)
-class Posed:
-    """A component as the solver takes it.
-
-    Attributes:
-        problem: Poses, scales and edges as arrays.
-        objective: What is minimised.
-        start: Where it starts.
-        trusted: Which closures (L,) an earlier solution did not reject; None where the start is not that solution.
-        places: Where rejected closures would put robots.
-    """
-
-    problem: Problem
-    objective: Objective
-    start: State
-    trusted: NDArray[np.bool_] | None
-    places: Places
-
-
-def is_confirmed(posed: Posed, solved: Solved) -> bool:
-    """Whether a solution rests on the closures that the one before it trusted."""
-    chosen = solved.weights[posed.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
-    return posed.trusted is not None and np.array_equal(chosen, posed.trusted)
-
-
-def _posed(kept: Filtered, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None) -> Posed:
-    """The problem of aligned logs and the closures that are left."""
-    closures = kept.left
-    problem = build(kept.trajectories, closures, config)
-    in_order = [closures[k] for k in problem.closure_ids]
-    linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
-    says = votes(in_order, config.cluster_keyframes_max)
-    return Posed(
-        problem,
-        Objective(problem.edges, problem.closure_rows, linear, config),
-        state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters),
-        trusted_closures(in_order, initial) if aligned.is_warm and initial is not None else None,
-        Places(problem, kept.trajectories, closures, says, config.steepness),
-    )

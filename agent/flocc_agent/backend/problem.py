@@ -1,7 +1,7 @@
 """One component of the pose graph as arrays: odometry edges, closure edges with scale model."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class Problem:
         closure_rows: Slice of the closures in `edges`.
         closure_ids: Index in the graph of each closure edge.
         clusters: Number of cluster scales.
+        scaled: Logs whose odometry has a scale; in a state they come after the clusters.
         scale_initial: (L,) metres per network unit at gamma = 1, per closure edge.
     """
 
@@ -41,10 +42,25 @@ class Problem:
     closure_ids: tuple[int, ...]
     clusters: int
     scale_initial: Float
+    scaled: tuple[LogId, ...] = ()
+
+    @property
+    def scales(self) -> int:
+        """Number of scales in a state."""
+        return self.clusters + len(self.scaled)
 
     def index(self, keyframe: KeyframeId) -> int:
         """Index of a keyframe's pose."""
         return self.offsets[keyframe.log] + keyframe.index
+
+    def with_scaled(self, logs: Collection[LogId]) -> "Problem":
+        """The same with a scale (true over measured length) for the odometry of these logs and no others."""
+        scaled = tuple(log for log in self.logs if log in logs)
+        of_log = np.array([self.clusters + scaled.index(log) if log in scaled else NO_CLUSTER for log in self.logs])
+        cluster, starts = self.edges.cluster.copy(), np.array([self.offsets[log] for log in self.logs])
+        of_odometry = slice(0, self.closure_rows.start)
+        cluster[of_odometry] = of_log[np.searchsorted(starts, self.edges.i[of_odometry], side="right") - 1]
+        return replace(self, edges=replace(self.edges, cluster=cluster), scaled=scaled)
 
 
 def build(

@@ -9,10 +9,10 @@ from flocc_agent.backend.covariance import covariances_of, kept_covariances
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, residuals, scales_at
 from flocc_agent.backend.problem import Problem
-from flocc_agent.backend.scale_report import scale_warnings
+from flocc_agent.backend.scale_report import odometry_warnings, scale_warnings
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.config import Solver
-from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, Trajectory
+from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, OdometryScale, Trajectory
 from flocc_agent.geometry import Float, inverse
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -42,6 +42,7 @@ class Solution:
     trajectories: Mapping[LogId, Trajectory]
     closures: Mapping[int, LoopClosure]
     earlier: Component | None = None
+    odometry_scales: Mapping[LogId, OdometryScale] = field(default_factory=dict)
 
 
 def excluded(closure: LoopClosure, reason: str) -> ClosureResult:
@@ -65,6 +66,7 @@ def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> SolvedLogs:
     results = closure_results(solution)
     component = _component(solution, wanted)
     warnings = scale_warnings(solution.problem, solution.solved, solution.closures)
+    warnings = (*warnings, *odometry_warnings(solution.odometry_scales))
     if not solution.solved.converged:
         warnings = (*warnings, f"{component.map_frame}: the solver stopped before it converged")
     return SolvedLogs((component,), results, warnings, solution.solved.iterations)
@@ -116,6 +118,7 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         cost_initial=objective.cost(solution.start, solution.solved.weights, hold=True),
         covariance_keyframe=of_keyframes,
         covariance_rounds=0 if kept is None or solution.earlier is None else solution.earlier.covariance_rounds + 1,
+        odometry_scales=solution.odometry_scales,
     )
 
 

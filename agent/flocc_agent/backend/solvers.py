@@ -47,6 +47,21 @@ def solve(objective: Objective, state: State, trusted: Bool | None = None, place
     return held(objective, solved)
 
 
+def solve_once(objective: Objective, state: State, places: Places) -> Solved:
+    """GNC by its most careful schedule alone."""
+    return held(objective, replaced(objective, scheduled(objective, state, START_RATIOS[-1]), places))
+
+
+def continued(objective: Objective, state: State) -> Solved:
+    """Go on from a state that differs little from a solution."""
+    if (
+        objective.config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
+        and objective.closures.start < objective.closures.stop
+    ):
+        return held(objective, selected(objective, state, 0))
+    return solve(objective, state)
+
+
 def lowest(objective: Objective, state: State) -> Solved:
     """LM from a state, or from averaged rotations where noise does not explain that and they are lower."""
     weights, edges = objective.weights(), objective.edges

@@ -29,8 +29,8 @@ class LinkConfig(Section):
     """Probability that a message may be overtaken."""
     reorder_delay_s: float = inner(0.2, ge=0)
     """How long such a message is held back."""
-    bandwidth_bytes_s: float | None = Field(None, gt=0)
-    """Capacity of each directed link; None is unlimited."""
+    bandwidth_bytes_s: float | None = Field(None, gt=0, allow_inf_nan=True)
+    """Capacity of each directed link; none, or inf, is unlimited."""
     queue_bytes_max: int = inner(4 * 1024 * 1024, ge=0)
     """What may wait for a link before messages are lost."""
 
@@ -75,8 +75,8 @@ class BlackoutConfig(Section):
 class RadioConfig(LinkConfig):
     """The emulated radio: the quality of every link, exceptions, range, and scheduled outages."""
 
-    range_m: float | None = Field(None, gt=0)
-    """Robots whose true positions are further apart do not hear each other; None is unlimited."""
+    range_m: float | None = Field(None, gt=0, allow_inf_nan=True)
+    """Robots whose true positions are further apart do not hear each other; none, or inf, is unlimited."""
     overrides: tuple[LinkOverrideConfig, ...] = ()
     """Links of another quality; the first match counts."""
     partitions: tuple[PartitionConfig, ...] = ()

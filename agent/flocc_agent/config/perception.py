@@ -55,7 +55,7 @@ class SyntheticConfig(Section):
     """Spread of metres per network unit between registrations (log-normal)."""
     scale_drift_sigma_ratio: float = Field(0.1, ge=0)
     """How much the odometry pair's metres per network unit differ from the loop pair's (log-normal)."""
-    latent_bytes: int = inner(0, ge=0, le=64 * 1024 * 1024)
+    latent_bytes: int = Field(0, ge=0, le=64 * 1024 * 1024)
     """Latents are padded to this size, to load links like another method's; MASt3R's are 1.5 MB."""
 
 

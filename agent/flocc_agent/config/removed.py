@@ -39,7 +39,6 @@ REMOVED: dict[str, str] = {
     "perception.classical.odometry_rotation_sigma_rad": "always 0.03",
     "perception.classical.odometry_direction_sigma_rad": "always 0.2",
     "perception.classical.odometry_pairs_max": "always 256",
-    "perception.synthetic.latent_bytes": "latents are as large as they are; radio.bandwidth_bytes_s loads links",
     "perception.synthetic.place_distance_m": "always 3.0",
     "perception.synthetic.place_angle_rad": "always 0.7",
     "perception.synthetic.descriptor_noise_ratio": "always 0.2",

@@ -7,6 +7,7 @@ brings its logs together again.
 
 import zlib
 
+from flocc_agent.core.pulls import remember
 from flocc_agent.core.registration import RegistrationFailure
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import CandidatePair
@@ -18,16 +19,16 @@ Logs = tuple[LogId, LogId]
 
 
 class FrontEnds:
-    """Which logs are apart; at most one entry for each two logs that are kept."""
+    """Which logs are apart: the latest that turned out to fit or not, a bounded number of them."""
 
     def __init__(self) -> None:
         self._failures: dict[Logs, int] = {}
-        self._fitting: set[Logs] = set()
+        self._fitting: dict[Logs, None] = {}
 
     def on_closure(self, pair: CandidatePair) -> None:
         """A pair was registered: its logs' latents fit."""
         logs = _logs(pair)
-        self._fitting.add(logs)
+        remember(self._fitting, logs, None)
         self._failures.pop(logs, None)
 
     def on_rejection(self, pair: CandidatePair, reason: str) -> bool:
@@ -35,7 +36,7 @@ class FrontEnds:
         logs = _logs(pair)
         if reason != RegistrationFailure.OTHER_FRONT_END.value or logs in self._fitting:
             return False
-        self._failures[logs] = self._failures.get(logs, 0) + 1
+        remember(self._failures, logs, self._failures.get(logs, 0) + 1)
         return self._failures[logs] == FAILURES_MIN
 
     def are_apart(self, pair: CandidatePair) -> bool:

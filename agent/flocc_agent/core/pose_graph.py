@@ -5,7 +5,7 @@ one `map` frame that is named after the component's anchor, its lowest log.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -159,6 +159,24 @@ class FactorResult:
     reason: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class OdometryScale:
+    """How long a robot's odometry measures one metre.
+
+    Attributes:
+        ratio: Measured over true length, 1 where it is true.
+        sigma_ratio: Standard deviation of `ratio`.
+        is_applied: The solution holds the robot's way to be shorter or longer than measured.
+        is_metric: Something in the component was measured in metres besides odometry; else ratios are relative to the
+            mean of its robots.
+    """
+
+    ratio: float
+    sigma_ratio: float
+    is_applied: bool
+    is_metric: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Component:
     """One connected part of the graph, solved in one map frame.
@@ -174,6 +192,7 @@ class Component:
         T_map_world: (4, 4) pose of the fixes' world frame, or None without fixes.
         T_map_landmark: (4, 4) pose of each landmark, by name: `tag/NAME`, `world`, `earth` (east, north, up).
         covariance_rounds: How many rounds ago `covariance_map_odom` was computed; 0 for this one.
+        odometry_scales: Of each log whose odometry could be compared with something.
     """
 
     logs: tuple[LogId, ...]
@@ -186,6 +205,7 @@ class Component:
     T_map_world: Float | None = None
     T_map_landmark: Mapping[str, Float] = field(default_factory=dict)
     covariance_rounds: int = 0
+    odometry_scales: Mapping[LogId, OdometryScale] = field(default_factory=dict)
 
     @property
     def anchor(self) -> LogId:
@@ -245,6 +265,13 @@ def landmark(name: str) -> KeyframeId:
 def is_landmark(log: LogId) -> bool:
     """Whether this is no robot's log."""
     return log.robot.startswith(LANDMARK)
+
+
+def stretched(trajectory: Trajectory, ratio: float) -> Trajectory:
+    """A way of the same shape that is `ratio` times as long."""
+    T = np.array(trajectory.T_odom_keyframe, dtype=float)
+    T[:, :3, 3] = T[0, :3, 3] + ratio * (T[:, :3, 3] - T[0, :3, 3])
+    return replace(trajectory, T_odom_keyframe=T)
 
 
 def map_frame(anchor: LogId) -> str:

@@ -8,7 +8,7 @@ told changes no robot's behaviour.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import Field, dataclass
+from dataclasses import Field, dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol, TypeVar, cast, dataclass_transform
 
@@ -299,6 +299,7 @@ class RoundSolved:
         measured_not_used: Other measurements that it threw out or could not take in.
         cost: What is left of all residuals.
         solve_s: How long it took.
+        odometry_scales: Robot -> measured over true length of its odometry, estimated; 1 where it is true.
         warnings: Sentences of the solver.
     """
 
@@ -314,6 +315,7 @@ class RoundSolved:
     measured_not_used: int | None = None
     cost: float | None = None
     solve_s: float | None = None
+    odometry_scales: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
 

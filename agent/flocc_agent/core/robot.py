@@ -406,6 +406,11 @@ class Robot:
             effects += [*self._append(record, now), Report(told(record, self.log))]
         return effects
 
+    def _has(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe's record is here; of others anybody can speak."""
+        copy = self.gossip.logs.get(keyframe.log)
+        return copy is not None and keyframe.index < copy.keyframes
+
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
@@ -599,7 +604,10 @@ class Robot:
         """Let the machines act on what changed."""
         effects = self.closing.tick(now)
         for keyframe in self.closing.own_lost():
-            effects += self._reject_lost(self.closing.on_latent_lost(keyframe, now), keyframe, now)
+            if self._has(keyframe):
+                pairs = self.closing.on_latent_lost(keyframe, now)
+                known = [pair for pair in pairs if self._has(pair.low) and self._has(pair.high)]
+                effects += self._reject_lost(known, keyframe, now)
         if self.distributed is not None:
             return [*effects, *self._optimise_together(self.distributed, now)]
         self.rounds.on_term(self.election.term if self.election.leading else None)

@@ -148,6 +148,9 @@ def solution_report(term: Term, round_number: int, solution: GraphSolution) -> R
         measured_not_used=sum(result.state is not ClosureState.USED for result in solution.measured),
         cost=sum(component.cost for component in solution.components),
         solve_s=solution.solve_s,
+        odometry_scales={
+            log.robot: scale.ratio for c in solution.components for log, scale in sorted(c.odometry_scales.items())
+        },
         warnings=solution.warnings,
     )
     return Report(fact)

@@ -65,6 +65,11 @@ def made(spec: Spec) -> Member:
     return Member(spec, PoseGraph(trajectories, [mixed[k] for k in order]), truth, order < len(closures))
 
 
+def stray(rng: np.random.Generator, member: Member) -> LoopClosure:
+    """One more wrong closure, between keyframes that have nothing to do with each other."""
+    return _measured(rng, _any_pair(rng, member.T_world_keyframe), _false_pose(rng, member.spec), member.spec)
+
+
 def _odometry(rng: np.random.Generator, T: Float, spec: Spec, scale_off: float) -> Trajectory:
     """What a robot measures of its own motion, from the identity on, with the declared covariance."""
     steps = inverse(T[:-1]) @ T[1:]

@@ -36,6 +36,14 @@ REASONS_LEFT = (
 )
 
 
+SOLVER_ADVICE = {
+    "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
+    "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
+    "the distance between robots": "Let them meet side by side as well as ahead, or measure a length: fix, tag, range.",
+}
+"""What to do about warnings that say so."""
+
+
 def deaths(loaded: LoadedRun) -> list[Finding]:
     """Agents that died; one that the scenario or an operator killed needs no advice."""
     unasked = Counter(deaths_unasked(loaded.events))
@@ -63,13 +71,20 @@ def solver_warnings(loaded: LoadedRun) -> list[Finding]:
     alike: dict[str, list[str]] = {}
     for text in rounds[-1].fact.warnings if rounds else ():
         alike.setdefault(re.sub(r"\S*\d\S*", "#", text), []).append(text.rstrip("."))
-    advice = "See docs/back-end.md; more closures from other view points make scales observable."
-    return [Finding("solver-warning", Severity.HINDERS, _warned(texts), advice) for texts in alike.values()]
+    return [Finding("solver-warning", Severity.HINDERS, _warned(texts), _advice(texts[0])) for texts in alike.values()]
 
 
 def _warned(texts: Sequence[str]) -> str:
     more = f" (the first of {len(texts)} such warnings)" if len(texts) > 1 else ""
     return f"The solver warns: {texts[0]}{more}."
+
+
+def _advice(warning: str) -> str:
+    """What to do about a warning of the solver."""
+    for said, advice in SOLVER_ADVICE.items():
+        if said in warning:
+            return advice
+    return "See docs/back-end.md; more closures from other view points make scales observable."
 
 
 def solver_refusals(loaded: LoadedRun) -> list[Finding]:

@@ -197,7 +197,7 @@ def label_counts(file: GraphFile, solution: GraphSolution) -> dict[str, int | No
     return {
         "labelled_outliers": len(file.outliers),
         "outliers_used": sum(states[k] is ClosureState.USED for k in file.outliers),
-        "inliers_rejected": sum(s is ClosureState.REJECTED for k, s in enumerate(states) if k not in file.outliers),
+        "inliers_rejected": sum(s is not ClosureState.USED for k, s in enumerate(states) if k not in file.outliers),
     }
 
 

@@ -83,7 +83,7 @@ def build(loaded: LoadedRun) -> RunReport:
         iate_odometry_m=None if during is None else during.odometry_m,
         iate_moments=0 if during is None else during.moments,
         if1=mean_f1(moments, judged_closures(loaded)),
-        odometry_scale=dict.fromkeys(loaded.robots),
+        odometry_scale=odometry_scales(loaded),
         maps_used=[str(run.settings["map"])] if "map" in run.settings else [],
         bytes=total_bytes(by_robot),
         bytes_by_robot=by_robot,
@@ -219,6 +219,14 @@ def optimisations_part(loaded: LoadedRun) -> Optimisations:
     return Optimisations(
         rounds=len(rounds), cost=rounds[-1].cost if rounds else None, solve_s_max=max(times_s, default=None)
     )
+
+
+def odometry_scales(loaded: LoadedRun) -> dict[str, float | None]:
+    """Scale of each robot's odometry as the last round that could tell estimated it; None where none could."""
+    scales: dict[str, float | None] = dict.fromkeys(loaded.robots)
+    for event in of_kind(loaded.events, RoundSolved):
+        scales.update({robot: ratio for robot, ratio in event.fact.odometry_scales.items() if robot in scales})
+    return scales
 
 
 def bytes_by_robot(loaded: LoadedRun) -> dict[str, RobotBytes]:

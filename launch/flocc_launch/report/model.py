@@ -184,7 +184,7 @@ class RunReport(Record):
     if1: float | None = None
     """F1 of the closures kept against those that agree with ground truth, the mean over all rounds."""
     odometry_scale: dict[str, float | None] = Field(default_factory=dict)
-    """Robot -> scale of its odometry; null where nobody estimated it."""
+    """Robot -> measured over true length of its odometry, 1 where it is true; null where nobody could estimate it."""
     maps_used: list[str] = Field(default_factory=list)
     """Maps of earlier runs that this one began with; this version begins every run without one."""
     bytes: dict[str, int]

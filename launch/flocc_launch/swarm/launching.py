@@ -149,6 +149,7 @@ class _Launch:
         self._map = use
         self._lives = lives or {}
         self._epoch_s = time.monotonic()
+        self._start = datetime.now(UTC)
         self._lines = Lines(folder.path / LAUNCHER_EVENTS)
         self._radio = scenario.links()
         self._faults = sorted(scenario.faults, key=lambda fault: fault.at_s)
@@ -321,7 +322,7 @@ class _Launch:
             seed=scenario.seed,
             robots=scenario.names(),
             servers=scenario.servers(),
-            start=datetime.now(UTC).isoformat(timespec="seconds"),
+            start=self._start.isoformat(timespec="seconds"),
             driver="launch",
             recordings={name: str(path.resolve()) for name, path in self._paths.items()},
             radio=json.loads(scenario.links().model_dump_json(), parse_constant=lambda _: None),

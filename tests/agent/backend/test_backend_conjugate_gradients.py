@@ -78,7 +78,7 @@ def test_a_whole_solve_reaches_the_same_optimum(monkeypatch: pytest.MonkeyPatch)
     config = BackendConfig(formulation=Formulation.SMOOTHED, solver=Solver.GNC_TLS, covariances=False)
     iterated = optimise(graph.graph, config)
     by_elimination = partial(LinearSolver, iterative_loops_min=10**9)
-    monkeypatch.setattr("flocc_agent.backend.optimiser.LinearSolver", by_elimination)
+    monkeypatch.setattr("flocc_agent.backend.posing.LinearSolver", by_elimination)
     eliminated = optimise(graph.graph, config)
     assert isinstance(iterated, GraphSolution)
     assert isinstance(eliminated, GraphSolution)
@@ -145,7 +145,7 @@ def test_covariances_that_the_solver_leaves_over_are_those_of_the_solution(monke
 
 def test_a_large_graph_s_covariances_stand_for_five_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     large = partial(LinearSolver, iterative_loops_min=1)
-    monkeypatch.setattr("flocc_agent.backend.optimiser.LinearSolver", large)
+    monkeypatch.setattr("flocc_agent.backend.posing.LinearSolver", large)
     graph, config = generated().graph, BackendConfig(weight_by_probability=False)
     earlier: GraphSolution | None = None
     ages = []

@@ -73,7 +73,8 @@ def test_rejected_closures_leave_the_solution_as_if_they_were_not_there() -> Non
             assert np.allclose(T, of_used.T_map_keyframe[log], atol=1e-4)
 
 
-def test_a_far_off_rejected_closure_does_not_pull() -> None:
+def test_a_far_off_rejected_closure_does_not_pull(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flocc_agent.backend.optimiser.held_closures", lambda *_: {})
     drawn = member(7)
     config = BackendConfig(weight_by_probability=False)
     first, last = KeyframeId(sorted(drawn.graph.trajectories)[0], 0), sorted(drawn.graph.trajectories)[-1]

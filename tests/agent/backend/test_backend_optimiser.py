@@ -115,11 +115,16 @@ def test_the_default_stays_within_twice_the_outlier_free_error(ratio: float) -> 
         assert error_m(dirty, solved(dirty.graph, config)) <= limit_m, f"seed {seed}"
 
 
-def test_an_outlier_is_rejected_and_named() -> None:
+def test_an_outlier_is_rejected_or_held_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = replace(
         closure(A, 4, B, 4), T_query_match_unscaled=pose(so3_exp(np.array([0.0, 0.0, 2.0])), np.array([0.0, 0.0, 1.0]))
     )
-    solution = solved(PoseGraph(ODOMETRY, [*pair_closures(), wrong]), BackendConfig())
+    graph = PoseGraph(ODOMETRY, [*pair_closures(), wrong])
+    held = solved(graph, BackendConfig())
+    assert [r.state for r in held.closures] == [ClosureState.USED] * 10 + [ClosureState.EXCLUDED]
+    assert held.closures[-1].reason.startswith(f"closure {wrong.query} - {wrong.match}: held until another one agrees")
+    monkeypatch.setattr("flocc_agent.backend.optimiser.held_closures", lambda *_: {})
+    solution = solved(graph, BackendConfig())
     assert [r.state for r in solution.closures] == [ClosureState.USED] * 10 + [ClosureState.REJECTED]
     assert solution.closures[-1].weight == 0.0
 

@@ -94,7 +94,11 @@ def test_turning_on_the_spot_and_identical_pictures_end_in_a_verdict(model: str)
     for match in (query, turned):
         result = registrar.register(query, match, None)
         assert isinstance(result, RegistrationFailed)
-        assert result.failure in (RegistrationFailure.DEGENERATE, RegistrationFailure.UNCONVINCING)
+        assert result.failure in (
+            RegistrationFailure.DEGENERATE,
+            RegistrationFailure.UNCONVINCING,
+            RegistrationFailure.FEW_CORRESPONDENCES,  # what stays at its pixel between two robots is left out
+        )
 
 
 def test_a_latent_of_the_other_model_is_refused() -> None:

@@ -15,6 +15,7 @@ from flocc_agent.config import StoreConfig
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.robot import Robot
+from flocc_agent.geometry import pose
 from flocc_agent.perception.synthetic import pose_image
 from flocc_agent.runtime.database import VERSION_MARK, LaterSchema
 from flocc_agent.runtime.persistence import restore
@@ -95,7 +96,8 @@ async def test_records_of_a_later_version_in_the_own_store_keep_no_agent_from_st
         assert log.encoded[27:] == later
         assert [type(record) for record in log.records[27:]] == [UnknownRecord, UnknownRecord]
         assert agent.status().keyframes == 13
-        await agent.add_keyframe(pose_image(np.eye(4), "r2/12").pixels, np.eye(4), 30.0)
+        T_odom_camera = pose(np.eye(3), np.array([12.0, 0.0, 0.0]))  # at the origin a new journey would begin
+        await agent.add_keyframe(pose_image(T_odom_camera, "r2/12").pixels, T_odom_camera, 30.0)
         async with asyncio.timeout(20.0):
             while len(log) < 30:
                 await asyncio.sleep(0.01)

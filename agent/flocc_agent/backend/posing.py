@@ -1,0 +1,83 @@
+"""A component as the solver takes it: arrays, what is minimised, where it starts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.backend.clusters import votes
+from flocc_agent.backend.descent import Objective, Solved
+from flocc_agent.backend.edges import State, state_of
+from flocc_agent.backend.initial import Aligned, trusted_closures
+from flocc_agent.backend.linear import LinearSolver
+from flocc_agent.backend.placing import Places
+from flocc_agent.backend.problem import Problem, build
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
+from flocc_agent.config import BackendConfig
+from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, Trajectory
+from flocc_protocol.ids import LogId
+
+ODOMETRY_SCALE_SIGMA = 0.1
+"""Prior standard deviation around 1 of a scale of odometry."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posed:
+    """A component as the solver takes it.
+
+    Attributes:
+        problem: Poses, scales and edges as arrays.
+        objective: What is minimised.
+        start: Where it starts.
+        trusted: Which closures (L,) an earlier solution did not reject; None where the start is not that solution.
+        places: Where rejected closures would put robots.
+    """
+
+    problem: Problem
+    objective: Objective
+    start: State
+    trusted: NDArray[np.bool_] | None
+    places: Places
+
+    def is_confirmed(self, solved: Solved) -> bool:
+        """Whether a solution rests on the closures that the one before it trusted."""
+        chosen = solved.weights[self.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
+        return self.trusted is not None and np.array_equal(chosen, self.trusted)
+
+    def with_scaled(self, scales: Mapping[LogId, float]) -> "Posed":
+        """The same in which the odometry of these logs, and of no others, has a scale that starts as given."""
+        if not scales and not self.problem.scaled:
+            return self
+        problem, config = self.problem.with_scaled(scales), self.objective.config
+        sigmas = np.full(problem.scales, config.scale_prior_unknown_sigma_ratio)
+        sigmas[problem.clusters :] = ODOMETRY_SCALE_SIGMA
+        started = [*self.start.scale[: problem.clusters].tolist(), *(scales[log] for log in problem.scaled)]
+        return replace(
+            self,
+            problem=problem,
+            objective=replace(self.objective, edges=problem.edges, linear=LinearSolver(0, sigmas)),
+            start=replace(self.start, scale=np.array(started)),
+            places=replace(self.places, problem=problem),
+        )
+
+
+def posed(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    aligned: Aligned,
+    config: BackendConfig,
+    initial: GraphSolution | None,
+) -> Posed:
+    """The problem of aligned logs and the closures that are left, with all odometry taken as true."""
+    problem = build(trajectories, closures, config)
+    in_order = [closures[k] for k in problem.closure_ids]
+    linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
+    says = votes(in_order, config.cluster_keyframes_max)
+    return Posed(
+        problem,
+        Objective(problem.edges, problem.closure_rows, linear, config),
+        state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters),
+        trusted_closures(in_order, initial) if aligned.is_warm and initial is not None else None,
+        Places(problem, trajectories, closures, says, config.steepness),
+    )

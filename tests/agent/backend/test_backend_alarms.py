@@ -1,0 +1,139 @@
+"""Closures that are held before the solve: single false ones, until a second one agrees; right ones are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flocc_agent.backend.alarms import held_closures
+from flocc_agent.backend.optimiser import optimise
+from flocc_agent.config import BackendConfig, Formulation
+from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
+from flocc_agent.geometry import inverse, pose, so3_exp
+from flocc_lab.graph_family.family_spec import Lengths, drawn
+from flocc_lab.graph_family.graphs import Member, made
+from flocc_lab.graph_family.methods import settings
+from flocc_protocol.ids import KeyframeId, LogId
+
+Float = NDArray[np.float64]
+FIRST, SECOND = LogId("r00"), LogId("r01")
+
+
+def two_robots(lengths: Lengths = Lengths.METRIC, noise_factor: float = 1.0) -> Member:
+    spec = replace(
+        drawn(8),
+        keyframes=(120, 120),
+        scale_off=(1.0, 1.0),
+        lengths=lengths,
+        closures=60,
+        odometry=(0.002, 0.02),
+        closure=(0.01, 0.05),
+        odometry_factor=noise_factor,
+        closure_factor=noise_factor,
+        heavy_tails=False,
+        outliers=0.0,
+        groups=0,
+        weak=False,
+        opposite=False,
+        parallel=False,
+        planar=True,
+    )
+    return made(spec)
+
+
+def said(member: Member, query: KeyframeId, match: KeyframeId, error: Float) -> LoopClosure:
+    """A metric closure that is wrong by a pose (4, 4)."""
+    T_query, T_match = (member.T_world_keyframe[k.log][k.index] for k in (query, match))
+    covariance = np.diag([1e-4] * 3 + [2.5e-3] * 3)
+    return LoopClosure(query, match, inverse(T_query) @ T_match @ error, covariance=covariance, metric=True)
+
+
+def held(member: Member, *more: LoopClosure, config: BackendConfig | None = None) -> dict[int, str]:
+    closures = dict(enumerate([*member.graph.closures, *more]))
+    return held_closures(member.graph.trajectories, closures, config or settings())
+
+
+MOVED = pose(np.eye(3), np.array([8.0, 0.0, 0.0]))
+TURNED = pose(so3_exp(np.array([0.0, 0.0, 1.2])), np.zeros(3))
+
+
+@pytest.mark.parametrize("lengths", list(Lengths))
+@pytest.mark.parametrize("noise_factor", [0.4, 1.0, 3.0])
+def test_right_closures_are_not_held_even_where_noise_is_understated(lengths: Lengths, noise_factor: float) -> None:
+    member = two_robots(lengths, noise_factor)
+    assert len(held(member)) <= (0.05 * len(member.graph.closures) if noise_factor > 1.0 else 0)
+
+
+def test_a_closure_that_moves_a_robot_further_than_uncertainties_allow_is_held() -> None:
+    member = two_robots()
+    false = said(member, KeyframeId(FIRST, 60), KeyframeId(SECOND, 60), MOVED)
+    found = held(member, false)
+    assert list(found) == [len(member.graph.closures)]
+    assert found[len(member.graph.closures)].startswith(
+        "closure r00/60 - r01/60: held until another one agrees with it, because it would move the robots by "
+    )
+
+
+def test_a_closure_that_turns_a_robot_is_held_and_the_sentence_says_so() -> None:
+    member = two_robots()
+    (reason,) = held(member, said(member, KeyframeId(FIRST, 60), KeyframeId(SECOND, 60), TURNED)).values()
+    assert "it would turn the robots by " in reason
+
+
+def test_a_closure_within_a_robot_that_bends_its_way_is_held() -> None:
+    member = two_robots()
+    false = said(member, KeyframeId(FIRST, 10), KeyframeId(FIRST, 50), MOVED)
+    assert list(held(member, false)) == [len(member.graph.closures)]
+
+
+def test_it_is_released_when_a_second_one_agrees() -> None:
+    member = two_robots()
+    T_world = member.T_world_keyframe
+    anchor = T_world[FIRST][10] @ MOVED @ inverse(T_world[FIRST][10])
+    pairs = [(KeyframeId(FIRST, 10 + n), KeyframeId(FIRST, 50 + n)) for n in range(2)]
+    agreeing = [
+        replace(
+            said(member, query, match, np.eye(4)),
+            T_query_match_unscaled=inverse(T_world[FIRST][query.index]) @ anchor @ T_world[FIRST][match.index],
+        )
+        for query, match in pairs
+    ]
+    assert len(held(member, agreeing[0])) == 1
+    assert held(member, *agreeing) == {}
+
+
+def test_a_closure_whose_scale_would_collapse_is_held() -> None:
+    member = two_robots(Lengths.GUESSED)
+    T = member.T_world_keyframe
+    chosen = max(
+        (c for c in member.graph.closures if c.query.log != c.match.log),
+        key=lambda c: float(
+            np.linalg.norm(T[c.query.log][c.query.index][:3, 3] - T[c.match.log][c.match.index][:3, 3])
+        ),
+    )
+    beside = chosen.query._replace(index=chosen.query.index + (1 if chosen.query.index == 0 else -1))
+    reversed_T = inverse(T[beside.log][beside.index]) @ T[chosen.match.log][chosen.match.index]
+    reversed_T[:3, 3] *= -1.0
+    false = replace(chosen, query=beside, T_query_match_unscaled=reversed_T, scale_initial=1.0)
+    (reason,) = held(member, false).values()
+    assert "its scale would collapse" in reason
+
+
+def test_the_solution_excludes_it_warns_and_is_as_without_it() -> None:
+    member = two_robots()
+    false = said(member, KeyframeId(FIRST, 60), KeyframeId(SECOND, 60), MOVED)
+    plain = optimise(member.graph, settings())
+    solution = optimise(PoseGraph(member.graph.trajectories, [*member.graph.closures, false]), settings())
+    assert isinstance(solution, GraphSolution)
+    assert isinstance(plain, GraphSolution)
+    assert solution.closures[-1].state is ClosureState.EXCLUDED
+    assert any("held until another one agrees" in warning for warning in solution.warnings)
+    moved = solution.components[0].T_map_keyframe[SECOND] - plain.components[0].T_map_keyframe[SECOND]
+    assert np.abs(moved).max() < 1e-6
+
+
+def test_measurements_that_count_as_given_are_not_held() -> None:
+    member = two_robots()
+    false = said(member, KeyframeId(FIRST, 60), KeyframeId(SECOND, 60), MOVED)
+    assert held(member, false, config=settings(formulation=Formulation.BASE)) == {}
