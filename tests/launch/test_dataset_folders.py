@@ -518,3 +518,51 @@ def test_decoders_do_not_speak_for_themselves(tmp_path: Path, capfd: pytest.Capt
     with quiet_decoders():
         os.write(2, b"somebody else\nlibpng error: x\n")
     assert capfd.readouterr().err == "somebody else\n"
+
+
+@pytest.mark.parametrize("kind", ["size", "text", "black", "folder"])
+def test_a_mask_that_is_none_is_said_of_the_folder_it_lies_in(tmp_path: Path, kind: str) -> None:
+    path = write_plain(tmp_path / "p")
+    mask = np.full((24, 32), 255, np.uint8)
+    cv2.imwrite(str(path / "mask.png"), mask)
+    assert not [line for line in (*info(path).notes, *info(path).faults) if "mask" in line]
+    convert(path, tmp_path / "good")
+    assert (tmp_path / "good" / "mask.png").is_file()
+    (path / "mask.png").unlink()
+    if kind == "folder":
+        (path / "mask.png").mkdir()
+    elif kind == "text":
+        (path / "mask.png").write_text("x")
+    else:
+        cv2.imwrite(str(path / "mask.png"), mask[:12] if kind == "size" else 0 * mask)
+    (fault,) = info(path).faults
+    assert str(path / "mask.png") in fault
+    with pytest.raises(FloccError, match="mask") as raised:
+        convert(path, tmp_path / "bad")
+    assert str(path / "mask.png") in str(raised.value)
+
+
+def test_images_that_no_pose_covers_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_plain(tmp_path / "p")
+    write_tum(path / "groundtruth.tum", Trajectory(np.array([100.0, 102.5]), moving(2)))
+    assert info(path).posed == 2
+    convert(path, tmp_path / "out")
+    assert "4 of 6 images lie outside of the trajectory's time, or in a gap of it: no robot uses them" in caplog.text
+
+
+def test_images_that_a_model_has_no_pose_of_are_counted(tmp_path: Path) -> None:
+    for k in range(5):
+        write_image(tmp_path / "images" / f"{k}.png")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 32 24 7 8 16 12\n")
+    (tmp_path / "images.txt").write_text("".join(f"{k + 1} 1 0 0 0 0 0 {k} 1 {k}.png\n\n" for k in range(3)))
+    notes = read_source(tmp_path).notes
+    assert f"{tmp_path / 'images'}: 2 more images have no pose in the model and were left out" in notes
+
+
+def test_a_frame_without_matrix_is_not_taken_for_two(tmp_path: Path) -> None:
+    frames = [{"file_path": "images/0.png", "transform_matrix": None}]
+    table = {"camera_model": "PINHOLE", "w": 32, "h": 24, "fl_x": 7, "fl_y": 8, "cx": 16, "cy": 12, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    write_image(tmp_path / "images" / "0.png")
+    with pytest.raises(DatasetError, match=r"the transform_matrix of images/0\.png is no matrix"):
+        read_source(tmp_path)

@@ -1,7 +1,9 @@
 """Claims about pose-graph files and `flocc optimise`: what was written is read, damage is named, references are met."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -256,3 +258,129 @@ def test_information_that_is_not_positive_definite_is_refused_by_line(tmp_path: 
     (tmp_path / "x.g2o").write_text(EDGE + "\n" + edge(1, 2, 1, 0, of))
     with pytest.raises(GraphFileError, match="line 2: the information matrix is not positive definite"):
         read_g2o(tmp_path / "x.g2o")
+
+
+def plane(first: int, second: int, x: float, yaw: float = 0.0, of: str = "1 0 0 1 0 1") -> str:
+    return f"EDGE_SE2 {first} {second} {x!r} 0 {yaw!r} {of}\n"
+
+
+RING = "".join(plane(k, (k + 1) % 4, 1.0 + 0.1 * (k == 3), np.pi / 2) for k in range(4))
+
+
+def solved(tmp_path: Path, text: str | bytes, solver: Solver = Solver.LM) -> dict[str, Any]:
+    (tmp_path / "x.g2o").write_bytes(text if isinstance(text, bytes) else text.encode())
+    return optimise_file(tmp_path / "x.g2o", tmp_path / "out", formulation=Formulation.BASE, solver=solver)
+
+
+@pytest.mark.parametrize("between", [(0, 1), (0, 2)])
+def test_information_of_a_repeated_measurement_is_added_up_not_doubled(
+    tmp_path: Path, between: tuple[int, int]
+) -> None:
+    first, second = between
+    text = plane(0, 1, 1.0) + plane(1, 2, 1.0) + plane(0, 2, 2.3)
+    line = next(line for line in text.splitlines() if line.startswith(f"EDGE_SE2 {first} {second} "))
+    weaker = line.replace("1 0 0 1 0 1", "0.5 0 0 0.5 0 0.5") + "\n"
+    sigma = {(0, 1): (1 / 1.5, 1.0, 1.0), (0, 2): (1.0, 1.0, 1 / 1.5)}[between]
+    assert solved(tmp_path, text + weaker)["cost"] == pytest.approx(0.3**2 / sum(sigma), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"\xef\xbb\xbf" + RING.encode(),
+        RING.encode("utf-16"),
+        b"# gr\xf6\xdfe\n" + RING.encode("latin-1"),
+        b"% matlab\n// c\n" + RING.replace("\n", " # end\r\n").encode(),
+        RING.replace("\n", "\r").encode(),
+    ],
+    ids=["mark", "utf-16", "latin comment", "comments", "old mac"],
+)
+def test_a_graph_is_read_whole_whatever_its_encoding_and_comments(tmp_path: Path, text: bytes) -> None:
+    expected = solved(tmp_path, RING)
+    found = solved(tmp_path, text)
+    assert found["cost"] == expected["cost"]
+    assert found["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (RING.replace("EDGE_SE2", "EDGE2"), "has no edges EDGE_SE3:QUAT or EDGE_SE2, but lines 4 of kind EDGE2"),
+        (RING + "FIX abc\n", "line 5"),
+        (RING + "FIX -1\n", "line 5: -1 is no key"),
+        ("VERTEX_SE2 0 nan 0 0\n" + RING, r"line 1: a vertex has 3 finite numbers after its key, this one \[nan 0 0\]"),
+        (plane(0, 1, 1e200) + RING, "the step of robot robot-0 from vertex 0 to 1 is 1e\\+200 m long"),
+        (plane(0, 1, 1.0, of="1e300 0 0 1e300 0 1e300") + RING, "line 1: the information matrix has eigenvalues from"),
+        (plane(0, 1, 1.0, of="1e12 0 0 1e-6 0 1") + RING, "line 1: the information matrix has eigenvalues from"),
+        ("\0" + RING, "is not text"),
+    ],
+)
+def test_what_would_be_lost_or_never_be_solved_is_refused_by_name(tmp_path: Path, text: str, complaint: str) -> None:
+    with pytest.raises(GraphFileError, match=complaint):
+        solved(tmp_path, text)
+
+
+@pytest.mark.parametrize("of", ["1e-15", "1e15"])
+def test_a_planar_graph_may_have_any_unit(tmp_path: Path, of: str) -> None:
+    text = RING + plane(0, 2, 1.0).replace("1 0 0 1 0 1", "1 0 0 1 0 1")
+    usual, scaled = solved(tmp_path, text), solved(tmp_path, text.replace("1 0 0 1 0 1", f"{of} 0 0 {of} 0 {of}"))
+    assert scaled["closures_excluded"] == []
+    assert not [w for w in scaled["warnings"] if "not positive definite" in w]
+    if float(of) > 1:
+        assert scaled["cost"] == pytest.approx(usual["cost"] * float(of), rel=1e-3)
+    else:
+        assert [w for w in scaled["warnings"] if w.startswith("information is as small as 1e-15")]
+
+
+def test_an_edge_that_is_far_stronger_than_the_others_is_named(tmp_path: Path) -> None:
+    found = solved(tmp_path, RING.replace("1 0 0 1 0 1", "1e9 0 0 1e9 0 1e9", 1))
+    assert [w for w in found["warnings"] if w.startswith("the edge from vertex 0 to 1 has over 1e+06 times")]
+
+
+def test_vertices_without_edges_twice_or_fixed_are_named_and_cost_no_frame(tmp_path: Path) -> None:
+    vertices = "".join(f"VERTEX_SE2 {key} {10 + k} 5 0\n" for k, key in enumerate([1, 5, 7, 9, 9]))
+    edges = plane(1, 5, 1.0) + plane(5, 9, 1.0)
+    found = solved(tmp_path, vertices + edges + "FIX 5 9 44\n")
+    assert found["warnings"] == [
+        "vertex 9: given more than once, the last pose counts",
+        "vertex 7: no edge joins it, left out",
+        "FIX 44: no vertex with an edge says where that is, nothing is held there",
+        "FIX 5, 9: the first of them that is joined places the result, none holds it",
+    ]
+    (T,) = read_g2o(tmp_path / "out" / "optimised.g2o").T_initial.values()
+    np.testing.assert_allclose(T[:, :3, 3], [[10, 5, 0], [11, 5, 0], [12, 5, 0]], atol=1e-6)
+
+
+def key_of(robot: str, label: str, index: int) -> int:
+    return (ord(robot) << 56) | ((ord(label) if label else 0) << 48) | index
+
+
+def test_robots_of_labelled_symbols_are_told_apart(tmp_path: Path) -> None:
+    one, other = ([key_of("x", label, k) for k in range(3)] for label in "AB")
+    text = "".join(plane(a, b, 1.0) for keys in (one, other) for a, b in pairwise(keys))
+    solved(tmp_path, text + plane(one[0], other[0], 2.0))
+    assert set(read_g2o(tmp_path / "x.g2o").graph.trajectories) == {LogId("xa"), LogId("xb")}
+
+
+def test_two_robots_whose_letters_differ_in_case_only_are_refused(tmp_path: Path) -> None:
+    text = "".join(plane(key_of(robot, "", 0), key_of(robot, "", 1), 1.0) for robot in "aA")
+    with pytest.raises(GraphFileError, match="are of two robots of which both are named a"):
+        solved(tmp_path, text + plane(key_of("a", "", 0), key_of("A", "", 0), 1.0))
+
+
+def test_what_was_left_out_is_said_without_json_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    from flocc_launch.commands.offline import optimise
+
+    (tmp_path / "x.g2o").write_text(RING + "".join(f"KIND_{k} 1\n" for k in range(12)))
+    optimise(tmp_path / "x.g2o", tmp_path / "out")
+    said = capfd.readouterr().err.splitlines()
+    assert "warning: 1 lines of kind KIND_0 are left out" in said
+    assert said[-1] == "warning: 2 more in result.json"
+
+
+@pytest.mark.parametrize("text", ["a,b,c\n", "1\n2\n", "1,2,3\n1,2\n"])
+def test_ground_truth_that_is_no_table_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    (tmp_path / "0.g2o").write_text(plane(0, 1, 1.0))
+    (tmp_path / "x_groundTruth.txt").write_text(text)
+    with pytest.raises(GraphFileError, match=r"x_groundTruth\.txt: is no table x,y,theta"):
+        read_g2o(tmp_path)

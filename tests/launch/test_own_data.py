@@ -263,3 +263,30 @@ def test_no_trajectory_is_said_with_the_names_that_it_could_have(own: Path, tmp_
     (own / "groundtruth.txt").rename(own / "KeyFrameTrajectory.txt")
     with pytest.raises(DatasetError, match=r"neither odometry nor ground truth \(odometry, trajectory, .* looked for"):
         convert(own, tmp_path / "out")
+
+
+def test_a_data_set_is_never_written_over(own: Path, tmp_path: Path) -> None:
+    before = {file: file.read_bytes() for file in own.rglob("*") if file.is_file()}
+    with pytest.raises(DatasetError, match="holds something else"):
+        convert(own, own)
+    assert {file: file.read_bytes() for file in own.rglob("*") if file.is_file()} == before
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "camera.toml").write_text("mine")
+    with pytest.raises(DatasetError, match=r"holds something else \(camera\.toml\)"):
+        convert(own, tmp_path / "notes")
+    assert [entry.name for entry in (tmp_path / "notes").iterdir()] == ["camera.toml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("x.g2o", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n", "is a pose graph, which has no images: flocc optimise FILE"),
+        ("x.tum", "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n", "is a trajectory; flocc needs the images, too"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_in_place_of_a_scenario(
+    tmp_path: Path, name: str, text: str, sentence: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError, match=sentence):
+        read_scenario(str(tmp_path / name), {})

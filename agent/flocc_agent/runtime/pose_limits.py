@@ -23,6 +23,10 @@ POSITION_MAX_M = COORDINATE_MAX - MOUNT_MAX_M
 STAMP_MAX_S = 1e12
 """Largest stamp that a record takes."""
 
+BREAK_RATIO, BREAK_MIN_M, BREAK_MIN_RAD = 10.0, 0.5, 0.5
+ACCELERATION_MAX_M_PER_S2, TURN_MAX_RAD_S = 100.0, 12.0
+"""A step so far, so fast against those beside it and beyond these is where odometry begins anew."""
+
 
 class PoseGate:
     """Remembers the last pose that was let in, and says what is wrong with the next."""
@@ -134,4 +138,29 @@ def spikes(positions_m: Float) -> NDArray[np.bool_]:
     away_m = np.minimum(steps_m[:-1], steps_m[1:])
     across_m = np.linalg.norm(positions_m[2:] - positions_m[:-2], axis=1)
     found[1:-1] = (away_m > far_m) & (across_m < 0.1 * away_m)
+    return found
+
+
+def breaks(stamps_s: Float, T: Float) -> NDArray[np.bool_]:
+    """Poses (N, 4, 4) to which a step leads that is unlike the steps before and after it, at increasing times (N,).
+
+    Such a step is `BREAK_RATIO` times as fast as both, and needs an acceleration that no robot survives, or a turn that
+    no gyroscope measures.
+    """
+    found = np.zeros(len(T), dtype=bool)
+    if len(T) < 4:
+        return found
+    step_s = np.diff(stamps_s)
+    R = T[:, :3, :3]
+    moved_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turned_rad = np.arccos(np.clip(0.5 * (np.einsum("nij,nij->n", R[:-1], R[1:]) - 1.0), -1.0, 1.0))
+
+    def lonely(amount: Float, amount_min: float, rate_min: Float | float) -> NDArray[np.bool_]:
+        rate = amount / step_s
+        beside = np.maximum(np.r_[0.0, rate[:-1]], np.r_[rate[1:], 0.0])
+        return np.asarray((amount > amount_min) & (rate > BREAK_RATIO * beside) & (rate - beside > rate_min))
+
+    inner = lonely(moved_m, BREAK_MIN_M, ACCELERATION_MAX_M_PER_S2 * step_s)
+    inner |= lonely(turned_rad, BREAK_MIN_RAD, TURN_MAX_RAD_S)
+    found[2:-1] = inner[1:-1]
     return found

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
 from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of
 from flocc_agent.runtime.dated_rows import dated
-from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, possible, spikes
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
 from flocc_agent.runtime.text_tables import RecordingError, Table, is_number, read_table
@@ -448,7 +448,15 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     odd = spikes(T[:, :3, 3])
     if np.any(odd):
         notes.append(_jumps(path, lines[odd], len(lines)))
-    return Trajectory(stamps_s[~odd], T[~odd]), tuple(notes)
+    stamps_s, T, lines = stamps_s[~odd], T[~odd], lines[~odd]
+    anew = breaks(stamps_s, T)
+    if np.any(anew):
+        more = f" (and at {np.count_nonzero(anew) - 1} other rows)" if np.count_nonzero(anew) > 1 else ""
+        notes.append(
+            f"{path}:{lines[np.argmax(anew)]}: the pose jumps and goes on from there{more}; it is taken as motion: "
+            "where odometry began anew, cut the file and convert the parts apart"
+        )
+    return Trajectory(stamps_s, T), tuple(notes)
 
 
 def _jumps(path: Path, lines: NDArray[np.int64], count: int) -> str:

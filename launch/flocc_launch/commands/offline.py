@@ -11,6 +11,7 @@ from flocc_launch.commands.common import EXIT_MISSED, Json, Speech, facts
 from flocc_protocol.errors import FloccError
 
 PROCESSES = 2
+WARNINGS_SAID = 10
 
 E = TypeVar("E", bound=Enum)
 
@@ -66,6 +67,11 @@ def optimise(
         typer.echo(f"{key.replace('_', ' '):14} {result[key] if result[key] is not None else 'not known'}")
     typer.echo(f"{'components':14} {_count(result['components'])}")
     typer.echo(f"{'rejected':14} {len(result['closures_rejected'])} closures")
+    warnings = result["warnings"]
+    for warning in warnings[:WARNINGS_SAID]:
+        typer.echo(f"warning: {warning}", err=True)
+    if len(warnings) > WARNINGS_SAID:
+        typer.echo(f"warning: {len(warnings) - WARNINGS_SAID} more in result.json", err=True)
     typer.echo(f"result: {(out / 'result.json').resolve()}")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.pictures import FULL
+from flocc_agent.runtime.recording import MASK, read_mask
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
@@ -55,7 +56,7 @@ class Info:
         path: The folder.
         format: Which reader read it.
         images: How many.
-        posed: How many of them lie within the trajectory's time.
+        posed: How many of them lie within the trajectory's time, and not in a gap of it.
         from_s: Stamp of the first image.
         to_s: Stamp of the last image.
         camera: Intrinsics.
@@ -116,7 +117,7 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         odometry_poses=len(source.odometry) if source.odometry else None,
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
-        faults=(*source.faults, *_missing(source)),
+        faults=(*source.faults, *_missing(source), *_mask_faults(source)),
         notes=(*source.notes, *_unused(source)),
         odometry_file=taken_file(path, ODOMETRY_STEMS) if source.odometry else None,
         truth_file=taken_file(path, TRUTH_STEMS) if source.truth else None,
@@ -130,17 +131,35 @@ def _unused(source: Source) -> list[str]:
     others = [
         entry.name
         for entry in sorted(root.iterdir())
-        if entry.name[0] != "." and entry.name not in used and not USED_NAMES.match(entry.name)
+        if entry.name[0] != "." and entry.name not in {*used, MASK} and not USED_NAMES.match(entry.name)
     ]
     more = f" and {len(others) - 8} more" if len(others) > 8 else ""
     return [f"{root}: not used: {', '.join(others[:8])}{more}"] if others else []
 
 
+def _mask_faults(source: Source) -> list[str]:
+    """Why a folder's mask cannot be used."""
+    camera = None if source.lens is None else source.lens.camera.agent_camera()
+    try:
+        if camera is not None:
+            read_mask(source.path / MASK, camera)
+    except FloccError as error:
+        return [str(error)]
+    return []
+
+
+def _tell_uncovered(source: Source, moved: Trajectory) -> None:
+    """Log how many images no pose covers: nothing fails, but no robot uses them."""
+    covered, count = _posed(source, moved), len(source.images)
+    if covered is not None and covered < count:
+        where = "outside of the trajectory's time, or in a gap of it"
+        logger.warning("%s: %d of %d images lie %s: no robot uses them", source.path, count - covered, count, where)
+
+
 def _posed(source: Source, trajectory: Trajectory | None) -> int | None:
     if trajectory is None:
         return None
-    first_s, last_s = float(trajectory.stamps_s[0]), float(trajectory.stamps_s[-1])
-    return sum(first_s <= stamp_s <= last_s for stamp_s, _ in source.images)
+    return sum(trajectory.at(stamp_s) is not None for stamp_s, _ in source.images)
 
 
 def _missing(source: Source) -> list[str]:
@@ -343,6 +362,7 @@ def convert(
     )
     given = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
     moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
+    _tell_uncovered(source, moved)
     write_source(source, out, moved, identity, progress)
     _note_drift(out, drift if given is None else None)
     _complain(source, out, len(source.images))

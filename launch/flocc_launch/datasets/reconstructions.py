@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import R_from_q_wxyz, inverse, pose
+from flocc_agent.runtime.recording import MASK
 from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
@@ -114,6 +115,9 @@ def read_transforms(path: Path) -> Source:
         table: Any = json.loads(read_text(file))
         frames = table["frames"]
         poses = {str(f["file_path"]): np.array(f["transform_matrix"], dtype=float) for f in frames}
+        without = next((name for name, T in poses.items() if T.ndim != 2), None)
+        if without is not None:
+            raise DatasetError(f"{file}: the transform_matrix of {without} is no matrix")
         twice = next(
             (f["file_path"] for f in frames if not np.array_equal(poses[str(f["file_path"])], f["transform_matrix"])),
             None,
@@ -158,12 +162,22 @@ def _source(
     notes = [f"{path}: a reconstruction has no metric scale unless it was set; its distances are taken as metres"]
     if invented:
         notes.append(f"{path}: images have no stamps; one every {STEP_S:g} s was assumed, in the order of their names")
+    others = _without_pose(folder, list(found.values()))
+    if others:
+        notes.append(f"{folder}: {others} more images have no pose in the model and were left out")
     if missing:
         notes.append(f"{folder}: {missing} of {len(poses)} images do not exist and were left out")
     images = tuple(zip(stamps.tolist(), (found[key] for key in keys), strict=True))
     if calibration is not None:
         lens = read_lens(calibration, size_of(images))
     return Source(path, name, images, lens, truth=truth, notes=tuple(notes))
+
+
+def _without_pose(folder: Path, found: list[Path]) -> int:
+    """How many images lie beside those of a model, of the kinds that it has."""
+    suffixes = {file.suffix for file in found}
+    beside = {file for place in {file.parent for file in found} for file in place.iterdir() if file.suffix in suffixes}
+    return len(beside - set(found) - {folder / MASK})
 
 
 def _file(folder: Path, name: str) -> Path | None:

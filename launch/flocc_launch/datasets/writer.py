@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.pictures import PictureError
-from flocc_agent.runtime.recording import MASK, write_camera
+from flocc_agent.runtime.recording import MASK, read_mask, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.datasets.pixels import ImageWriter, read_bytes
 from flocc_launch.datasets.source import DatasetError, Lens, Source
@@ -45,11 +45,11 @@ class RecordingWriter:
             identity: What is written, one line; a folder with another identity is not touched.
 
         Raises:
-            DatasetError: The folder holds another recording.
+            DatasetError: The folder holds another recording, or anything else.
         """
         self.path = path
-        (path / "images").mkdir(parents=True, exist_ok=True)
         _claim(path / "source.txt", identity)
+        (path / "images").mkdir(exist_ok=True)
         self.count = 0
         self.last_stamp_s: float | None = None
         listing = path / "images.txt"
@@ -213,10 +213,14 @@ def _write(path: str, data: bytes) -> None:
 
 def _claim(path: Path, identity: str) -> None:
     if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
         if (path.parent / "images.txt").exists():
             raise DatasetError(
                 f"{path.parent}: holds a recording that this command did not write; choose another folder"
             )
+        others = sorted(entry.name for entry in path.parent.iterdir() if not entry.name.startswith("."))
+        if others:
+            raise DatasetError(f"{path.parent}: holds something else ({', '.join(others[:4])}); choose another folder")
         path.write_text(identity + "\n", encoding="utf-8")
     elif (found := path.read_text(encoding="utf-8").strip()) != identity:
         raise DatasetError(f"{path.parent}: holds another recording ({found}); remove it or choose another folder")
@@ -255,15 +259,19 @@ def _carry_mask(source: Source, lens: Lens, out: Path) -> None:
 
     Raises:
         DatasetError: There is a mask, and the pictures are straightened.
+        RecordingError: It is no mask of these images.
     """
     mask = source.path / MASK
-    if not mask.is_file():
+    if not mask.exists():
         return
     if source.lens is not None and lens.camera != source.lens.camera:
         raise DatasetError(
             f"{mask}: is of the pictures as they were taken, and these are straightened; leave it out, convert, and "
             f"put one of the straightened pictures into {out}"
         )
+    camera = lens.camera.agent_camera()
+    if camera is not None:
+        read_mask(mask, camera)
     shutil.copyfile(mask, out / MASK)
 
 

@@ -5,8 +5,9 @@ holds one file per robot (keys of all robots in their top byte), and maybe a `*_
 all keyframes, robot after robot.
 """
 
+import codecs
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +36,13 @@ SE3_NUMBERS, SE2_NUMBERS = 7 + 21, 3 + 6
 EDGES = ("EDGE_SE3:QUAT", "EDGE_SE2")
 VERTICES = {"VERTEX_SE3:QUAT": 7, "VERTEX_SE2": 3}
 KNOWN = {*EDGES, *VERTICES, "FIX"}
+COMMENTS = ("#", "%", "//")
+NAMED_MAX = 5
+SIGMA_MIN, SIGMA_MAX, CONDITION_MAX = 1e-10, 1e10, 1e13
+"""Standard deviations (m, rad), and ratio of the largest variance to the smallest, of what a solver can weigh."""
+FREE_RATIO = 1e10
+STRONGEST_RATIO, WEAK_INFORMATION = 1e6, 1e-6
+"""From here on LM and GNC end early: an edge so much stronger than the median one, and a median so weak."""
 ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
@@ -49,17 +57,22 @@ def read_g2o(path: Path, isotropic: bool = False) -> GraphFile:
     planar = all(line.words[0] != "EDGE_SE3:QUAT" for line in lines)
     read = (_measurement(line, isotropic, planar) for line in lines)
     measurements = distinct((m for m in read if m is not None), add_up=True)
+    left_out = Counter(line.words[0] for line in lines if line.words[0] not in KNOWN)
     if not measurements:
-        raise GraphFileError(f"{path}: has no edges")
+        there = ", ".join(f"{count} of kind {kind[:30]}" for kind, count in left_out.most_common(NAMED_MAX))
+        raise GraphFileError(f"{path}: has no edges {' or '.join(EDGES)}" + (f", but lines {there}" if there else ""))
     graph = pose_graph(measurements, str(path))
-    vertices = dict(v for line in lines if (v := _vertex(line)) is not None)
+    keys = {key for m in measurements for key in (m.first, m.second)}
+    vertices, notes = _vertices(lines, keys)
+    fixed, fix_notes = _fixed(lines, vertices, keys)
     return GraphFile(
         graph,
         _truth(path, graph) if path.is_dir() else {},
         T_initial=_initial(vertices, graph),
         planar=planar,
-        left_out=Counter(line.words[0] for line in lines if line.words[0] not in KNOWN),
-        fixed=_fixed(lines, vertices),
+        left_out=left_out,
+        fixed=fixed,
+        notes=(*notes, *fix_notes, *_weight_notes(measurements, planar)),
     )
 
 
@@ -80,14 +93,23 @@ class Line:
 
 
 def _lines(path: Path) -> Iterable[Line]:
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        words = line.split("#")[0].split()
+        if words and not words[0].startswith(COMMENTS):
+            yield Line(path, number, words)
+
+
+def _text(path: Path) -> str:
+    """Text of a file: only comments have other letters than ASCII, so that their encoding does not count."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        data = path.read_bytes()
+        marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = data.decode("utf-16") if marked else data.decode("utf-8-sig", errors="replace")
     except (OSError, UnicodeDecodeError) as error:
         raise GraphFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    for number, line in enumerate(lines, 1):
-        words = line.split()
-        if words and not words[0].startswith("#"):
-            yield Line(path, number, words)
+    if "\0" in text:
+        raise GraphFileError(f"{path}: cannot be read: is not text")
+    return text
 
 
 def _measurement(line: Line, isotropic: bool, planar: bool) -> Measurement | None:
@@ -118,10 +140,11 @@ def _vertex(line: Line) -> tuple[int, Float] | None:
     kind, *numbers = line.words
     if kind not in VERTICES:
         return None
+    words = " ".join(numbers[1 : SE3_NUMBERS + 1])
     try:
         key, *v = _key(numbers[0]), *(float(number) for number in numbers[1:])
         if len(v) != VERTICES[kind] or not np.all(np.isfinite(v)):
-            raise ValueError(f"a vertex has {len(v)} finite numbers, expected {VERTICES[kind]}")
+            raise ValueError(f"a vertex has {VERTICES[kind]} finite numbers after its key, this one [{words}]")
         if kind == "VERTEX_SE2":
             return key, pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
         return key, pose(R_from_q_wxyz(np.array(v)[[6, 3, 4, 5]]), np.array(v[:3]))
@@ -129,12 +152,63 @@ def _vertex(line: Line) -> tuple[int, Float] | None:
         raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
 
 
-def _fixed(lines: Sequence[Line], vertices: Mapping[int, Float]) -> tuple[KeyframeId, ...]:
-    """Keyframes of `FIX` lines, where the vertices say their place."""
-    keys = [int(word) for line in lines if line.words[0] == "FIX" for word in line.words[1:] if word.isdigit()]
-    found = [key for key in keys if key in vertices]
-    before = {key: sum(other < key and log_of(other) == log_of(key) for other in vertices) for key in found}
-    return tuple(KeyframeId(log_of(key), before[key]) for key in found)
+def _vertices(lines: Iterable[Line], keys: Set[int]) -> tuple[dict[int, Float], list[str]]:
+    """Poses of the vertices that edges join, and what is said of others and of those that occur twice."""
+    found: dict[int, Float] = {}
+    again, alone = dict[int, None](), dict[int, None]()
+    for line in lines:
+        if (vertex := _vertex(line)) is None:
+            continue
+        key, T = vertex
+        if key in found and not np.array_equal(found[key], T):
+            again[key] = None
+        if key not in keys:
+            alone[key] = None
+        found[key] = T
+    notes = [f"{_named('vertex', again)}: given more than once, the last pose counts"] if again else []
+    notes += [f"{_named('vertex', alone)}: no edge joins it, left out"] if alone else []
+    return {key: T for key, T in found.items() if key in keys}, notes
+
+
+def _named(what: str, keys: Collection[int]) -> str:
+    more = f" and {len(keys) - NAMED_MAX} more" if len(keys) > NAMED_MAX else ""
+    return f"{what} {', '.join(str(key) for key in list(keys)[:NAMED_MAX])}{more}"
+
+
+def _weight_notes(measurements: Sequence[Measurement], planar: bool) -> list[str]:
+    """What is said of information with which a solver may not find the minimum."""
+    used = [2, 3, 4] if planar else list(range(6))
+    information = 1.0 / np.array([np.diag(m.covariance)[used] for m in measurements])
+    usual = np.median(information, axis=0)
+    k = int(np.argmax((information / usual).max(axis=1)))
+    notes = []
+    if (information[k] > STRONGEST_RATIO * usual).any():
+        notes.append(
+            f"the edge from vertex {measurements[k].first} to {measurements[k].second} has over {STRONGEST_RATIO:g} "
+            "times the information of the usual edge: the solve may end early, and right closures be let go"
+        )
+    if (usual < WEAK_INFORMATION).all():
+        notes.append(f"information is as small as {usual.min():g}: lm ends before the minimum; scale it up")
+    return notes
+
+
+def _fixed(
+    lines: Sequence[Line], vertices: Mapping[int, Float], keys: Set[int]
+) -> tuple[tuple[KeyframeId, ...], list[str]]:
+    """Keyframes of `FIX` lines, where the vertices say their place, and what is said of others."""
+    fixed: dict[int, None] = {}
+    for line in lines:
+        try:
+            fixed |= dict.fromkeys(_key(word) for word in line.words[1:] if line.words[0] == "FIX")
+        except ValueError as error:
+            raise GraphFileError(f"{line.path}: line {line.number}: {error}") from error
+    found = [key for key in fixed if key in vertices]
+    lost = [key for key in fixed if key not in vertices]
+    before = {key: sum(other < key and log_of(other) == log_of(key) for other in keys) for key in found[:NAMED_MAX]}
+    notes = [f"{_named('FIX', lost)}: no vertex with an edge says where that is, nothing is held there"] if lost else []
+    if len(found) > 1:
+        notes.append(f"{_named('FIX', found)}: the first of them that is joined places the result, none holds it")
+    return tuple(KeyframeId(log_of(key), count) for key, count in before.items()), notes
 
 
 def _initial(vertices: Mapping[int, Float], graph: PoseGraph) -> dict[LogId, Float]:
@@ -173,19 +247,28 @@ def _covariance(information: Float) -> Float:
     """The inverse of an information matrix.
 
     Raises:
-        ValueError: It is not positive definite.
+        ValueError: It is not positive definite, or no solver can weigh it.
     """
-    if np.min(np.linalg.eigvalsh(information)) <= 0.0:
+    eigenvalues = np.linalg.eigvalsh(information)
+    low, high = float(eigenvalues[0]), float(eigenvalues[-1])
+    if low <= 0.0:
         raise ValueError("the information matrix is not positive definite")
+    if high > CONDITION_MAX * low or low < SIGMA_MAX**-2 or high > SIGMA_MIN**-2:
+        raise ValueError(
+            f"the information matrix has eigenvalues from {low:g} to {high:g}; they must lie between {SIGMA_MAX**-2:g} "
+            f"and {SIGMA_MIN**-2:g}, the largest at most {CONDITION_MAX:g} times the smallest"
+        )
     return np.asarray(np.linalg.inv(information))
 
 
 def _se2(words: list[str], isotropic: bool, planar: bool) -> Measurement:
     first, second, v = _numbers(words, SE2_NUMBERS)
     T = pose(so3_exp(np.array([0.0, 0.0, v[2]])), np.array([v[0], v[1], 0.0]))
-    covariance = np.eye(6)
+    planar_covariance = _covariance(_symmetric(v[3:], 3))
+    variances = np.linalg.eigvalsh(planar_covariance)
+    covariance = np.eye(6) * np.clip(1.0, variances[-1] / FREE_RATIO, variances[0] * FREE_RATIO)
     in_plane = np.ix_([3, 4, 2], [3, 4, 2])
-    covariance[in_plane] = _covariance(_symmetric(v[3:], 3))
+    covariance[in_plane] = planar_covariance
     return Measurement(first, second, T, isotropic_noise(covariance, planar) if isotropic else covariance)
 
 
@@ -194,7 +277,12 @@ def _truth(folder: Path, graph: PoseGraph) -> dict[LogId, Float]:
     file = next(iter(sorted(folder.glob("*_groundTruth.txt"))), None)
     if file is None:
         return {}
-    rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    try:
+        rows = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise GraphFileError(f"{file}: is no table x,y,theta: {getattr(error, 'strerror', None) or error}") from error
+    if rows.shape[1] < 2:
+        raise GraphFileError(f"{file}: is no table x,y,theta: a row has {rows.shape[1]} numbers")
     positions = np.column_stack([rows[:, 0], rows[:, 1], np.zeros(len(rows))])
     truth, start = {}, 0
     for log in sorted(graph.trajectories):

@@ -17,6 +17,9 @@ Float = NDArray[np.float64]
 
 INDEX_BITS = 56
 INDEX_MASK = (1 << INDEX_BITS) - 1
+LABEL_BITS = 48
+STEP_MAX_M = 1e6
+"""A longer step of a robot is damage: a closure as long is refused by the back end, odometry has to be refused here."""
 OPEN_SIGMA_RAD, OPEN_SIGMA_M = 1e4, 1e6
 """Standard deviations of a step that nothing measured: it says where the next keyframe starts, and no more."""
 
@@ -48,6 +51,7 @@ class GraphFile:
         planar: Whether it was a file of two dimensions.
         left_out: How many lines of each kind were not read.
         fixed: Keyframes that the file holds where they are.
+        notes: What else of the file was not taken as it stands, in one sentence each.
         stamps_s: (N,) time of every keyframe of each log, counted from the file's first, where it has times.
     """
 
@@ -60,6 +64,7 @@ class GraphFile:
     planar: bool = False
     left_out: Mapping[str, int] = field(default_factory=dict)
     fixed: tuple[KeyframeId, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def without_outliers(self) -> "GraphFile":
         """The same file without the closures that it labels as wrong."""
@@ -148,10 +153,15 @@ def unit_length(closure: LoopClosure) -> LoopClosure:
 
 
 def log_of(key: int) -> LogId:
-    """The log of a GTSAM-style key: its top byte is the robot's letter, or nothing where there is one robot."""
-    number = key >> INDEX_BITS
+    """The log of a GTSAM-style key: its top byte is the robot's letter, or nothing where there is one robot.
+
+    A letter in the byte below it, where no index reaches, is the robot's label (GTSAM's `LabeledSymbol`).
+    """
+    number, label = key >> INDEX_BITS, chr((key >> LABEL_BITS) & 0xFF)
     letter = chr(number).lower() if number < 128 else ""
-    return LogId(letter if letter.isascii() and letter.isalnum() else f"robot-{number}")
+    if not (letter.isascii() and letter.isalnum()):
+        return LogId(f"robot-{number}")
+    return LogId(letter + label.lower() if label.isascii() and label.isalpha() else letter)
 
 
 def distinct(measurements: Iterable[Measurement], add_up: bool) -> list[Measurement]:
@@ -162,13 +172,18 @@ def distinct(measurements: Iterable[Measurement], add_up: bool) -> list[Measurem
         add_up: Their information is added up (g2o: every line is a term of the sum); otherwise it is taken once
             (JRL: both robots list what they share).
     """
-    counts: dict[tuple[int, int, bytes], int] = {}
-    first: dict[tuple[int, int, bytes], Measurement] = {}
+    same: dict[tuple[int, int, bytes], list[Measurement]] = {}
     for m in measurements:
-        mark = (m.first, m.second, m.T_first_second.tobytes())
-        counts[mark] = counts.get(mark, 0) + 1
-        first.setdefault(mark, m)
-    return [replace(m, covariance=m.covariance / (counts[mark] if add_up else 1)) for mark, m in first.items()]
+        same.setdefault((m.first, m.second, m.T_first_second.tobytes()), []).append(m)
+    return [
+        replace(ms[0], covariance=_together([m.covariance for m in ms])) if add_up and len(ms) > 1 else ms[0]
+        for ms in same.values()
+    ]
+
+
+def _together(covariances: Sequence[Float]) -> Float:
+    """Covariance of a measurement that occurs with each of these: their information is added up."""
+    return np.asarray(np.linalg.inv(np.sum(np.linalg.inv(np.array(covariances)), axis=0)), dtype=np.float64)
 
 
 def pose_graph(measurements: Sequence[Measurement], path: str) -> PoseGraph:
@@ -179,9 +194,10 @@ def pose_graph(measurements: Sequence[Measurement], path: str) -> PoseGraph:
     covariance says nothing.
 
     Raises:
-        GraphFileError: There is no such way.
+        GraphFileError: There is no such way, two robots have one name, or a step is longer than any robot goes.
     """
     keys = sorted({key for m in measurements for key in (m.first, m.second)})
+    _one_name_each(keys, path)
     following = {a: b for a, b in pairwise(keys) if log_of(a) == log_of(b)}
     odometry: dict[int, int] = {}
     for forward in (True, False):
@@ -194,9 +210,32 @@ def pose_graph(measurements: Sequence[Measurement], path: str) -> PoseGraph:
     gaps = {a: b for a, b in following.items() if a not in steps}
     if gaps:
         steps |= _bridged(gaps, measurements, path)
+    for key, m in steps.items():
+        _possible(key, following[key], m, path)
     taken, numbers = set(odometry.values()), _numbers(keys)
     closures = [_closure(m, numbers) for k, m in enumerate(measurements) if k not in taken]
     return PoseGraph(_trajectories(keys, steps), closures)
+
+
+def _one_name_each(keys: Sequence[int], path: str) -> None:
+    """Refuse robots whose letters differ in their case only: names of logs have lower case."""
+    letters: dict[LogId, int] = {}
+    for key in keys:
+        other = letters.setdefault(log_of(key), key >> LABEL_BITS if key >> INDEX_BITS else 0)
+        if key >> INDEX_BITS and other != key >> LABEL_BITS:
+            raise GraphFileError(
+                f"{path}: vertices {other << LABEL_BITS} and {key} are of two robots of which both are named "
+                f"{log_of(key)}, because case does not count; give one another letter"
+            )
+
+
+def _possible(first: int, second: int, m: Measurement, path: str) -> None:
+    length_m = float(np.abs(m.T_first_second[:3, 3]).max())
+    if length_m > STEP_MAX_M:
+        where = f"robot {log_of(first)} from vertex {first & INDEX_MASK} to {second & INDEX_MASK}"
+        raise GraphFileError(
+            f"{path}: the step of {where} is {length_m:g} m long, {STEP_MAX_M:g} m at most are possible"
+        )
 
 
 def inverted(m: Measurement) -> Measurement:

@@ -91,6 +91,8 @@ def optimise_file(
     solution = optimise(file.graph, config, initial)
     if isinstance(solution, OptimisationFailed):
         raise OptimiseError(f"{path}: {solution.reason}")
+    if not np.isfinite([c.cost for c in solution.components]).all():
+        raise OptimiseError(f"{path}: no finite cost was found: its measurements are out of all proportion")
     result = {
         "file": str(path),
         "seed": seed,
@@ -178,6 +180,7 @@ def report(file: GraphFile, config: BackendConfig, solution: GraphSolution) -> d
 
 def _unread(file: GraphFile) -> list[str]:
     lines = [f"{count} lines of kind {kind} are left out" for kind, count in sorted(file.left_out.items())]
+    lines += file.notes
     unmeasured = {log: unmeasured_steps(t) for log, t in sorted(file.graph.trajectories.items())}
     return lines + [
         f"{count} steps of robot {log} are not measured: they start along other measurements, and hold nothing"

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from flocc_agent.config import ConfigError
+from flocc_launch.datasets.other_kinds import kind_of_file
 from flocc_launch.scenarios.own_data import OwnData, is_own_data
 from flocc_launch.scenarios.scenario import Scenario
 
@@ -47,6 +48,8 @@ def read_scenario(
         if tell is not None:
             tell(own.sentence())
         return Scenario.of(own.fields(), changes, Path(text))
+    if Path(text).suffix != ".toml" and Path(text).is_file() and (kind := kind_of_file(Path(text))) is not None:
+        raise ConfigError(f"{text}: {kind}")
     read = Scenario.read if Path(text).suffix == ".toml" or Path(text).is_file() else None
     scenario = read(Path(text), changes) if read else read_shipped(text, changes)
     if agents is None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.geometry import Float, pose, so3_exp
-from flocc_agent.runtime.pose_limits import POSITION_MAX_M, PoseGate, possible, spikes
+from flocc_agent.runtime.pose_limits import POSITION_MAX_M, PoseGate, breaks, possible, spikes
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory_text import read_trajectory
 
@@ -130,3 +130,42 @@ def test_a_ride_that_goes_on_elsewhere_has_no_spike() -> None:
     ferry = np.concatenate([np.arange(20.0), 5000.0 + np.arange(20.0)])[:, None] * [1.0, 0.0, 0.0]
     assert not spikes(ferry).any()
     assert not spikes(np.array([[0.0, 0, 0], [5000.0, 0, 0], [0.0, 0, 0]])).any()
+
+
+def drawn_ride(rng: np.random.Generator) -> tuple[Float, Float]:
+    """Stamps and poses of somebody who speeds up, stands and turns smoothly, at any rate, with jitter and gaps."""
+    count, step_s = int(rng.integers(30, 300)), float(np.exp(rng.uniform(np.log(0.005), np.log(1.0))))
+    dt_s = step_s * rng.uniform(0.5, 1.5, count)
+    dt_s[rng.random(count) < 0.02] *= 20.0
+    stamps_s = np.cumsum(dt_s)
+    phase = 2 * np.pi * stamps_s / rng.uniform(20.0, 60.0)
+    speed_m_s = rng.choice([0.5, 3.0, 25.0]) * np.clip(np.sin(phase) + 0.3, 0.0, None)
+    positions = np.cumsum(speed_m_s * dt_s)[:, None] * [1.0, 0.2, 0.0] + rng.normal(0, 0.005, (count, 3))
+    turns = np.cumsum(0.6 * np.sin(phase) * dt_s)
+    return stamps_s, np.array(
+        [pose(so3_exp(np.array([0.0, 0.0, turn])), x) for turn, x in zip(turns, positions, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_rides_have_no_break_and_one_that_is_put_in_is_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamps_s, T = drawn_ride(rng)
+    assert not breaks(stamps_s, T).any()
+    k = int(rng.integers(5, len(T) - 5))
+    stamps_s[k:] += stamps_s[k - 1] + min(0.1, stamps_s[k] - stamps_s[k - 1]) - stamps_s[k]
+    moved = np.array(T)
+    if seed % 2:
+        moved[k:, :3, 3] += [500.0, 0.0, 0.0]
+    else:
+        moved[k:] = moved[k:] @ pose(so3_exp(np.array([0.0, 0.0, 3.0])), np.zeros(3))
+    assert np.flatnonzero(breaks(stamps_s, moved)).tolist() == [k]
+
+
+def test_a_jump_that_goes_on_is_said_with_its_row(tmp_path: Path) -> None:
+    rows = [f"{100 + 0.1 * k:.1f} {0.1 * k + 50 * (k >= 6):.2f} 0 0 0 0 0 1" for k in range(12)]
+    (tmp_path / "odometry.tum").write_text("\n".join(rows) + "\n")
+    trajectory, notes = read_trajectory(tmp_path / "odometry.tum")
+    assert len(trajectory) == 12
+    (note,) = notes
+    assert "odometry.tum:7: the pose jumps and goes on from there; it is taken as motion" in note
