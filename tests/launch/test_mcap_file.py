@@ -20,6 +20,7 @@ from tests.agent.runtime.loopback import free_ports
 from tests.launch import synthetic_run
 
 from flocc_agent.geometry import Float, pose_from_tq
+from flocc_launch.commands.main import _record
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.recordings import recordings
@@ -256,6 +257,17 @@ def test_what_cannot_be_written_is_one_sentence_and_leaves_nothing(tmp_path: Pat
     with pytest.raises(McapError, match=r"run.mcap: cannot be written \("):
         write_mcap(run, tmp_path / "file" / "run.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_file_that_cannot_be_written_does_not_hide_what_came_of_the_run(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`launch` goes on to its report; stdout stays free for JSON."""
+    (tmp_path / "file").write_text("")
+    assert _record(run.path, tmp_path / "file" / "run.mcap")
+    out, err = capsys.readouterr()
+    assert (out, err.count("error: "), "cannot be written" in err) == ("", 1, True)
+    assert not _record(run.path, tmp_path / "run.mcap")
 
 
 def test_without_the_package_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, run: RunFolder) -> None:
