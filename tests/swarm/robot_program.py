@@ -19,6 +19,9 @@ from flocc_agent.perception.synthetic import pose_image
 RADIUS_M = 6.0
 STEP_RAD = 0.12
 STATUS_PERIOD_S = 0.1
+ORIGIN_RAD = -0.5
+"""Before all phases (modulo a turn): odometry that were at its origin after a restart would be a new journey."""
+ORIGINS_APART_RAD = 0.35
 CAMERA = Camera(128, 1, 100.0, 100.0, 64.0, 0.5)
 
 
@@ -33,8 +36,9 @@ def T_world_camera_at(angle_rad: float) -> NDArray[np.float64]:
 
 
 async def drive(agent: Agent, name: str, keyframes: int, period_s: float, phase_rad: float) -> None:
-    """Give the agent its keyframes; its odometry starts at its own origin."""
-    T_odom_world = np.linalg.inv(T_world_camera_at(phase_rad))
+    """Give the agent its keyframes; its odometry goes on over restarts, in a frame of this robot's own."""
+    origin_rad = ORIGIN_RAD - ORIGINS_APART_RAD * (sum(name.encode()) % 5)
+    T_odom_world = np.linalg.inv(T_world_camera_at(origin_rad))
     for index in range(keyframes):
         T_world_camera = T_world_camera_at(phase_rad + STEP_RAD * index)
         image = pose_image(T_world_camera, f"{name}/{index}")
