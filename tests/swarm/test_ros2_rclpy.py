@@ -222,9 +222,10 @@ def check_diagnostics(team: Team) -> None:
     """Each robot says once a second how it is, by simulated time, and what it has heard."""
     for robot in team.robots:
         one, values = team.listener.status(robot.name)
-        assert one.level == DiagnosticStatus.OK, one.message
+        held = "held until another one agrees" in one.message  # a lone closure that a chance match gave
+        assert held or one.level == DiagnosticStatus.OK, one.message
         assert one.name == f"flocc: {robot.name}"
-        assert ("leads" in one.message) == (values["leader"] == robot.name)
+        assert held or ("leads" in one.message) == (values["leader"] == robot.name)
         assert values["map frame"] == team.listener.map_frame(robot.name)
         assert values["neighbours"] == ({*NAMES} - {robot.name}).pop()
         assert int(values["heard: image"]) > 5
