@@ -292,7 +292,7 @@ MUTANTS = (
     Mutant("a correction is not persisted", Corrections, "_apply", without(PersistCorrection)),
     Mutant("a correction is delivered twice", Corrections, "_apply", afterwards(_delivers_twice)),
     Mutant("a correction is never delivered", Corrections, "_apply", always([])),
-    Mutant("an older correction is applied", Corrections, "is_news", always(True)),
+    Mutant("an older correction is applied", Corrections, "_has_knots", always(False)),
     Mutant("the applied correction is forgotten at a restart", Corrections, "restore", _forgets_the_correction),
     # judgement, registration and the graph
     Mutant("closures are inverted", robot, "judged", afterwards(_inverted)),
