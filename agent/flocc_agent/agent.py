@@ -208,11 +208,17 @@ class Agent:
 
     async def _journey_of(self, T_odom_body: Float) -> None:
         """Begin another journey where the first pose after a start is that of odometry which began meanwhile."""
-        before, self._before = self._before, None
-        if self.config.folder is not None and began_anew(before, np.asarray(T_odom_body, dtype=float)):
-            logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
+        if self._began_while_off(np.asarray(T_odom_body, dtype=float)):
             await self.begin_journey()
             self._before = None
+
+    def _began_while_off(self, T_odom_body: Float) -> bool:
+        """Whether the first pose (4, 4) after a start is that of odometry which began meanwhile; asked once."""
+        before, self._before = self._before, None
+        if not began_anew(before, T_odom_body):
+            return False
+        logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
+        return True
 
     async def _look_at_network(self) -> None:
         """Say once what of the configured network is not there; the agent goes on trying."""
@@ -529,9 +535,7 @@ class Agent:
 
     async def _add_of_ros(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
         """A keyframe of the robot's ROS 2; odometry that began while the agent was off begins another journey."""
-        before, self._before = self._before, None
-        if began_anew(before, T_odom_camera @ inverse(self._T_body_camera)):
-            logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
+        if self._began_while_off(T_odom_camera @ inverse(self._T_body_camera)):
             self._begin_anew()
             return
         await self._started.add_keyframe(image, T_odom_camera, stamp_s)

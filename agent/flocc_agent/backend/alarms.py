@@ -40,7 +40,7 @@ QUARTER_OF_SIX = 3.455
 COLLAPSED_RATIO = 0.1
 """A guessed length that becomes shorter than this part of the guess has collapsed; one without a guess, below zero."""
 FIXED_M = 1e-6
-ODOMETRY_SCALE_SIGMA = 0.05
+ODOMETRY_LENGTH_SIGMA = 0.05
 """What odometry's lengths may be off by, beside its noise."""
 
 
@@ -83,7 +83,7 @@ class Way:
         lever = self.levered[high] - self.levered[low]
         squared = self.squared[high] - self.squared[low]
         swung = squared - 2.0 * np.einsum("ki,ki->k", x, lever) + rotation * np.einsum("ki,ki->k", x, x)
-        stretch = ODOMETRY_SCALE_SIGMA**2 * np.sum((self.T[i, :3, 3] - self.T[j, :3, 3]) ** 2, axis=1)
+        stretch = ODOMETRY_LENGTH_SIGMA**2 * np.sum((self.T[i, :3, 3] - self.T[j, :3, 3]) ** 2, axis=1)
         return rotation, np.maximum(swung, 0.0) + self.translation[high] - self.translation[low] + stretch
 
 

@@ -45,13 +45,14 @@ def tie_warnings(
         steepness: k of Eq. (2).
         cluster_keyframes_max: Closures so near to each other count as one place (`clusters.votes`).
     """
+    if used.all():
+        return ()
     says = votes([closures[k] for k in problem.closure_ids], cluster_keyframes_max)
     by_pair: dict[tuple[LogId, LogId], list[int]] = {}
     for n, k in enumerate(problem.closure_ids):
         a, b = sorted((closures[k].query.log, closures[k].match.log))
         if a != b:
             by_pair.setdefault((a, b), []).append(n)
-    path_m = {log: travelled_m(trajectory) for log, trajectory in trajectories.items()}
 
     def sentences() -> Iterator[str]:
         for (a, b), rows in sorted(by_pair.items()):
@@ -64,6 +65,7 @@ def tie_warnings(
             for k in ids:
                 query, match = closures[k].query, closures[k].match
                 ends[k] = (query, match) if query.log == a else (match, query)
+            path_m = {log: travelled_m(trajectories[log]) for log in (a, b)}
             found = align_pair(rays_from(ids, closures, ends, T_keyframes, path_m, steepness))
             agreeing = [n for n in rejected if problem.closure_ids[n] in found.agreeing]
             if len(agreeing) < REJECTED_MIN or says[agreeing].sum() < enough:
