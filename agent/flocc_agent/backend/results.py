@@ -85,7 +85,6 @@ def _ties(solution: Solution, results: Mapping[int, ClosureResult]) -> tuple[str
         solution.trajectories,
         solution.closures,
         config.steepness,
-        config.cluster_keyframes_max,
     )
 
 

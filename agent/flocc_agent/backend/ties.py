@@ -1,16 +1,21 @@
-"""Robots whose rejected closures would put them elsewhere with nearly as many votes: said, because it is a guess.
+"""Robots that rejected closures would put elsewhere, nearly as many as were followed: said, because it is a guess.
 
 Two halves of a symmetrical hall look the same. Four closures then say that a robot is in one half, four that it is in
 the other; one of the two is taken, and which of them depends on next to nothing.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.alignment import align_pair, rays_from, travelled_m
-from flocc_agent.backend.clusters import votes
+from flocc_agent.backend.alignment import (
+    ROTATION_TOLERANCE_RAD,
+    TRANSLATION_TOLERANCE_M,
+    align_pair,
+    rays_from,
+    travelled_m,
+)
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import angle_rad
@@ -22,7 +27,7 @@ Float = NDArray[np.float64]
 REJECTED_MIN = 2
 """A single closure puts a robot nowhere that another one confirms."""
 NEARLY_RATIO = 0.75
-"""So large a part of the votes that were followed is nearly as many."""
+"""So large a part of those that were followed is nearly as many."""
 
 
 def tie_warnings(
@@ -32,9 +37,10 @@ def tie_warnings(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
     steepness: float,
-    cluster_keyframes_max: int,
 ) -> tuple[str, ...]:
     """One sentence for each pair of robots whose rejected closures agree on another place.
+
+    Places that the alignment of robots takes for one are one: closures are also rejected for being inexact.
 
     Args:
         problem: The component.
@@ -43,40 +49,39 @@ def tie_warnings(
         trajectories: Odometry of the component's logs.
         closures: Its closures, by their index in the graph.
         steepness: k of Eq. (2).
-        cluster_keyframes_max: Closures so near to each other count as one place (`clusters.votes`).
     """
     if used.all():
         return ()
-    says = votes([closures[k] for k in problem.closure_ids], cluster_keyframes_max)
     by_pair: dict[tuple[LogId, LogId], list[int]] = {}
     for n, k in enumerate(problem.closure_ids):
         a, b = sorted((closures[k].query.log, closures[k].match.log))
         if a != b:
             by_pair.setdefault((a, b), []).append(n)
 
-    def sentences() -> Iterator[str]:
-        for (a, b), rows in sorted(by_pair.items()):
-            followed, rejected = [n for n in rows if used[n]], [n for n in rows if not used[n]]
-            enough = NEARLY_RATIO * says[followed].sum()
-            if not followed or len(rejected) < REJECTED_MIN or says[rejected].sum() < enough:
-                continue
-            ids = [problem.closure_ids[n] for n in rejected]
-            ends = {}
-            for k in ids:
-                query, match = closures[k].query, closures[k].match
-                ends[k] = (query, match) if query.log == a else (match, query)
-            path_m = {log: travelled_m(trajectories[log]) for log in (a, b)}
-            found = align_pair(rays_from(ids, closures, ends, T_keyframes, path_m, steepness))
-            agreeing = [n for n in rejected if problem.closure_ids[n] in found.agreeing]
-            if len(agreeing) < REJECTED_MIN or says[agreeing].sum() < enough:
-                continue
-            middle = T_keyframes[b][:, :3, 3].mean(axis=0)
-            moved_m = float(np.linalg.norm(found.T_a_b[:3, :3] @ middle + found.T_a_b[:3, 3] - middle))
-            turned_deg = float(np.degrees(angle_rad(found.T_a_b[:3, :3])))
-            yield (
-                f"robots {a.robot} and {b.robot}: {len(followed)} closures agree on the place that was taken, and "
-                f"{len(agreeing)} others on another one, {moved_m:.1f} m and {turned_deg:.0f} degrees away; places "
-                "that look the same do this, and nothing here tells which is right"
-            )
-
-    return tuple(sentences())
+    sentences: list[str] = []
+    for (a, b), rows in sorted(by_pair.items()):
+        followed, rejected = [n for n in rows if used[n]], [n for n in rows if not used[n]]
+        enough = max(NEARLY_RATIO * len(followed), REJECTED_MIN)
+        if not followed or len(rejected) < enough:
+            continue
+        ids = [problem.closure_ids[n] for n in rejected]
+        ends = {}
+        for k in ids:
+            query, match = closures[k].query, closures[k].match
+            ends[k] = (query, match) if query.log == a else (match, query)
+        path_m = {log: travelled_m(trajectories[log]) for log in (a, b)}
+        found = align_pair(rays_from(ids, closures, ends, T_keyframes, path_m, steepness))
+        if len(found.agreeing) < enough:
+            continue
+        middle = T_keyframes[b][:, :3, 3].mean(axis=0)
+        moved_m = float(np.linalg.norm(found.T_a_b[:3, :3] @ middle + found.T_a_b[:3, 3] - middle))
+        turned_rad = angle_rad(found.T_a_b[:3, :3])
+        if moved_m <= TRANSLATION_TOLERANCE_M and turned_rad <= ROTATION_TOLERANCE_RAD:
+            continue
+        turned_deg = np.degrees(turned_rad)
+        sentences.append(
+            f"robots {a.robot} and {b.robot}: {len(followed)} closures agree on the place that was taken, and "
+            f"{len(found.agreeing)} others on another one, {moved_m:.1f} m and {turned_deg:.0f} degrees away; "
+            "places that look the same do this, and nothing here tells which is right"
+        )
+    return tuple(sentences)

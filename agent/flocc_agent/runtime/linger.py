@@ -18,7 +18,7 @@ from pathlib import Path
 
 ZENOH_LINGER_S = 10
 """What zenoh sets. Sockets with any other linger are somebody else's, such as the program's around an agent."""
-PERIOD_S = 1.0
+PERIOD_S = 0.5
 """Less than the shortest lease, so that no link can end before its linger is off."""
 LINGER = struct.Struct("ii")
 OPEN_FILES = Path("/proc/self/fd" if sys.platform.startswith("linux") else "/dev/fd")
