@@ -43,7 +43,7 @@ class Chains:
         closures: Between them, by their number in the graph; keyframes are named by their place in `numbers`.
         whole: Odometry of all keyframes.
         recorded: The closures as they were.
-        shares: (N, 6, 6) of each log: what part of its chain's twist a keyframe takes, in the tangent of the chain's end.
+        shares: (N, 6, 6) of each log: what part of its chain's twist a keyframe takes, in the tangent at the end.
         config: The noise model.
     """
 
@@ -150,9 +150,7 @@ def kept_numbers(held: Sequence[int], keyframes: int) -> Int:
     numbers = np.unique(np.array([0, *(n for n in held if n < keyframes), keyframes - 1], dtype=np.int64))
     gaps = np.diff(numbers)
     parts = -(-gaps // CHAIN_EDGES_MAX)
-    cuts = [
-        numbers[k] + (gaps[k] * np.arange(1, parts[k])) // parts[k] for k in np.flatnonzero(parts > 1).tolist()
-    ]
+    cuts = [numbers[k] + (gaps[k] * np.arange(1, parts[k])) // parts[k] for k in np.flatnonzero(parts > 1).tolist()]
     return np.unique(np.concatenate([numbers, *cuts])) if cuts else numbers
 
 

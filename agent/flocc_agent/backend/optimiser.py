@@ -195,7 +195,8 @@ def _solve_connected(
     chains = chains_of(kept.trajectories, kept.left, wanted, config)
     found = _solve_aligned(kept, chains, aligned, config, initial)
     if chains is not None and not _is_explained(chains, found):
-        chains, found = None, _solve_all(kept, chains, found, config)
+        found = _solve_all(kept, chains, found, config)
+        chains = None
     solved, at = found.solved, found.posed
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
