@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
@@ -90,6 +90,8 @@ class GraphAssembly:
         self._unbuilt: set[CandidatePair] = set()
         self._built: dict[CandidatePair, LoopClosure] = {}
         self._order: list[CandidatePair] = []
+        self._reads_all = True
+        self._of_log: dict[LogId, list[CandidatePair]] = {}
         self._early: dict[KeyframeId, int] = {}
         self._measured = MeasuredRecords()
         self._odometry_pairs: dict[KeyframeId, tuple[KeyframeId, Pose7]] = {}
@@ -111,8 +113,10 @@ class GraphAssembly:
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
                 self._add_closure(new, record)
-            case RejectionRecord() | UnknownRecord():
+            case RejectionRecord():
                 pass
+            case UnknownRecord():
+                self._reads_all = False
             case _:
                 assert_never(record)
 
@@ -137,6 +141,26 @@ class GraphAssembly:
         """T_odom_camera (N, 4, 4) of the known keyframes of a log."""
         odometry = self._odometry.get(log)
         return np.empty((0, 4, 4)) if odometry is None else odometry.matrices()
+
+    def ties(self, log: LogId) -> Sequence[ClosureRecord]:
+        """Closures of a log, in the order in which they came."""
+        return [self._closures[pair][2] for pair in self._of_log.get(log, ())]
+
+    def joined(self, log: LogId, other: LogId) -> bool:
+        """Whether closures, other measurements or the opened map lead from one log to the other.
+
+        Where there are records of a later version, any of them may: another log is enough then.
+        """
+        if not self._reads_all and log in self._odometry and other in self._odometry:
+            return True
+        graph = self.graph()
+        links = [(closure.query.log, closure.match.log) for closure in graph.closures]
+        links += [(factor.query.log, factor.match.log) for factor in graph.measured]
+        ends = {end for link in links for end in link}
+        if self._saved is not None:
+            links += [(self._saved.anchor, each) for each in self._saved.logs]
+        groups = groups_of(sorted({*graph.trajectories, *ends}), links)
+        return any(log in group and other in group for group in groups)
 
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
@@ -186,6 +210,9 @@ class GraphAssembly:
         """Of several registrations of one pair the one in the lowest log counts, on every robot."""
         pair = CandidatePair.of(record.query, record.match)
         held = self._closures.get(pair)
+        if held is None:
+            for log in sorted({pair.low.log, pair.high.log}):
+                self._of_log.setdefault(log, []).append(pair)
         if held is None or (new.log, new.number) < held[:2]:
             self._closures[pair] = (new.log, new.number, record)
             self._unbuilt.add(pair)
