@@ -18,11 +18,11 @@ from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.knot_requests import GRACE_S, KnotRequests
 from flocc_agent.core.knots import Track, corrected, knots_of, strays
 from flocc_agent.core.parameters import GossipParameters
-from flocc_agent.core.plausibility import FINAL, Doubts, Evidence, Placed
+from flocc_agent.core.plausibility import FINAL, Doubts, HeldGraph, Placed
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose7, symmetric
+from flocc_agent.geometry import pose7s, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
@@ -85,7 +85,7 @@ class Corrections:
         odometry: Callable[[LogId], Float] = _nowhere,
         near: Callable[[str], bool] = lambda robot: False,  # noqa: ARG005
         towards: Callable[[Term], list[str]] = lambda term: [],  # noqa: ARG005
-        evidence: Evidence | None = None,
+        evidence: HeldGraph | None = None,
     ) -> None:
         """Start without any.
 
@@ -417,4 +417,4 @@ def told_poses(message: LogCorrection, T_odom_camera: Float) -> tuple[tuple[int,
     step = max(1, -(-(last + 1) // TOLD_MAX))
     numbers = np.arange(last % step, last + 1, step)
     poses = corrected(message, T_odom_camera[numbers], numbers)
-    return tuple(int(number) for number in numbers), tuple(pose7(T) for T in poses)
+    return tuple(numbers.tolist()), pose7s(poses)

@@ -56,15 +56,15 @@ AGREE_M, AGREE_RAD = 2.0, np.deg2rad(5.0)
 """Two leaders put a robot to the same place."""
 
 
-class Evidence(Protocol):
+class HeldGraph(Protocol):
     """What a robot knows of the graph itself."""
 
     def odometry(self, log: LogId) -> Float:
         """T_odom_camera (N, 4, 4) of the known keyframes of a log."""
         ...
 
-    def ties(self, log: LogId) -> Sequence[ClosureRecord]:
-        """Closures of a log, in the order in which they came."""
+    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
+        """The newest closures of a log."""
         ...
 
     def joined(self, log: LogId, other: LogId) -> bool:
@@ -80,29 +80,29 @@ class Placed:
     others: Mapping[LogId, LogCorrection]
 
 
-def contradiction(placed: Placed, before: Placed | None, evidence: Evidence) -> str | None:
+def contradiction(placed: Placed, before: Placed | None, graph: HeldGraph) -> str | None:
     """What speaks against a correction, None where nothing does.
 
     Args:
         placed: The correction, and those of others that are known with it.
         before: What was applied last.
-        evidence: What this robot holds.
+        graph: What this robot holds.
     """
     correction = placed.own
-    odometry = evidence.odometry(correction.log)
+    odometry = graph.odometry(correction.log)
     if not len(odometry):
         return None
     camera = corrected(correction, odometry, np.arange(len(odometry)))
     return (
-        _frame(correction, before, camera, odometry, evidence)
-        or _away(placed, camera, evidence)
+        _frame(correction, before, camera, odometry, graph)
+        or _away(placed, camera, graph)
         or _bent(camera, odometry)
-        or _torn(placed, before, camera, odometry, evidence)
+        or _torn(placed, before, camera, odometry, graph)
     )
 
 
 def _frame(
-    correction: LogCorrection, before: Placed | None, camera: Float, odometry: Float, evidence: Evidence
+    correction: LogCorrection, before: Placed | None, camera: Float, odometry: Float, graph: HeldGraph
 ) -> str | None:
     if correction.anchor == correction.log:
         moved = between(odometry[0], camera[0])
@@ -110,12 +110,12 @@ def _frame(
         return None if stays else MOVED
     if before is not None and before.own.anchor == correction.anchor:
         return None
-    return None if evidence.joined(correction.log, correction.anchor) else UNTIED
+    return None if graph.joined(correction.log, correction.anchor) else UNTIED
 
 
-def _away(placed: Placed, camera: Float, evidence: Evidence) -> str | None:
+def _away(placed: Placed, camera: Float, graph: HeldGraph) -> str | None:
     """A robot is not farther from the beginning of its map than all ways together are long, nor is its anchor."""
-    start, anchor = evidence.odometry(placed.own.anchor), placed.others.get(placed.own.anchor)
+    start, anchor = graph.odometry(placed.own.anchor), placed.others.get(placed.own.anchor)
     if not len(start):
         return None
     if anchor is not None and anchor.anchor == anchor.log:
@@ -123,10 +123,13 @@ def _away(placed: Placed, camera: Float, evidence: Evidence) -> str | None:
         if np.linalg.norm(drifted_m) > VIEW_M + DRIFTED_RATIO * _way_m(start):
             return "its anchor is not where it began"
     away_m = float(np.linalg.norm(camera[-1, :3, 3] - start[0, :3, 3]))
+    first = list(dict.fromkeys([placed.own.log, placed.own.anchor]))
     reach_m = 0.0
-    for log in sorted({placed.own.log, placed.own.anchor, *placed.others}):
-        reach_m += REACH_M + REACH_RATIO * _way_m(evidence.odometry(log))
-    return None if away_m <= reach_m else "it moves this robot out of the map"
+    for log in (*first, *sorted(set(placed.others).difference(first))):
+        reach_m += REACH_M + REACH_RATIO * _way_m(graph.odometry(log))
+        if away_m <= reach_m:
+            return None
+    return "it moves this robot out of the map"
 
 
 def _bent(camera: Float, odometry: Float) -> str | None:
@@ -139,20 +142,20 @@ def _bent(camera: Float, odometry: Float) -> str | None:
     return None if excess_m <= BENT_M + BENT_RATIO * lengths_m.sum() else BENT
 
 
-def _torn(placed: Placed, before: Placed | None, camera: Float, odometry: Float, evidence: Evidence) -> str | None:
+def _torn(placed: Placed, before: Placed | None, camera: Float, odometry: Float, graph: HeldGraph) -> str | None:
     """Closures may be rejected, and what leads to a log whose correction is not known says nothing."""
     view_m = VIEW_M + VIEW_STEPS * _way_m(odometry) / max(len(odometry) - 1, 1)
     known = before if before is not None and before.own.anchor == placed.own.anchor else None
     camera_before = None if known is None else corrected(known.own, odometry, np.arange(len(odometry)))
     counted = torn = 0
-    for far, ties in _by_far_log(placed.own.log, evidence.ties(placed.own.log)[-TIES_MAX:], len(odometry)).items():
+    for far, ties in _by_far_log(placed.own.log, graph.ties(placed.own.log, TIES_MAX), len(odometry)).items():
         near, ends = np.array([tie.near for tie in ties]), np.array([tie.far for tie in ties])
-        apart = _apart_m(placed, far, near, ends, camera, evidence)
+        apart = _apart_m(placed, far, near, ends, camera, graph)
         if apart is None:
             continue
         may_m = view_m + VIEW_LENGTHS * np.array([tie.length_m for tie in ties]) + apart.sigma_m
         if known is not None and camera_before is not None:
-            last = _apart_m(known, far, near, ends, camera_before, evidence)
+            last = _apart_m(known, far, near, ends, camera_before, graph)
             may_m += 0.0 if last is None else np.nan_to_num(last.distance_m)
         counted += int(np.isfinite(apart.distance_m).sum())
         torn += int((apart.distance_m > may_m).sum())
@@ -192,12 +195,12 @@ def _apart_m(
     near: NDArray[np.integer],
     far: NDArray[np.integer],
     camera: Float,
-    evidence: Evidence,
+    graph: HeldGraph,
 ) -> _Apart | None:
     """How far apart the cameras of closures with one log are; None where that log's correction is not known."""
     own = log == placed.own.log
     correction = placed.own if own else placed.others.get(log)
-    odometry = evidence.odometry(log)
+    odometry = graph.odometry(log)
     if correction is None or correction.anchor != placed.own.anchor or not len(odometry):
         return None
     known = far < len(odometry)
@@ -224,12 +227,12 @@ class Doubts:
         confirmed: Leaders with whom another robot's solution agreed later, until somebody clears it.
     """
 
-    def __init__(self, evidence: Evidence | None) -> None:
+    def __init__(self, graph: HeldGraph | None) -> None:
         self.doubted: set[LogId] = set()
         self.confirmed: set[LogId] = set()
-        self._evidence = evidence
+        self._graph = graph
         self._before: Placed | None = None
-        self._held: _Held | None = None
+        self._held: _HeldBack | None = None
         self._refused: LogCorrection | None = None
         self._next_look_s = float("-inf")
 
@@ -250,16 +253,16 @@ class Doubts:
 
         What another robot's solution says as well is believed in the end.
         """
-        if self._evidence is None or self._is_confirmed(placed.own):
+        if self._graph is None or self._is_confirmed(placed.own):
             return None
-        why = contradiction(placed, self._before, self._evidence)
+        why = contradiction(placed, self._before, self._graph)
         if why is None:
             return None
         if why in FINAL:
             self._refuse(placed.own)
             return why
         if self._held is None:
-            self._held = _Held(placed.own, now, why)
+            self._held = _HeldBack(placed.own, now, why)
         elif self._held.correction.version <= placed.own.version:
             self._held = replace(self._held, correction=placed.own, why=why)
         return why
@@ -289,9 +292,9 @@ class Doubts:
     def _is_confirmed(self, correction: LogCorrection) -> bool:
         """Whether another robot's refused solution put this one to the same place in the same map."""
         refused = self._refused
-        if refused is None or refused.term.leader.robot == correction.term.leader.robot or self._evidence is None:
+        if refused is None or refused.term.leader.robot == correction.term.leader.robot or self._graph is None:
             return False
-        odometry = self._evidence.odometry(correction.log)
+        odometry = self._graph.odometry(correction.log)
         if refused.anchor != correction.anchor or not len(odometry):
             return False
         last = np.array([len(odometry) - 1])
@@ -301,7 +304,7 @@ class Doubts:
 
 
 @dataclass(frozen=True, slots=True)
-class _Held:
+class _HeldBack:
     """What is held back, since when, and why."""
 
     correction: LogCorrection

@@ -181,7 +181,7 @@ class Robot:
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
         self._answers = AnswerBudget()
         self._muted = Muted()
-        self.assembly = GraphAssembly(restored.saved)
+        self.assembly = GraphAssembly(restored.saved, self._record_at)
         closed = restored.closed()
         self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
@@ -525,6 +525,9 @@ class Robot:
 
     # Records
 
+    def _record_at(self, log: LogId, number: int) -> Record:
+        return self.gossip.logs[log].records[number]
+
     def _append(self, record: Record, now: float) -> list[Effect]:
         new, effects, batch = self.gossip.append(record)
         return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
@@ -622,7 +625,7 @@ class Robot:
                     term_counter_max=self.election.counter_max,
                     load=self.closing.load,
                     records=len(own),
-                    checksum=own.checksums[-1],
+                    checksum=own.checksum,
                     digests=self.gossip.state(),
                     versions=self.corrections.state(),
                     wants=self.closing.wants(now),
