@@ -38,7 +38,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
-from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.network_faults import found_by, network_faults
 from flocc_agent.runtime.new_journeys import began_anew, last_body
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
@@ -147,6 +147,7 @@ class Agent:
     async def __aenter__(self) -> "Agent":
         """Open the store and the network, restore what the disk holds, start the loop and the playback."""
         try:
+            logger.info("robot %s: %s", self.config.name, found_by(self.config.transport, self.config.swarm))
             self._driver = await asyncio.to_thread(self._compose)
             if self.config.metrics.port is not None:
                 self._metrics = MetricsServer(self.config.metrics, self.config.name, lambda: self._started.look())
