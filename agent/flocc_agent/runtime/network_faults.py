@@ -8,6 +8,7 @@ import struct
 from collections.abc import Iterator
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.certificate_faults import certificate_faults
 
 _SIOCGIFFLAGS = 0x8913
 _UP, _LOOPBACK, _MULTICAST = 0x1, 0x8, 0x1000
@@ -28,7 +29,7 @@ def found_by(config: TransportConfig, swarm: str) -> str:
 
 def network_faults(config: TransportConfig, robot: str) -> list[str]:
     """One sentence for each part of a network that is not there now; asks the resolver, and may take seconds."""
-    return [*interface_faults(config), *host_faults(config, robot)]
+    return [*certificate_faults(config.tls), *interface_faults(config), *host_faults(config, robot)]
 
 
 def interface_faults(config: TransportConfig) -> Iterator[str]:
