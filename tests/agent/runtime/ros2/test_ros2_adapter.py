@@ -389,6 +389,23 @@ async def test_what_cannot_be_used_is_said_once_counted_and_left_out() -> None:
     assert len(agent.problems()) == len(set(agent.problems())) == 7
 
 
+async def test_messages_that_a_publisher_numbered_and_that_never_came_are_said_and_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flocc_agent.runtime.ros2.adapter.PATIENCE_S", 1.0)
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port) as (agent, adapter):
+            await drive(robot, agent, 1)
+            robot.node._publishers["/r1/camera/image_raw"][1][0] += 30  # as if the network had lost them
+            times = iter(range(200_000, 300_000, 50))
+            await until(lambda: bool(agent.problems()), act=lambda: robot.image(next(times)))
+            lost = adapter.counters()["ros2 image lost before this node"]
+    assert lost == 30
+    assert len(agent.problems()) == 1
+    assert agent.problems()[0].startswith("/r1/camera/image_raw: messages are lost before they reach this node")
+
+
 async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None:
     (port,) = free_ports(1)
     async with adapted(port, camera_mounting=MOUNTING) as (agent, _):
