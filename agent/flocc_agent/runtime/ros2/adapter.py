@@ -25,7 +25,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.hearing import KINDS, Hearing
 from flocc_agent.runtime.ros2.markers import KnownClosure
 from flocc_agent.runtime.ros2.merged_maps import MergedMaps
-from flocc_agent.runtime.ros2.node import RosNode, open_node
+from flocc_agent.runtime.ros2.node import RosNode, ignore, open_node
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes
 from flocc_agent.runtime.ros2.synchroniser import PosedImage
@@ -44,6 +44,8 @@ INBOX_BYTES_MAX = 64 * 1024 * 1024
 WATCH_PERIOD_S = 1.0
 PATIENCE_S = 5.0
 SERVICE_TIMEOUT_S = 5.0
+MISSED = ("odometry", "fix", "image")
+"""Kinds of which each message counts."""
 LOST_MIN, LOST_RATIO_MAX = 10, 0.01
 """Fewer lost messages are not worth a sentence."""
 LOST_BEFORE = (
@@ -163,7 +165,8 @@ class Ros2Adapter:
         grids = MergedMaps(config, self._robot, self._types, node, self._problems)
         teller = self._teller = Teller(config, self._types, node, self._bodies, self._host, grids)
         for kind, (topic, type_name, qos) in hearing.wanted().items():
-            missing = partial(self._counter.count_dropped, f"{kind} lost before this node")
+            lost = partial(self._counter.count_dropped, f"{kind} lost before this node")
+            missing = lost if kind in MISSED else ignore
             hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind), missing)
         node.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))
         node.serve("save_map", partial(_answered, loop, self._save_map))
