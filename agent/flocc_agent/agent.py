@@ -429,7 +429,17 @@ class Agent:
         boot = int.from_bytes(os.urandom(6))
         distributed = config.backend.mode is BackendMode.DISTRIBUTED
         core_parameters = config.core.under(config.bandwidth_bytes_s)
-        core = Robot(log, config.compute_class, boot, core_parameters, self._clock_s(), restored, sealer, distributed)
+        core = Robot(
+            log,
+            _compute_class(config, sealer),
+            boot,
+            core_parameters,
+            self._clock_s(),
+            restored,
+            sealer,
+            distributed,
+            None if sealer is None else sealer.compute_classes,
+        )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
         )
@@ -604,6 +614,20 @@ def stored_result(config: AgentConfig) -> RobotResult:
 
 def _sealer(config: AgentConfig) -> RecordSealer | None:
     return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
+
+
+def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:
+    """The configured one, but where the swarm's list of members says what this robot has."""
+    if sealer is None or sealer.compute_classes is None:
+        return config.compute_class
+    listed = sealer.compute_classes.get(config.name, 0)
+    if listed != config.compute_class:
+        logger.warning(
+            "compute_class %d of the configuration does not count: the list of members says %d",
+            config.compute_class,
+            listed,
+        )
+    return listed
 
 
 def _open_store(config: AgentConfig) -> Store:

@@ -256,6 +256,11 @@ def pose7(T: Float) -> Pose7:
     return (x, y, z, qw, qx, qy, qz)
 
 
+def pose7s(T: Float) -> tuple[Pose7, ...]:
+    """Poses (N, 4, 4) as the wire has them."""
+    return tuple([(x, y, z, qw, qx, qy, qz) for x, y, z, qw, qx, qy, qz in tq_from_poses(T).tolist()])
+
+
 def interpolated(T_a_b: Float, T_a_c: Float, share: float) -> Float:
     """Pose on the way from b (share 0) to c (share 1), along one twist."""
     return np.asarray(T_a_b @ se3_exp(share * se3_log(between(T_a_b, T_a_c))))

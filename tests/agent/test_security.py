@@ -9,7 +9,7 @@ import pytest
 from tests.agent.runtime.loopback import loopback_configs, until
 
 from flocc_agent.config import TlsConfig, TransportConfig
-from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.security import RecordSealer, read_members
 from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportError
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
@@ -50,6 +50,15 @@ def test_admits_more_robots_without_touching_those_that_are_there(tmp_path: Path
     assert list(both) == ["operator", "r1", "r2"]
     lists = [json.loads((folder / "members.json").read_bytes()) for folder in both.values()]
     assert [sorted(content["robots"]) for content in lists] == [["r1", "r2"]] * 3
+
+
+def test_the_list_of_members_says_compute_classes_once_one_is_given(tmp_path: Path) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    assert read_members(tmp_path / "r1/members.json").compute_classes is None
+    make_keys(tmp_path, SWARM, ["server"], compute_classes={"server": 9})
+    make_keys(tmp_path, SWARM, ["r2"])
+    assert read_members(tmp_path / "r1/members.json").compute_classes == {"server": 9}
+    assert RecordSealer.of(TlsConfig(folder=tmp_path / "r1")).compute_classes == {"server": 9}
 
 
 def test_one_folder_is_of_one_swarm(tmp_path: Path) -> None:

@@ -255,7 +255,5 @@ def test_nothing_is_dropped_at_ten_images_a_second(team: tuple[list[Camera], Ear
     later_s = [each for one in later for each in one[len(one) // 2 :]]
     for words, of_s in (("all", corrected_s), ("later half", later_s)):
         median_s, worst_s = statistics.median(of_s), np.quantile(of_s, 0.9)
-        sys.stdout.write(
-            f"image to correction, {words}: median {median_s:.2f} s, 90 % {worst_s:.2f} s\n"
-        )
+        sys.stdout.write(f"image to correction, {words}: median {median_s:.2f} s, 90 % {worst_s:.2f} s\n")
     assert statistics.median(later_s) < CORRECTION_MEDIAN_MAX_S

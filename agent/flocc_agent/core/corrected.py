@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.knots import corrected
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import interpolated, inverse, pose_from_tq, symmetric

@@ -8,7 +8,7 @@ import pytest
 from flocc_agent.core.corrected import CorrectedLog, RecordedOdometry
 from flocc_agent.core.earth_frame import T_earth_map
 from flocc_agent.core.geodesy import Place, T_earth_enu, place_of
-from flocc_agent.core.gossip import LogCopy
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.geometry import Float, inverse, pose, pose7, se3_exp
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
@@ -32,7 +32,7 @@ def log_of(cameras_m: Float, wrong_m: dict[int, float] | None = None, seed: int 
         place = place_of((T_EARTH_MAP @ T_MAP_ODOM @ [*camera_m, 1.0])[:3] + off_m)
         fix = GeodeticFixRecord(k, *place, Array.of(SIGMA_M**2 * np.eye(3).ravel(), "f4"))
         for record in (keyframe, fix):
-            copy.append(record, encode_record(record))
+            copy.append(encode_record(record))
     knots = Knots(None, Array.of(np.zeros(3), "f8"), Array.of(np.array([0]), "u4"), Array.of(np.zeros((1, 6)), "f4"))
     return CorrectedLog(LogCorrection(R1, Term(1, R1), 1, R1, pose7(T_MAP_ODOM), knots), RecordedOdometry(copy))
 

@@ -19,8 +19,8 @@ from tests.agent.runtime.ros2.raw_node import RawNode, gid, open_router
 from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.corrected import CorrectedLog, Correction, RecordedOdometry
 from flocc_agent.core.geodesy import place_of
-from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.core.measurements import GeodeticFix, Measurement, OdometryCovariance
 from flocc_agent.core.reports import Fact
 from flocc_agent.geometry import Float, pose, pose7, so3_exp, tq_from_pose
