@@ -187,6 +187,7 @@ def secure_configs(folders: dict[str, Path]) -> dict[str, TransportConfig]:
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_members_talk_and_fetch(folders: dict[str, Path]) -> None:
     configs = secure_configs(folders)
     one, two = Listener("r1", configs["r1"]), Listener("r2", configs["r2"])
@@ -219,6 +220,7 @@ def stranger_configs(folders: dict[str, Path], elsewhere: Path) -> dict[str, dic
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.parametrize("who", ["no certificate", "another authority's certificate", "plain TCP"])
 async def test_a_stranger_reads_nothing_and_writes_nothing(folders: dict[str, Path], tmp_path: Path, who: str) -> None:
     configs = secure_configs(folders)
@@ -248,6 +250,7 @@ async def test_a_stranger_reads_nothing_and_writes_nothing(folders: dict[str, Pa
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path]) -> None:
     """r3, rightly certified, turns rogue: it leaves its own rules away and writes as r2."""
     configs = secure_configs(folders)
@@ -270,12 +273,14 @@ async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path])
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_a_fetch_from_a_robot_without_a_link_says_no_answer(folders: dict[str, Path]) -> None:
     async with Listener("r1", secure_configs(folders)["r1"]).transport as transport:
         assert await transport.fetch_latent("r2", "r2/0", 10.0) == FetchFailed(FetchProblem.NO_ANSWER)
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_only_operators_are_answered(folders: dict[str, Path]) -> None:
     configs = secure_configs(folders)
     one = Listener("r1", configs["r1"])
