@@ -14,7 +14,7 @@ from flocc_launch.report.model import RunReport
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.swarm.launching import Watch, launch
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)

@@ -21,7 +21,7 @@ from flocc_agent.runtime.recording import Frame, Recording
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 NAMES = ("r1", "r2")
 RATE = 4.0

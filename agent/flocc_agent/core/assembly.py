@@ -6,8 +6,8 @@ closures it is kept where their records stand, and both become matrices when som
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable
-from itertools import chain
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, islice
 from typing import assert_never
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
@@ -116,6 +116,7 @@ class GraphAssembly:
         self._record_at = record_at or self._kept_record
         self._closures: dict[CandidatePair, tuple[LogId, int]] = {}
         self._unbuilt: set[CandidatePair] = set()
+        self._reads_all = True
         self._built: list[CandidatePair] = []
         self._loop_closures: list[LoopClosure] = []
         self._early: dict[KeyframeId, int] = {}
@@ -139,8 +140,10 @@ class GraphAssembly:
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
                 self._add_closure(new, record)
-            case RejectionRecord() | UnknownRecord():
+            case RejectionRecord():
                 pass
+            case UnknownRecord():
+                self._reads_all = False
             case _:
                 assert_never(record)
 
@@ -165,6 +168,28 @@ class GraphAssembly:
         """T_odom_camera (N, 4, 4) of the known keyframes of a log."""
         odometry = self._odometry.get(log)
         return np.empty((0, 4, 4)) if odometry is None else odometry.matrices()
+
+    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
+        """The newest closures of a log."""
+        pairs = (pair for pair in reversed(self._closures) if log in (pair.low.log, pair.high.log))
+        records = (self._record_at(*self._closures[pair]) for pair in islice(pairs, ties_max))
+        return [record for record in records if isinstance(record, ClosureRecord)]
+
+    def joined(self, log: LogId, other: LogId) -> bool:
+        """Whether closures, other measurements or the opened map lead from one log to the other.
+
+        Where there are records of a later version, any of them may: another log is enough then.
+        """
+        if not self._reads_all and log in self._odometry and other in self._odometry:
+            return True
+        links = list(dict.fromkeys((pair.low.log, pair.high.log) for pair in self._closures))
+        measured = self._measured.factors(self._odometry, self._known)
+        links += [(factor.query.log, factor.match.log) for factor in measured]
+        if self._saved is not None:
+            links += [(self._saved.anchor, each) for each in self._saved.logs]
+        ends = {end for link in links for end in link}
+        groups = groups_of(sorted(ends), links)
+        return any(log in group and other in group for group in groups)
 
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""

@@ -178,7 +178,9 @@ class _Launch:
 
     def _agents(self) -> list[AgentProcess]:
         names = self._scenario.names()
-        keys = make_keys(self._folder.path / "keys", self._scenario.name, names) if self._secure else None
+        classes = {name: self._scenario.robot(name).compute_class for name in names}
+        folder = self._folder.path / "keys"
+        keys = make_keys(folder, self._scenario.name, names, compute_classes=classes) if self._secure else None
         transports = loopback_transports(names, keys)
         agents = []
         for name in names:
