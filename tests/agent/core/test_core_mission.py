@@ -8,6 +8,7 @@ import gc
 import time
 import tracemalloc
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -109,7 +110,7 @@ def growth_mb(held: int) -> list[float]:
     finally:
         tracemalloc.stop()
         hour.pages.close()
-    return [round((b - a) / MB, 3) for a, b in zip(marks, marks[1:], strict=False)]
+    return [round((b - a) / MB, 3) for a, b in pairwise(marks)]
 
 
 def test_memory_does_not_follow_the_clock() -> None:
