@@ -83,7 +83,7 @@ def make_keys(
             members[role][name] = public_key.hex()
         return _publish(folder, swarm, members, authority)
     except OSError as error:
-        raise KeysError(f"{error.filename}: cannot be written: {error.strerror}") from error
+        raise KeysError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
 
 
 def _publish(folder: Path, swarm: str, members: dict[str, dict[str, str]], authority: Authority) -> dict[str, Path]:
