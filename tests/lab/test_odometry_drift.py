@@ -15,7 +15,7 @@ def loop(count: int = 4000) -> Trajectory:
     for k in range(count):
         poses.append(T)
         T = T @ pose(so3_exp(np.array([0.0, 0.0, 0.02 * np.sin(k / 150)])), np.array([0.5, 0.0, 0.0]))
-    return Trajectory(np.arange(count) * 0.1, np.array(poses))
+    return Trajectory(np.linspace(0.0, 0.1 * (count - 1), count), np.array(poses))
 
 
 def test_walks_and_constants_that_were_drawn_are_found() -> None:

@@ -84,7 +84,8 @@ def found_drift(odometry: Float, truth: Float, up_truth: Float, planar: bool = F
 
 def _walk(lengths_m: list[Float], squares: list[Float]) -> float:
     """What grows with the root of the length, without what short and long pieces share (noise of their ends)."""
-    (short_m, long_m), (short, long) = map(np.mean, lengths_m), map(np.mean, squares)
+    short_m, long_m = (float(np.mean(each)) for each in lengths_m)
+    short, long = (float(np.mean(each)) for each in squares)
     return float(np.sqrt(max(0.0, (long - short) / (long_m - short_m))))
 
 
@@ -104,7 +105,8 @@ def _pieces(
         true_m.append(level @ true[:3, 3])
         across = error - (error @ up) * up
         tilted.append([np.linalg.norm(across) / np.sqrt(2)])
-    return along_m[cuts[1:]] - along_m[cuts[:-1]], *(np.array(each) for each in (turned, said_m, true_m, tilted))
+    length_m = along_m[cuts[1:]] - along_m[cuts[:-1]]
+    return length_m, np.array(turned), np.array(said_m), np.array(true_m), np.array(tilted)
 
 
 def of_files(odometry: Path, truth: Path) -> DriftFound:
