@@ -36,6 +36,7 @@ class Sweeps:
     def __init__(self, graph: PoseGraph, config: BackendConfig, loss_ratio: float = 0.0, seed: int = 0) -> None:
         self.parts = begun(graph, config)
         self.payload_bytes = 0
+        self.refused = 0
         self._loss_ratio = loss_ratio
         self._rng = np.random.default_rng(seed)
 
@@ -53,7 +54,10 @@ class Sweeps:
                 self.payload_bytes += len(payload)
                 if self._rng.random() >= self._loss_ratio:
                     count = len(part.neighbours[other].index)
-                    self.parts[other].hear(log, SharedPoses.unpacked(payload, count))
+                    try:
+                        self.parts[other].hear(log, SharedPoses.unpacked(payload, count))
+                    except ValueError:
+                        self.refused += 1
 
 
 def begun(graph: PoseGraph, config: BackendConfig) -> dict[LogId, ConsensusPart]:

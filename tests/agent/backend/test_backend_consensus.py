@@ -67,6 +67,7 @@ def test_robots_come_to_the_optimum_of_a_central_solver(
     graph = three_robots(noise=METRIC if formulation is Formulation.BASE else None).graph
     settings = config(formulation)
     team = swept(graph, settings, sweeps, loss_ratio)
+    assert team.refused == 0
     assert cost(graph, settings, team.T) == pytest.approx(
         cost(graph, settings, poses_of(central(graph, settings))), rel=1e-3
     )
