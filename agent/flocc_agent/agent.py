@@ -26,6 +26,7 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
+from flocc_agent.runtime.certificate_faults import certificate_faults
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
@@ -38,8 +39,9 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
-from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.network_faults import found_by, network_faults
 from flocc_agent.runtime.new_journeys import began_anew, last_body
+from flocc_agent.runtime.page_file import PageFile
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
@@ -59,6 +61,9 @@ if TYPE_CHECKING:
     from flocc_agent.runtime.ros2.adapter import Ros2Adapter
 
 logger = logging.getLogger(__name__)
+
+SILENCE_S = 60.0
+"""How often an agent looks whether it hears anybody."""
 
 Float = NDArray[np.float64]
 
@@ -147,6 +152,7 @@ class Agent:
     async def __aenter__(self) -> "Agent":
         """Open the store and the network, restore what the disk holds, start the loop and the playback."""
         try:
+            logger.info("robot %s: %s", self.config.name, found_by(self.config.transport, self.config.swarm))
             self._driver = await asyncio.to_thread(self._compose)
             if self.config.metrics.port is not None:
                 self._metrics = MetricsServer(self.config.metrics, self.config.name, lambda: self._started.look())
@@ -221,9 +227,17 @@ class Agent:
         return True
 
     async def _look_at_network(self) -> None:
-        """Say once what of the configured network is not there; the agent goes on trying."""
+        """Say once what of the configured network is not there, and when nobody is heard; the agent goes on trying."""
         for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
             logger.warning("%s: %s", self.config.name, fault)
+        is_silent = False
+        while True:
+            await asyncio.sleep(SILENCE_S)
+            was_silent, is_silent = is_silent, not self._started.robot.neighbours.names()
+            if is_silent and not was_silent:
+                logger.warning("%s: hears nobody; 'flocc doctor' looks at the network", self.config.name)
+                for fault in await asyncio.to_thread(lambda: [*certificate_faults(self.config.transport.tls)]):
+                    logger.warning("%s: %s", self.config.name, fault)
 
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.
@@ -439,6 +453,7 @@ class Agent:
             sealer,
             distributed,
             None if sealer is None else sealer.compute_classes,
+            PageFile(config.folder),
         )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s

@@ -3,12 +3,15 @@
 import asyncio
 import json
 import stat
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from tests.agent.runtime.loopback import loopback_configs, until
 
 from flocc_agent.config import TlsConfig, TransportConfig
+from flocc_agent.runtime.certificate_faults import certificate_faults
+from flocc_agent.runtime.network_faults import network_faults
 from flocc_agent.runtime.security import RecordSealer, read_members
 from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportError
 from flocc_agent.runtime.zenoh_admin import ask
@@ -59,6 +62,23 @@ def test_the_list_of_members_says_compute_classes_once_one_is_given(tmp_path: Pa
     make_keys(tmp_path, SWARM, ["r2"])
     assert read_members(tmp_path / "r1/members.json").compute_classes == {"server": 9}
     assert RecordSealer.of(TlsConfig(folder=tmp_path / "r1")).compute_classes == {"server": 9}
+
+
+def test_a_certificate_that_expired_or_is_not_valid_yet_is_said(tmp_path: Path) -> None:
+    made = datetime(2020, 1, 1, tzinfo=UTC)
+    tls = TlsConfig(folder=make_keys(tmp_path, SWARM, ["r1"], now=made)["r1"])
+    path = tmp_path / "r1/robot.crt"
+    sentences = [*certificate_faults(tls, made + timedelta(days=1826))]
+    assert sentences == [
+        f"{path}: expired on 2024-12-30: nobody accepts it; remove it and its key, and run 'flocc keys' again"
+    ]
+    assert [*certificate_faults(tls, made + timedelta(days=400))] == []
+    assert [*certificate_faults(tls, made + timedelta(days=1810))] == [
+        f"{path}: expires on 2024-12-30; remove it and its key, and run 'flocc keys' again"
+    ]
+    early = [*certificate_faults(tls, made - timedelta(days=400))]
+    assert early[0] == f"{path}: is valid from 2019-12-31 on, and the clock says 2018-11-27; nobody is heard"
+    assert network_faults(TransportConfig(tls=tls), "r1")[0].startswith(f"{path}: expired on")
 
 
 def test_one_folder_is_of_one_swarm(tmp_path: Path) -> None:
