@@ -29,7 +29,7 @@ __all__ = ["Run", "RobotResult", "RunFolder", "RunFolderError"]
 R = TypeVar("R", bound=Record)
 
 
-WRITTEN = frozenset({"odometry", "trajectories", "groundtruth", "report", "pose_graph", "errors"})
+WRITTEN = frozenset({"odometry", "trajectories", "report", "pose_graph", "errors"})
 """Files and folders, by the first part of their names, that are made of what a run left."""
 
 
