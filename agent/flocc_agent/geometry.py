@@ -155,6 +155,14 @@ def adjoint(T: Float) -> Float:
     return out
 
 
+def adjoints(T: Float) -> Float:
+    """Adjoints (N, 6, 6) of poses (N, 4, 4), rotation first."""
+    out = np.zeros((len(T), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = T[:, :3, :3]
+    out[:, 3:, :3] = hats(T[:, :3, 3]) @ T[:, :3, :3]
+    return out
+
+
 def angle_rad(R: Float) -> float:
     """Angle of a rotation, in [0, pi]."""
     return float(np.linalg.norm(so3_log(R)))

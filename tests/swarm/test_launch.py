@@ -96,6 +96,16 @@ def test_a_robot_comes_back_from_its_disk_with_its_numbering(tmp_path: Path) -> 
     assert known["r1"]["logs"] == known["r2"]["logs"]
 
 
+def test_a_robot_that_is_killed_before_it_says_anything_is_no_failure_to_start(tmp_path: Path) -> None:
+    faults = [
+        Fault(at_s=0.1, kind=FaultKind.KILL, robots=("r2",)),
+        Fault(at_s=0.5, kind=FaultKind.RESTART, robots=("r2",)),
+    ]
+    tracks = {"robots": 2, "seed": 3, "area_m": 6.0, "length_m": 10.0}
+    report = launch(meeting(faults=faults, settle_s=1.0, tracks=tracks), tmp_path / "run")
+    assert {robot.robot: robot.end for robot in report.robot_details} == {"r1": "stopped", "r2": "stopped"}
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["ctrl-c", "closed terminal"])
 def test_an_end_from_outside_stops_every_agent_in_order_and_still_reports(
     tmp_path: Path, number: signal.Signals

@@ -301,9 +301,8 @@ class _Launch:
             self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
-        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and agent.status is None]
-        if died and self._now_s() < START_S:
-            raise LaunchError(f"robot {died[0].name} could not start: {_sentence(died[0].last_words())}")
+            if code != 0 and not scripted and agent.status is None and self._now_s() < START_S:
+                raise LaunchError(f"robot {agent.name} could not start: {_sentence(agent.last_words())}")
 
     # Files
 
