@@ -86,7 +86,7 @@ def make_keys(
         members["compute_classes"] |= compute_classes or {}
         return _publish(folder, swarm, members, authority)
     except OSError as error:
-        raise KeysError(f"{error.filename}: cannot be written: {error.strerror}") from error
+        raise KeysError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
 
 
 def _publish(folder: Path, swarm: str, members: dict[str, dict[str, Any]], authority: Authority) -> dict[str, Path]:
