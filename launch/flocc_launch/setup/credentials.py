@@ -61,7 +61,7 @@ def make_keys(
         swarm: Name of the swarm; one authority certifies one swarm.
         robots: Names of robots to admit.
         operators: Names of people who may ask for status and inject faults.
-        addresses: IP addresses or host names of each robot, for `names_verified`.
+        addresses: IP addresses or host names of each robot, written into its certificate.
         now: Begin of validity; None is the clock's time.
         compute_classes: Of robots; where any was ever given, all others have 0 and nobody can claim another one.
 
