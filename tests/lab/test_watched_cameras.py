@@ -1,14 +1,17 @@
 """The table of what the watch over cameras names: its cells, and that cached features are the encoder's own."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.classical.encoder import ClassicalEncoder, decode_features
-from flocc_lab.bench.watched_cameras import CachedFeatures, Trouble, Watched, cell, counted, covered, zoomed
+from flocc_lab.bench.overlaid_recording import covered, overlay_robot
+from flocc_lab.bench.watched_cameras import CachedFeatures, Trouble, Watched, cell, counted, zoomed
 from flocc_lab.bench.watched_drives import drawn_town
 
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 250.0, (-0.2, 0.05, 0.001, 0.0))
@@ -51,10 +54,24 @@ def test_late_and_wrong_names_are_counted_apart() -> None:
 
 def test_an_overlay_covers_its_share_and_is_the_same_each_time() -> None:
     pixels = picture().pixels
-    cover = covered(0.3)(pixels)
+    cover = covered(pixels, 0.3, 1)
     assert cover.shape == pixels.shape
     assert np.array_equal(cover[:336], pixels[:336])
-    assert np.array_equal(cover[336:], covered(0.3)(255 - pixels)[336:])
+    assert np.array_equal(cover[336:], covered(np.asarray(255 - pixels, np.uint8), 0.3, 1)[336:])
+    assert not np.array_equal(cover[336:], covered(pixels, 0.3, 2)[336:])
+
+
+def test_an_overlaid_robot_keeps_all_but_its_pictures_lower_part(tmp_path: Path) -> None:
+    source = tmp_path / "r1"
+    (source / "images").mkdir(parents=True)
+    (source / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
+    cv2.imwrite(str(source / "images" / "0.png"), picture().pixels)
+    overlay_robot(source, tmp_path / "out" / "r1", 0.5, 1, with_mask=True)
+    seen = cv2.imread(str(tmp_path / "out" / "r1" / "images" / "0.png"))
+    mask = cv2.imread(str(tmp_path / "out" / "r1" / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    assert np.array_equal(np.flatnonzero(np.any(seen != picture().pixels, axis=(1, 2))), np.arange(240, 480))
+    assert np.array_equal(mask[:, 0] == 0, np.arange(480) >= 240)
+    assert (tmp_path / "out" / "r1" / "odometry.txt").read_text() == "0 0 0 0 0 0 0 1\n"
 
 
 def test_a_seed_draws_one_town_and_others_draw_others() -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from itertools import chain, groupby
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from flocc_agent.perception.classical.features import FeatureExtractor, Features
 from flocc_agent.perception.classical.sift_registrar import classical_registrar
 from flocc_agent.perception.multiview.picture import rays_of
 from flocc_agent.perception.watch.camera_watch import CameraWatch
+from flocc_lab.bench.overlaid_recording import covered
 from flocc_lab.bench.registration_scenes import SceneView
 from flocc_lab.bench.watched_drives import Drive, drawn_drives, recorded_drives
 
@@ -38,6 +38,7 @@ WATCHED_KEYFRAMES = 40
 TURNED_RAD = float(np.radians(5.0))
 FACTORS = (0.5, 0.8, 0.9, 1.1, 1.25)
 FROZEN_FROM = 4
+BUMPER_SEED = 99
 SIDE_PX = 1000
 """Focal length of the camera, without centre and distortion, that cached features are kept for."""
 
@@ -90,7 +91,7 @@ def troubles() -> Iterator[Trouble]:
     yield Trouble("mirrored", "mirrored", pixels=lambda pixels: np.ascontiguousarray(pixels[:, ::-1]))
     yield Trouble("frozen", "frozen", frozen_from=FROZEN_FROM)
     for share in (0.1, 0.3, 0.5):
-        yield Trouble(f"overlay {100 * share:.0f} %", "overlay", pixels=covered(share))
+        yield Trouble(f"overlay {100 * share:.0f} %", "overlay", pixels=overlaid(share))
 
 
 def zoomed(factor: float) -> Callable[[Camera], Camera]:
@@ -98,17 +99,9 @@ def zoomed(factor: float) -> Callable[[Camera], Camera]:
     return lambda camera: replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
-def covered(share: float) -> Callable[[Bytes], Bytes]:
+def overlaid(share: float) -> Callable[[Bytes], Bytes]:
     """Pictures whose lower part shows the robot itself."""
-
-    def cover(pixels: Bytes) -> Bytes:
-        height, width = pixels.shape[:2]
-        rows = round(height * share)
-        blocks = np.random.default_rng(99).integers(0, 256, (max(rows // 8, 2), width // 8), dtype=np.uint8)
-        bumper = cv2.resize(blocks, (width, rows), interpolation=cv2.INTER_CUBIC)
-        return np.concatenate([pixels[: height - rows], np.repeat(bumper[..., None], 3, axis=2)])
-
-    return cover
+    return lambda pixels: covered(pixels, share, BUMPER_SEED)
 
 
 class CachedFeatures:
