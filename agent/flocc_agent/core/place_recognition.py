@@ -1,6 +1,7 @@
 """Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A)."""
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,6 +18,9 @@ Descriptor = NDArray[np.float32]
 
 CAPACITY_FIRST = 64
 DIRECTIONS_MAX = 1024
+RUN_REACH = 2
+"""Keyframes to either side that a run has; 1 and 3 tell as much on `street`."""
+RUN_MIN = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +46,11 @@ class _Descriptors:
     @property
     def matrix(self) -> Descriptor:
         return self._rows[: len(self.indices)]
+
+    def position(self, index: int) -> int | None:
+        """Row of a keyframe, None where it has none."""
+        at = bisect_left(self.indices, index)
+        return at if at < len(self.indices) and self.indices[at] == index else None
 
     def append(self, index: int, descriptor: Descriptor) -> None:
         count = len(self.indices)
@@ -95,6 +104,18 @@ class PlaceRecognition:
                 found += self._among_all(keyframe, descriptor)
                 others = []
         return found + self._among_own(others)
+
+    def agreement(self, pair: CandidatePair) -> float | None:
+        """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""
+        one, other = self._by_log.get(pair.low.log), self._by_log.get(pair.high.log)
+        if one is None or other is None or one.dimension != other.dimension:
+            return None
+        row, column = one.position(pair.low.index), other.position(pair.high.index)
+        if row is None or column is None:
+            return None
+        first, left = max(row - RUN_REACH, 0), max(column - RUN_REACH - 1, 0)
+        rows, columns = one.matrix[first : row + RUN_REACH + 1], other.matrix[left : column + RUN_REACH + 2]
+        return run_agreement(rows @ columns.T, row - first, column - left)
 
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
@@ -162,6 +183,29 @@ class PlaceRecognition:
             for k in best
             if similarities[k] >= self._parameters.similarity_threshold
         ]
+
+
+def run_agreement(similarities: Descriptor, row: int, column: int) -> float | None:
+    """The mean similarity of two runs of keyframes through a pair, in the same or in opposite directions.
+
+    Each keyframe of one run is compared with the one across and those beside it, since robots differ in pace.
+
+    Args:
+        similarities: (M, N) of keyframes around the pair's.
+        row: Of the pair.
+        column: Of the pair.
+    """
+    best: float | None = None
+    for way in (1, -1):
+        means = []
+        for step in range(-RUN_REACH, RUN_REACH + 1):
+            across = column + way * step
+            if 0 <= row + step < len(similarities):
+                near = similarities[row + step, max(across - 1, 0) : max(across + 2, 0)]
+                means += [float(near.max())] if near.size else []
+        if len(means) >= RUN_MIN:
+            best = max(float(np.mean(means)), -1.0 if best is None else best)
+    return best
 
 
 def _sorted(found: list[Found]) -> list[Found]:
