@@ -22,7 +22,7 @@ from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Rea
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
-from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospects
+from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.work import OdometryPairOf, WorkTable
@@ -140,6 +140,7 @@ class LoopClosing:
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
+        self._prospects.on_resolved(pair)
         self._undecided.pop(pair, None)
         if pair in self._work or pair in self._offers:
             self._work.remove(pair)
@@ -152,6 +153,7 @@ class LoopClosing:
             self._spectral.on_closure(pair)
         self._front_ends.on_closure(pair)
         self.on_resolved(pair)
+        self._changed = True
         for other in self._prospects.on_judged(pair, is_closure=True):
             self._resolved.discard(other)
             if self._owner(other) == self._own:
@@ -274,11 +276,12 @@ class LoopClosing:
             self._hand_on_or_add(candidate, now)
         effects = self._offers.tell(self._reach, now)
         if self.latents.free() > 0:
-            effects += self.latents.fetch(self._worth_fetching(), self._reach, now)
+            effects += self.latents.fetch(self._worth_fetching(now), self._reach, now)
         effects += self._register(now)
         self._changed = bool(self._unlikely)
         heard_s = self._listens_until_s if self._undecided else float("inf")
-        self._due_s = min(self._offers.due_s(), self._work.due_s(), self.latents.due_s(now), heard_s)
+        held_s = self._prospects.due_s(now)
+        self._due_s = min(self._offers.due_s(), self._work.due_s(), self.latents.due_s(now), heard_s, held_s)
         return effects
 
     def deadline(self) -> float:
@@ -383,16 +386,17 @@ class LoopClosing:
         chosen = [keyframe for pair in self._choice() if (work := self._work.get(pair)) for keyframe in work.lacking]
         return chosen or self._fetchable_by_similarity()
 
-    def _worth_fetching(self) -> Iterator[KeyframeId]:
-        """The same without those whose pairs are all unlikely; these pairs are to be refused, a few at a time."""
+    def _worth_fetching(self, now: float) -> Iterator[KeyframeId]:
+        """The same without those of which no pair is likely; pairs that stay so are to be refused, a few at a time."""
         for keyframe in self._fetchable():
-            pairs = self._work.using(keyframe)
-            if keyframe.log == self._own or not all(map(self._prospects.is_unlikely, pairs)):
+            prospects = {pair: self._prospects.of(pair, now) for pair in self._work.using(keyframe)}
+            if keyframe.log == self._own or Prospect.LIKELY in prospects.values():
                 yield keyframe
-            elif len(self._unlikely) >= UNLIKELY_AT_ONCE_MAX:
+                continue
+            if len(self._unlikely) >= UNLIKELY_AT_ONCE_MAX:
                 return
-            else:
-                self._unlikely += [pair for pair in pairs if pair not in self._unlikely]
+            unlikely = (pair for pair, prospect in prospects.items() if prospect is Prospect.UNLIKELY)
+            self._unlikely += [pair for pair in unlikely if pair not in self._unlikely]
 
     def _fetchable_by_similarity(self) -> list[KeyframeId]:
         lacking = self._work.lacking

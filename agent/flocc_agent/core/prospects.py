@@ -3,14 +3,16 @@
 Two keyframes at one place have neighbours at one place: along the two ways, in the same or in opposite directions,
 descriptors agree in order (as in SeqSLAM, Milford and Wyeth 2012). How much, costs nothing: descriptors are here. What
 agreement is worth, this swarm's registrations tell: a pair is unlikely where the `REFUSED_MIN` registered pairs that
-agree just a bit better were all refused, so that no threshold depends on place or descriptor. Nothing is cut for good:
-one unlikely pair in `PROBED_EVERY` is registered all the same, and what lies beside a closure is taken up again. A
-pair whose latents are here is registered in any case.
+agree just a bit better were all refused, so that no threshold depends on place or descriptor. Such a pair is held for
+`HOLD_S`, since later keyframes may agree, and then refused by a record. Nothing is cut for good: one unlikely pair in
+`PROBED_EVERY` is registered all the same, and what lies beside a closure is taken up again. A pair whose latents are
+here is registered in any case.
 """
 
 import zlib
 from bisect import bisect_left, insort
 from collections.abc import Callable
+from enum import Enum
 from itertools import product
 
 from flocc_agent.core.pulls import remember
@@ -19,8 +21,11 @@ from flocc_protocol.messages import CandidatePair
 
 UNLIKELY = "pairs that agree better were refused"
 """Reason in the record of a pair that was refused unseen."""
-REFUSED_MIN = 8
-PROBED_EVERY = 16
+REFUSED_MIN = 4
+"""Chosen with `PROBED_EVERY` on street and the demo's town, each alone: docs/bandwidth.md has what 4 to 12 cost."""
+PROBED_EVERY = 32
+HOLD_S = 5.0
+"""A walking robot takes the next keyframes of a run within this time."""
 BESIDE = 2
 """Keyframes to either side that lie beside a closure."""
 JUDGED_MAX = 512
@@ -30,6 +35,14 @@ Agreement = Callable[[CandidatePair], float | None]
 """How well the surroundings of two keyframes agree, -1 to 1; None where too little is known of them."""
 Judged = tuple[float, CandidatePair, bool]
 """Agreement of a registered pair, and whether it became a closure."""
+
+
+class Prospect(Enum):
+    """What is to be done about a pair."""
+
+    LIKELY = "fetch its latents"
+    HELD = "wait for later keyframes"
+    UNLIKELY = "refuse it"
 
 
 class Prospects:
@@ -43,6 +56,7 @@ class Prospects:
         self._order: list[Judged] = []
         self._closures: dict[CandidatePair, None] = {}
         self._unlikely: dict[CandidatePair, None] = {}
+        self._held_since_s: dict[CandidatePair, float] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -51,6 +65,7 @@ class Prospects:
             "judged": (len(self._fresh) + len(self._judged), 2 * JUDGED_MAX),
             "closures beside": (len(self._closures), UNLIKELY_MAX),
             "unlikely": (len(self._unlikely), UNLIKELY_MAX),
+            "held": (len(self._held_since_s), UNLIKELY_MAX),
         }
 
     def on_judged(self, pair: CandidatePair, is_closure: bool) -> list[CandidatePair]:
@@ -69,9 +84,29 @@ class Prospects:
         """A pair was refused unseen."""
         remember(self._unlikely, pair, None, UNLIKELY_MAX)
 
-    def is_unlikely(self, pair: CandidatePair) -> bool:
-        """Whether a pair may be refused unseen."""
-        if is_probe(pair) or any(other in self._closures for other in beside(pair)):
+    def on_resolved(self, pair: CandidatePair) -> None:
+        """A record says what became of a pair."""
+        self._held_since_s.pop(pair, None)
+        self._found.pop(pair, None)
+
+    def due_s(self, now: float) -> float:
+        """When the next pair has been held long enough."""
+        return next((s + HOLD_S for s in self._held_since_s.values() if s + HOLD_S > now), float("inf"))
+
+    def of(self, pair: CandidatePair, now: float) -> Prospect:
+        """What is to be done about a pair that lacks a latent."""
+        if not self._is_unlikely(pair):
+            self._held_since_s.pop(pair, None)
+            return Prospect.LIKELY
+        if pair not in self._held_since_s:
+            remember(self._held_since_s, pair, now, UNLIKELY_MAX)
+        if now < self._held_since_s[pair] + HOLD_S:
+            return Prospect.HELD
+        self._found.pop(pair, None)
+        return Prospect.UNLIKELY if self._is_unlikely(pair) else Prospect.LIKELY
+
+    def _is_unlikely(self, pair: CandidatePair) -> bool:
+        if is_probe(pair):
             return False
         if pair not in self._found:
             remember(self._found, pair, self._rounded(pair), UNLIKELY_MAX)
@@ -81,7 +116,9 @@ class Prospects:
         self._learn()
         first = bisect_left(self._order, agreement, key=lambda judged: judged[0])
         better = self._order[first : first + REFUSED_MIN]
-        return len(better) == REFUSED_MIN and not any(is_closure for _, _, is_closure in better)
+        if len(better) < REFUSED_MIN or any(is_closure for _, _, is_closure in better):
+            return False
+        return not any(other in self._closures for other in beside(pair))
 
     def _learn(self) -> None:
         """Put pairs that were judged meanwhile into their order; only now is everything of their surroundings here."""

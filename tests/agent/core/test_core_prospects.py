@@ -1,6 +1,7 @@
 """Pairs that are refused unseen: only where better ones were refused, never for good, and by a record."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -10,7 +11,16 @@ from flocc_agent.core.latents import Peer
 from flocc_agent.core.loop_closing import UNLIKELY_AT_ONCE_MAX, LoopClosing, registrar_of
 from flocc_agent.core.parameters import LoopClosingParameters, PlaceRecognitionParameters
 from flocc_agent.core.place_recognition import Candidate, PlaceRecognition, run_agreement
-from flocc_agent.core.prospects import PROBED_EVERY, REFUSED_MIN, UNLIKELY, Prospects, beside, is_probe
+from flocc_agent.core.prospects import (
+    HOLD_S,
+    PROBED_EVERY,
+    REFUSED_MIN,
+    UNLIKELY,
+    Prospect,
+    Prospects,
+    beside,
+    is_probe,
+)
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
@@ -32,6 +42,11 @@ def of_own(
     return [one for one in pairs if registrar_of(one) == R1 and is_wanted(one)][:count]
 
 
+def is_unlikely(prospects: Prospects, one: CandidatePair) -> bool:
+    """Whether a pair is not fetched at once."""
+    return prospects.of(one, 0.0) is not Prospect.LIKELY
+
+
 def after_refusals(count: int, agreement: float = 0.3) -> Prospects:
     """What is known after some pairs that agree by 0.5 were refused; all others agree as given."""
     refused = [pair(10 * k) for k in range(count)]
@@ -43,9 +58,9 @@ def after_refusals(count: int, agreement: float = 0.3) -> Prospects:
 
 def test_a_pair_is_unlikely_only_where_enough_better_ones_were_refused() -> None:
     one = of_own(1)[0]
-    assert after_refusals(REFUSED_MIN).is_unlikely(one)
-    assert not after_refusals(REFUSED_MIN - 1).is_unlikely(one)
-    assert not after_refusals(REFUSED_MIN, agreement=0.6).is_unlikely(one)
+    assert is_unlikely(after_refusals(REFUSED_MIN), one)
+    assert not is_unlikely(after_refusals(REFUSED_MIN - 1), one)
+    assert not is_unlikely(after_refusals(REFUSED_MIN, agreement=0.6), one)
 
 
 def test_a_closure_that_agrees_just_better_keeps_a_pair_likely_and_a_much_better_one_does_not() -> None:
@@ -57,13 +72,13 @@ def test_a_closure_that_agrees_just_better_keeps_a_pair_likely_and_a_much_better
         for other in refused:
             prospects.on_judged(other, is_closure=False)
         prospects.on_judged(closure, is_closure=True)
-        assert prospects.is_unlikely(one) is expected
+        assert is_unlikely(prospects, one) is expected
 
 
 def test_one_unlikely_pair_in_a_few_is_registered_all_the_same() -> None:
     prospects = after_refusals(REFUSED_MIN)
     probes = of_own(300, lambda _: True)
-    share = sum(not prospects.is_unlikely(one) for one in probes) / len(probes)
+    share = sum(not is_unlikely(prospects, one) for one in probes) / len(probes)
     assert 0.5 / PROBED_EVERY < share < 2.0 / PROBED_EVERY
 
 
@@ -71,7 +86,7 @@ def test_nothing_is_unlikely_of_which_too_little_is_known() -> None:
     prospects = Prospects(lambda _: None)
     for k in range(3 * REFUSED_MIN):
         prospects.on_judged(pair(10 * k), is_closure=False)
-    assert not any(map(prospects.is_unlikely, of_own(20)))
+    assert not any(is_unlikely(prospects, one) for one in of_own(20))
 
 
 def test_what_lies_beside_a_closure_is_taken_up_again_and_likely_from_then_on() -> None:
@@ -83,7 +98,7 @@ def test_what_lies_beside_a_closure_is_taken_up_again_and_likely_from_then_on() 
         prospects.on_unlikely(other)
     assert prospects.on_judged(one, is_closure=True) == [near]
     assert prospects.on_judged(one, is_closure=True) == []
-    assert not prospects.is_unlikely(near)
+    assert not is_unlikely(prospects, near)
 
 
 def test_tables_stay_within_their_maximum() -> None:
@@ -91,7 +106,7 @@ def test_tables_stay_within_their_maximum() -> None:
     for k in range(1500):
         prospects.on_judged(pair(k), is_closure=k % 3 == 0)
         prospects.on_unlikely(pair(k, 9000))
-        prospects.is_unlikely(pair(k, 7000))
+        prospects.of(pair(k, 7000), float(k))
     assert all(size <= size_max for size, size_max in prospects.sizes().values())
 
 
@@ -146,15 +161,15 @@ def test_recognition_gives_the_agreement_of_any_two_logs_it_holds() -> None:
 # In loop closing
 
 
-def closing_after_refusals() -> LoopClosing:
-    """r1 beside r2, after enough refusals; no other pair agrees as well."""
+def closing_after_refusals(levels: Mapping[CandidatePair, float] = MappingProxyType({})) -> LoopClosing:
+    """r1 beside r2, after enough refusals; no other pair agrees as well, but as given."""
     refused = [pair(10 * k) for k in range(REFUSED_MIN)]
     machine = LoopClosing(
         R1,
         0,
         lambda k: (KeyframeId(k.log, k.index - 1), ONE),
         LoopClosingParameters(),
-        agreement=lambda one: 0.5 if one in refused else 0.3,
+        agreement=lambda one: 0.5 if one in refused else levels.get(one, 0.3),
     )
     machine.on_peer("r2", Peer(0, log=R2))
     for one in refused:
@@ -170,6 +185,9 @@ def test_an_unlikely_pair_is_refused_and_its_latent_not_fetched() -> None:
     machine, (one, *_) = closing_after_refusals(), of_own(1)
     machine.on_candidates([Candidate(one, 0.4)], 0.0)
     assert fetched(machine.tick(0.0)) == []
+    assert machine.take_unlikely() == []
+    assert machine.deadline() == HOLD_S
+    assert fetched(machine.tick(HOLD_S)) == []
     assert machine.take_unlikely() == [one]
     assert machine.take_unlikely() == []
 
@@ -205,11 +223,30 @@ def test_a_pair_that_was_refused_unseen_is_fetched_once_a_closure_lies_beside_it
     machine, (one, *_) = closing_after_refusals(), of_own(1)
     machine.on_candidates([Candidate(one, 0.4)], 0.0)
     machine.tick(0.0)
+    machine.tick(HOLD_S)
     for refused in machine.take_unlikely():
         machine.on_rejection(refused, UNLIKELY, was_seen=False)
     assert machine.open_pairs() == []
-    machine.on_closure(CandidatePair(KeyframeId(R1, one.low.index + 1), one.high), 1.0)
+    machine.on_closure(CandidatePair(KeyframeId(R1, one.low.index + 1), one.high), 9.0)
     assert machine.open_pairs() == [one]
+    assert fetched(machine.tick(9.0)) == [one.high]
+
+
+def test_a_pair_that_is_held_is_fetched_when_later_keyframes_agree() -> None:
+    levels: dict[CandidatePair, float] = {}
+    machine, (one, *_) = closing_after_refusals(levels), of_own(1)
+    machine.on_candidates([Candidate(one, 0.4)], 0.0)
+    assert fetched(machine.tick(0.0)) == []
+    levels[one] = 0.6
+    assert fetched(machine.tick(HOLD_S)) == [one.high]
+    assert machine.take_unlikely() == []
+
+
+def test_a_pair_that_is_held_is_fetched_at_once_when_a_closure_lies_beside_it() -> None:
+    machine, (one, *_) = closing_after_refusals(), of_own(1)
+    machine.on_candidates([Candidate(one, 0.4)], 0.0)
+    assert fetched(machine.tick(0.0)) == []
+    machine.on_closure(CandidatePair(KeyframeId(R1, one.low.index + 1), one.high), 1.0)
     assert fetched(machine.tick(1.0)) == [one.high]
 
 
@@ -228,9 +265,10 @@ def test_many_unlikely_pairs_are_refused_a_few_at_a_time() -> None:
     machine, pairs = closing_after_refusals(), of_own(UNLIKELY_AT_ONCE_MAX + 5)
     machine.on_candidates([Candidate(one, 0.4) for one in pairs], 0.0)
     machine.tick(0.0)
+    machine.tick(HOLD_S)
     first = machine.take_unlikely()
     assert len(first) == UNLIKELY_AT_ONCE_MAX
     for one in first:
         machine.on_rejection(one, UNLIKELY, was_seen=False)
-    machine.tick(0.0)
+    machine.tick(HOLD_S)
     assert sorted(first + machine.take_unlikely()) == sorted(pairs)
