@@ -29,7 +29,7 @@ from flocc_launch.world.spec import WorldSpec
 
 Float = NDArray[np.float64]
 
-TOWN_ROUTE_M = 45.0
+TOWN_ROUTE_M = 30.0
 KINDS: tuple[DriftKind | None, ...] = (None, *DRIFTS)
 """Of a town's odometry; None: a generated world's own."""
 
