@@ -78,6 +78,13 @@ def test_the_default_holds_on_ten_members(tmp_path: Path) -> None:
     assert "| flocc | 10 |" in table(verdicts)
 
 
+def test_two_robots_that_hold_each_other_are_moved_together_from_a_repeated_facade() -> None:
+    """Ten wrong closures that agree hold one of them to the rest, seven right ones both; sixteen metres before."""
+    graph = member(541)
+    answer = flocc(settings())(graph)
+    assert judged(graph, "flocc", answer, oracle(graph)).ratio < 1.1
+
+
 def test_a_method_without_an_answer_fails(tmp_path: Path) -> None:
     def silent(_: object) -> None:
         raise NoAnswer("it ends")

@@ -11,7 +11,7 @@ from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.classical.encoder import ClassicalEncoder, decode_features
 from flocc_lab.bench.overlaid_recording import covered, overlay_robot
-from flocc_lab.bench.watched_cameras import CachedFeatures, Trouble, Watched, cell, counted, zoomed
+from flocc_lab.bench.watched_cameras import CachedFeatures, Trouble, WatchedDrive, cell, counted, zoomed
 from flocc_lab.bench.watched_drives import drawn_town
 
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 250.0, (-0.2, 0.05, 0.001, 0.0))
@@ -39,16 +39,16 @@ def test_cached_features_are_those_of_the_encoder_with_that_camera(factor: float
 
 
 def test_a_cell_says_when_and_what_else() -> None:
-    found = Watched(9, (("mounting", 6, 5.0), ("focal length", 9, 1.2)), 1.0)
+    found = WatchedDrive(9, (("mounting", 6, 5.0), ("focal length", 9, 1.2)), 1.0)
     assert cell(found, FOCAL) == "9 [mounting at 6]"
-    assert cell(Watched(40, (), 1.0), FOCAL) == "-"
-    assert cell(Watched(40, (("overlay", 3, 0.1),), 1.0), Trouble("right", "")) == "[overlay at 3]"
-    assert cell(Watched(40, (), 1.0), Trouble("right", "")) == ""
+    assert cell(WatchedDrive(40, (), 1.0), FOCAL) == "-"
+    assert cell(WatchedDrive(40, (("overlay", 3, 0.1),), 1.0), Trouble("right", "")) == "[overlay at 3]"
+    assert cell(WatchedDrive(40, (), 1.0), Trouble("right", "")) == ""
 
 
 def test_late_and_wrong_names_are_counted_apart() -> None:
-    found = [Watched(9, (("focal length", k, 1.2),), 1.0) for k in (6, 20, 21)]
-    found += [Watched(40, (("mounting", 6, 5.0),), 1.0), Watched(40, (), 1.0)]
+    found = [WatchedDrive(9, (("focal length", k, 1.2),), 1.0) for k in (6, 20, 21)]
+    found += [WatchedDrive(40, (("mounting", 6, 5.0),), 1.0), WatchedDrive(40, (), 1.0)]
     assert counted(found, FOCAL) == "2 + 1 late, 1 otherwise"
 
 

@@ -69,12 +69,28 @@ class Places:
         return {log: T[offsets[log] : offsets[log] + len(self.trajectories[log])] for log in self.problem.logs}
 
     def _bodies(self, chosen: Bool) -> list[frozenset[LogId]]:
-        """Parts that chosen closures join, where there are several, then robots alone; not the whole."""
-        logs = self.problem.logs
-        used = [self.closures[k] for k, on in zip(self.problem.closure_ids, chosen, strict=True) if on]
-        groups = [frozenset(group) for group in components_of(logs, used)]
-        bodies = [*(groups[1:] if len(groups) > 1 else ()), *(frozenset((log,)) for log in logs)]
+        """Parts that chosen closures join more firmly than the rest, the loosest first, then robots alone.
+
+        Pairs of robots fall away in the order of their votes: two robots that many closures join move together, where
+        few hold both of them to the others. The part with the anchor stays.
+        """
+        bodies: list[frozenset[LogId]] = []
+        joining = self._joining(chosen)
+        for firmness in (0.0, *sorted({votes for votes, _ in joining.values()})):
+            firm = [closure for votes, closure in joining.values() if votes > firmness]
+            bodies += [frozenset(group) for group in components_of(self.problem.logs, firm)[1:]]
+        bodies += [frozenset((log,)) for log in self.problem.logs]
         return list(dict.fromkeys(bodies))
+
+    def _joining(self, chosen: Bool) -> dict[frozenset[LogId], tuple[float, LoopClosure]]:
+        """Votes of the chosen closures of each two robots, and one of them."""
+        joining: dict[frozenset[LogId], tuple[float, LoopClosure]] = {}
+        for n in np.flatnonzero(chosen).tolist():
+            closure = self.closures[self.problem.closure_ids[n]]
+            pair = frozenset((closure.query.log, closure.match.log))
+            before, _ = joining.get(pair, (0.0, closure))
+            joining[pair] = before + float(self.votes[n]), closure
+        return {pair: found for pair, found in joining.items() if len(pair) > 1}
 
     def _crossing(self, body: frozenset[LogId]) -> Bool:
         """Closures (L,) between a body and the rest."""

@@ -66,7 +66,7 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
-class Watched:
+class WatchedDrive:
     """What came of one drive.
 
     Attributes:
@@ -149,7 +149,7 @@ class NoPlace:
         return np.ones(1, np.float32)
 
 
-def watched(drive: Drive, trouble: Trouble, eyes: CachedFeatures) -> Watched:
+def watched(drive: Drive, trouble: Trouble, eyes: CachedFeatures) -> WatchedDrive:
     """Walk a drive with something wrong until that is named, or with nothing wrong to its end."""
     perception = Perception(NoPlace(), eyes, classical_registrar(ClassicalConfig()))
     watch = CameraWatch()
@@ -165,7 +165,7 @@ def watched(drive: Drive, trouble: Trouble, eyes: CachedFeatures) -> Watched:
         if trouble.doubt and any(word == trouble.doubt for word, _, _ in named):
             views = views[: k + 1]
             break
-    return Watched(len(views), tuple(named), 1e3 * looks_s / len(views))
+    return WatchedDrive(len(views), tuple(named), 1e3 * looks_s / len(views))
 
 
 def troubled(views: Sequence[SceneView], k: int, trouble: Trouble) -> Image:
@@ -175,14 +175,14 @@ def troubled(views: Sequence[SceneView], k: int, trouble: Trouble) -> Image:
     return Image(trouble.pixels(image.pixels), trouble.camera(views[k].camera))
 
 
-def cell(found: Watched, trouble: Trouble) -> str:
+def cell(found: WatchedDrive, trouble: Trouble) -> str:
     """What is said of one drive."""
     others = sorted({f"{word} at {k}" for word, k, _ in found.named if word != trouble.doubt})
     when = next((str(k) for word, k, _ in found.named if word == trouble.doubt), "" if not trouble.doubt else "-")
     return " ".join([when, *(f"[{other}]" for other in others)]).strip()
 
 
-def summary(rows: Sequence[tuple[Drive, dict[str, Watched]]], tried: Sequence[Trouble]) -> Iterator[str]:
+def summary(rows: Sequence[tuple[Drive, dict[str, WatchedDrive]]], tried: Sequence[Trouble]) -> Iterator[str]:
     """By recording: of each fault how often it was named in time, and how far the figure told was off."""
     yield "| recording | drives | keyframes | false alarms | " + " | ".join(t.name for t in tried if t.doubt) + " |"
     yield "| --- " * (4 + sum(bool(t.doubt) for t in tried)) + "|"
@@ -194,7 +194,7 @@ def summary(rows: Sequence[tuple[Drive, dict[str, Watched]]], tried: Sequence[Tr
         yield f"| {name} | " + " | ".join(cells) + " |"
 
 
-def counted(found: Sequence[Watched], trouble: Trouble) -> str:
+def counted(found: Sequence[WatchedDrive], trouble: Trouble) -> str:
     """Named within the limit, later, wrongly."""
     hits = [next((k for word, k, _ in one.named if word == trouble.doubt), None) for one in found]
     in_time = sum(k is not None and k <= WITHIN_KEYFRAMES for k in hits)
@@ -203,7 +203,7 @@ def counted(found: Sequence[Watched], trouble: Trouble) -> str:
     return f"{in_time}" + (f" + {late} late" if late else "") + (f", {other} otherwise" if other else "")
 
 
-def amounts(rows: Sequence[tuple[Drive, dict[str, Watched]]], tried: Sequence[Trouble]) -> Iterator[str]:
+def amounts(rows: Sequence[tuple[Drive, dict[str, WatchedDrive]]], tried: Sequence[Trouble]) -> Iterator[str]:
     """How far the figures that were told first are off, at the median and at most."""
     for trouble in (t for t in tried if t.amount is not None):
         told = [
