@@ -69,6 +69,7 @@ def test_an_overlaid_robot_keeps_all_but_its_pictures_lower_part(tmp_path: Path)
     overlay_robot(source, tmp_path / "out" / "r1", 0.5, 1, with_mask=True)
     seen = cv2.imread(str(tmp_path / "out" / "r1" / "images" / "0.png"))
     mask = cv2.imread(str(tmp_path / "out" / "r1" / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None
     assert np.array_equal(np.flatnonzero(np.any(seen != picture().pixels, axis=(1, 2))), np.arange(240, 480))
     assert np.array_equal(mask[:, 0] == 0, np.arange(480) >= 240)
     assert (tmp_path / "out" / "r1" / "odometry.txt").read_text() == "0 0 0 0 0 0 0 1\n"
