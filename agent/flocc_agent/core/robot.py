@@ -387,7 +387,7 @@ class Robot:
             return self._overtaken(sender, message, now)
         if not self.corrections.is_news(message, now):
             return []
-        refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
+        refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term, now)
         return refused or self.corrections.take(message, now)
 
     def _reconsider(self, now: float) -> list[Effect]:
@@ -416,7 +416,7 @@ class Robot:
             return []
         self._overtaken_s = now
         refused = self.corrections.refused(sender.robot, message)
-        return refused or self.election.on_applied(sender, message.term)
+        return refused or self.election.on_applied(sender, message.term, now)
 
     def _is_distrusted(self, leader: LogId, now: float) -> bool:
         return self._distrusted.is_muted(leader.robot, leader.robot, now)

@@ -192,6 +192,9 @@ def simulate(
     duration: Duration = None,
     sets: Set = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
+    family: Annotated[
+        str, typer.Option(help="Of the drawn ones: small, large (20 robots, ten minutes) or hour (20 robots).")
+    ] = "small",
     shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
     json_out: Json = False,
     quiet: Quiet = False,
@@ -211,7 +214,7 @@ def simulate(
     if seeds is not None and given:
         fail(f"a campaign draws its scenarios; {given[0]} is for one of your own, without --seeds")
     if seeds is not None:
-        run_campaign(seeds, seed or 0, shrink, out, speech)
+        run_campaign(seeds, seed or 0, shrink, out, speech, family)
         return
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")

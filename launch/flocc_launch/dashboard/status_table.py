@@ -51,6 +51,7 @@ class RobotStatus(MergeStatus):
     logs: dict[str, tuple[int, int]] = Field(default_factory=dict)
     loss: dict[str, float] = Field(default_factory=dict)
     queues: dict[str, int] = Field(default_factory=dict)
+    doubles: tuple[str, ...] = ()
 
 
 def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0) -> list[RobotStatus]:
