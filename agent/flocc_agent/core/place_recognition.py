@@ -34,6 +34,9 @@ SAME_PLACE_STEP = 0.05
 """Where the representatives are too many, less similar ones stand for each other."""
 ROWS_AT_ONCE = 256
 """int8 rows that are compared at one time: as floats they stay in a processor's cache."""
+RUN_REACH = 2
+"""Keyframes to either side that a run has; 1 and 3 tell as much on `street`."""
+RUN_MIN = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +167,15 @@ class _Rows:
             found *= np.array([[each.inverse_norm] for each in descriptors], dtype=np.float32)
         return found
 
+    def around(self, log: int, index: int, reach: int) -> tuple[Floats, int] | None:
+        """Unit descriptors (K, D) of a log's keyframes up to `reach` from one, and which is its; None without it."""
+        near = (self.logs == log) & (np.abs(self.indices - index) <= reach)
+        rows = np.flatnonzero(near)
+        at = np.flatnonzero(self.indices[rows] == index)
+        if not len(at):
+            return None
+        return self._rows[rows] * self._inverse_norms[rows, None], int(at[0])
+
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
         if self._rows.dtype == np.float32:
@@ -250,6 +262,20 @@ class PlaceRecognition:
                 others = []
         return found + self._among_own(others)
 
+    def agreement(self, pair: CandidatePair) -> float | None:
+        """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""
+        one, other = self._around(pair.low, RUN_REACH), self._around(pair.high, RUN_REACH + 1)
+        if one is None or other is None or one[0].shape[1] != other[0].shape[1]:
+            return None
+        return run_agreement(one[0] @ other[0].T, one[1], other[1])
+
+    def _around(self, keyframe: KeyframeId, reach: int) -> tuple[Floats, int] | None:
+        number = self._numbers.get(keyframe.log)
+        if number is None:
+            return None
+        rows = self._own_rows if keyframe.log == self._own else self._others.get(self._dimensions[number])
+        return None if rows is None else rows.around(number, keyframe.index, reach)
+
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
         log, dimension = keyframe.log, len(descriptor.row)
@@ -331,6 +357,29 @@ class PlaceRecognition:
             for k in best
             if similarities[k] >= self._parameters.similarity_threshold
         ]
+
+
+def run_agreement(similarities: Floats, row: int, column: int) -> float | None:
+    """The mean similarity of two runs of keyframes through a pair, in the same or in opposite directions.
+
+    Each keyframe of one run is compared with the one across and those beside it, since robots differ in pace.
+
+    Args:
+        similarities: (M, N) of keyframes around the pair's.
+        row: Of the pair.
+        column: Of the pair.
+    """
+    best: float | None = None
+    for way in (1, -1):
+        means = []
+        for step in range(-RUN_REACH, RUN_REACH + 1):
+            across = column + way * step
+            if 0 <= row + step < len(similarities):
+                near = similarities[row + step, max(across - 1, 0) : max(across + 2, 0)]
+                means += [float(near.max())] if near.size else []
+        if len(means) >= RUN_MIN:
+            best = max(float(np.mean(means)), -1.0 if best is None else best)
+    return best
 
 
 def _sorted(found: list[Found]) -> list[Found]:
