@@ -105,42 +105,54 @@ class _Rows:
         self._count += 1
 
     def thin(self, held: int) -> None:
-        """Keep the newest so many rows, and at most so many that stand for the older ones."""
+        """Keep the newest so many rows whole, and at most so many that stand for the older ones.
+
+        A log is looked through in blocks of its own rows, so that robots which hold it find the same ones to stay, and
+        ask for the same pairs.
+        """
         while self._count - self._thinned >= held + THINNED_AT_ONCE:
-            self._thin(self._thinned, self._thinned + THINNED_AT_ONCE)
+            unthinned = self._logs[self._thinned : self._count]
+            longest = int(np.bincount(unthinned).argmax())
+            oldest = self._thinned + np.flatnonzero(unthinned == longest)[:THINNED_AT_ONCE]
+            if len(oldest) < THINNED_AT_ONCE:
+                return
+            self._keep(oldest[self._stays(oldest, self._thinned)], oldest)
             while self._thinned > held and self._same_place > -1.0:
                 self._same_place -= SAME_PLACE_STEP
-                until, self._thinned = self._thinned, 0
-                while self._thinned < until:
-                    done = min(THINNED_AT_ONCE, until - self._thinned)
-                    until -= self._thin(self._thinned, self._thinned + done)
+                self._thin_again()
 
-    def _thin(self, first: int, end: int) -> int:
-        """Leave out rows between two places that a row before `first`, or a later one that stays, stands for.
+    def _thin_again(self) -> None:
+        """Look through the rows that stand for others with the present bound."""
+        until, self._thinned = self._thinned, 0
+        while self._thinned < until:
+            block = np.arange(self._thinned, min(self._thinned + THINNED_AT_ONCE, until))
+            stay = block[self._stays(block, self._thinned)]
+            until -= len(block) - len(stay)
+            self._keep(stay, block)
 
-        Returns:
-            How many were left out.
-        """
-        rows = self._units(slice(first, end))
-        logs = self._logs[first:end]
-        stays = np.ones(end - first, dtype=bool)
+    def _stays(self, block: NDArray[np.intp], first: int) -> NDArray[np.bool_]:
+        """Which of these rows neither a row before `first` nor one before it in the block stands for."""
+        rows, logs = self._units(block), self._logs[block]
+        stays = np.ones(len(block), dtype=bool)
         for begin in range(0, first, ROWS_AT_ONCE):
-            before = slice(begin, min(begin + ROWS_AT_ONCE, first))
+            before = np.arange(begin, min(begin + ROWS_AT_ONCE, first))
             alike = (rows @ self._units(before).T >= self._same_place) & (logs[:, None] == self._logs[before])
             stays &= ~alike.any(axis=1)
         among = (rows @ rows.T >= self._same_place) & (logs[:, None] == logs)
         for k in np.flatnonzero(stays).tolist():
             stays[k] = not np.any(among[k, :k] & stays[:k])
-        chosen = first + np.flatnonzero(stays)
-        fewer = end - first - len(chosen)
-        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
-            values[first : end - fewer] = values[chosen]
-            values[end - fewer : self._count - fewer] = values[end : self._count].copy()
-        self._count -= fewer
-        self._thinned = end - fewer
-        return fewer
+        return stays
 
-    def _units(self, places: slice) -> Floats:
+    def _keep(self, stay: NDArray[np.intp], block: NDArray[np.intp]) -> None:
+        """Of a block of rows that are not thinned yet these stay, and are thinned from now on."""
+        others = np.setdiff1d(np.arange(self._thinned, self._count), block, assume_unique=True)
+        order = np.concatenate([stay, others])
+        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
+            values[self._thinned : self._thinned + len(order)] = values[order]
+        self._count = self._thinned + len(order)
+        self._thinned += len(stay)
+
+    def _units(self, places: NDArray[np.intp]) -> Floats:
         """Rows (K, D) of unit length."""
         return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
 
