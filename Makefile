@@ -42,17 +42,19 @@ types:
 contracts:
 	$(BIN)/lint-imports
 
-# Two workers share two cores; tests of a live swarm measure time, so they get the machine to themselves. What fails
-# there is tried once more, since the machine itself may stall; both results are printed.
+# Two workers share two cores, also those live swarms that measure nothing in time; the others get the machine to
+# themselves. What fails of a live swarm is tried once more, alone, since the machine itself may stall; all is printed.
+LIVE := swarm and not scenarios
 tests:
-	@mkdir -p build; set -o pipefail; status=0; \
+	@mkdir -p build; set -o pipefail; status=0; live=0; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -m "not swarm" | tee build/pytest.txt || status=1; \
 	rm -f build/pytest-swarm-again.txt; \
-	$(BIN)/python -m pytest -q -m "swarm and not scenarios" | tee build/pytest-swarm.txt \
-		|| $(BIN)/python -m pytest -q -m "swarm and not scenarios" --lf --lfnf none | tee build/pytest-swarm-again.txt \
-		|| status=1; \
-	echo "pytest:              $$(tail -n 1 build/pytest.txt)"; \
-	echo "pytest, live swarms: $$(tail -n 1 build/pytest-swarm.txt)"; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "$(LIVE) and beside" | tee build/pytest-beside.txt || live=1; \
+	$(BIN)/python -m pytest -q -m "$(LIVE) and not beside" | tee build/pytest-swarm.txt || live=1; \
+	[ $$live -eq 0 ] || $(BIN)/python -m pytest -q -m "$(LIVE)" --lf --lfnf none | tee build/pytest-swarm-again.txt || status=1; \
+	echo "pytest:                    $$(tail -n 1 build/pytest.txt)"; \
+	echo "live swarms, side by side: $$(tail -n 1 build/pytest-beside.txt)"; \
+	echo "live swarms, alone:        $$(tail -n 1 build/pytest-swarm.txt)"; \
 	[ ! -e build/pytest-swarm-again.txt ] || echo "second try of what failed: $$(tail -n 1 build/pytest-swarm-again.txt)"; \
 	exit $$status
 

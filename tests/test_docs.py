@@ -31,7 +31,7 @@ def page_id(page: Path) -> str:
 
 def run_pages() -> list[object]:
     """Pages with something to run; those that start agents are tests of live swarms."""
-    marks = {True: [pytest.mark.swarm, pytest.mark.slow], False: []}
+    marks = {True: [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow], False: []}
     scripts = {page: script(page) for page in PAGES}
     return [
         pytest.param(page, marks=marks[bool(LIVE.search(text))], id=page_id(page))

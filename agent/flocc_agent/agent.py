@@ -26,6 +26,7 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
+from flocc_agent.runtime.certificate_faults import certificate_faults
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
@@ -38,7 +39,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
-from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.network_faults import found_by, network_faults
 from flocc_agent.runtime.new_journeys import began_anew, last_body
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
@@ -59,6 +60,9 @@ if TYPE_CHECKING:
     from flocc_agent.runtime.ros2.adapter import Ros2Adapter
 
 logger = logging.getLogger(__name__)
+
+SILENCE_S = 60.0
+"""How often an agent looks whether it hears anybody."""
 
 Float = NDArray[np.float64]
 
@@ -147,6 +151,7 @@ class Agent:
     async def __aenter__(self) -> "Agent":
         """Open the store and the network, restore what the disk holds, start the loop and the playback."""
         try:
+            logger.info("robot %s: %s", self.config.name, found_by(self.config.transport, self.config.swarm))
             self._driver = await asyncio.to_thread(self._compose)
             if self.config.metrics.port is not None:
                 self._metrics = MetricsServer(self.config.metrics, self.config.name, lambda: self._started.look())
@@ -221,9 +226,17 @@ class Agent:
         return True
 
     async def _look_at_network(self) -> None:
-        """Say once what of the configured network is not there; the agent goes on trying."""
+        """Say once what of the configured network is not there, and when nobody is heard; the agent goes on trying."""
         for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
             logger.warning("%s: %s", self.config.name, fault)
+        is_silent = False
+        while True:
+            await asyncio.sleep(SILENCE_S)
+            was_silent, is_silent = is_silent, not self._started.robot.neighbours.names()
+            if is_silent and not was_silent:
+                logger.warning("%s: hears nobody; 'flocc doctor' looks at the network", self.config.name)
+                for fault in await asyncio.to_thread(lambda: [*certificate_faults(self.config.transport.tls)]):
+                    logger.warning("%s: %s", self.config.name, fault)
 
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.
@@ -429,7 +442,17 @@ class Agent:
         boot = int.from_bytes(os.urandom(6))
         distributed = config.backend.mode is BackendMode.DISTRIBUTED
         core_parameters = config.core.under(config.bandwidth_bytes_s)
-        core = Robot(log, config.compute_class, boot, core_parameters, self._clock_s(), restored, sealer, distributed)
+        core = Robot(
+            log,
+            _compute_class(config, sealer),
+            boot,
+            core_parameters,
+            self._clock_s(),
+            restored,
+            sealer,
+            distributed,
+            None if sealer is None else sealer.compute_classes,
+        )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
         )
@@ -604,6 +627,20 @@ def stored_result(config: AgentConfig) -> RobotResult:
 
 def _sealer(config: AgentConfig) -> RecordSealer | None:
     return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
+
+
+def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:
+    """The configured one, but where the swarm's list of members says what this robot has."""
+    if sealer is None or sealer.compute_classes is None:
+        return config.compute_class
+    listed = sealer.compute_classes.get(config.name, 0)
+    if listed != config.compute_class:
+        logger.warning(
+            "compute_class %d of the configuration does not count: the list of members says %d",
+            config.compute_class,
+            listed,
+        )
+    return listed
 
 
 def _open_store(config: AgentConfig) -> Store:

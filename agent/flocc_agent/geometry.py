@@ -155,6 +155,14 @@ def adjoint(T: Float) -> Float:
     return out
 
 
+def adjoints(T: Float) -> Float:
+    """Adjoints (N, 6, 6) of poses (N, 4, 4), rotation first."""
+    out = np.zeros((len(T), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = T[:, :3, :3]
+    out[:, 3:, :3] = hats(T[:, :3, 3]) @ T[:, :3, :3]
+    return out
+
+
 def angle_rad(R: Float) -> float:
     """Angle of a rotation, in [0, pi]."""
     return float(np.linalg.norm(so3_log(R)))
@@ -254,6 +262,11 @@ def pose7(T: Float) -> Pose7:
     """A pose (4, 4) as the wire has it: translation x y z, quaternion w x y z."""
     x, y, z, qw, qx, qy, qz = (float(v) for v in tq_from_pose(T))
     return (x, y, z, qw, qx, qy, qz)
+
+
+def pose7s(T: Float) -> tuple[Pose7, ...]:
+    """Poses (N, 4, 4) as the wire has them."""
+    return tuple([(x, y, z, qw, qx, qy, qz) for x, y, z, qw, qx, qy, qz in tq_from_poses(T).tolist()])
 
 
 def interpolated(T_a_b: Float, T_a_c: Float, share: float) -> Float:

@@ -269,10 +269,12 @@ class Radio:
     ) -> str | None:
         """Why the two cannot hear each other at all, if so."""
         parameters = self._parameters
-        if any(b.silences(sender, now_s) or b.silences(receiver, now_s) for b in parameters.blackouts):
-            return "blackout"
-        if any(partition.separates(sender, receiver, now_s) for partition in parameters.partitions):
-            return "partition"
+        for blackout in parameters.blackouts:
+            if blackout.silences(sender, now_s) or blackout.silences(receiver, now_s):
+                return "blackout"
+        for partition in parameters.partitions:
+            if partition.separates(sender, receiver, now_s):
+                return "partition"
         if parameters.range_m is None:
             return None
         here = self._positions_m.get(sender) if from_m is None else from_m

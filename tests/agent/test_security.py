@@ -3,13 +3,16 @@
 import asyncio
 import json
 import stat
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from tests.agent.runtime.loopback import loopback_configs, until
 
 from flocc_agent.config import TlsConfig, TransportConfig
-from flocc_agent.runtime.security import RecordSealer
+from flocc_agent.runtime.certificate_faults import certificate_faults
+from flocc_agent.runtime.network_faults import network_faults
+from flocc_agent.runtime.security import RecordSealer, read_members
 from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportError
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
@@ -50,6 +53,32 @@ def test_admits_more_robots_without_touching_those_that_are_there(tmp_path: Path
     assert list(both) == ["operator", "r1", "r2"]
     lists = [json.loads((folder / "members.json").read_bytes()) for folder in both.values()]
     assert [sorted(content["robots"]) for content in lists] == [["r1", "r2"]] * 3
+
+
+def test_the_list_of_members_says_compute_classes_once_one_is_given(tmp_path: Path) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    assert read_members(tmp_path / "r1/members.json").compute_classes is None
+    make_keys(tmp_path, SWARM, ["server"], compute_classes={"server": 9})
+    make_keys(tmp_path, SWARM, ["r2"])
+    assert read_members(tmp_path / "r1/members.json").compute_classes == {"server": 9}
+    assert RecordSealer.of(TlsConfig(folder=tmp_path / "r1")).compute_classes == {"server": 9}
+
+
+def test_a_certificate_that_expired_or_is_not_valid_yet_is_said(tmp_path: Path) -> None:
+    made = datetime(2020, 1, 1, tzinfo=UTC)
+    tls = TlsConfig(folder=make_keys(tmp_path, SWARM, ["r1"], now=made)["r1"])
+    path = tmp_path / "r1/robot.crt"
+    sentences = [*certificate_faults(tls, made + timedelta(days=1826))]
+    assert sentences == [
+        f"{path}: expired on 2024-12-30: nobody accepts it; remove it and its key, and run 'flocc keys' again"
+    ]
+    assert [*certificate_faults(tls, made + timedelta(days=400))] == []
+    assert [*certificate_faults(tls, made + timedelta(days=1810))] == [
+        f"{path}: expires on 2024-12-30; remove it and its key, and run 'flocc keys' again"
+    ]
+    early = [*certificate_faults(tls, made - timedelta(days=400))]
+    assert early[0] == f"{path}: is valid from 2019-12-31 on, and the clock says 2018-11-27; nobody is heard"
+    assert network_faults(TransportConfig(tls=tls), "r1")[0].startswith(f"{path}: expired on")
 
 
 def test_one_folder_is_of_one_swarm(tmp_path: Path) -> None:
@@ -158,6 +187,7 @@ def secure_configs(folders: dict[str, Path]) -> dict[str, TransportConfig]:
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_members_talk_and_fetch(folders: dict[str, Path]) -> None:
     configs = secure_configs(folders)
     one, two = Listener("r1", configs["r1"]), Listener("r2", configs["r2"])
@@ -190,6 +220,7 @@ def stranger_configs(folders: dict[str, Path], elsewhere: Path) -> dict[str, dic
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.parametrize("who", ["no certificate", "another authority's certificate", "plain TCP"])
 async def test_a_stranger_reads_nothing_and_writes_nothing(folders: dict[str, Path], tmp_path: Path, who: str) -> None:
     configs = secure_configs(folders)
@@ -219,6 +250,7 @@ async def test_a_stranger_reads_nothing_and_writes_nothing(folders: dict[str, Pa
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path]) -> None:
     """r3, rightly certified, turns rogue: it leaves its own rules away and writes as r2."""
     configs = secure_configs(folders)
@@ -241,12 +273,14 @@ async def test_a_member_writes_under_its_own_name_only(folders: dict[str, Path])
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_a_fetch_from_a_robot_without_a_link_says_no_answer(folders: dict[str, Path]) -> None:
     async with Listener("r1", secure_configs(folders)["r1"]).transport as transport:
         assert await transport.fetch_latent("r2", "r2/0", 10.0) == FetchFailed(FetchProblem.NO_ANSWER)
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 async def test_only_operators_are_answered(folders: dict[str, Path]) -> None:
     configs = secure_configs(folders)
     one = Listener("r1", configs["r1"])

@@ -126,6 +126,7 @@ def test_the_secure_variant_gives_each_container_its_own_keys_and_nothing_else(t
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 @pytest.mark.parametrize("is_secure", [False, True], ids=["plain", "secure"])
 def test_the_containers_commands_start_agents_that_hear_each_other(tmp_path: Path, is_secure: bool) -> None:

@@ -76,6 +76,7 @@ def test_systemd_finds_it_little_exposed(local_unit: Path) -> None:
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 def test_what_it_starts_hands_over_and_ends_on_sigterm(tmp_path: Path) -> None:
     config = tmp_path / "agent.toml"

@@ -68,10 +68,10 @@ def test_under_loss_repetition_and_deaths_every_byte_is_received_lost_or_under_w
     links = swarm.network.links
     for end_s in (9.0, 15.0, 40.0):
         swarm.run_until(end_s)
-        for link, sent in links.sent.items():
-            assert sent + links.repeated[link] == links.received[link] + links.lost[link] + links.under_way[link]
-    assert sum(links.lost.values()) > 0
-    assert sum(links.repeated.values()) > 0
+        for each in links.counts.values():
+            assert each.sent + each.repeated == each.received + each.lost + each.under_way
+    assert sum(each.lost for each in links.counts.values()) > 0
+    assert sum(each.repeated for each in links.counts.values()) > 0
 
 
 def test_lost_and_repeated_bytes_stand_apart(tmp_path: Path) -> None:

@@ -320,3 +320,58 @@ def test_toml_with_a_mark_is_read_and_what_is_no_file_is_refused(tmp_path: Path)
     (tmp_path / "endless.yaml").symlink_to("/dev/zero")
     with pytest.raises(DatasetError, match="is not a file"):
         read_lens(tmp_path / "endless.yaml")
+
+
+REALSENSE = (
+    '{"width": 160, "height": 120, "ppx": 80.0, "ppy": 60.0, "fx": 150.5, "fy": 151.5, "model": "distortion.%s", '
+)
+REALSENSE += '"coeffs": %s}'
+
+
+def test_realsenses_other_models_are_a_pinhole_only_with_zeros(tmp_path: Path) -> None:
+    zeros = read(tmp_path, REALSENSE % ("inverse_brown_conrady", "[0.0, 0.0, 0.0, 0.0, 0.0]"), "rs.json")
+    assert zeros.camera == CameraModel(160, 120, 150.5, 151.5, 80.0, 60.0)
+    brown = read(tmp_path, REALSENSE % ("brown_conrady", "[-0.3, 0.1, 0.001, -0.002, 0.0]"), "rs.json")
+    assert brown.camera == PINHOLE
+    with pytest.raises(DatasetError, match="with other numbers than zeros"):
+        read(tmp_path, REALSENSE % ("inverse_brown_conrady", "[-0.3, 0.1, 0.001, -0.002, 0.0]"), "rs.json")
+
+
+def test_zeds_distortion_in_a_section_of_its_own_is_used(tmp_path: Path) -> None:
+    conf = "[LEFT_CAM_VGA]\nfx=350.5\nfy=351.5\ncx=336.5\ncy=188.5\n\n"
+    conf += "[LEFT_DISTO]\nk1=-0.17\nk2=0.02\np1=0.001\np2=0.002\n"
+    camera = read(tmp_path, conf, "SN1.conf", (672, 376)).camera
+    assert camera == CameraModel(672, 376, 350.5, 351.5, 336.5, 188.5, (-0.17, 0.02, 0.001, 0.002))
+    with pytest.raises(DatasetError, match="LEFT_CAM_VGA and LEFT_DISTO give k1 twice"):
+        read(tmp_path, conf.replace("cy=188.5", "cy=188.5\nk1=0.1"), "SN1.conf", (672, 376))
+    with pytest.raises(DatasetError, match="the section 'LEFT_FISHEYE' is not understood"):
+        read(tmp_path, conf.replace("LEFT_DISTO", "LEFT_FISHEYE"), "SN1.conf", (672, 376))
+
+
+def test_four_coefficients_of_a_stereo_pair_may_be_a_fisheyes(tmp_path: Path) -> None:
+    pair = f"%YAML:1.0\n---\nK1: {K}\nD1: [0.1, 0.02, 0.001, 0.002]\nK2: {K}\nD2: [0.1, 0.02, 0.001, 0.002]\n"
+    with pytest.raises(DatasetError, match="nothing says whether the four numbers of D1 are of a fisheye"):
+        read(tmp_path, pair, "stereo.yml", (160, 120))
+    five = read(tmp_path, pair.replace("0.002]", "0.002, 0.0]"), "stereo.yml#left", (160, 120)).camera
+    assert five.distortion[:4] == (0.1, 0.02, 0.001, 0.002)
+
+
+def test_the_unified_model_is_the_extended_one_with_one(tmp_path: Path) -> None:
+    text = (
+        '{"value0": {"T_imu_cam": [{"px": 0, "py": 0, "pz": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1}], "intrinsics": '
+        '[{"camera_type": "ucm", "intrinsics": {"fx": 120.0, "fy": 121.0, "cx": 80.0, "cy": 60.0, "alpha": 0.6}}], '
+        '"resolution": [[160, 120]]}}'
+    )
+    wanted = CameraModel(160, 120, 120.0, 121.0, 80.0, 60.0, (), LensKind.EUCM, (0.6, 1.0))
+    assert read(tmp_path, text, "calib.json").camera == wanted
+
+
+def test_a_fisheye_in_rtabmaps_six_numbers_has_four(tmp_path: Path) -> None:
+    text = (
+        "image_width: 160\nimage_height: 120\ndistortion_model: fisheye\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {K}\n"
+        "distortion_coefficients:\n  rows: 1\n  cols: 6\n  data: [0.1, 0.02, 0.0, 0.0, 0.001, 0.002]\n"
+    )
+    assert read(tmp_path, text).camera.distortion == (0.1, 0.02, 0.001, 0.002)
+    with pytest.raises(DatasetError, match="has 4 coefficients, but there are 6"):
+        read(tmp_path, text.replace("0.02, 0.0, 0.0", "0.02, 0.3, 0.0"))

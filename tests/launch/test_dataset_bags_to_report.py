@@ -16,7 +16,7 @@ from flocc_launch.swarm.launching import launch
 from flocc_launch.world.generate import generate
 from flocc_launch.world.spec import WorldSpec
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow, pytest.mark.timeout(600)]
 
 ROBOTS = 3
 

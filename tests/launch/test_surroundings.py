@@ -34,7 +34,7 @@ from flocc_launch.setup import cache
 from flocc_launch.setup.cache import CacheError, cache_folder
 from flocc_launch.setup.world_faults import sentence_of
 from flocc_launch.swarm import agent_process
-from flocc_launch.swarm.agent_process import RETRY_S, Lines
+from flocc_launch.swarm.agent_process import LOOK_PERIOD_S, RETRY_S, Lines
 from flocc_protocol.errors import FloccError
 
 
@@ -165,6 +165,19 @@ def test_events_are_written_again_once_there_is_room(tmp_path: Path, caplog: pyt
     lines.close()
     assert [json.loads(line)["t"] for line in path.read_text().splitlines()] == [3 * RETRY_S, 3 * RETRY_S + 1.0]
     assert "events are written again; 4 were lost" in caplog.text
+
+
+def test_events_go_to_a_new_file_when_the_old_one_was_rotated_away(tmp_path: Path) -> None:
+    now_s, path = [0.0], tmp_path / "events.jsonl"
+    lines = Lines(path, lambda: now_s[0])
+    for t, rotates in ((0.0, True), (LOOK_PERIOD_S / 2, False), (LOOK_PERIOD_S, False), (LOOK_PERIOD_S + 1.0, False)):
+        now_s[0] = t
+        lines.write(Reported(t, "r1", AgentStopped()))
+        if rotates:
+            path.rename(tmp_path / "events.jsonl.1")
+    lines.close()
+    assert [json.loads(line)["t"] for line in path.read_text().splitlines()] == [LOOK_PERIOD_S, LOOK_PERIOD_S + 1.0]
+    assert len((tmp_path / "events.jsonl.1").read_text().splitlines()) == 2
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.latents import Latents
+from flocc_agent.core.log_copy import EncodedRecords
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.offers import Offers
@@ -144,7 +145,7 @@ def test_a_disk_that_forgets_what_was_published_is_noticed(monkeypatch: pytest.M
 
     def forgetful(self: Disk) -> Restored:
         for log, records in self.records.items():
-            self.records[log] = records[:-1]
+            self.records[log] = EncodedRecords(records[:-1])
         return original(self)
 
     monkeypatch.setattr(Disk, "restored", forgetful)

@@ -22,7 +22,7 @@ def write(robots: Robots, name: str, record: Record) -> None:
 
 
 def logs(robot: Robot) -> dict[str, tuple[int, int]]:
-    return {str(log): (len(copy), copy.checksums[-1]) for log, copy in robot.gossip.logs.items()}
+    return {str(log): (len(copy), copy.checksum) for log, copy in robot.gossip.logs.items()}
 
 
 def closures(robot: Robot) -> int:

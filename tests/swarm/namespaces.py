@@ -75,6 +75,17 @@ class Host:
         """Bring it back."""
         run("ip", "link", "set", self._port, "up")
 
+    def lose_address(self) -> None:
+        """Switch the interface off and take its address, as where Wi-Fi is not there yet."""
+        run(*self.prefix, "ip", "address", "flush", "dev", INTERFACE)
+        run(*self.prefix, "ip", "link", "set", INTERFACE, "down")
+
+    def get_address(self, number: int) -> None:
+        """Switch the interface on, with an address of the bridge's network."""
+        self.address = f"{SUBNET}.{number}"
+        run(*self.prefix, "ip", "link", "set", INTERFACE, "up")
+        run(*self.prefix, "ip", "address", "add", f"{self.address}/24", "dev", INTERFACE)
+
     def lose(self, probability: float) -> None:
         """Lose this share of the packets that come in."""
         match = ("-m", "statistic", "--mode", "random", "--probability", str(probability))

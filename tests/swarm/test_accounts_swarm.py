@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.swarm.launching import Watch, launch
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
 LATENT_BYTES = 400_000

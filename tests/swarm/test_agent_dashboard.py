@@ -38,6 +38,7 @@ def is_merged(state: dict[str, Any]) -> bool:
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 def test_one_agent_shows_every_robot_of_its_swarm(tmp_path: Path) -> None:
     scenario = read_shipped("heterogeneous")

@@ -8,7 +8,7 @@ import pytest
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.swarm.launching import launch
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 
 def test_three_processes_optimise_together_over_a_lossy_link(

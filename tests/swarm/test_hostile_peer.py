@@ -22,7 +22,7 @@ from flocc_agent.runtime.zenoh_session import Plane, open_session, session_setti
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.messages import MESSAGE_KINDS
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 MESSAGES = int(os.environ.get("FLOCC_FUZZ_MESSAGES", "40000"))
 SEED = 20261122

@@ -9,7 +9,7 @@ import pytest
 from tests.agent.runtime.loopback import loopback_configs
 from tests.swarm.robots import RobotProcess, agent_configs, logs_equal, reached
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 KILLS = 4
 SEED = 20261122

@@ -14,7 +14,7 @@ from flocc_launch.report.model import RunReport
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.swarm.launching import Watch, launch
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)
@@ -94,6 +94,16 @@ def test_a_robot_comes_back_from_its_disk_with_its_numbering(tmp_path: Path) -> 
     assert [keyframe["index"] for keyframe in keyframes] == list(range(len(keyframes)))
     assert known["r2"]["incarnation"] == 0
     assert known["r1"]["logs"] == known["r2"]["logs"]
+
+
+def test_a_robot_that_is_killed_before_it_says_anything_is_no_failure_to_start(tmp_path: Path) -> None:
+    faults = [
+        Fault(at_s=0.1, kind=FaultKind.KILL, robots=("r2",)),
+        Fault(at_s=0.5, kind=FaultKind.RESTART, robots=("r2",)),
+    ]
+    tracks = {"robots": 2, "seed": 3, "area_m": 6.0, "length_m": 10.0}
+    report = launch(meeting(faults=faults, settle_s=1.0, tracks=tracks), tmp_path / "run")
+    assert {robot.robot: robot.end for robot in report.robot_details} == {"r1": "stopped", "r2": "stopped"}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=["ctrl-c", "closed terminal"])

@@ -14,7 +14,7 @@ from flocc_launch.scenarios.scenario import Fault, FaultKind
 from flocc_launch.swarm.launching import launch
 from flocc_protocol.ids import LogId
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 
 def test_a_launched_team_comes_back_to_its_map_also_after_a_kill(

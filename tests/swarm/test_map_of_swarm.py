@@ -12,7 +12,7 @@ from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_launch.swarm.harvest import HarvestFailed, save_swarm
 
-pytestmark = pytest.mark.swarm
+pytestmark = [pytest.mark.swarm, pytest.mark.beside]
 
 
 def config(name: str, swarm: str) -> AgentConfig:

@@ -18,7 +18,7 @@ from flocc_launch.swarm.launching import launch
 
 torch = pytest.importorskip("torch", reason="needs the extra flocc[mast3r]")
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
 FRAMES = 5

@@ -15,7 +15,7 @@ from flocc_agent.core.measurements import Measurement, RobotSighting, TagSightin
 from flocc_agent.geometry import Float, inverse, pose, so3_exp
 from flocc_agent.perception.synthetic import pose_image
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 KEYFRAMES = 8
 TIGHT = 1e-4 * np.eye(6)

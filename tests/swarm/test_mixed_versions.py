@@ -22,7 +22,7 @@ from flocc_protocol.ids import LogId
 from flocc_protocol.messages import PROTOCOL_VERSION, decode
 from flocc_protocol.records import UnknownRecord
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
 KEYFRAMES = 12

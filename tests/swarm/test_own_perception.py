@@ -15,7 +15,7 @@ from flocc_launch.world.spec import WorldSpec
 
 EXAMPLE = Path(__file__).parents[2] / "examples/own_perception/orb_eyes.py"
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

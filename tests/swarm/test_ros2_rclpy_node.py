@@ -123,7 +123,7 @@ def written() -> dict[str, Any]:
     """Each message that flocc writes, with something in every field."""
     outgoing = Outgoing(TYPES, "map", "r1/odom")
     return {
-        types.TF: outgoing.transform(T, 1_234_567_890_123_456_789),
+        types.TF: outgoing.transforms(T, T, 1_234_567_890_123_456_789),
         types.PATH: outgoing.path(np.stack([T, np.eye(4)]), [10**9, 2 * 10**9 + 7], 2 * 10**9 + 7),
         types.POSE: outgoing.pose(T, np.diag([1.0, 2, 3, 4, 5, 6]), T, 5 * 10**9),
         types.MARKERS: markers(),
@@ -321,5 +321,5 @@ def test_a_package_that_is_not_there_is_noted_and_the_rest_goes_on(monkeypatch: 
     monkeypatch.setitem(sys.modules, "tf2_msgs", None)
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
     with opened() as node:
-        node.publisher("/tf", types.TF, Qos(100)).put(Outgoing(TYPES, "map", "odom").transform(T, 0))
+        node.publisher("/tf", types.TF, Qos(100)).put(Outgoing(TYPES, "map", "odom").transforms(T, None, 0))
         assert node.notes == ["this ROS has no tf2_msgs, so /tf is not published: apt install ros-$ROS_DISTRO-tf2-msgs"]

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from tests.agent.runtime.loopback import free_ports, until
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 CONFIG = """

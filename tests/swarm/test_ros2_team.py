@@ -21,12 +21,13 @@ from flocc_agent.runtime.recording import Frame, Recording
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Scenario
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 NAMES = ("r1", "r2")
 RATE = 4.0
 EPOCH_NS = 1_700_000_000 * 10**9
 TIMEOUT_S = 60.0
+STANDING_PERIOD_S = 0.1
 ERROR_MAX_M = 0.5
 IMAGE, INFO, ODOMETRY = "/camera/image_raw", "/camera/camera_info", "/odom"
 
@@ -38,6 +39,7 @@ class Robot:
         self.node = node
         self.recording = recording
         self.played = 0
+        self._placed_s = 0.0
         node.advertise(ODOMETRY, "nav_msgs/msg/Odometry")
         node.advertise(IMAGE, "sensor_msgs/msg/Image")
         node.advertise(INFO, "sensor_msgs/msg/CameraInfo")
@@ -45,11 +47,15 @@ class Robot:
         node.subscribe("/flocc/map_frame", "std_msgs/msg/String", latched=True)
 
     def play(self, elapsed_s: float) -> None:
-        """Publish the frames that are due."""
+        """Publish the frames that are due; a robot whose recording is over stands, and its odometry goes on."""
         frames = self.recording.frames
         while self.played < len(frames) and frames[self.played].stamp_s - frames[0].stamp_s <= elapsed_s * RATE:
             self._publish(frames[self.played])
             self.played += 1
+            self._placed_s = elapsed_s
+        if self.played == len(frames) and elapsed_s > self._placed_s + STANDING_PERIOD_S:
+            self._placed_s = elapsed_s
+            self._place(frames[-1].T_odom_body, frames[0].stamp_s + elapsed_s * RATE)
 
     def _publish(self, frame: Frame) -> None:
         stamp = divmod(EPOCH_NS + round(frame.stamp_s * 1e9), 10**9)
@@ -60,7 +66,11 @@ class Robot:
         self.node.publish(INFO, cdr_by_hand.camera_info(stamp, "optical", size, K, [0.0] * 5, P))
         payload = cdr_by_hand.image(stamp, "optical", size, "rgb8", image.pixels.tobytes(), 3 * width)
         self.node.publish(IMAGE, payload)
-        position, quaternion = position_and_quaternion(frame.T_odom_body)
+        self._place(frame.T_odom_body, frame.stamp_s)
+
+    def _place(self, T_odom_body: Float, stamp_s: float) -> None:
+        stamp = divmod(EPOCH_NS + round(stamp_s * 1e9), 10**9)
+        position, quaternion = position_and_quaternion(T_odom_body)
         self.node.publish(ODOMETRY, cdr_by_hand.odometry(Stamped(stamp, "odom", "base_link", position, quaternion)))
 
     def T_map_odom(self) -> Float | None:

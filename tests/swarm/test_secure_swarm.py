@@ -15,7 +15,7 @@ from flocc_launch.setup.credentials import make_keys
 from flocc_protocol.ids import LogId
 from flocc_protocol.records import decode_record
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
 

@@ -11,7 +11,7 @@ from flocc_agent.core.measurement_text import KINDS
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.swarm.launching import launch
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)

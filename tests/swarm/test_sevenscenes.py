@@ -28,6 +28,7 @@ def scenario(shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> S
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize("radio", [{}, {"loss_ratio": 0.3, "latency_s": 0.1}], ids=["clear", "lossy"])

@@ -28,6 +28,8 @@ ITERATIVE_POSES_MIN = 10_000
 """From so many poses on they are so with few loops, too (`flocc bench solver --keyframes 20000 --closures 2000`)."""
 DISSECTED_POSES_MIN = 10_000
 """From so many poses on, nested dissection gives the order of elimination."""
+DISSECTED_LOOPS_MIN = 2500
+"""With so many factors beyond a tree it does so however few the poses, which are chains then."""
 MARGINALS_ELIMINATED_POSES_MAX = 50_000
 """Above, elimination for the sake of covariances would take most of a gigabyte."""
 TOLERANCE_RATIO = 4e-3
@@ -263,7 +265,7 @@ def ordering(graph: gtsam.GaussianFactorGraph, poses: int) -> gtsam.Ordering:
     Nested dissection (METIS) takes longer to find, and makes a flat tree: at 100,000 poses four covariances take 0.1 s
     in it, and 15 s in that of COLAMD.
     """
-    if poses < DISSECTED_POSES_MIN:
+    if poses < DISSECTED_POSES_MIN and graph.size() - poses < DISSECTED_LOOPS_MIN:
         return gtsam.Ordering.ColamdGaussianFactorGraph(graph)
     return gtsam.Ordering.MetisGaussianFactorGraph(graph)
 

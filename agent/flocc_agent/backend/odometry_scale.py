@@ -35,8 +35,8 @@ BIAS_RATIO = 0.005
 ASKED_CLOSURES_MAX = 2500
 """Of more closures so many, evenly chosen, are asked for the scales."""
 ROUNDS_MAX = 3
-ASKED_EVERY_ROUND_POSES_MAX = 5000
-"""In a larger graph, rounds that confirm the one before them do not estimate anew."""
+ASKED_EVERY_ROUND_EDGES_MAX = 5000
+"""With more edges, rounds that confirm the one before them do not estimate anew."""
 ASKED_POSES_MAX = 50_000
 """A still larger graph is not asked at all: everything but the scales is eliminated for it."""
 SCALE_MIN = 0.1
@@ -107,14 +107,14 @@ def solve_with_scales(posed: Posed, initial: GraphSolution | None, anew: PosedAn
     begun = posed.with_scaled(scales_before(posed, initial))
     solved = solve(begun.objective, begun.start, begun.trusted, begun.places)
     told = told_before(posed, initial) if begun.is_confirmed(solved) else None
-    if told is not None and posed.problem.poses > ASKED_EVERY_ROUND_POSES_MAX:
+    if told is not None and len(posed.problem.edges) > ASKED_EVERY_ROUND_EDGES_MAX:
         return SolvedWithScales(begun, solved, told)
     found = settled(begun, solved)
     if not is_worth_another(found):
         return found
     free = posed.with_scaled(dict.fromkeys(scalable(posed), 1.0))
     found = lower(found, settled(free, solve_once(free.objective, free.start, free.places)))
-    applied = applied_at(found.posed, found.solved.state)
+    applied = found.posed.problem.scales_applied(found.solved.state)
     if not applied or set(applied) == set(begun.problem.scaled):
         return found
     aligned = anew(applied).with_scaled(applied)
@@ -190,7 +190,7 @@ def estimated(posed: Posed, solved: Solved) -> Estimates:
     problem, rows = posed.problem, posed.problem.closure_rows
     if problem.poses > ASKED_POSES_MAX:
         return Estimates()
-    now = dict.fromkeys(scalable(posed), 1.0) | applied_at(posed, solved.state)
+    now = dict.fromkeys(scalable(posed), 1.0) | problem.scales_applied(solved.state)
     free = replace(posed, start=solved.state).with_scaled(now)
     weights, edges = asked(solved.weights, rows), free.problem.edges
     at = residuals(edges, free.start)
@@ -225,11 +225,6 @@ def free_lengths(posed: Posed) -> NDArray[np.bool_]:
     """Whether each closure (L,) has a scale of its own or of its cluster."""
     edges, rows = posed.problem.edges, posed.problem.closure_rows
     return np.asarray((edges.sigma[rows] > 0) | (edges.cluster[rows] >= 0))
-
-
-def applied_at(posed: Posed, state: State) -> dict[LogId, float]:
-    """Scales of odometry at a state."""
-    return dict(zip(posed.problem.scaled, state.scale[posed.problem.clusters :].tolist(), strict=True))
 
 
 def asked(weights: Float, closures: slice) -> Float:

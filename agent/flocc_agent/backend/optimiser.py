@@ -9,20 +9,21 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from flocc_agent.backend.alarms import held_closures
+from flocc_agent.backend.chains import STRAIN_RATIO_MAX, Chains, chains_of
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import component_with, initial_poses
+from flocc_agent.backend.initial import Aligned, component_with, initial_poses
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
-from flocc_agent.backend.odometry_scale import solve_with_scales
+from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scales
 from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
+from flocc_agent.backend.solvers import continued
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import (
     ClosureState,
@@ -184,13 +185,6 @@ def summed_timings(outcomes: Sequence[SolvedLogs]) -> dict[str, float]:
     return {name: sum(outcome.timings_s.get(name, 0.0) for outcome in outcomes) for name in names}
 
 
-def _posed_anew(kept: Filtered, config: BackendConfig, scales: Mapping[LogId, float]) -> Posed:
-    """The component, begun with the ways of logs made longer or shorter."""
-    longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
-    aligned = initial_poses(longer, kept.left, config.steepness, None)
-    return posed(kept.trajectories, kept.left, aligned, config, None)
-
-
 def _solve_connected(
     kept: Filtered, config: BackendConfig, initial: GraphSolution | None, wanted: Sequence[KeyframeId]
 ) -> SolvedLogs:
@@ -198,18 +192,69 @@ def _solve_connected(
     times = [time.perf_counter()]
     aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
     times.append(time.perf_counter())
-    begun = posed(kept.trajectories, kept.left, aligned, config, initial)
-    found = solve_with_scales(begun, initial, partial(_posed_anew, kept, config))
-    solved = found.solved
+    chains = chains_of(kept.trajectories, kept.left, wanted, config)
+    found = _solve_aligned(kept, chains, aligned, config, initial)
+    if chains is not None and not _is_explained(chains, found):
+        found = _solve_all(kept, chains, found, config)
+        chains = None
+    solved, at = found.solved, found.posed
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
         raise SingularSystem("the solution is not finite")
     times.append(time.perf_counter())
-    at = found.posed
     earlier = component_with(kept.trajectories, initial) if at.is_confirmed(solved) else None
+    trajectories, closures = (kept if chains is None else chains).trajectories, at.places.closures
     solution = Solution(
-        at.problem, at.objective, at.start, solved, kept.trajectories, kept.left, earlier, found.odometry_scales
+        at.problem,
+        at.objective,
+        at.start,
+        solved,
+        trajectories,
+        closures,
+        earlier,
+        found.odometry_scales,
+        chains,
     )
     outcome = collect(solution, wanted)
     times.append(time.perf_counter())
     spans_s = np.diff(times).tolist()
     return replace(outcome, timings_s=dict(zip(("alignment", "solver", "results"), spans_s, strict=True)))
+
+
+def _solve_aligned(
+    kept: Filtered, chains: Chains | None, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None
+) -> SolvedWithScales:
+    """Solve an aligned component, with all its keyframes or by its chains."""
+    if chains is None:
+        begun = posed(kept.trajectories, kept.left, aligned, config, initial)
+    else:
+        shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
+        begun = posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded)
+
+    def anew(scales: Mapping[LogId, float]) -> Posed:
+        """The component, begun with the ways of logs made longer or shorter."""
+        longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
+        again = initial_poses(longer, kept.left, config.steepness, None)
+        if chains is None:
+            return posed(kept.trajectories, kept.left, again, config, None)
+        shorter = Aligned(chains.shortened(again.T_map_keyframe), again.is_warm)
+        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded)
+
+    return solve_with_scales(begun, initial, anew)
+
+
+def _is_explained(chains: Chains, found: SolvedWithScales) -> bool:
+    """Whether chains say what odometry of all their keyframes would say."""
+    problem, solved = found.posed.problem, found.solved
+    strain = chains.strain(problem.by_log(solved.state.poses()), problem.scales_applied(solved.state))
+    return bool(np.isfinite(strain)) and abs(strain) <= STRAIN_RATIO_MAX * max(solved.cost, 1.0)
+
+
+def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: BackendConfig) -> SolvedWithScales:
+    """Go on from where the chains' solution has all keyframes, with all of odometry and the same closures."""
+    problem, state = found.posed.problem, found.solved.state
+    scales = problem.scales_applied(state)
+    T = chains.lengthened(problem.by_log(state.poses()), scales)
+    whole = posed(kept.trajectories, kept.left, Aligned(T, False), config, None).with_scaled(scales)
+    start = replace(whole.start, scale=state.scale)
+    whole = replace(whole, start=start, trusted=found.posed.trusted)
+    return replace(found, posed=whole, solved=continued(whole.objective, start))

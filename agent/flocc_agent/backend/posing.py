@@ -68,10 +68,14 @@ def posed(
     aligned: Aligned,
     config: BackendConfig,
     initial: GraphSolution | None,
+    recorded: Mapping[int, LoopClosure] | None = None,
 ) -> Posed:
-    """The problem of aligned logs and the closures that are left, with all odometry taken as true."""
-    problem = build(trajectories, closures, config)
-    in_order = [closures[k] for k in problem.closure_ids]
+    """The problem of aligned logs and the closures that are left, with all odometry taken as true.
+
+    Where the closures' keyframes are named by their places in chains, `recorded` has them under their own numbers.
+    """
+    problem = build(trajectories, closures, config, recorded)
+    in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     says = votes(in_order, config.cluster_keyframes_max)
     aligned_state = state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters)

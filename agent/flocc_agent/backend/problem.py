@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import cluster_labels
-from flocc_agent.backend.edges import NO_CLUSTER, Edges
+from flocc_agent.backend.edges import NO_CLUSTER, Edges, State
 from flocc_agent.config import BackendConfig, Formulation, ScaleInitial
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.core.registration import closure_probability
@@ -53,6 +53,15 @@ class Problem:
         """Index of a keyframe's pose."""
         return self.offsets[keyframe.log] + keyframe.index
 
+    def by_log(self, values: Float) -> dict[LogId, Float]:
+        """What there is one of for each pose (N, ...), apart for each log."""
+        ends = [*list(self.offsets.values())[1:], self.poses]
+        return {log: values[begin:end] for (log, begin), end in zip(self.offsets.items(), ends, strict=True)}
+
+    def scales_applied(self, state: State) -> dict[LogId, float]:
+        """Scales of odometry at a state."""
+        return dict(zip(self.scaled, state.scale[self.clusters :].tolist(), strict=True))
+
     def with_scaled(self, logs: Collection[LogId]) -> "Problem":
         """The same with a scale (true over measured length) for the odometry of these logs and no others."""
         scaled = tuple(log for log in self.logs if log in logs)
@@ -67,6 +76,7 @@ def build(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
     config: BackendConfig,
+    recorded: Mapping[int, LoopClosure] | None = None,
 ) -> Problem:
     """Turn a component into arrays.
 
@@ -74,6 +84,8 @@ def build(
         trajectories: Usable odometry of the component's logs.
         closures: Usable closures between them, by their index in the graph.
         config: The formulation, the noise model and the scale priors.
+        recorded: The same closures under their keyframes' own numbers, where those above are places in chains: what is
+            near to what is asked of these.
     """
     logs = tuple(sorted(trajectories))
     lengths = [len(trajectories[log]) for log in logs]
@@ -83,7 +95,8 @@ def build(
     used = [closures[k] for k in ids]
     scale_initial = np.array([initial_scale(closures[k], config) for k in ids])
     odometry = [odometry_edges(trajectories[log], offsets[log], config) for log in logs]
-    closure_part, clusters = closure_edges(used, offsets, scale_initial, config)
+    near = used if recorded is None else [recorded[k] for k in ids]
+    closure_part, clusters = closure_edges(used, offsets, scale_initial, config, near)
     parts = [*odometry, closure_part]
     first = sum(len(part) for part in odometry)
     rows = slice(first, first + len(used))
@@ -136,7 +149,11 @@ def initial_scale(closure: LoopClosure, config: BackendConfig) -> float:
 
 
 def closure_edges(
-    closures: Sequence[LoopClosure], offsets: Mapping[LogId, int], scale_initial: Float, config: BackendConfig
+    closures: Sequence[LoopClosure],
+    offsets: Mapping[LogId, int],
+    scale_initial: Float,
+    config: BackendConfig,
+    recorded: Sequence[LoopClosure] | None = None,
 ) -> tuple[Edges, int]:
     """Edges of loop closures with their scale model, and the number of cluster scales."""
     if not closures:
@@ -149,7 +166,7 @@ def closure_edges(
     T_hat[:, :3, 3] *= scale_initial[:, None]
     metric = plain_edges(i, j, T_hat, np.zeros((len(i), 6, 6)))
     covariances = closure_covariances(closures, scale_initial, config)
-    labels, sigma, clusters = scale_model(closures, config)
+    labels, sigma, clusters = scale_model(recorded or closures, config)
     L = sqrt_informations(covariances)
     wide = sqrt_informations(covariances + sigma[:, None, None] ** 2 * metric.d[:, :, None] * metric.d[:, None, :])
     return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels), clusters

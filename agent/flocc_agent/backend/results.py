@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from flocc_agent.backend.chains import Chains
 from flocc_agent.backend.covariance import covariances_of, kept_covariances
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, residuals, scales_at
@@ -33,7 +34,8 @@ class SolvedLogs:
 class Solution:
     """A solved component, still in arrays, with where it started and what it was made of.
 
-    `earlier` is the component of the round before, where all of its closures stand.
+    `earlier` is the component of the round before, where all of its closures stand; `chains` are what its odometry
+    was shortened to, where it was.
     """
 
     problem: Problem
@@ -44,6 +46,12 @@ class Solution:
     closures: Mapping[int, LoopClosure]
     earlier: Component | None = None
     odometry_scales: Mapping[LogId, OdometryScale] = field(default_factory=dict)
+    chains: Chains | None = None
+
+    @property
+    def recorded(self) -> Mapping[int, LoopClosure]:
+        """The closures under their keyframes' own numbers."""
+        return self.closures if self.chains is None else self.chains.recorded
 
 
 def excluded(closure: LoopClosure, reason: str) -> ClosureResult:
@@ -66,7 +74,7 @@ def collect(solution: Solution, wanted: Sequence[KeyframeId]) -> SolvedLogs:
     """Component, closure results and warnings of a solved component; covariances where they are wanted."""
     results = closure_results(solution)
     component = _component(solution, wanted)
-    warnings = scale_warnings(solution.problem, solution.solved, solution.closures)
+    warnings = scale_warnings(solution.problem, solution.solved, solution.recorded)
     warnings = (*warnings, *odometry_warnings(solution.odometry_scales), *_ties(solution, results))
     if not solution.solved.converged:
         warnings = (*warnings, f"{component.map_frame}: the solver stopped before it converged")
@@ -96,7 +104,7 @@ def closure_results(solution: Solution) -> dict[int, ClosureResult]:
     rejects = solution.objective.config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
     results = {}
     for n, k in enumerate(problem.closure_ids):
-        closure, weight = solution.closures[k], float(solved.weights[rows][n])
+        closure, weight = solution.recorded[k], float(solved.weights[rows][n])
         used = weight >= ACCEPTED_WEIGHT_MIN or not rejects
         results[k] = ClosureResult(
             query=closure.query,
@@ -113,6 +121,8 @@ def closure_results(solution: Solution) -> dict[int, ClosureResult]:
 def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
     """The component in the frame of its anchor, whose first keyframe lies at its odometry pose."""
     problem, trajectories, objective = solution.problem, solution.trajectories, solution.objective
+    chains = solution.chains
+    places = wanted if chains is None else [chains.place(keyframe) for keyframe in wanted]
     T_all = solution.solved.state.poses()
     anchor = problem.logs[0]
     T_map_all = trajectories[anchor].T_odom_keyframe[0] @ inverse(T_all[0])
@@ -122,10 +132,10 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
     }
     kept = kept_covariances(objective, problem, solution.earlier, wanted)
     if kept is None:
-        of_logs, of_keyframes = covariances_of(problem, objective, solution.solved, trajectories, wanted)
+        of_logs, of_keyframes = covariances_of(problem, objective, solution.solved, trajectories, places)
     else:
         of_logs, of_keyframes = dict(kept), {}
-    return Component(
+    component = Component(
         logs=problem.logs,
         T_map_keyframe=T_map_keyframe,
         T_map_odom={log: _T_map_odom(T_map_keyframe[log], trajectories[log]) for log in problem.logs},
@@ -136,6 +146,9 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         covariance_rounds=0 if kept is None or solution.earlier is None else solution.earlier.covariance_rounds + 1,
         odometry_scales=solution.odometry_scales,
     )
+    if chains is None:
+        return component
+    return chains.whole_component(component, problem.scales_applied(solution.solved.state))
 
 
 def _T_map_odom(T_map_keyframe: Float, trajectory: Trajectory) -> Float:

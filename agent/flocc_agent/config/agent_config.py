@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, PlainSerializer, model_validator
 
 from flocc_agent.config.backend import BackendConfig, BackendMode
 from flocc_agent.config.emulated_radio import RadioConfig
-from flocc_agent.config.network import MetricsConfig, TransportConfig
+from flocc_agent.config.network import UNNAMED_SWARM, MetricsConfig, TransportConfig
 from flocc_agent.config.perception import PerceptionConfig
 from flocc_agent.config.ros2 import Ros2Config
 from flocc_agent.config.section import (
@@ -75,8 +75,8 @@ class AgentConfig(Section):
 
     name: Annotated[str, AfterValidator(checked_name)]
     """Name of the robot, unique in its swarm: 1 to 32 of a-z, 0-9, '-' and '_'."""
-    swarm: Annotated[str, AfterValidator(checked_name)] = "swarm"
-    """Name of the swarm; robots of different swarms ignore each other."""
+    swarm: Annotated[str, AfterValidator(checked_name)] = UNNAMED_SWARM
+    """Name of the swarm; robots of different swarms ignore each other. Without a name none is found by multicast."""
     compute_class: int = Field(0, ge=0, le=9)
     """0: small robot, 9: server with a GPU; the highest leads and registers for the others."""
     incarnation: int | None = Field(None, ge=0)

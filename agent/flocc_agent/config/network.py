@@ -42,6 +42,10 @@ def checked_group(text: str) -> str:
     return text
 
 
+UNNAMED_SWARM = "swarm"
+"""What a swarm is called that nobody gave a name."""
+
+
 class PeerEndpoints(Section):
     """Where one known robot listens."""
 
@@ -70,7 +74,7 @@ class TransportConfig(Section):
     roster: dict[str, PeerEndpoints] = Field(default_factory=dict)
     """Known robots by name. Of each pair the higher name dials, for ever, also after a partition."""
     multicast: bool = True
-    """Find robots of the same network by multicast; needs no roster, but many Wi-Fi access points drop it."""
+    """Find robots of the same network by multicast, once `swarm` has a name; many Wi-Fi access points drop it."""
     multicast_address: Annotated[str, AfterValidator(checked_group)] = "224.0.0.224:7446"
     """Group and port for finding control sessions, bulk is at the next port; swarms on one network may differ."""
     interface: str = "auto"
@@ -99,6 +103,13 @@ class TransportConfig(Section):
     """Mutual TLS and one writer per key; None is for trusted networks and emulation."""
     chaos: bool = False
     """Take orders of `flocc chaos`: partitions, loss, kills. For tests; without tls anybody in reach may order."""
+
+    def scouts(self, swarm: str) -> bool:
+        """Whether others are looked for by multicast: two teams that nobody named must not become one.
+
+        With keys they cannot.
+        """
+        return self.multicast and (swarm != UNNAMED_SWARM or self.tls is not None)
 
     def multicast_group(self, control: bool) -> str:
         """Where control sessions, or bulk sessions, find each other."""

@@ -1,11 +1,13 @@
 """Pose-graph assembly: from the records of all logs to the graph that the leader optimises.
 
-Every robot takes in every record, and only a leader asks for the graph: records are kept as they are, and become
-matrices when somebody wants them.
+Every robot takes in every record, and only a leader asks for the graph: odometry is kept as columns of numbers, of
+closures it is kept where their records stand, and both become matrices when somebody wants them.
 """
 
-from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain, islice
 from typing import assert_never
 
 import numpy as np
@@ -13,35 +15,52 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, MeasurementRecord, RejectionRecord, UnknownRecord
+from flocc_protocol.records import (
+    ClosureRecord,
+    KeyframeRecord,
+    MeasurementRecord,
+    Record,
+    RejectionRecord,
+    UnknownRecord,
+)
 
 Float = NDArray[np.float64]
 
 
 class _Odometry:
-    """One log's keyframes: poses as its records give them, and whether each was described.
+    """One log's keyframes as columns: poses as its records give them, stamps, and whether each was described.
 
     The place of a keyframe that a later version wrote is taken by the pose of the next one; nothing is tied to it.
     """
 
     def __init__(self) -> None:
-        self.poses: list[Pose7] = []
-        self.stamps_s: list[float] = []
-        self.encoded: list[bool] = []
+        self.stamps_s = array("d")
+        self.encoded = bytearray()
         self.unread: set[int] = set()
+        self._poses = array("d")
         self._matrices: Float = np.empty((0, 4, 4))
+
+    def __len__(self) -> int:
+        return len(self.stamps_s)
+
+    def add(self, stamp_s: float, T_odom_keyframe: Pose7, is_described: bool) -> None:
+        """The next keyframe."""
+        self.stamps_s.append(stamp_s)
+        self._poses.extend(T_odom_keyframe)
+        self.encoded.append(is_described)
 
     def matrices(self) -> Float:
         """All poses (N, 4, 4), T_odom_keyframe."""
         known = len(self._matrices)
-        if known < len(self.poses):
-            self._matrices = np.concatenate([self._matrices, poses_from_tq(np.array(self.poses[known:]))])
+        if known < len(self):
+            added = np.array(self._poses[7 * known :]).reshape(-1, 7)
+            self._matrices = np.concatenate([self._matrices, poses_from_tq(added)])
         return self._matrices
 
     def pose(self, index: int) -> Float:
@@ -64,12 +83,12 @@ class _Odometry:
 
     def neighbour(self, index: int) -> int | None:
         """The nearest described keyframe before this one, for the first ones the nearest after it."""
-        around = (*range(index - 1, -1, -1), *range(index + 1, len(self.encoded)))
+        around = chain(range(index - 1, -1, -1), range(index + 1, len(self.encoded)))
         return next((other for other in around if self.encoded[other]), None)
 
     def between(self, index: int, other: int) -> Pose7:
         """Pose of one keyframe in the frame of another, `T_other_index`."""
-        T_odom_other, T_odom_index = (pose_from_tq(np.array(self.poses[k])) for k in (other, index))
+        T_odom_other, T_odom_index = (pose_from_tq(np.array(self._poses[7 * k : 7 * k + 7])) for k in (other, index))
         return pose7(between(T_odom_other, T_odom_index))
 
 
@@ -81,15 +100,25 @@ class GraphAssembly:
         revision: Grows when a solution is out of date: a new log, closure or fix, or a keyframe that one waited for.
     """
 
-    def __init__(self, saved: SavedMap | None = None) -> None:
+    def __init__(self, saved: SavedMap | None = None, record_at: Callable[[LogId, int], Record] | None = None) -> None:
+        """Start with nothing.
+
+        Args:
+            saved: The opened map, where there is one.
+            record_at: Gives a record again by its log and number, when closures are built; None: nobody else keeps
+                them.
+        """
         self.keyframes = 0
         self.revision = 0
         self._saved = saved
         self._odometry: dict[LogId, _Odometry] = {}
-        self._closures: dict[CandidatePair, tuple[LogId, int, ClosureRecord]] = {}
+        self._records: dict[tuple[LogId, int], Record] | None = {} if record_at is None else None
+        self._record_at = record_at or self._kept_record
+        self._closures: dict[CandidatePair, tuple[LogId, int]] = {}
         self._unbuilt: set[CandidatePair] = set()
-        self._built: dict[CandidatePair, LoopClosure] = {}
-        self._order: list[CandidatePair] = []
+        self._reads_all = True
+        self._built: list[CandidatePair] = []
+        self._loop_closures: list[LoopClosure] = []
         self._early: dict[KeyframeId, int] = {}
         self._measured = MeasuredRecords()
         self._odometry_pairs: dict[KeyframeId, tuple[KeyframeId, Pose7]] = {}
@@ -111,8 +140,10 @@ class GraphAssembly:
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
                 self._add_closure(new, record)
-            case RejectionRecord() | UnknownRecord():
+            case RejectionRecord():
                 pass
+            case UnknownRecord():
+                self._reads_all = False
             case _:
                 assert_never(record)
 
@@ -124,7 +155,7 @@ class GraphAssembly:
         found = self._odometry_pairs.get(keyframe)
         if found is None:
             odometry = self._odometry.get(keyframe.log)
-            if odometry is None or keyframe.index >= len(odometry.poses):
+            if odometry is None or keyframe.index >= len(odometry):
                 return None
             index = odometry.neighbour(keyframe.index)
             if index is None:
@@ -138,13 +169,34 @@ class GraphAssembly:
         odometry = self._odometry.get(log)
         return np.empty((0, 4, 4)) if odometry is None else odometry.matrices()
 
+    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
+        """The newest closures of a log."""
+        pairs = (pair for pair in reversed(self._closures) if log in (pair.low.log, pair.high.log))
+        records = (self._record_at(*self._closures[pair]) for pair in islice(pairs, ties_max))
+        return [record for record in records if isinstance(record, ClosureRecord)]
+
+    def joined(self, log: LogId, other: LogId) -> bool:
+        """Whether closures, other measurements or the opened map lead from one log to the other.
+
+        Where there are records of a later version, any of them may: another log is enough then.
+        """
+        if not self._reads_all and log in self._odometry and other in self._odometry:
+            return True
+        links = list(dict.fromkeys((pair.low.log, pair.high.log) for pair in self._closures))
+        measured = self._measured.factors(self._odometry, self._known)
+        links += [(factor.query.log, factor.match.log) for factor in measured]
+        if self._saved is not None:
+            links += [(self._saved.anchor, each) for each in self._saved.logs]
+        ends = {end for link in links for end in link}
+        groups = groups_of(sorted(ends), links)
+        return any(log in group and other in group for group in groups)
+
     def graph(self) -> PoseGraph:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
         trajectories = {log: self._trajectory(log) for log in sorted(self._odometry)}
         self._build()
-        closures = tuple([self._built[pair] for pair in self._order])
         measured = self._measured.factors(self._odometry, self._known)
-        return PoseGraph(trajectories, closures, measured=measured, saved=self._saved)
+        return PoseGraph(trajectories, tuple(self._loop_closures), measured=measured, saved=self._saved)
 
     def _trajectory(self, log: LogId) -> Trajectory:
         T_odom_keyframe = self._odometry[log].matrices()
@@ -155,42 +207,52 @@ class GraphAssembly:
         ready = sorted(pair for pair in self._unbuilt if self._known(pair.low) and self._known(pair.high))
         if not ready:
             return
-        self._order += [pair for pair in ready if pair not in self._built]
-        self._order.sort()
-        self._built.update(zip(ready, _loop_closures([self._closures[pair][2] for pair in ready]), strict=True))
+        built = _loop_closures([self._record_at(*self._closures[pair]) for pair in ready])
         self._unbuilt.difference_update(ready)
+        if not self._built:
+            self._built, self._loop_closures = ready, built
+            return
+        for pair, closure in zip(ready, built, strict=True):
+            at = bisect_left(self._built, pair)
+            if at < len(self._built) and self._built[at] == pair:
+                self._loop_closures[at] = closure
+            else:
+                self._built.insert(at, pair)
+                self._loop_closures.insert(at, closure)
 
     def _known(self, keyframe: KeyframeId) -> bool:
         odometry = self._odometry.get(keyframe.log)
-        return odometry is not None and keyframe.index < len(odometry.poses) and keyframe.index not in odometry.unread
+        return odometry is not None and keyframe.index < len(odometry) and keyframe.index not in odometry.unread
 
     def _add_keyframe(self, log: LogId, record: KeyframeRecord) -> None:
         """A new log, or a keyframe that a closure was waiting for, makes the last solution out of date."""
         odometry = self._odometry.get(log)
         if odometry is None:
             odometry = self._odometry[log] = _Odometry()
-        while len(odometry.poses) < record.index:
-            odometry.unread.add(len(odometry.poses))
-            odometry.poses.append(record.T_odom_camera)
-            odometry.encoded.append(False)
-            odometry.stamps_s.append(record.stamp_s)
-        odometry.poses.append(record.T_odom_camera)
-        odometry.stamps_s.append(record.stamp_s)
-        odometry.encoded.append(record.descriptor is not None)
+        while len(odometry) < record.index:
+            odometry.unread.add(len(odometry))
+            odometry.add(record.stamp_s, record.T_odom_camera, is_described=False)
+        odometry.add(record.stamp_s, record.T_odom_camera, is_described=record.descriptor is not None)
         self.keyframes += self._saved is None or log not in self._saved.closed
-        awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry.poses) - 1), 0) > 0
+        awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry) - 1), 0) > 0
         awaited |= self._measured.awaited(log.robot, record.stamp_s)
-        self.revision += awaited or len(odometry.poses) == 1
+        self.revision += awaited or len(odometry) == 1
 
     def _add_closure(self, new: NewRecord, record: ClosureRecord) -> None:
         """Of several registrations of one pair the one in the lowest log counts, on every robot."""
         pair = CandidatePair.of(record.query, record.match)
         held = self._closures.get(pair)
-        if held is None or (new.log, new.number) < held[:2]:
-            self._closures[pair] = (new.log, new.number, record)
+        if held is None or (new.log, new.number) < held:
+            self._closures[pair] = (new.log, new.number)
+            if self._records is not None:
+                self._records[new.log, new.number] = record
             self._unbuilt.add(pair)
             self.revision += 1
             self._await((record.query, record.match))
+
+    def _kept_record(self, log: LogId, number: int) -> Record:
+        assert self._records is not None
+        return self._records[log, number]
 
     def _await(self, keyframes: Iterable[KeyframeId]) -> None:
         """A solution will be out of date when one of these comes."""
@@ -199,8 +261,9 @@ class GraphAssembly:
                 self._early[keyframe] = self._early.get(keyframe, 0) + 1
 
 
-def _loop_closures(records: Sequence[ClosureRecord]) -> list[LoopClosure]:
-    poses = poses_from_tq(np.array([record.T_query_match_unscaled for record in records]))
+def _loop_closures(records: Iterable[Record]) -> list[LoopClosure]:
+    closures = [record for record in records if isinstance(record, ClosureRecord)]
+    poses = poses_from_tq(np.array([record.T_query_match_unscaled for record in closures]))
     return [
         LoopClosure(
             query=record.query,
@@ -210,5 +273,5 @@ def _loop_closures(records: Sequence[ClosureRecord]) -> list[LoopClosure]:
             scale_initial=record.scale_initial,
             covariance=None if record.covariance is None else symmetric(record.covariance.numpy()),
         )
-        for record, T_query_match_unscaled in zip(records, poses, strict=True)
+        for record, T_query_match_unscaled in zip(closures, poses, strict=True)
     ]

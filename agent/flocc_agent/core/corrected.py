@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.gossip import LogCopy
 from flocc_agent.core.knots import corrected
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import interpolated, inverse, pose_from_tq, symmetric
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import LogCorrection
-from flocc_protocol.records import KeyframeRecord
+from flocc_protocol.records import GeodeticFixRecord, KeyframeRecord
 
 Float = NDArray[np.float64]
 
@@ -35,6 +35,7 @@ class RecordedOdometry:
         self._read = 0
         self._stamps_s: list[float] = []
         self._T_odom_camera: list[Float] = []
+        self._fixes: list[GeodeticFixRecord] = []
 
     def stamps_s(self) -> list[float]:
         """Time of each keyframe on its robot's clock, seconds."""
@@ -46,6 +47,11 @@ class RecordedOdometry:
         self._read_on()
         return self._T_odom_camera
 
+    def fixes(self) -> list[GeodeticFixRecord]:
+        """Places on Earth that were measured at keyframes."""
+        self._read_on()
+        return self._fixes
+
     def _read_on(self) -> None:
         records = self._copy.records[self._read :]
         self._read += len(records)
@@ -54,6 +60,8 @@ class RecordedOdometry:
                 unread = record.index - len(self._stamps_s)
                 self._stamps_s += [record.stamp_s] * (unread + 1)
                 self._T_odom_camera += [pose_from_tq(np.array(record.T_odom_camera))] * (unread + 1)
+            elif isinstance(record, GeodeticFixRecord):
+                self._fixes.append(record)
 
 
 class CorrectedLog:
@@ -112,6 +120,17 @@ class CorrectedLog:
         """Corrected poses (N, 4, 4) at all known keyframes."""
         poses = np.array(self._odometry.poses()).reshape(-1, 4, 4)
         return self._bodies(poses, np.arange(len(poses)))
+
+    def fixed_cameras(self) -> tuple[list[GeodeticFixRecord], Float]:
+        """Places on Earth, and (N, 3) metres where their cameras are in the map.
+
+        None where only the end of the log is known in the map: the way before it would be its odometry.
+        """
+        poses = self._odometry.poses()
+        fixes = [fix for fix in self._odometry.fixes() if fix.index < len(poses) and self._correction.knots is not None]
+        numbers = np.array([fix.index for fix in fixes], dtype=int)
+        T_odom_camera = np.array(poses).reshape(-1, 4, 4)[numbers]
+        return fixes, corrected(self._correction, T_odom_camera, numbers)[:, :3, 3]
 
     def _bodies(self, T_odom_camera: Float, numbers: NDArray[np.integer]) -> Float:
         T_map_camera = corrected(self._correction, T_odom_camera, numbers)

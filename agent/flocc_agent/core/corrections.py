@@ -18,10 +18,11 @@ from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.knot_requests import GRACE_S, KnotRequests
 from flocc_agent.core.knots import Track, corrected, knots_of, strays
 from flocc_agent.core.parameters import GossipParameters
+from flocc_agent.core.plausibility import FINAL, Doubts, HeldGraph, Placed
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose7, symmetric
+from flocc_agent.geometry import pose7s, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId, Term
@@ -47,6 +48,8 @@ TOLD_MAX = 16
 COVARIANCE_CHANGE_RATIO = 0.1
 """A correction whose covariance changed by more than this is sent again although nothing moved."""
 
+UNTRUE = "a correction that cannot be true"
+
 
 def _nowhere(log: LogId) -> Float:  # noqa: ARG001
     return np.empty((0, 4, 4))
@@ -71,6 +74,7 @@ class Corrections:
 
     Attributes:
         failed_signers: Leaders who did not sign what stands under their names, until somebody clears it.
+        doubts: Corrections of the own log that are not believed.
     """
 
     def __init__(
@@ -81,6 +85,7 @@ class Corrections:
         odometry: Callable[[LogId], Float] = _nowhere,
         near: Callable[[str], bool] = lambda robot: False,  # noqa: ARG005
         towards: Callable[[Term], list[str]] = lambda term: [],  # noqa: ARG005
+        evidence: HeldGraph | None = None,
     ) -> None:
         """Start without any.
 
@@ -91,8 +96,10 @@ class Corrections:
             odometry: T_odom_camera (N, 4, 4) of the known keyframes of a log.
             near: Whether a robot of this name is in range.
             towards: Robots in range, those that are nearest to the leader of a term first.
+            evidence: What corrections of the own log are held against; None: they are believed.
         """
         self.failed_signers: set[str] = set()
+        self.doubts = Doubts(evidence)
         self._own = own
         self._gossip = gossip
         self._sealer = sealer
@@ -137,6 +144,8 @@ class Corrections:
         if message is not None:
             self._whole[message.log] = message
             self._keep(message)
+            if message.log == self._own:
+                self.doubts.on_applied(self._placed(message))
         self._frame_unknown = frame_changed
 
     # What is known in short
@@ -183,7 +192,7 @@ class Corrections:
         """Ask for the knots of newer corrections of this robot's log, and of those that somebody looks at."""
         for log in self._newest if self._follows_all else (self._own,):
             short = self._newest.get(log)
-            if short is not None and not self._has_knots(short.version):
+            if short is not None and not self._has_knots(short.version) and not self.doubts.knows(short.version):
                 comes_by_itself = self._near(short.term.leader.robot) and log == self._own
                 self._requests.want(short.version, now + (GRACE_S if comes_by_itself else 0.0))
         return self._requests.ask(now)
@@ -211,7 +220,7 @@ class Corrections:
         """Whether a correction is newer than the one that is held, or brings knots that somebody waits for."""
         if self._is_newer(message.version) or self._is_shorter(message):
             return True
-        if message.knots is None or self._has_knots(message.version):
+        if message.knots is None or self._has_knots(message.version) or self.doubts.knows(message.version):
             return False
         return message.log == self._own or self._follows_all or self._requests.waits(message.log, now)
 
@@ -229,7 +238,12 @@ class Corrections:
         return len(self._newest) < self._gossip.logs_max and lives(self._newest, log.robot) < LIVES_MAX
 
     def take(self, message: LogCorrection, now: float = 0.0) -> list[Effect]:
-        """Keep a newer correction that was not refused; apply it when it is this robot's and whole."""
+        """Keep a newer correction that was not refused; apply it when it is this robot's, whole, and can be true."""
+        own = message.log == self._own and message.knots is not None and not self._has_knots(message.version)
+        if own:
+            why = self.doubts.believes(self._placed(message), now)
+            if why is not None:
+                return [_untrue(message, why)] if why in FINAL else []
         if self._is_newer(message.version) or self._is_shorter(message):
             self._keep(message)
         if message.knots is None:
@@ -243,6 +257,29 @@ class Corrections:
         self._whole[message.log] = message
         effects: list[Effect] = [Unicast(peer, CorrectionBatch((message,))) for peer in passed_on]
         return effects + (self._apply(message, held) if message.log == self._own else [])
+
+    def forget(self, leader: str) -> None:
+        """Hold nothing more that this leader made, but for what was applied, so that it fences nobody out."""
+        for log in [log for log, held in self._newest.items() if held.term.leader.robot == leader]:
+            del self._newest[log]
+            self._announcer.remove(log)
+        applied = self.applied
+        if applied is not None and self._own not in self._newest:
+            self._keep(applied)
+
+    def _placed(self, own: LogCorrection) -> Placed:
+        """A correction of the own log and what is known of the other logs."""
+        others = {log: known for log in self._newest if log != self._own and (known := self.of(log)) is not None}
+        return Placed(own, others)
+
+    def reconsider(self, now: float) -> list[Effect]:
+        """Apply what was held back once it can be true; refuse it after a while."""
+        held = self.doubts.to_look_at(now)
+        if held is None:
+            return []
+        effects = self.take(held, now)
+        why = self.doubts.given_up(now)
+        return effects if why is None else [_untrue(held, why)]
 
     def _is_newer(self, version: CorrectionVersion) -> bool:
         held = self._newest.get(version.log)
@@ -345,6 +382,7 @@ class Corrections:
     def _apply(self, message: LogCorrection, held: LogCorrection | None) -> list[Effect]:
         changed = self._frame_unknown or (held is not None and held.anchor != message.anchor)
         self._frame_unknown = False
+        self.doubts.on_applied(self._placed(message))
         knots, T_map_camera = told_poses(message, self._odometry(self._own))
         fact = CorrectionApplied(
             term=message.term.counter,
@@ -367,6 +405,10 @@ def _is_surer(held: LogCorrection, covariance: Float | None) -> bool:
     return bool(np.linalg.norm(covariance - told) > COVARIANCE_CHANGE_RATIO * np.linalg.norm(told))
 
 
+def _untrue(message: LogCorrection, why: str) -> Report:
+    return Report(PeerRefused(peer=message.term.leader.robot, reason=f"{UNTRUE}: {why}"))
+
+
 def told_poses(message: LogCorrection, T_odom_camera: Float) -> tuple[tuple[int, ...], tuple[Pose7, ...]]:
     """Numbers and poses of at most `TOLD_MAX` evenly spread keyframes of a correction, its last one among them."""
     if message.knots is None or not len(T_odom_camera):
@@ -375,4 +417,4 @@ def told_poses(message: LogCorrection, T_odom_camera: Float) -> tuple[tuple[int,
     step = max(1, -(-(last + 1) // TOLD_MAX))
     numbers = np.arange(last % step, last + 1, step)
     poses = corrected(message, T_odom_camera[numbers], numbers)
-    return tuple(int(number) for number in numbers), tuple(pose7(T) for T in poses)
+    return tuple(numbers.tolist()), pose7s(poses)

@@ -113,8 +113,25 @@ class LeaderElection:
     """One robot's part in the election."""
 
     def __init__(
-        self, own: LogId, compute_class: int, counter_max: int, parameters: ElectionParameters, now: float
+        self,
+        own: LogId,
+        compute_class: int,
+        counter_max: int,
+        parameters: ElectionParameters,
+        now: float,
+        compute_classes: Mapping[str, int] | None = None,
     ) -> None:
+        """Begin to listen.
+
+        Args:
+            own: This robot's log.
+            compute_class: Its class.
+            counter_max: Highest term counter that it knew before its start.
+            parameters: Times and limits.
+            now: Time.
+            compute_classes: Of the swarm's list of members; robots that it does not name have 0, whatever they claim.
+        """
+        self._listed = compute_classes
         self._own = own
         self._compute_class = compute_class
         self._rank = rank(compute_class, own)
@@ -166,7 +183,12 @@ class LeaderElection:
         refused = self._learn_counter(sender, advert.term.counter) if _is_first_hand(sender, advert) else []
         return [*refused, *self._on_advert(advert, now), *self._renew_if_overtaken(now)]
 
-    def _meet(self, sender: LogId, compute_class: int) -> None:
+    def class_of(self, robot: str, claimed: int) -> int:
+        """A robot's compute class, which the list of members knows better than the robot."""
+        return claimed if self._listed is None else self._listed.get(robot, 0)
+
+    def _meet(self, sender: LogId, claimed: int) -> None:
+        compute_class = self.class_of(sender.robot, claimed)
         known = self._peers.get(sender.robot)
         if known is None or known.rank != (-compute_class, sender):
             self._peers[sender.robot] = _Peer(rank(compute_class, sender), sender.robot)
@@ -210,12 +232,19 @@ class LeaderElection:
     def on_applied(self, sender: LogId, term: Term) -> list[Effect]:
         """Somebody gave a correction of this term that its leader made; what is refused must not be applied here.
 
-        A leader whose own term is older claims anew with its next `tick`, since nobody would apply what it says.
+        A leader whose own term is older claims anew with its next `tick`, since nobody would apply what it says; so it
+        does where somebody else spoke in its term.
         """
         refused = self._learn_counter(sender, term.counter)
-        if not refused and self._leader is not None and self.leading and term > self._leader.term:
+        if not refused and self._leader is not None and self.leading and term >= self._leader.term:
             self._due_s = float("-inf")
         return refused
+
+    def on_distrusted(self, name: str, now: float) -> list[Effect]:
+        """A leader is not believed; who follows it elects another one."""
+        if self._leader is None or self.leading or self._leader.term.leader.robot != name:
+            return []
+        return self._lose_leader("not believed", now)
 
     def on_lost(self, name: str) -> None:
         """A robot is out of range; it need not be asked."""
@@ -256,7 +285,8 @@ class LeaderElection:
     def _on_advert(self, advert: LeaderAdvert, now: float) -> list[Effect]:
         if advert.term.leader == self._own or advert.hops >= self._parameters.hops_max:
             return []
-        heard = LeaderAdvert(advert.term, advert.compute_class, advert.beat, advert.hops + 1)
+        compute_class = self.class_of(advert.term.leader.robot, advert.compute_class)
+        heard = LeaderAdvert(advert.term, compute_class, advert.beat, advert.hops + 1)
         if heard.beat <= self._lost.get(heard.term, -1):
             return []
         if self._leader is not None and heard.term == self._leader.term:

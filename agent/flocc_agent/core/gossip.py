@@ -9,12 +9,11 @@ is what shows that somebody else writes its log.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
+from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.parameters import GossipParameters
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, Pulls, remember
 from flocc_agent.core.reports import LogForked, PeerRefused
@@ -31,17 +30,8 @@ from flocc_protocol.messages import (
     Records,
     TableState,
 )
-from flocc_protocol.records import (
-    KEYFRAME_CODE,
-    KeyframeRecord,
-    Record,
-    UnknownRecord,
-    chain,
-    decode_record,
-    encode_record,
-)
+from flocc_protocol.records import Record, decode_record, encode_record
 
-DECODED_MAX = 1024
 RECORDS_MAX = 200_000
 """Records that are kept of one log: a keyframe and a closure each second for a day. Further ones are refused."""
 LIVES_MAX = 16
@@ -77,36 +67,6 @@ class Sealer(Protocol):
             DecodeError: It is not that leader's.
         """
         ...
-
-
-@dataclass(slots=True)
-class LogCopy:
-    """A prefix of one robot's log: records without descriptors, their bytes, and the chained checksum before each."""
-
-    records: list[Record] = field(default_factory=list)
-    encoded: list[bytes] = field(default_factory=list)
-    checksums: list[int] = field(default_factory=lambda: [0])
-    keyframes: int = 0
-
-    def __len__(self) -> int:
-        return len(self.records)
-
-    def append(self, record: Record, data: bytes) -> None:
-        """Add the next record."""
-        self.records.append(record)
-        self.encoded.append(data)
-        self.checksums.append(chain(self.checksums[-1], data))
-        self.keyframes += isinstance(record, KeyframeRecord) or _is_later_keyframe(record)
-
-    def continues(self, batch: RecordBatch) -> bool:
-        """Whether a batch that starts within this copy agrees with it, as far as both go."""
-        held = self.encoded[batch.first : batch.first + len(batch.records)]
-        same_before = self.checksums[batch.first] == batch.checksum_before
-        return same_before and held == list(batch.records[: len(held)])
-
-    def accepts(self, record: Record) -> bool:
-        """Whether the record can be next: keyframes are numbered without gaps."""
-        return not isinstance(record, KeyframeRecord) or record.index == self.keyframes
 
 
 class NewRecord(NamedTuple):
@@ -167,21 +127,21 @@ class Gossip:
         Raises:
             DecodeError: It is none, or the swarm's keys do not open it.
         """
-        record = decode_record(self._opened(log, self._held(log), data))
+        opened = self._opened(log, self._held(log), data)
+        record = decode_record(opened)
         copy = self.logs.setdefault(log, LogCopy())
-        copy.append(kept(record), data)
+        copy.append(data, len(data) - len(opened))
         self._announce(log, copy)
         return NewRecord(log, len(copy) - 1, record)
 
     def append(self, record: Record) -> tuple[NewRecord, list[Effect], RecordBatch]:
         """Add a record to the own log: persist it, then send the batch."""
         copy = self.logs[self._own]
-        number, before = len(copy), copy.checksums[-1]
-        data = encode_record(record)
-        if self._sealer is not None:
-            data = self._sealer.seal(self._own, number, data)
+        number, before = len(copy), copy.checksum
+        encoded = encode_record(record)
+        data = encoded if self._sealer is None else self._sealer.seal(self._own, number, encoded)
         assert copy.accepts(record), "own keyframes are numbered without gaps"
-        copy.append(kept(record), data)
+        copy.append(data, len(data) - len(encoded))
         self._announce(self._own, copy)
         batch = RecordBatch(self._own, number, before, (data,))
         return NewRecord(self._own, number, record), [PersistRecord(self._own, number, data)], batch
@@ -216,10 +176,10 @@ class Gossip:
     def _on_digest(self, peer: str, digest: LogDigest, now: float) -> list[Effect]:
         log, count, checksum = digest
         copy = self.logs.get(log)
-        if copy is None or count > len(copy.encoded):
+        if copy is None or count > len(copy):
             return self._behind(peer, log, count) if count else []
         self._pulls.on_level(peer, log)
-        if copy.checksums[count] != checksum:
+        if copy.checksum_at(count) != checksum:
             if log == self._own:
                 return self._doubt(peer, count, now)
             return self._fork(peer, log, "two writers of one log")
@@ -251,7 +211,7 @@ class Gossip:
             if copy is None or first >= len(copy):
                 continue
             following = copy.encoded[first : first + RECORDS_BATCH_MAX]
-            batch = RecordBatch.of(log, first, copy.checksums[first], following, room)
+            batch = RecordBatch.of(log, first, copy.checksum_at(first), following, room)
             if not batch.records:
                 break
             room -= batch.size_bytes
@@ -281,7 +241,7 @@ class Gossip:
             copy = LogCopy()
         if batch.first > len(copy):
             return [], self._behind(peer, batch.log, batch.first + len(batch.records))
-        if not copy.continues(batch):
+        if not copy.agrees(batch.first, batch.checksum_before, batch.records):
             self._pulls.on_level(peer, batch.log)
             return [], self._fork(peer, batch.log, "two writers of one log")
         refusal = self._no_room(batch.log)
@@ -299,23 +259,24 @@ class Gossip:
         effects: list[Effect] = []
         for data in batch.records[len(copy) - batch.first :]:
             try:
-                record, record_kept = decoded(self._opened(batch.log, len(copy), data))
+                opened = self._opened(batch.log, len(copy), data)
+                record, _ = decoded(opened)
             except DecodeError as error:
                 return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
             if not copy.accepts(record) or len(copy) >= RECORDS_MAX:
                 return new, [*effects, *self._refused(peer, f"record of {batch.log} out of place")]
             number = len(copy)
-            copy.append(record_kept, data)
+            copy.append(data, len(data) - len(opened))
             new.append(NewRecord(batch.log, number, record))
             effects.append(PersistRecord(batch.log, number, data))
         return new, effects
 
     def _held(self, log: LogId) -> int:
         copy = self.logs.get(log)
-        return 0 if copy is None else len(copy.encoded)
+        return 0 if copy is None else len(copy)
 
     def _announce(self, log: LogId, copy: LogCopy) -> None:
-        self._announcer.put(log, LogDigest(log, len(copy), copy.checksums[-1]))
+        self._announcer.put(log, LogDigest(log, len(copy), copy.checksum))
 
     def _opened(self, log: LogId, number: int, data: bytes) -> bytes:
         if self._sealer is None:
@@ -344,7 +305,7 @@ class Gossip:
             except DecodeError as error:
                 return self._refused(peer, f"bad record of {self._own}: {error}")
             return self._fork(peer, self._own, "others hold records of this robot's log that it did not write")
-        if 0 < batch.first <= len(own) and own.checksums[batch.first] != batch.checksum_before:
+        if 0 < batch.first <= len(own) and own.checksum_at(batch.first) != batch.checksum_before:
             self._doubted_until_s.pop(peer, None)
             return self._doubt(peer, batch.first, now)
         return []
@@ -374,26 +335,3 @@ def _is_full(message: Records) -> bool:
     sizes = [batch.size_bytes for batch in message.batches]
     many = any(len(batch.records) == RECORDS_BATCH_MAX for batch in message.batches)
     return many or sum(sizes) >= RECORDS_BATCH_BYTES_MAX // 2
-
-
-def _is_later_keyframe(record: Record) -> bool:
-    """Whether a later version wrote a keyframe that this one cannot read: it has a number all the same."""
-    return isinstance(record, UnknownRecord) and record.code == KEYFRAME_CODE
-
-
-@lru_cache(maxsize=DECODED_MAX)
-def decoded(data: bytes) -> tuple[Record, Record]:
-    """A record, and what is kept of it, decoded once where several copies of a log live in one process."""
-    record = decode_record(data)
-    return record, kept(record)
-
-
-def kept(record: Record) -> Record:
-    """A record without what is held elsewhere: place recognition has the descriptor, the log the record's bytes."""
-    match record:
-        case KeyframeRecord():
-            return replace(record, descriptor=None)
-        case UnknownRecord(code):
-            return UnknownRecord(code, b"")
-        case _:
-            return record

@@ -34,6 +34,10 @@ class _Question:
     asked: int = 0
     peers: dict[str, float] = field(default_factory=dict)
 
+    def is_given_up(self) -> bool:
+        """Whether it was asked for often enough, for others."""
+        return self.asked >= ASKED_MAX and not self.own
+
 
 class KnotRequests:
     """Questions for knots that are open at one robot."""
@@ -46,6 +50,7 @@ class KnotRequests:
         """
         self._towards = towards
         self._open: dict[LogId, _Question] = {}
+        self._due_s = float("-inf")
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -55,6 +60,9 @@ class KnotRequests:
     def want(self, version: CorrectionVersion, not_before_s: float) -> None:
         """This robot needs the knots of a correction, or of a later one of that log."""
         question = self._open.get(version.log)
+        if question is not None and question.version >= version and question.own:
+            return
+        self._due_s = float("-inf")
         if question is None or question.version < version:
             peers = {} if question is None else question.peers
             remember(self._open, version.log, _Question(version, not_before_s, own=True, peers=peers))
@@ -70,6 +78,7 @@ class KnotRequests:
             remember(self._open, version.log, question)
         if question.asked >= ASKED_MAX and question.next_s <= now:
             question.asked = 0
+        self._due_s = float("-inf")
         remember(question.peers, peer, now + INTEREST_S, PEERS_MAX)
 
     def waits(self, log: LogId, now: float) -> bool:
@@ -88,9 +97,11 @@ class KnotRequests:
 
     def ask(self, now: float) -> list[Effect]:
         """Ask for what is due, each of one robot in range; other robots in turn."""
+        if now < self._due_s:
+            return []
         questions: dict[str, list[CorrectionVersion]] = {}
         for question in self._open.values():
-            if question.next_s > now or (question.asked >= ASKED_MAX and not question.own):
+            if question.next_s > now or question.is_given_up():
                 continue
             on_the_way = [peer for peer in self._towards(question.version.term) if peer not in question.peers]
             if not on_the_way:
@@ -100,4 +111,6 @@ class KnotRequests:
                 asked.append(question.version)
                 question.asked += 1
                 question.next_s = now + (REQUEST_TIMEOUT_S if question.asked < ASKED_MAX else RARELY_S)
+        open_ = (question.next_s for question in self._open.values() if not question.is_given_up())
+        self._due_s = min(open_, default=float("inf"))
         return [Unicast(peer, KnotRequest(tuple(versions))) for peer, versions in questions.items()]

@@ -17,7 +17,6 @@ from flocc_agent.geometry import (
     pose7,
     pose_from_tq,
     poses_of_twists,
-    quaternions,
     twists_of_poses,
     upper_triangle,
 )
@@ -52,10 +51,11 @@ class Track:
 def corrected(correction: LogCorrection, T_odom_camera: Float, numbers: NDArray[np.integer]) -> Float:
     """Corrected poses (N, 4, 4) of keyframes (N, 4, 4) with these numbers (N,)."""
     T_map_odom = pose_from_tq(np.array(correction.T_map_odom))
-    if correction.knots is None or not len(numbers):
+    twists = None if correction.knots is None or not len(numbers) else correction.knots.twists.numpy()
+    if correction.knots is None or twists is None or not twists.any():
         return np.asarray(T_map_odom @ T_odom_camera)
     about_m = correction.knots.about_odom_m.numpy()
-    twists = _between(correction.knots.keyframes.numpy(), correction.knots.twists.numpy(), numbers)
+    twists = _between(correction.knots.keyframes.numpy(), twists, numbers)
     return np.asarray(T_map_odom @ _moved(about_m) @ poses_of_twists(twists) @ _moved(-about_m) @ T_odom_camera)
 
 
@@ -69,17 +69,24 @@ def knots_of(track: Track) -> tuple[Pose7, Knots]:
     """T_map_odom as it is told, and as many knots as say the solution within `CHOSEN_WITHIN` of the bounds.
 
     The worst keyframe of each stretch becomes a knot, until none is beyond the bounds; where a message does not hold so
-    many, the bounds are widened.
+    many, the bounds are widened. Odometry that was moved as a whole needs no twists.
     """
     told = pose7(track.T_map_odom)
     about_m = track.T_odom_camera[-1, :3, 3]
+    covariance = None if track.covariance is None else upper_triangle(track.covariance)
+    moved = pose_from_tq(np.array(told)) @ track.T_odom_camera
+    if _errors(moved, track.T_map_camera).max() <= CHOSEN_WITHIN:
+        ends = np.unique([0, len(moved) - 1])
+        return told, Knots(
+            covariance, Array.of(about_m, "f8"), Array.of(ends, "u4"), Array.of(np.zeros((len(ends), 6)), "f4")
+        )
     T_point_camera = _moved(-about_m) @ track.T_odom_camera
     T_map_point = pose_from_tq(np.array(told)) @ _moved(about_m)
     targets = inverse(T_map_point) @ track.T_map_camera @ inverse(T_point_camera)
     twists = twists_of_poses(targets).astype(np.float32).astype(np.float64)
     keyframes = _chosen(twists, targets @ T_point_camera, T_point_camera)
     return told, Knots(
-        covariance=None if track.covariance is None else upper_triangle(track.covariance),
+        covariance=covariance,
         about_odom_m=Array.of(about_m, "f8"),
         keyframes=Array.of(keyframes, "u4"),
         twists=Array.of(twists[keyframes], "f4"),
@@ -113,10 +120,13 @@ def _between(knots: Float | NDArray[np.integer], twists: Float, numbers: NDArray
 
 
 def _errors(T_a: Float, T_b: Float) -> Float:
-    """Distances of poses (N, 4, 4), in bounds of translation or rotation, whichever is more."""
-    shift_m = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
-    q = quaternions(np.swapaxes(T_a[:, :3, :3], 1, 2) @ T_b[:, :3, :3])
-    turn_rad = 2.0 * np.arctan2(np.linalg.norm(q[:, 1:], axis=1), q[:, 0])
+    """Distances of poses (N, 4, 4), in bounds of translation or rotation, whichever is more.
+
+    Two rotations by an angle apart differ by 8 sin^2(angle / 2) in the sum of their squared entries.
+    """
+    squares = np.square(T_a[:, :3] - T_b[:, :3]).sum(axis=1)
+    shift_m = np.sqrt(squares[:, 3])
+    turn_rad = 2.0 * np.arcsin(np.minimum(np.sqrt(squares[:, :3].sum(axis=1) / 8.0), 1.0))
     return np.asarray(np.maximum(shift_m / TRANSLATION_BOUND_M, turn_rad / ROTATION_BOUND_RAD))
 
 

@@ -68,14 +68,20 @@ class _Silence:
 
 
 class Muted:
-    """Peers in whose messages a signature of some robot failed, and of whom."""
+    """Peers in whose messages a signature of some robot failed, and of whom; or leaders that are not believed."""
 
-    def __init__(self) -> None:
+    def __init__(self, first_s: float = MUTED_FIRST_S, max_s: float = MUTED_MAX_S) -> None:
+        self._first_s = first_s
+        self._max_s = max_s
         self._silences: dict[tuple[str, str], _Silence] = {}
 
-    def sizes(self) -> dict[str, tuple[int, int]]:
-        """Tables with their maximum."""
-        return {"muted": (len(self._silences), SILENCES_MAX)}
+    def sizes(self, name: str) -> dict[str, tuple[int, int]]:
+        """The table with its maximum, under a name."""
+        return {name: (len(self._silences), SILENCES_MAX)}
+
+    def forgive(self, peer: str, signer: str) -> None:
+        """It was no failure."""
+        self._silences.pop((peer, signer), None)
 
     def is_muted(self, peer: str, signer: str, now: float) -> bool:
         """Whether what a peer sends of a robot is not looked at now."""
@@ -86,7 +92,7 @@ class Muted:
         """A signature of a robot failed in what a peer sent."""
         last = self._silences.get((peer, signer))
         fresh = last is None or last.until_s + FORGIVEN_S <= now
-        lasts_s = MUTED_FIRST_S if last is None or fresh else min(2 * last.lasts_s, MUTED_MAX_S)
+        lasts_s = self._first_s if last is None or fresh else min(2 * last.lasts_s, self._max_s)
         remember(self._silences, (peer, signer), _Silence(now + lasts_s, lasts_s), SILENCES_MAX)
 
 

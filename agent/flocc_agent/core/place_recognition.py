@@ -1,9 +1,15 @@
-"""Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A)."""
+"""Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A).
+
+Descriptors are compared as they came: int8 rows with one number each that makes them of unit length. Products of such
+rows are whole numbers that a float32 holds exactly up to 1,040 numbers, so a similarity is the same whether it is found
+alone or in a batch.
+"""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +19,12 @@ from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
-Descriptor = NDArray[np.float32]
+Floats = NDArray[np.float32]
 
 CAPACITY_FIRST = 64
-DIRECTIONS_MAX = 1024
+DESCRIPTORS_MAX = 1024
+ROWS_AT_ONCE = 256
+"""int8 rows that are compared at one time: as floats they stay in a processor's cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,26 +39,79 @@ Found = tuple[KeyframeId, Candidate]
 """A new keyframe and a candidate that it gave."""
 
 
-class _Descriptors:
-    """The descriptors of one log, as the rows of one growing matrix."""
+class Descriptor(NamedTuple):
+    """A place descriptor: a row (D,) of int8 or float32, and what makes it of unit length."""
 
-    def __init__(self, dimension: int) -> None:
-        self._rows = np.empty((CAPACITY_FIRST, dimension), dtype=np.float32)
+    row: NDArray[Any]
+    inverse_norm: float
+
+
+class _Rows:
+    """Descriptors of one length of one or more logs, as the rows of one growing matrix.
+
+    Attributes:
+        dimension: D.
+        logs: Number (N,) of each row's log.
+        indices: Keyframe (N,) of each row in its log.
+    """
+
+    def __init__(self, dimension: int, dtype: type[np.int8 | np.float32]) -> None:
         self.dimension = dimension
-        self.indices: list[int] = []
+        self._count = 0
+        self._rows: NDArray[Any] = np.empty((CAPACITY_FIRST, dimension), dtype=dtype)
+        self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
+        self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
+        self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
+
+    def __len__(self) -> int:
+        return self._count
 
     @property
-    def matrix(self) -> Descriptor:
-        return self._rows[: len(self.indices)]
+    def logs(self) -> NDArray[np.int32]:
+        return self._logs[: self._count]
 
-    def append(self, index: int, descriptor: Descriptor) -> None:
-        count = len(self.indices)
-        if count == len(self._rows):
-            rows = np.empty((count + max(CAPACITY_FIRST, count // 4), self.dimension), dtype=np.float32)
-            rows[:count] = self._rows
-            self._rows = rows
-        self._rows[count] = descriptor
-        self.indices.append(index)
+    @property
+    def indices(self) -> NDArray[np.int32]:
+        return self._indices[: self._count]
+
+    def append(self, log: int, index: int, descriptor: Descriptor) -> None:
+        """Add a row; the first one that is no int8 makes all of them float32."""
+        if self._count == len(self._rows):
+            more = max(CAPACITY_FIRST, self._count // 4)
+            self._rows = np.concatenate([self._rows, np.empty((more, self.dimension), dtype=self._rows.dtype)])
+            self._inverse_norms = np.resize(self._inverse_norms, self._count + more)
+            self._logs = np.resize(self._logs, self._count + more)
+            self._indices = np.resize(self._indices, self._count + more)
+        if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
+            self._rows = self._rows.astype(np.float32)
+        self._rows[self._count] = descriptor.row
+        self._inverse_norms[self._count] = descriptor.inverse_norm
+        self._logs[self._count] = log
+        self._indices[self._count] = index
+        self._count += 1
+
+    def similarities(self, descriptors: Sequence[Descriptor]) -> Floats:
+        """Cosine similarities (B, N) of B descriptors with all rows."""
+        queries = np.array([each.row for each in descriptors], dtype=np.float32)
+        found = self._products(queries)
+        found *= self._inverse_norms[: self._count]
+        if len(descriptors) == 1:
+            found *= np.float32(descriptors[0].inverse_norm)
+        else:
+            found *= np.array([[each.inverse_norm] for each in descriptors], dtype=np.float32)
+        return found
+
+    def _products(self, queries: Floats) -> Floats:
+        """Products (B, N) of queries (B, D) with all rows."""
+        if self._rows.dtype == np.float32:
+            return np.asarray(queries @ self._rows[: self._count].T)
+        products = np.empty((len(queries), self._count), dtype=np.float32)
+        floats = np.empty((ROWS_AT_ONCE, self.dimension), dtype=np.float32)
+        for first in range(0, self._count, ROWS_AT_ONCE):
+            rows = self._rows[first : min(first + ROWS_AT_ONCE, self._count)]
+            np.copyto(floats[: len(rows)], rows)
+            products[:, first : first + len(rows)] = queries @ floats[: len(rows)].T
+        return products
 
 
 class PlaceRecognition:
@@ -61,8 +122,6 @@ class PlaceRecognition:
 
     Attributes:
         refused: Descriptors of another length than their log's, or without direction.
-        best_similarities: Robot -> best similarity of any of its keyframes with one of this robot's, also below the
-            threshold; at most as many as logs are kept.
     """
 
     def __init__(
@@ -71,21 +130,35 @@ class PlaceRecognition:
         self._own = own
         self._closed = closed
         self._parameters = parameters
-        self._by_log: dict[LogId, _Descriptors] = {}
+        self._numbers: dict[LogId, int] = {}
+        self._logs: list[LogId] = []
+        self._dimensions: list[int] = []
+        self._best: list[float] = []
+        self._own_rows: _Rows | None = None
+        self._others: dict[int, _Rows] = {}
         self.refused = 0
-        self.best_similarities: dict[str, float] = {}
 
     @property
     def similarity_threshold(self) -> float:
         """From which on two keyframes are candidates."""
         return self._parameters.similarity_threshold
 
+    @property
+    def best_similarities(self) -> dict[str, float]:
+        """Robot -> best similarity of any of its keyframes with one of this robot's, also below the threshold."""
+        best: dict[str, float] = {}
+        for log, similarity in zip(self._logs, self._best, strict=True):
+            name = str(log) if log.robot == self._own.robot else log.robot  # an earlier journey of this one
+            if similarity > best.get(name, -1.0):
+                best[name] = similarity
+        return best
+
     def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
         """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
         found: list[Found] = []
         others: list[tuple[KeyframeId, Descriptor]] = []
         for keyframe, place in keyframes:
-            descriptor = direction(place)
+            descriptor = comparable(place)
             if descriptor is None or not self._add(keyframe, descriptor):
                 self.refused += 1
             elif self._is_compared(keyframe.log):
@@ -98,67 +171,80 @@ class PlaceRecognition:
 
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
-        known = self._by_log.get(keyframe.log)
-        if known is None:
-            known = self._by_log[keyframe.log] = _Descriptors(len(descriptor))
-        elif known.dimension != len(descriptor):
+        log, dimension = keyframe.log, len(descriptor.row)
+        number = self._numbers.get(log)
+        if number is None:
+            number = self._numbers[log] = len(self._logs)
+            self._logs.append(log)
+            self._dimensions.append(dimension)
+            self._best.append(-1.0)
+        elif self._dimensions[number] != dimension:
             return False
-        known.append(keyframe.index, descriptor)
+        if log == self._own:
+            if self._own_rows is None:
+                self._own_rows = _Rows(dimension, np.float32)
+            self._own_rows.append(number, keyframe.index, descriptor)
+        elif self._is_compared(log):
+            rows = self._others.get(dimension)
+            if rows is None:
+                rows = self._others[dimension] = _Rows(dimension, np.int8)
+            rows.append(number, keyframe.index, descriptor)
         return True
 
     def _among_all(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
         """Candidates of one of this robot's keyframes, with each other robot's and, if wanted, with its own."""
         found = self._within(keyframe, descriptor) if self._parameters.own_gap_keyframes > 0 else []
-        for log in sorted(self._by_log):
-            others = self._by_log[log]
-            if self._is_compared(log) and others.dimension == len(descriptor):
-                similarities = others.matrix @ descriptor
-                found += self._best(keyframe, log, others.indices, similarities, self._name(log))
+        others = self._others.get(len(descriptor.row))
+        if others is None:
+            return found
+        similarities = others.similarities([descriptor])[0]
+        best = np.full(len(self._logs), -1.0, dtype=np.float32)
+        np.maximum.at(best, others.logs, similarities)
+        self._best = np.maximum(best, self._best).tolist()
+        for number in np.flatnonzero(best >= self._parameters.similarity_threshold).tolist():
+            rows = np.flatnonzero(others.logs == number)
+            found += self._candidates(keyframe, self._logs[number], others.indices[rows], similarities[rows])
         return _sorted(found)
 
     def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
         """Candidates of other robots' keyframes with this robot's."""
-        own = self._by_log.get(self._own)
-        if own is None:
+        own = self._own_rows
+        fitting = [each for each in keyframes if own is not None and own.dimension == len(each[1].row)]
+        if own is None or not fitting:
             return []
         found: list[Found] = []
-        fitting = [(keyframe, descriptor) for keyframe, descriptor in keyframes if own.dimension == len(descriptor)]
-        if fitting:
-            similarities = np.array([descriptor for _, descriptor in fitting]) @ own.matrix.T
-            for (keyframe, _), row in zip(fitting, similarities, strict=True):
-                found += _sorted(self._best(keyframe, self._own, own.indices, row, self._name(keyframe.log)))
+        similarities = own.similarities([descriptor for _, descriptor in fitting])
+        for k, highest in enumerate(similarities.max(axis=1).tolist()):
+            keyframe = fitting[k][0]
+            number = self._numbers[keyframe.log]
+            if highest > self._best[number]:
+                self._best[number] = highest
+            if highest >= self._parameters.similarity_threshold:
+                found += _sorted(self._candidates(keyframe, self._own, own.indices, similarities[k]))
         return found
 
     def _is_compared(self, log: LogId) -> bool:
         """Whether a log's keyframes may be partners of this robot's."""
         return log.robot != self._own.robot or (log in self._closed and log != self._own)
 
-    def _name(self, log: LogId) -> str:
-        """Whose log it is, for people: a robot, or an earlier journey of this one."""
-        return str(log) if log.robot == self._own.robot else log.robot
-
     def _within(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
         """Candidates among this robot's own keyframes that are far enough apart."""
-        own = self._by_log[self._own]
-        apart = keyframe.index - np.array(own.indices)
-        similarities = np.where(apart >= self._parameters.own_gap_keyframes, own.matrix @ descriptor, -2.0)
-        return self._best(keyframe, self._own, own.indices, similarities, None)
+        own = self._own_rows
+        assert own is not None
+        apart = keyframe.index - own.indices
+        similarities = own.similarities([descriptor])[0]
+        far = np.where(apart >= self._parameters.own_gap_keyframes, similarities, np.float32(-2.0))
+        return self._candidates(keyframe, self._own, own.indices, far)
 
-    def _best(
-        self, keyframe: KeyframeId, log: LogId, indices: list[int], similarities: Descriptor, robot: str | None
+    def _candidates(
+        self, keyframe: KeyframeId, log: LogId, indices: NDArray[np.int32], similarities: Floats
     ) -> list[Found]:
-        """The most similar keyframes of one log, those above the threshold; what was best is noted for a robot."""
-        first = int(similarities.argmax())
-        highest = float(similarities[first])
-        if robot is not None and highest > self.best_similarities.get(robot, -1.0):
-            self.best_similarities[robot] = highest
-        if highest < self._parameters.similarity_threshold:
-            return []
-        best = [first]
+        """The most similar keyframes of one log, those above the threshold."""
+        best = [int(similarities.argmax())]
         if self._parameters.best_matches > 1:
             best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
         return [
-            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, indices[k])), float(similarities[k])))
+            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, int(indices[k]))), float(similarities[k])))
             for k in best
             if similarities[k] >= self._parameters.similarity_threshold
         ]
@@ -171,13 +257,22 @@ def _sorted(found: list[Found]) -> list[Found]:
     return found
 
 
-@lru_cache(maxsize=DIRECTIONS_MAX)
-def direction(place: Array) -> Descriptor | None:
-    """Descriptor (D,) of unit length, or None where it has no direction; found once for all robots of a process."""
+@lru_cache(maxsize=DESCRIPTORS_MAX)
+def comparable(place: Array) -> Descriptor | None:
+    """A descriptor (D,) to compare, or None where it has no direction; found once for all robots of a process."""
     values = place.numpy()
     norm = math.sqrt(float(values.dot(values)))
     if not math.isfinite(norm) or norm < 1e-12:
         return None
+    if place.dtype == "i1":
+        row: NDArray[Any] = np.frombuffer(place.data, dtype=np.int8)
+        return Descriptor(row, place.scale / norm)
     unit = np.asarray(values / norm, dtype=np.float32)
     unit.flags.writeable = False
-    return unit
+    return Descriptor(unit, 1.0)
+
+
+def direction(place: Array) -> Floats | None:
+    """A descriptor (D,) of unit length, or None where it has no direction."""
+    descriptor = comparable(place)
+    return None if descriptor is None else np.asarray(descriptor.row * np.float32(descriptor.inverse_norm))

@@ -281,6 +281,11 @@ def map_frame(anchor: LogId) -> str:
 
 def components_of(logs: Sequence[LogId], closures: Sequence[LoopClosure]) -> tuple[tuple[LogId, ...], ...]:
     """Group logs that closures connect; each group sorted, groups sorted by their lowest log."""
+    return groups_of(logs, [(closure.query.log, closure.match.log) for closure in closures])
+
+
+def groups_of(logs: Sequence[LogId], links: Sequence[tuple[LogId, LogId]]) -> tuple[tuple[LogId, ...], ...]:
+    """Group logs that links connect; each group sorted, groups sorted by their lowest log."""
     parent = {log: log for log in logs}
 
     def root(log: LogId) -> LogId:
@@ -289,8 +294,7 @@ def components_of(logs: Sequence[LogId], closures: Sequence[LoopClosure]) -> tup
             log = parent[log]
         return log
 
-    for closure in closures:
-        a, b = closure.query.log, closure.match.log
+    for a, b in links:
         if a in parent and b in parent:
             low, high = sorted((root(a), root(b)))
             parent[high] = low

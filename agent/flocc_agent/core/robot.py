@@ -4,8 +4,8 @@ The driver calls `handle` for each event and `tick` when `deadline` is due; both
 order. Same seed and same events give the same effects, on virtual time and on a robot.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import assert_never
 
 from flocc_agent.core.assembly import GraphAssembly
@@ -100,6 +100,9 @@ from flocc_protocol.records import (
 
 NOBODY = -1
 """Compute class, as loop closing sees it, of a name under which two robots run: both would register what it gets."""
+DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
+"""How long a leader whose signed correction cannot be true is not followed: the first time, and at most."""
+OVERTAKEN_PERIOD_S = 1.0
 GREETING_RATIO = 0.2
 """Least pause between heartbeats that greet new neighbours, against the usual one."""
 
@@ -159,6 +162,7 @@ class Robot:
         restored: Restored | None = None,
         sealer: Sealer | None = None,
         distributed: bool = False,
+        compute_classes: Mapping[str, int] | None = None,
     ) -> None:
         restored = restored or Restored()
         self.log = log
@@ -177,7 +181,7 @@ class Robot:
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
         self._answers = AnswerBudget()
         self._muted = Muted()
-        self.assembly = GraphAssembly(restored.saved)
+        self.assembly = GraphAssembly(restored.saved, self._record_at)
         closed = restored.closed()
         self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
@@ -195,8 +199,14 @@ class Robot:
             odometry=self.assembly.odometry,
             near=self.neighbours.__contains__,
             towards=self.neighbours.towards,
+            evidence=self.assembly,
         )
-        self.election = LeaderElection(log, compute_class, restored.counter_max(), parameters.election, now)
+        self._has_keys = sealer is not None
+        self._overtaken_s = float("-inf")
+        self._distrusted = Muted(DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S)
+        self.election = LeaderElection(
+            log, compute_class, restored.counter_max(), parameters.election, now, compute_classes
+        )
         self.rounds = Rounds(self.assembly, parameters.rounds)
         self.distributed = self._distributed(restored.correction) if distributed else None
         self._restore(restored, now)
@@ -248,7 +258,8 @@ class Robot:
             **self.corrections.sizes(),
             **self.election.sizes(),
             **self._answers.sizes(),
-            **self._muted.sizes(),
+            **self._muted.sizes("muted"),
+            **self._distrusted.sizes("distrusted"),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
 
@@ -293,6 +304,8 @@ class Robot:
         sender, message = envelope.sender, envelope.message
         if sender.robot == self.log.robot and not isinstance(message, Heartbeat):
             return []
+        if isinstance(message, Election | Answer | Coordinator | Handover) and self._is_distrusted(sender, now):
+            return []
         match message:
             case Heartbeat():
                 return self._on_heartbeat(sender, message, now)
@@ -336,6 +349,7 @@ class Robot:
         else:
             heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
             effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
+        effects += self._reconsider(now)
         for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
             for signer in failed:
                 muted.on_failed(peer, signer, now)
@@ -351,9 +365,10 @@ class Robot:
             self._greet(heartbeat, now)
         if self.in_map is not None:
             effects += self.in_map.on_heartbeat(sender)
-        effects += self.election.on_heartbeat(sender, heartbeat, now)
+        effects += self.election.on_heartbeat(sender, self._believed(heartbeat, now), now)
         effects += self._compare(sender, heartbeat, now)
-        helps = NOBODY if self.neighbours.is_double(sender.robot) else heartbeat.compute_class
+        compute_class = self.election.class_of(sender.robot, heartbeat.compute_class)
+        helps = NOBODY if self.neighbours.is_double(sender.robot) else compute_class
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
         self.closing.on_wants(heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
@@ -362,10 +377,43 @@ class Robot:
 
     def _on_correction(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
         """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
+        if self._is_distrusted(message.term.leader, now):
+            return self._overtaken(sender, message, now)
         if not self.corrections.is_news(message, now):
             return []
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
         return refused or self.corrections.take(message, now)
+
+    def _reconsider(self, now: float) -> list[Effect]:
+        """Look again at a correction that was not believed; where leaders sign, one that lies is not followed."""
+        effects, doubts = self.corrections.reconsider(now), self.corrections.doubts
+        if self._has_keys:
+            for leader in sorted(doubts.doubted):
+                self._distrusted.on_failed(leader.robot, leader.robot, now)
+                self.corrections.forget(leader.robot)
+                effects += self.election.on_distrusted(leader.robot, now)
+            for leader in sorted(doubts.confirmed):
+                self._distrusted.forgive(leader.robot, leader.robot)
+        doubts.doubted.clear()
+        doubts.confirmed.clear()
+        return effects
+
+    def _believed(self, heartbeat: Heartbeat, now: float) -> Heartbeat:
+        """A heartbeat as the election hears it: without a leader that is not followed."""
+        advert = heartbeat.leader
+        distrusted = advert is not None and self._is_distrusted(advert.term.leader, now)
+        return replace(heartbeat, leader=None) if distrusted else heartbeat
+
+    def _overtaken(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
+        """Lead above the terms of a robot that is not followed, now and then: others may have applied what it said."""
+        if not self.election.leading or now < self._overtaken_s + OVERTAKEN_PERIOD_S:
+            return []
+        self._overtaken_s = now
+        refused = self.corrections.refused(sender.robot, message)
+        return refused or self.election.on_applied(sender, message.term)
+
+    def _is_distrusted(self, leader: LogId, now: float) -> bool:
+        return self._distrusted.is_muted(leader.robot, leader.robot, now)
 
     def _compare(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Ask a neighbour for what it has more of, and for what changed in its tables where they are others."""
@@ -374,15 +422,16 @@ class Robot:
         effects = self.gossip.on_digests(sender, own, now)
         if heartbeat.versions.hash != versions.hash:
             effects += self.corrections.ask(peer, now)
-        effects += self.corrections.ask_knots(now)
+        effects += [*self.corrections.ask_knots(now), *self._reconsider(now)]
         return effects + self.comparisons.on_heartbeat(peer, heartbeat, digests, versions, now)
 
     def _on_digests(self, sender: LogId, message: Digests, now: float) -> list[Effect]:
         """What others hold: whoever has less of a log or an older correction asks for it."""
-        helped = self.gossip.has_news(message.digests) or self.corrections.has_news(message.versions)
+        versions = tuple(each for each in message.versions if not self._is_distrusted(each.term.leader, now))
+        helped = self.gossip.has_news(message.digests) or self.corrections.has_news(versions)
         self.comparisons.on_digests(sender.robot, message, helped, now)
         effects = self.gossip.on_digests(sender, message.digests, now, at_once=True)
-        return effects + self.corrections.on_versions(sender.robot, message.versions, now)
+        return effects + self.corrections.on_versions(sender.robot, versions, now)
 
     def _on_digest_request(self, sender: LogId, request: DigestRequest, now: float) -> list[Effect]:
         if sender.robot not in self.neighbours or not self.comparisons.may_answer(sender.robot, now):
@@ -475,6 +524,9 @@ class Robot:
         return [report, *self.corrections.publish(event.term, event.round, event.solution)]
 
     # Records
+
+    def _record_at(self, log: LogId, number: int) -> Record:
+        return self.gossip.logs[log].records[number]
 
     def _append(self, record: Record, now: float) -> list[Effect]:
         new, effects, batch = self.gossip.append(record)
@@ -573,7 +625,7 @@ class Robot:
                     term_counter_max=self.election.counter_max,
                     load=self.closing.load,
                     records=len(own),
-                    checksum=own.checksums[-1],
+                    checksum=own.checksum,
                     digests=self.gossip.state(),
                     versions=self.corrections.state(),
                     wants=self.closing.wants(now),

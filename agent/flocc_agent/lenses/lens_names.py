@@ -15,6 +15,8 @@ EQUIDISTANT = frozenset(
 )  # fmt: skip
 FOV = frozenset({"fov", "atan", "pinhole_fov"})
 NONE = frozenset({"", "none", "no_distortion", "perspective", "rectified", "null"})
+ZEROED = frozenset({"inverse_brown_conrady", "modified_brown_conrady"})
+"""What RealSense writes with zeros for images without distortion; with other numbers these are other models."""
 OMNIDIRECTIONAL = frozenset({"omni", "omni_radtan", "omnidirectional", "mei", "unified", "ucm_mei"})
 DOUBLE_SPHERE = frozenset({"ds", "ds_none", "double_sphere", "doublesphere"})
 EUCM = frozenset({"eucm", "eucm_none", "extended_unified"})
@@ -25,15 +27,15 @@ Coefficients = Sequence[float]
 
 
 def plain_name(name: str) -> str:
-    """A model's name without the differences of capitals, dashes and spaces."""
-    return name.strip().lower().replace("-", "_").replace(" ", "_")
+    """A model's name without the differences of capitals, dashes and spaces, and without RealSense's prefix."""
+    return name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("distortion.")
 
 
 def kind_of(name: str) -> LensKind | None:
     """The family that a name of a camera or distortion model says; None where it is not known."""
     plain = plain_name(name)
     families = {
-        LensKind.PINHOLE: RADTAN | RATIONAL | NONE,
+        LensKind.PINHOLE: RADTAN | RATIONAL | NONE | ZEROED,
         LensKind.EQUIDISTANT: EQUIDISTANT,
         LensKind.FOV: FOV,
         LensKind.OMNIDIRECTIONAL: OMNIDIRECTIONAL,
@@ -65,6 +67,8 @@ def with_distortion(
         return CameraModel(*size, *focal, kind=kind, shape=_counted(name, coefficients, (1,)))
     if kind is LensKind.EQUIDISTANT:
         return CameraModel(*size, *focal, _counted(name, coefficients, (4,)), kind)
+    if plain in ZEROED and any(coefficients):
+        raise ValueError(f"the distortion model is {name!r} with other numbers than zeros; flocc reads {READ}")
     counts: tuple[int, ...] = (0, 4, 5, 8, 12, 14)
     if plain in NONE and plain:
         counts = (0,)

@@ -21,18 +21,27 @@ _UNIT_NAMES = {
 _METRES = {"": 1.0, "m": 1.0, "meter": 1.0, "meters": 1.0, "metres": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3}
 _UNIT_OF = {name: unit for unit, names in _UNIT_NAMES.items() for name in names}
 _STAMP = re.compile(r"(.*[._/])?(t|ts|time|times|stamp|timestamp|time_stamp|unix_?time|epoch|utc|clock)")
-_HEADER_STAMP = re.compile(r"(.*[._/])?header[._/]stamp")
+_HEADER_STAMP = re.compile(r"(.*[._/])?header[._/]stamp([._/]secs?)?")
 _POSITION = re.compile(
     r"|t|p|pose|pos|position|trans|translation|loc|location|[pt]_\w+|(.*[._/])?(position|translation)(_\w+)?"
 )
 _QUATERNION = re.compile(
-    r"(.*[._/])?q|quat|quaternion|rot|rotation|ori|orient|orientation|q_\w+|(.*[._/])?(orientation|rotation|quaternion|quat)"
+    r"(.*[._/])?q|o|quat|quaternion|rot|rotation|ori|orient|orientation|q_\w+|(.*[._/])?(orientation|rotation|quaternion|quat)"
 )
 _ANGLES = re.compile(r"(.*[._/])?(roll|pitch|yaw|heading|azimuth|euler_?\w*|rx|ry|rz|phi|theta|psi)(_\w+)?")
 _ORDER = re.compile(
     r"\b(q|quat|quaternion)[\w ]*?[ _(\[]+([wxyz])[, ]?([wxyz])[, ]?([wxyz])[, ]?([wxyz])[)\]]?(?=[\s,;]|$)"
 )
 """A quaternion in one word, `q_wxyz` or `quat(x,y,z,w)`."""
+_REVERSED = re.compile(
+    r"(?:^|_)(?:[bcis][wg]|(?:cam|camera|body|imu|base)_?(?:world|map|odom|global)"
+    r"|(?:world|map|odom|global|w|g)_?(?:to|2|in)_?(?:cam|camera|body|imu|base|[bcis])(?:_?link)?)(?:_|$)"
+)
+"""A pose of the fixed frame in the moving one: `q_cw_x`, `p_BW_y`, `t_world_to_cam_z`."""
+_LABEL = re.compile(r"(.*[._/])?(child_frame(_id)?|frame_id|device(_id)?|robot(_id|_name)?|vehicle(_id)?|sensor(_id)?)")
+"""Columns that say what a row's pose is of."""
+_PX4 = ("timestamp_sample", "q_offset[")
+"""What a header of PX4's logs has, as `ulog2csv` writes it: arrays x y z and w x y z, stamps in microseconds."""
 _OTHER_PARTS = ("cov", "twist", "veloc", "accel", "gyro", "bias", "sigma", "std", "error", "imu", "mag")
 
 
@@ -46,6 +55,7 @@ class Columns:
         unit: What the stamp is in, one of `UNITS_S`, or None where nothing says so.
         nanoseconds: Column of the nanoseconds that are added to the stamp's seconds, or None.
         metres: What one unit of the position is.
+        labels: Names and columns of words that say what a pose is of, such as `child_frame_id`.
     """
 
     stamp: int | None
@@ -53,6 +63,7 @@ class Columns:
     unit: str | None = None
     nanoseconds: int | None = None
     metres: float = 1.0
+    labels: tuple[tuple[str, int], ...] = ()
 
 
 class HeaderError(ValueError):
@@ -69,7 +80,9 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
     Raises:
         HeaderError: It names some, but not one column for each number of a stamped pose.
     """
-    names = _names(header)
+    names = _names(_px4_named(header))
+    has_rest = bool(names) and names[-1].startswith("*")
+    names = names[:-1] if has_rest else names
     roles = [_role(name) for name in names]
     if roles.count("stamp") == 2 and any(_HEADER_STAMP.fullmatch(_bare(name)) for name in names):
         roles = [
@@ -80,7 +93,7 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
         names, roles = names[1:], roles[1:]
     if sum(role is not None for role in roles) < ROLES_MIN:
         return None
-    if count is not None and len(roles) != count:
+    if count is not None and (len(roles) > count if has_rest else len(roles) != count):
         raise HeaderError(f"the header names {len(roles)} columns, but rows have {count}")
     for role in (*POSE_COLUMNS, "stamp"):
         if roles.count(role) > 1:
@@ -91,22 +104,46 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
         angles = [name for name in names if _ANGLES.fullmatch(_bare(name))]
         instead = f"; it has angles ({', '.join(angles[:3])}), whose order and axes differ" if angles else ""
         raise HeaderError(f"the header names no {', '.join(missing)}{instead}")
+    turned = next((n for n, r in zip(names, roles, strict=True) if r in POSE_COLUMNS and _is_reversed(n)), None)
+    if turned is not None:
+        raise HeaderError(f"the header gives the pose of the world in the body or camera ({turned}): invert the poses")
+    labels = tuple((_bare(name), k) for k, name in enumerate(names) if _LABEL.fullmatch(_bare(name)))
     stamp = roles.index("stamp")
     split = roles.index("nanoseconds") if "nanoseconds" in roles else None
     unit = "seconds" if split is not None else _unit(names[stamp])
     metres = {_metres(names[roles.index(axis)]) for axis in "xyz"}
     if len(metres) > 1:
         raise HeaderError("the header gives positions in several units")
-    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split, metres.pop())
+    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split, metres.pop(), labels)
+
+
+def _px4_named(header: str) -> str:
+    """A header of PX4's logs with names for the elements of its arrays, and any other header as it is."""
+    if not any(sign in header for sign in _PX4):
+        return header
+    named = re.sub(r"\bposition\[([0-2])\]", lambda found: "position_" + "xyz"[int(found[1])], header)
+    named = re.sub(r"\bq\[([0-3])\]", lambda found: "q_" + "wxyz"[int(found[1])], named)
+    return re.sub(r"\btimestamp\b(?!_)", "timestamp[us]", named)
+
+
+def _is_reversed(name: str) -> bool:
+    frames = re.sub(r"_?[xyzw]$", "", re.split(r"[./]", _bare(name))[-1])
+    return _REVERSED.search(frames) is not None
 
 
 def _metres(name: str) -> float:
     """What one unit of a position is, by what stands in brackets behind its name."""
     bracketed = re.search(r"[\[(](.*?)[\])]", name)
-    unit = bracketed[1].strip().lower() if bracketed else "m"
+    unit = bracketed[1].strip().lower() if bracketed else _length_unit(_bare(name)) or "m"
     if unit not in _METRES:
         raise HeaderError(f"the header gives positions in {unit!r}, not in metres")
     return _METRES[unit]
+
+
+def _length_unit(bare: str) -> str | None:
+    """The unit in which a name ends, as `tx_mm` does."""
+    stem, _, last = bare.rpartition("_")
+    return last if stem and last in _METRES else None
 
 
 def _names(header: str) -> list[str]:
@@ -134,6 +171,8 @@ def _role(name: str) -> str | None:
         return "stamp"
     if _STAMP.fullmatch(_without_unit(bare)):
         return "stamp"
+    if (unit := _length_unit(bare)) is not None:
+        bare = bare.removesuffix(f"_{unit}")
     found = re.fullmatch(r"(?P<group>.*?)[_./]?(?P<axis>[xyzw])", bare)
     if found is None:
         return None

@@ -8,14 +8,28 @@ import struct
 from collections.abc import Iterator
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.certificate_faults import certificate_faults
 
 _SIOCGIFFLAGS = 0x8913
 _UP, _LOOPBACK, _MULTICAST = 0x1, 0x8, 0x1000
 
 
+def found_by(config: TransportConfig, swarm: str) -> str:
+    """How a robot finds others of its swarm: the first line of its log."""
+    ways = []
+    if config.scouts(swarm):
+        ways.append(f"by multicast ({config.multicast_address})")
+    if config.roster:
+        ways.append(f"at the addresses of {len(config.roster)} robots (transport.roster)")
+    found = f"swarm {swarm}: " + (f"others are found {' and '.join(ways)}" if ways else "waits for others to dial it")
+    if config.multicast and not config.scouts(swarm):
+        found += '; the swarm has no name (swarm = "..."), so that it looks for nobody by multicast'
+    return found
+
+
 def network_faults(config: TransportConfig, robot: str) -> list[str]:
     """One sentence for each part of a network that is not there now; asks the resolver, and may take seconds."""
-    return [*interface_faults(config), *host_faults(config, robot)]
+    return [*certificate_faults(config.tls), *interface_faults(config), *host_faults(config, robot)]
 
 
 def interface_faults(config: TransportConfig) -> Iterator[str]:

@@ -32,7 +32,7 @@ def clear_order(positions_m: Float, quaternions: Float) -> Order | None:
     kept = _spaced(positions_m)
     t, q = positions_m[kept], quaternions[kept]
     readings = {"xyzw": rotations(q[:, [3, 0, 1, 2]]), "wxyz": rotations(q)}
-    signs = {_by_start(quaternions[0]), _by_axis(t, readings), _by_heading(t, readings)} - {None}
+    signs = {start_order(quaternions[0]), _by_axis(t, readings), _by_heading(t, readings)} - {None}
     return signs.pop() if len(signs) == 1 else None
 
 
@@ -54,7 +54,8 @@ def rotations(q_wxyz: Float) -> Float:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def _by_start(first: Float) -> Order | None:
+def start_order(first: Float) -> Order | None:
+    """The order in which the first quaternion is exactly no rotation."""
     if np.allclose(np.abs(first), [0, 0, 0, 1], atol=EXACT):
         return "xyzw"
     return "wxyz" if np.allclose(np.abs(first), [1, 0, 0, 0], atol=EXACT) else None

@@ -13,7 +13,7 @@ from flocc_agent.core.pose_graph import GraphSolution, map_frame
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.core.reports import ClosureAccepted, CorrectionApplied, Fact, KeyframeTaken
 from flocc_agent.core.robot import Robot
-from flocc_agent.geometry import inverse, pose7, pose_from_tq
+from flocc_agent.geometry import inverse, pose7, pose7s, pose_from_tq, poses_from_tq
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_protocol.codec import Pose7
@@ -46,7 +46,7 @@ class Reporter:
             case KeyframeTaken():
                 return replace(fact, T_odom_body=self._body(fact.T_odom_body))
             case CorrectionApplied():
-                return replace(fact, T_map_body=tuple(_rounded(self._body(T)) for T in fact.T_map_body))
+                return replace(fact, T_map_body=tuple(map(_rounded, self._bodies(fact.T_map_body))))
             case ClosureAccepted():
                 return replace(fact, probability=round(closure_probability(fact.ratio, self.steepness), 6))
         return fact
@@ -54,6 +54,11 @@ class Reporter:
     def _body(self, T_camera: Pose7) -> Pose7:
         """The body's pose, of the camera's in the same frame."""
         return pose7(pose_from_tq(np.array(T_camera)) @ inverse(self.T_body_camera))
+
+    def _bodies(self, T_camera: tuple[Pose7, ...]) -> tuple[Pose7, ...]:
+        if not T_camera:
+            return ()
+        return pose7s(poses_from_tq(np.array(T_camera)) @ inverse(self.T_body_camera))
 
 
 def _rounded(pose: Pose7) -> Pose7:

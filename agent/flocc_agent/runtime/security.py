@@ -37,11 +37,13 @@ class Members:
         swarm: Name of the swarm.
         robots: Public signing key (32 bytes) by robot; each writes under its own name only.
         operators: Names of certificates that may ask for status and inject faults.
+        compute_classes: Compute class by robot, 0 for those that are not named; None: robots say so themselves.
     """
 
     swarm: str
     robots: Mapping[str, bytes]
     operators: tuple[str, ...]
+    compute_classes: Mapping[str, int] | None = None
 
 
 def read_members(path: Path) -> Members:
@@ -53,10 +55,16 @@ def read_members(path: Path) -> Members:
     try:
         content = json.loads(read(path))
         robots = {str(name): bytes.fromhex(key) for name, key in content["robots"].items()}
-        members = Members(str(content["swarm"]), robots, tuple(str(name) for name in content["operators"]))
+        classes = content.get("compute_classes")
+        members = Members(
+            str(content["swarm"]),
+            robots,
+            tuple(str(name) for name in content["operators"]),
+            None if classes is None else {str(name): int(each) for name, each in classes.items()},
+        )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise TransportError(f"{path}: is not a list of members: {error}") from error
-    names = [*members.robots, *members.operators]
+    names = [*members.robots, *members.operators, *(members.compute_classes or ())]
     if len(names) > MEMBERS_MAX or not all(NAME_PATTERN.fullmatch(name) for name in names):
         raise TransportError(f"{path}: holds more than {MEMBERS_MAX} names, or one that is no name")
     return members
@@ -166,9 +174,19 @@ class RecordSealer:
 
     The signature covers swarm, log and number as well, so that a record cannot be moved to another place. Corrections
     are signed by the leader that made them, apart from their bytes.
+
+    Attributes:
+        compute_classes: Those of the list of members, None where it names none.
     """
 
-    def __init__(self, swarm: str, signing_key: "Ed25519PrivateKey", members: Mapping[str, bytes]) -> None:
+    def __init__(
+        self,
+        swarm: str,
+        signing_key: "Ed25519PrivateKey",
+        members: Mapping[str, bytes],
+        compute_classes: Mapping[str, int] | None = None,
+    ) -> None:
+        self.compute_classes = compute_classes
         self._swarm = swarm
         self._signing_key = signing_key
         self._verifying_keys = {robot: _public_key(key) for robot, key in members.items()}
@@ -192,7 +210,7 @@ class RecordSealer:
         if not isinstance(signing_key, Ed25519PrivateKey):
             raise TransportError(f"{path}: is not an Ed25519 key")
         members = read_members(tls.folder / MEMBERS)
-        return cls(members.swarm, signing_key, members.robots)
+        return cls(members.swarm, signing_key, members.robots, members.compute_classes)
 
     def seal(self, log: LogId, number: int, record: bytes) -> bytes:
         """Append this robot's signature to a record of its own log."""

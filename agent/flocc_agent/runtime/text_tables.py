@@ -23,6 +23,8 @@ _BOMS = (
 )
 _CONTROLS = bytes([*range(1, 9), *range(14, 32)])
 CONTROLS_RATIO_MAX = 0.02
+_QUOTED = re.compile(r'"([^"]*)"')
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _BRACKETS = str.maketrans("", "", "[](){}")
 """Lists as programs print them."""
 
@@ -155,13 +157,19 @@ def _is_words(text: str) -> bool:
     return sum(is_number(word) for word in words) < len(words) / 2
 
 
+def _without_commas(found: re.Match[str]) -> str:
+    """A quoted field as one word: a number with a decimal comma gets a point, a list loses its commas."""
+    inner = found[1].strip()
+    return inner.replace(",", "." if _DECIMAL_COMMA.fullmatch(inner) else "\u00b7").replace(" ", "")
+
+
 class _Splitter:
     """Splits rows as the first one is written."""
 
     def __init__(self, first: str) -> None:
         words = first.split()
         self._semicolons = ";" in first
-        inner = [word for word in words if re.fullmatch(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", word)]
+        inner = [word for word in words if _DECIMAL_COMMA.fullmatch(word)]
         spaced = len(words) >= 4 and bool(inner) and not any("." in word or word.endswith(",") for word in words)
         self._decimal_comma = spaced or (self._semicolons and "," in first)
         self._commas = "," in first and not self._decimal_comma
@@ -169,8 +177,10 @@ class _Splitter:
     def __call__(self, text: str) -> list[str]:
         text = text.translate(_BRACKETS)
         if self._semicolons:
+            text = _QUOTED.sub(lambda found: found[1].replace(";", "\u00b7"), text)
             fields = [field.strip(" \t\"'") for field in text.split(";")]
         elif self._commas:
+            text = _QUOTED.sub(_without_commas, text)
             fields = [field.strip(" \t\"'") for field in text.split(",")]
             if any(" " in field and is_number(field.split()[0]) for field in fields):
                 fields = re.split(r"[\s,]+", text)

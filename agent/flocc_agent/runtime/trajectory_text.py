@@ -7,6 +7,7 @@ row costs itself.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -296,6 +297,7 @@ def _wanted(columns: Columns) -> list[int]:
 
 def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], tuple[str, ...]]:
     """Stamp and pose of each row that is whole, its line, and what was left out."""
+    _refuse_mixed(table, columns)
     wanted = _wanted(columns)
     good, lines, damaged = [], [], []
     count = max(_usual_count(table), max(wanted) + 1)
@@ -316,6 +318,21 @@ def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], t
         values[:, 0] += values[:, -1] * 1e-9
     note = f"{table.path}: {len(damaged)} of {len(table.rows)} rows were left out, the first at line "
     return values, np.array(lines), (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
+
+
+def _refuse_mixed(table: Table, columns: Columns) -> None:
+    """Refuse a table in which the poses of several bodies alternate.
+
+    Raises:
+        RecordingError: A column that says what a pose is of says several things, each of many rows.
+    """
+    for name, index in columns.labels:
+        found = Counter(fields[index] for _, fields in table.rows if len(fields) > index)
+        if 1 < len(found) <= len(table.rows) / 2:
+            several = ", ".join(sorted(found)[:4])
+            raise RecordingError(
+                f"{table.path}: holds poses of {len(found)} different {name} ({several}); keep the rows of one of them"
+            )
 
 
 def _damage(fields: list[str], columns: Columns) -> str | None:

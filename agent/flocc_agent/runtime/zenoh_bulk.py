@@ -79,11 +79,15 @@ class BulkService:
         for token in self._in_flight:
             token.cancel()
 
-    def close(self) -> None:
-        """Close the session and end the threads; blocks."""
+    def close_session(self) -> None:
+        """Close the session, which `open` makes anew; blocks."""
         session, self._session = self._session, None
         if session is not None:
             session.close()
+
+    def close(self) -> None:
+        """Close the session and end the threads; blocks."""
+        self.close_session()
         self._servers.shutdown(wait=True, cancel_futures=True)
         self._fetchers.shutdown(wait=True, cancel_futures=True)
 

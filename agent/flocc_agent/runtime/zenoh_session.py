@@ -64,7 +64,7 @@ def session_settings(
             "period_max_ms": round(RETRY_MAX_S * 1000),
             "period_increase_factor": 1.5,
         },
-        "scouting/multicast/enabled": config.multicast,
+        "scouting/multicast/enabled": config.scouts(swarm),
         "scouting/multicast/address": config.multicast_group(control),
         "scouting/multicast/interface": config.interface,
         "scouting/multicast/autoconnect_strategy": strategy,

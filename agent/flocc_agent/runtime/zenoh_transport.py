@@ -23,6 +23,7 @@ import zenoh
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import Radio
+from flocc_agent.runtime.addresses import Addresses, AddressWatch, at_addresses, machine_addresses
 from flocc_agent.runtime.inbox import Inbox, Incoming, RateLimiter
 from flocc_agent.runtime.transport import (
     Fetched,
@@ -46,6 +47,8 @@ POSITION = struct.Struct(">3d")
 FRAGMENT_BYTES = 60_000
 SLOW_PUTS_MAX = 16
 ADDRESSES_MAX = 4096
+ADDRESSES_PERIOD_S = 1.0
+"""How often this machine's addresses are looked at; sessions are opened anew when they stayed for so long."""
 DELAYED_MAX = 20_000
 INBOX_BYTES_MAX = 32 * 1024 * 1024
 """Bytes of one kind of message that wait for the robot; the oldest is dropped for a new one."""
@@ -115,6 +118,8 @@ class ZenohTransport:
         self._delayed_count = 0
         self._named: set[tuple[str, ...]] = set()
         self._linked: dict[str, str] = {}
+        self._watching: asyncio.Task[None] | None = None
+        self._closed = False
 
     async def __aenter__(self) -> "ZenohTransport":
         try:
@@ -166,16 +171,57 @@ class ZenohTransport:
         self._loop = asyncio.get_running_loop()
         limits = (self._config.inbox_messages_max, INBOX_BYTES_MAX)
         self._inbox = Inbox(self._loop, self._arrived, self._counter, *limits)
+        watch = AddressWatch(machine_addresses(), self._config.interface)
         try:
             await asyncio.to_thread(self._open_blocking)
         except BaseException:
             await self.close()
             raise
+        if self._config.scouts(self.swarm):
+            self._watching = asyncio.create_task(self._watch_addresses(watch))
 
-    def _open_blocking(self) -> None:
+    async def _watch_addresses(self, watch: AddressWatch) -> None:
+        """Open both sessions anew when this machine has other addresses: zenoh scouts on those that it found."""
+        failed = False
+        while True:
+            await asyncio.sleep(ADDRESSES_PERIOD_S)
+            news = watch.news(machine_addresses())
+            if not news and not failed:
+                continue
+            told = f" ({', '.join(news)})" if news else ""
+            logger.warning("robot %s: this machine has other addresses%s, opening the network anew", self.robot, told)
+            try:
+                await asyncio.shield(asyncio.to_thread(self._reopen_blocking))
+                failed = False
+            except TransportError as error:
+                logger.warning("%s; it is tried again", error)
+                failed = True
+
+    def _reopen_blocking(self) -> None:
+        """Messages of the meantime are not sent; logs repair that."""
+        session, self._session = self._session, None
+        self._linked = {}
+        self._bulk.close_session()
+        if session is not None:
+            session.close()
+        if not self._closed:
+            self._open_blocking(machine_addresses())
+
+    def _open_blocking(self, addresses: Addresses = frozenset()) -> None:
         whose = f"robot {self.robot}"
         control, bulk = (session_settings(self._config, self.swarm, self.robot, plane) for plane in Plane)
-        session = self._session = open_session(control, whose)
+        if addresses:
+            control, bulk = at_addresses(control, addresses), at_addresses(bulk, addresses)
+        session = open_session(control, whose)
+        try:
+            self._declare_all(session)
+            self._bulk.open(bulk, whose)
+        except BaseException:
+            session.close()
+            raise
+        self._session = session
+
+    def _declare_all(self, session: zenoh.Session) -> None:
         for pattern in (
             keys.broadcasts_pattern(self.swarm),
             keys.unicasts_pattern(self.swarm, self.robot),
@@ -184,15 +230,12 @@ class ZenohTransport:
         liveliness = session.liveliness()
         liveliness.declare_subscriber(keys.presence_pattern(), self._presence_changed, history=True)
         self._token = liveliness.declare_token(keys.alive_key(self.swarm, self.robot, self.boot))
-        for kind in keys.Kind:
-            self._publishers[kind.value] = self._declare(kind.value)
+        self._publishers = {kind.value: self._declare(session, kind.value) for kind in keys.Kind}
         assert self._loop is not None
         self._admin.open(session, self._loop)
-        self._bulk.open(bulk, whose)
 
-    def _declare(self, kind: str) -> zenoh.Publisher:
-        assert self._session is not None
-        return self._session.declare_publisher(
+    def _declare(self, session: zenoh.Session, kind: str) -> zenoh.Publisher:
+        return session.declare_publisher(
             keys.broadcast_key(self.swarm, self.robot, kind),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=PRIORITY.get(kind, zenoh.Priority.DATA),
@@ -204,7 +247,11 @@ class ZenohTransport:
         for handle in self._delayed.values():
             handle.cancel()
         self._delayed.clear()
+        self._closed = True
         self._bulk.stop_fetching()
+        if self._watching is not None:
+            self._watching.cancel()
+            await asyncio.gather(self._watching, return_exceptions=True)
         await asyncio.shield(asyncio.to_thread(self._close_blocking))
 
     def _close_blocking(self) -> None:
@@ -227,7 +274,7 @@ class ZenohTransport:
         if session is None or not self._may_send(payload):
             return self._counter.count_dropped("not-sent")
         if kind not in self._publishers:
-            self._publishers[kind] = self._declare(kind)
+            self._publishers[kind] = self._declare(session, kind)
         publisher, attachment = self._publishers[kind], self._position()
         self._put(lambda: publisher.put(payload, attachment=attachment), payload)
         return self._counter.count_sent(kind, len(payload), set(self._linked.values()))

@@ -4,8 +4,9 @@ A writer gives a file's name and text, and says which camera models and whether 
 """
 
 import json
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -536,8 +537,60 @@ def zed(rig: Rig) -> str:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     keys = "".join(f"{key}={value!r}\n" for key, value in zip(names, (*_focal(m), *_radtan(m, 5)), strict=True))
     name = {(672, 376): "VGA", (1280, 720): "HD", (1920, 1080): "FHD"}[(m.width, m.height)]
-    other = "fx=1\nfy=1\ncx=1\ncy=1\nk1=0\n"
+    other = "fx=1\nfy=1\ncx=1\ncy=1\n"
     return f"[LEFT_CAM_2K]\n{other}\n[LEFT_CAM_{name}]\n{keys}\n[RIGHT_CAM_{name}]\n{other}\n[STEREO]\nBaseline=119.9\n"
+
+
+def zed_apart(rig: Rig) -> str:
+    """Write SNxxxx.conf as newer tools of ZED do, with one distortion for all sizes of pictures."""
+    m = rig.model
+    bare = re.sub(r"^[kp]\d=.*\n", "", zed(Rig(replace(m, distortion=()), rig.T_body_camera)), flags=re.MULTILINE)
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    values = "".join(f"{key}={value!r}\n" for key, value in zip(names, _radtan(m, 8), strict=True))
+    return f"{bare}\n[LEFT_DISTO]\n{values}\n[RIGHT_DISTO]\nk1=0.1\n\n[MISC]\nSensor_ID=1\n"
+
+
+def realsense(rig: Rig) -> str:
+    """Write pyrealsense2's intrinsics, as people dump them."""
+    m = rig.model
+    names = ("fx", "fy", "ppx", "ppy")
+    model = "kannala_brandt4" if m.kind is E else "brown_conrady" if any(m.distortion) else "inverse_brown_conrady"
+    table: dict[str, Any] = {"width": m.width, "height": m.height, **dict(zip(names, _focal(m), strict=True))}
+    return json.dumps({**table, "model": f"distortion.{model}", "coeffs": [*_radtan(m, 5)]})
+
+
+def okvis2(rig: Rig) -> str:
+    """Write settings of OKVIS 2, whose camera_type is that of the pictures."""
+    return okvis(rig).replace(
+        "distortion_type", "camera_type: gray,\n        slam_use: okvis,\n        distortion_type"
+    )
+
+
+def opencv_fisheye_stereo(rig: Rig) -> str:
+    """Write K1 D1 K2 D2 of a pair of cameras."""
+    text = opencv_stereo(rig)
+    return re.sub(r"^M([12]):", r"K\1:", text, flags=re.MULTILINE)
+
+
+def scannet(rig: Rig) -> str:
+    """Write scene0000_00.txt of ScanNet."""
+    m = rig.model
+    focal = "".join(f"{key} = {value!r}\n" for key, value in zip(
+        ("fx_color", "fy_color", "mx_color", "my_color"), _focal(m), strict=True
+    ))  # fmt: skip
+    return f"axisAlignment = 1 0 0 0\ncolorHeight = {m.height}\ncolorWidth = {m.width}\nfx_depth = 5\n{focal}"
+
+
+def bundlefusion(rig: Rig) -> str:
+    """Write _info.txt of BundleFusion's recordings."""
+    m = rig.model
+    K = np.eye(4)
+    K[:3, :3] = m.K()
+    row = " ".join(map(repr, K.ravel().tolist()))
+    return (
+        f"m_versionNumber = 4\nm_colorWidth = {m.width}\nm_colorHeight = {m.height}\nm_depthWidth = 1\n"
+        f"m_calibrationColorIntrinsic = {row}\nm_calibrationDepthIntrinsic = 1 0 0 0\nm_frames.size = 9\n"
+    )
 
 
 def nested(rig: Rig) -> str:
@@ -589,6 +642,14 @@ FORMS: dict[str, WriterForm] = {
     "Record3D": WriterForm("metadata.json", record3d, counts=(0,)),
     "SpectacularAI": WriterForm("spectacular.json", spectacular, (P, E), mounting=True),
     "ZED": WriterForm("SN123.conf", zed, counts=(0, 4, 5), sizes=((672, 376), (1280, 720), (1920, 1080)), sized=False),
+    "ZED, distortion apart": WriterForm(
+        "SN124.conf", zed_apart, counts=(0, 8), sizes=((672, 376), (1280, 720), (1920, 1080)), sized=False
+    ),
+    "RealSense (pyrealsense2)": WriterForm("realsense.json", realsense, (P, E), (0, 4, 5)),
+    "OKVIS 2": WriterForm("okvis2.yaml", okvis2, (P, E), (4,), True),
+    "OpenCV stereo, K1 D1": WriterForm("stereo.yml", opencv_fisheye_stereo, counts=(5, 8), sized=False),
+    "ScanNet scene": WriterForm("scene0000_00.txt", scannet, counts=(0,)),
+    "BundleFusion": WriterForm("_info.txt", bundlefusion, counts=(0,)),
     "NICE-SLAM, MonoGS": WriterForm("fr1_desk.yaml", nested, counts=(0, 4, 5)),
 }
 """Every form that is read, by the name that docs/data-sets.md has for it."""
@@ -613,6 +674,14 @@ REFUSED: dict[str, tuple[str, str]] = {
         "realsense.txt",
         ' Intrinsic of "Color" / 640x480\n  PPX:  320.6\n  Distortion: Inverse Brown Conrady\n',
     ),
+    "Azure Kinect": ("kinect.json", '{"CalibrationInformation": {"Cameras": []}}'),
+    "calib.io": ("calibio.json", '{"Calibration": {"cameras": []}}'),
+    "Project Aria": ("aria.json", '{"CameraCalibrations": [{"Label": "camera-rgb"}]}'),
+    "EasyMocap": ("intri.yml", '%YAML:1.0\n---\nnames:\n  - "1"\nK_1: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n'),
+    "Pix4D": ("pix4d.cam", "Pix4D camera calibration file 0\n#Focal Length mm\nF 8.8\n"),
+    "Middlebury stereo": ("calib.txt", "cam0=[600 0 320; 0 600 240; 0 0 1]\nwidth=640\nheight=480\n"),
+    "MRPT": ("mrpt.ini", "[CAMERA_PARAMS]\nresolution=[640 480]\nfx=600\n"),
+    "cuVSLAM EDEX": ("stereo.edex", '[{"version": "0.9", "cameras": []}]'),
     "ROS launch file": ("camera.launch", "<launch>\n<node pkg='a'/></launch>\n"),
 }
 """Forms that are refused by name, with a file of each."""

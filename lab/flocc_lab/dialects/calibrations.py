@@ -167,7 +167,10 @@ FAULTS: dict[str, Fault] = {
     "a model that contradicts": _model_contradicts,
     "a mounting that is no pose": _not_rigid,
 }
-TEXTS = ("ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw", "ZED")
+TEXTS = (
+    "ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw", "ZED", "ZED, distortion apart",
+    "ScanNet scene", "BundleFusion",
+)  # fmt: skip
 
 
 def judged(name: str, fault: str | None, rng: np.random.Generator, folder: Path) -> DialectVerdict:

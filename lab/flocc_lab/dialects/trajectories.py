@@ -35,6 +35,8 @@ from flocc_protocol.errors import FloccError
 
 POSES = (8, 120)
 SURFACES = ("as it is", "BOM", "UTF-16", "CRLF", "old Mac", "tabs", "semicolons", "decimal commas", "comments", "blank")
+UNITLESS = ("OKVIS", "LaMAR", "ZED")
+"""Forms whose header names no unit: stamps say it themselves where they count from 1970."""
 FAULTS = ("nan", "word", "short", "zero quaternion", "duplicate", "step back")
 
 
@@ -139,7 +141,7 @@ def judge_trajectory(rng: np.random.Generator, folder: Path) -> FileVerdict:
             truth = Trajectory(truth.stamps_s + 1.5e9, truth.T_fixed_body)
             rows = rows_of(truth)
         text, file, must_read = form.write(rows), form.file, form.how in ("header", "suffix", "columns")
-        must_read = must_read and (name != "OKVIS" or truth.stamps_s[0] > 1e9)  # its header says no unit
+        must_read = must_read and (name not in UNITLESS or truth.stamps_s[0] > 1e9)
     elif which == "free":
         name, text, must_read = free_form(rows, rng)
         file = "free.txt"

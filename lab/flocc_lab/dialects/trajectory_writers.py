@@ -157,6 +157,57 @@ FORMS: dict[str, TrajectoryForm] = {
             + "".join(line([*divmod(ns(row[0]), 10**9), *wxyz(row)], ",") for row in rows)
         ),
     ),
+    "PX4 (ulog2csv)": TrajectoryForm(
+        "vehicle_odometry_0.csv",
+        "header",
+        lambda rows: (
+            "timestamp,timestamp_sample,position[0],position[1],position[2],q[0],q[1],q[2],q[3],pose_frame\n"
+            + "".join(line([ns(row[0]) // 1000, ns(row[0]) // 1000 - 9, *wxyz(row), 1], ",") for row in rows)
+        ),
+    ),
+    "bagpy": TrajectoryForm(
+        "odom-odom.csv",
+        "header",
+        lambda rows: (
+            "Time,header.seq,header.stamp.secs,header.stamp.nsecs,header.frame_id,child_frame_id,"
+            + ",".join([*(f"pose.pose.position.{a}" for a in "xyz"), *(f"pose.pose.orientation.{a}" for a in "xyzw")])
+            + ",pose.covariance\n"
+            + "".join(
+                line([row[0] + 0.01, k, *divmod(ns(row[0]), 10**9), "odom", "base", *xyzw(row), '"(0.1, 0.0)"'], ",")
+                for k, row in enumerate(rows)
+            )
+        ),
+    ),
+    "maplab": TrajectoryForm(
+        "vertex_poses_velocities_biases.csv",
+        "header",
+        lambda rows: (
+            "vertex index, timestamp [ns], vertex-id(hex), mission-id(hex), p_G_Ix [m], p_G_Iy [m], p_G_Iz [m], "
+            "q_G_Iw, q_G_Ix, q_G_Iy, q_G_Iz, v_x [m/s]\n"
+            + "".join(line([k, ns(row[0]), "0a1b", "ffee", *wxyz(row), 0.0], ", ") for k, row in enumerate(rows))
+        ),
+    ),
+    "LaMAR": TrajectoryForm(
+        "trajectories.txt",
+        "header",
+        lambda rows: (
+            "# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz, *covar\n"
+            + "".join(line([ns(row[0]) // 1000, "ios", *wxyz(row)[3:], *wxyz(row)[:3]], ", ") for row in rows)
+        ),
+    ),
+    "ZED": TrajectoryForm(
+        "zed_poses.csv",
+        "header",
+        lambda rows: "Timestamp,tx,ty,tz,ox,oy,oz,ow\n" + "".join(line([ns(row[0]), *xyzw(row)], ",") for row in rows),
+    ),
+    "units in names": TrajectoryForm(
+        "poses_mm.csv",
+        "header",
+        lambda rows: (
+            "timestamp_ms,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
+            + "".join(line([1e3 * r[0], *(1e3 * r[1]).tolist(), *r[2].tolist()], ",") for r in rows)
+        ),
+    ),
     "ORB-SLAM": TrajectoryForm("KeyFrameTrajectory.txt", "motion", _tum),
 }
 REFUSED: dict[str, tuple[str, str]] = {
@@ -167,6 +218,15 @@ REFUSED: dict[str, tuple[str, str]] = {
     "unknown order": ("vio.txt", "1700000000.0 1 2 3 0.5 0.5 0.5 0.5\n1700000000.1 1 2 3 0.5 0.5 0.5 0.5\n"),
     "unknown unit": ("odometry.txt", "".join(f"{2 * k} {k} 0 0 0 0 0 1\n" for k in range(5))),
     "g2o": ("poses.g2o", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"),
+    "the world in the camera": (
+        "poses.csv",
+        "timestamp,t_cw_x,t_cw_y,t_cw_z,q_cw_x,q_cw_y,q_cw_z,q_cw_w\n0,0,0,0,0,0,0,1\n",
+    ),
+    "poses of several bodies": (
+        "tf.csv",
+        "timestamp,child_frame_id,x,y,z,qx,qy,qz,qw\n"
+        + "".join(f"1700000000.{k},{'base' if k % 2 else 'lidar'},{k},0,0,0,0,0,1\n" for k in range(8)),
+    ),
     "JSON": ("poses.json", '{"poses": [[1, 2, 3]]}\n'),
 }
 

@@ -250,14 +250,21 @@ def fetch(
 
 def keys(
     folder: Annotated[Path, typer.Argument(help="Where the authority and a folder per robot stand or will stand.")],
-    robots: Annotated[list[str], typer.Argument(help="Names of the robots to admit.")],
+    robots: Annotated[
+        list[str], typer.Argument(help="Names of the robots to admit; NAME=9 gives one its compute class, 0 to 9.")
+    ],
     swarm: Annotated[str, typer.Option(help="Name of the swarm; one authority certifies one swarm.")] = "swarm",
     json_out: Json = False,
 ) -> None:
     """Make a swarm's certificate authority, and a certificate and a signing key per robot."""
     from flocc_launch.setup.credentials import make_keys
 
-    made = make_keys(folder, swarm, robots)
+    named = dict(robot.partition("=")[::2] for robot in robots)
+    bad = sorted(name for name, given in named.items() if given and given not in "0123456789")
+    if bad:
+        raise typer.BadParameter(f"{bad[0]}={named[bad[0]]}: a compute class is a number from 0 to 9")
+    classes = {name: int(given) for name, given in named.items() if given}
+    made = make_keys(folder, swarm, named, compute_classes=classes)
     if json_out:
         facts(made)
         return

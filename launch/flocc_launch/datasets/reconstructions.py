@@ -6,7 +6,7 @@ own: stamps are those that the names say, else one image every `STEP_S`; and tha
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from flocc_agent.runtime.recording import MASK
 from flocc_agent.runtime.text_tables import is_number, numbered_lines, read_text
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.datasets.colmap_order import SEEN_MAX, contradicted, read_points, seen_in
 from flocc_launch.datasets.files import image_files, listed_file, natural
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import size_of
@@ -60,39 +61,87 @@ def read_colmap(path: Path) -> Source:
             f"{path}: is a model of COLMAP in its binary form; write it as text: colmap model_converter --input_path "
             "FOLDER --output_path FOLDER --output_type TXT"
         )
-    poses: dict[str, Float] = {}
-    used: dict[str, int] = {}
     file = place / "images.txt"
-    lines = [(line, text.split()) for line, text in numbered_lines(file) if not text.startswith("#")]
-    cut, after_image = [], False
-    for line, words in lines:
-        if len(words) < 10 or is_number(words[9]) or not all(is_number(word) for word in words[:9]):
-            is_points = after_image and len(words) % 3 == 0 and all(is_number(word) for word in words)
-            cut += [] if is_points else [line]
-            after_image = False
-            continue
-        after_image = True
-        where = f"{file}:{line}"
-        if not words[8].isdecimal():
-            raise DatasetError(f"{where}: CAMERA_ID must be a whole number, not {words[8]!r}")
-        w, x, y, z, *t_m = (float(word) for word in words[1:8])
-        try:
-            T_camera_world = pose(R_from_q_wxyz(np.array([w, x, y, z])), np.array(t_m))
-        except ValueError as error:
-            raise DatasetError(f"{where}: {error}") from error
-        name = " ".join(words[9:])
-        if name in poses:
-            raise DatasetError(f"{where}: gives {name} a second pose")
-        poses[name], used[name] = inverse(checked_pose(T_camera_world, where)), int(words[8])
+    images, seen, cut = _model_images(file)
+    used = {image.camera for image in images.values()}
+    poses = {
+        name: inverse(checked_pose(pose(R_from_q_wxyz(image.q), image.t_m), image.where))
+        for name, image in images.items()
+    }
     if not poses:
         raise DatasetError(
             f"{place / 'images.txt'}: holds no pose of an image (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME)"
         )
-    if len(set(used.values())) > 1:
-        raise DatasetError(f"{place / 'images.txt'}: images are of {len(set(used.values()))} cameras; flocc takes one")
-    lens = read_lens(place / f"cameras.txt#{next(iter(used.values()))}")
+    if len(used) > 1:
+        raise DatasetError(f"{place / 'images.txt'}: images are of {len(used)} cameras; flocc takes one")
+    lens = read_lens(place / f"cameras.txt#{next(iter(used))}")
+    _refuse_other_order(place, images, seen, lens)
     source = _source(path, "colmap", _image_folder(path), poses, lens)
     return replace(source, notes=(*source.notes, *_cut_rows(file, cut, len(poses))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ModelImage:
+    """A row of images.txt: quaternion as written, translation of the camera from the world, camera, file and line."""
+
+    q: Float
+    t_m: Float
+    camera: int
+    where: str
+
+
+def _model_images(file: Path) -> tuple[dict[str, _ModelImage], list[tuple[str, list[str]]], list[int]]:
+    """Rows of images.txt by the images' names, words of the rows of their points, and lines that are neither.
+
+    Raises:
+        DatasetError: A row is of another form.
+    """
+    images: dict[str, _ModelImage] = {}
+    seen: list[tuple[str, list[str]]] = []
+    cut, last = [], None
+    lines = ((line, text.split()) for line, text in numbered_lines(file) if not text.startswith("#"))
+    for line, words in lines:
+        if len(words) < 10 or is_number(words[9]) or not all(is_number(word) for word in words[:9]):
+            if last is not None and len(words) % 3 == 0 and all(is_number(word) for word in words):
+                seen.append((last, words))
+            else:
+                cut.append(line)
+            last = None
+            continue
+        where, name = f"{file}:{line}", " ".join(words[9:])
+        if not words[8].isdecimal():
+            raise DatasetError(f"{where}: CAMERA_ID must be a whole number, not {words[8]!r}")
+        if name in images:
+            raise DatasetError(f"{where}: gives {name} a second pose")
+        q, t_m = np.array([float(word) for word in words[1:5]]), np.array([float(word) for word in words[5:8]])
+        try:
+            R_from_q_wxyz(q)
+        except ValueError as error:
+            raise DatasetError(f"{where}: {error}") from error
+        images[name], last = _ModelImage(q / np.linalg.norm(q), t_m, int(words[8]), where), name
+    return images, seen, cut
+
+
+def _refuse_other_order(
+    place: Path, images: dict[str, _ModelImage], seen: list[tuple[str, list[str]]], lens: Lens
+) -> None:
+    """Refuse a model whose quaternions stand with w last.
+
+    Raises:
+        DatasetError: They do.
+    """
+    names = sorted(images, key=lambda name: natural(Path(name)))
+    number = {name: k for k, name in enumerate(names)}
+    every = max(1, len(seen) * 100 // SEEN_MAX)
+    observed = [each for name, words in seen[::every] for each in seen_in(words[:300], number[name])]
+    points = read_points(place / "points3D.txt") if observed else {}
+    q, t_m = np.array([images[name].q for name in names]), np.array([images[name].t_m for name in names])
+    why = contradicted(q, t_m, observed, points, lens.camera)
+    if why is not None:
+        raise DatasetError(
+            f"{images[names[0]].where}: COLMAP's quaternions are QW QX QY QZ, but these must be QX QY QZ QW: {why}; "
+            "write w first"
+        )
 
 
 def _cut_rows(file: Path, cut: list[int], count: int) -> list[str]:

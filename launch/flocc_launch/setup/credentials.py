@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from flocc_agent.extras import to_install
 from flocc_agent.runtime.security import CA, CERTIFICATE, KEY, MEMBERS, SIGNING_KEY
@@ -52,6 +52,7 @@ def make_keys(
     operators: Iterable[str] = OPERATORS,
     addresses: Mapping[str, Iterable[str]] | None = None,
     now: datetime | None = None,
+    compute_classes: Mapping[str, int] | None = None,
 ) -> dict[str, Path]:
     """Make what is missing: the authority, and keys for each robot and operator.
 
@@ -62,6 +63,7 @@ def make_keys(
         operators: Names of people who may ask for status and inject faults.
         addresses: IP addresses or host names of each robot, for `names_verified`.
         now: Begin of validity; None is the clock's time.
+        compute_classes: Of robots; where any was ever given, all others have 0 and nobody can claim another one.
 
     Returns:
         Each member's folder, also of those admitted earlier.
@@ -81,18 +83,21 @@ def make_keys(
         for name, role in sorted(names.items()):
             public_key = _member_keys(folder / name, name, authority, list((addresses or {}).get(name, ())), moment)
             members[role][name] = public_key.hex()
+        members["compute_classes"] |= compute_classes or {}
         return _publish(folder, swarm, members, authority)
     except OSError as error:
         raise KeysError(f"{error.filename}: cannot be written: {error.strerror}") from error
 
 
-def _publish(folder: Path, swarm: str, members: dict[str, dict[str, str]], authority: Authority) -> dict[str, Path]:
+def _publish(folder: Path, swarm: str, members: dict[str, dict[str, Any]], authority: Authority) -> dict[str, Path]:
     """Give every member the list of members and the authority's certificate."""
     from cryptography.hazmat.primitives.serialization import Encoding
 
     content = {"swarm": swarm, "robots": members["robots"], "operators": sorted(members["operators"])}
+    if members["compute_classes"]:
+        content["compute_classes"] = members["compute_classes"]
     listed = json.dumps(content, indent=2, sort_keys=True).encode() + b"\n"
-    folders = {name: folder / name for role in members.values() for name in role}
+    folders = {name: folder / name for role in ("robots", "operators") for name in members[role]}
     for path in (folder / AUTHORITY, *folders.values()):
         path.mkdir(parents=True, exist_ok=True)
         _write(path / MEMBERS, listed)
@@ -100,14 +105,19 @@ def _publish(folder: Path, swarm: str, members: dict[str, dict[str, str]], autho
     return dict(sorted(folders.items()))
 
 
-def _members(path: Path, swarm: str) -> dict[str, dict[str, str]]:
+def _members(path: Path, swarm: str) -> dict[str, dict[str, Any]]:
     """Read the members admitted so far."""
     if not path.exists():
-        return {"robots": {}, "operators": {}}
+        return {"robots": {}, "operators": {}, "compute_classes": {}}
     content = json.loads(path.read_bytes())
     if content["swarm"] != swarm:
         raise KeysError(f"{path}: is of swarm {content['swarm']}, not of {swarm}")
-    return {"robots": content["robots"], "operators": dict.fromkeys(content["operators"], "")}
+    operators = dict.fromkeys(content["operators"], "")
+    return {
+        "robots": content["robots"],
+        "operators": operators,
+        "compute_classes": content.get("compute_classes", {}),
+    }
 
 
 def _authority(folder: Path, swarm: str, now: datetime) -> Authority:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.effects import PersistRecord
 from flocc_agent.core.events import KeyframeCaptured
-from flocc_agent.core.gossip import LogCopy, decoded
+from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_launch.simulation.invariants import Step, core, groups
 from flocc_launch.simulation.rightness import component_of
 from flocc_launch.simulation.swarm import Swarm

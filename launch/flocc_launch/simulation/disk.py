@@ -9,6 +9,7 @@ anything comes back with another log. Only an older copy of everything cannot be
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from flocc_agent.core.log_copy import EncodedRecords
 from flocc_agent.core.robot import Restored
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.persistence import COPIES_PERIOD_S, joined_logs
@@ -44,7 +45,7 @@ class Disk:
 
     own: LogId
     latent_bytes_max: int = 2 * 1024**3
-    records: dict[LogId, list[bytes]] = field(default_factory=dict)
+    records: dict[LogId, EncodedRecords] = field(default_factory=dict)
     latents: dict[KeyframeId, bytes] = field(default_factory=dict)
     term_counter: int = 0
     correction: LogCorrection | None = None
@@ -61,7 +62,9 @@ class Disk:
 
     def put_record(self, log: LogId, number: int, data: bytes, now_s: float) -> None:
         """Append a record; the core never leaves a gap. Copies of others' wait a moment before they are written."""
-        records = self.records.setdefault(log, [])
+        records = self.records.get(log)
+        if records is None:
+            records = self.records[log] = EncodedRecords()
         assert number == len(records), f"record {number} of {log} does not follow {len(records)}"
         records.append(data)
         if log == self.own or now_s >= self._written_s + COPIES_PERIOD_S:
@@ -109,7 +112,7 @@ class Disk:
     def lose_unwritten(self) -> None:
         """The robot's process died: what waited to be written, or was kept in memory as the disk was full, is gone."""
         for log, count in self._waiting.items():
-            del self.records[log][len(self.records[log]) - count :]
+            self.records[log].truncate(len(self.records[log]) - count)
         self._waiting.clear()
         if self._full is not None:
             self.restore(self._full)
@@ -124,7 +127,7 @@ class Disk:
         places = [(log, k) for log, records in sorted(self.records.items()) for k in range(len(records))]
         if places:
             log, k = places[number % len(places)]
-            del self.records[log][k:]
+            self.records[log].truncate(k)
             self.whole &= log != self.own
         if self.latents:
             spoilt = sorted(self.latents)[number % len(self.latents)]
@@ -140,7 +143,7 @@ class Disk:
     def restore(self, content: DiskContent) -> None:
         """Put a copy of an earlier time in the place of everything."""
         self.own, self.term_counter = content.own, content.term_counter
-        self.records = {log: list(data) for log, data in content.records.items()}
+        self.records = {log: EncodedRecords(data) for log, data in content.records.items()}
         self.latents = dict(content.latents)
         self.latent_bytes = sum(map(len, self.latents.values()))
         self.correction, self.frame_changed = content.correction, content.frame_changed

@@ -48,7 +48,8 @@ class Led:
             yield f"{name} left without handing over"
         if isinstance(step.event, MessageReceived) and isinstance(step.event.envelope.message, Handover):
             handed = step.event.envelope.message.term
-            if election.term == handed and handed.leader == step.event.envelope.sender:
+            of_another = handed.leader.robot != step.station.log.robot  # what a namesake says is not taken
+            if of_another and election.term == handed and handed.leader == step.event.envelope.sender:
                 yield f"{name} follows {handed}, which was handed over"
         self._led[name] = election.leading
         yield from self._undelivered(step)

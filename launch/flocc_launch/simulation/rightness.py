@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.corrected import CorrectedLog, RecordedOdometry
 from flocc_agent.core.effects import Deliver, PersistRecord, Register
 from flocc_agent.core.events import GraphOptimised, PairRegistered
-from flocc_agent.core.gossip import LogCopy, decoded
+from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.pose_graph import Component, GraphSolution, LoopClosure
 from flocc_agent.core.registration import ODOMETRY_CORRESPONDENCES_MIN, Registration, RegistrationFailed

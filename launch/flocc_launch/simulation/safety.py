@@ -22,7 +22,7 @@ from flocc_agent.core.events import (
     MessageReceived,
     PairRegistered,
 )
-from flocc_agent.core.gossip import decoded
+from flocc_agent.core.log_copy import decoded
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.reports import NeighbourDown, NeighbourUp

@@ -86,7 +86,7 @@ class Swarm:
         self._reporters: dict[str, Reporter] = {}
         self.forked: set[LogId] = set()
         self._lives = dict(equipment.lives)
-        self._near: dict[tuple[str, float | None], list[str]] = {}
+        self._near: tuple[float | None, dict[str, list[str]]] | None = None
         self._around = Surroundings(
             self._broadcast, self._unicast, self._fetcher.fetch, self._observe, lambda station: self.kill(station.name)
         )
@@ -132,7 +132,7 @@ class Swarm:
         self._named[name] += self._named.pop(twin)
         self.stations[twin].log = LogId(name)
         self._begin_log(self.stations[twin])
-        self._near.clear()
+        self._near = None
 
     def lose_disk(self, name: str) -> None:
         """A dead robot's disk is replaced; it comes back as a new incarnation."""
@@ -237,21 +237,16 @@ class Swarm:
             if position_m is not None:
                 self.radio.update_position(name, position_m)
                 moving |= since_s <= station.playback.lasts_s()
-        self._near.clear()
+        self._near = None
         if moving:
             self.agenda.after(POSITION_PERIOD_S, self._move)
 
     def _in_range(self, sender: str) -> list[str]:
         """Stations that the radio's range does not rule out; the radio itself decides."""
         range_m = self.radio.parameters.range_m
-        near = self._near.get((sender, range_m))
-        if near is None:
-            here = self.radio.position_m(sender)
-            near = [
-                name for name in self.stations if name != sender and _within(here, self.radio.position_m(name), range_m)
-            ]
-            self._near[sender, range_m] = near
-        return near
+        if self._near is None or self._near[0] != range_m:
+            self._near = (range_m, _near_each(list(self.stations), self.radio, range_m))
+        return self._near[1][sender]
 
     def _broadcast(self, sender: Station, message: Message) -> None:
         self.network.send(sender.name, Envelope(sender.log, message), self._in_range(sender.name))
@@ -279,5 +274,12 @@ class Swarm:
             observer(station, event, effects)
 
 
-def _within(here: tuple[float, ...] | None, there: tuple[float, ...] | None, range_m: float | None) -> bool:
-    return range_m is None or here is None or there is None or math.dist(here, there) <= range_m
+def _near_each(names: list[str], radio: Radio, range_m: float | None) -> dict[str, list[str]]:
+    """Of each station the others that may be in range, those without a position among them."""
+    positions = [radio.position_m(name) for name in names]
+    points = np.array([(np.nan,) * 3 if position is None else position for position in positions])
+    far_m = math.inf if range_m is None else range_m * (1.0 + 1e-9)
+    apart_m = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = ~(apart_m > far_m)
+    np.fill_diagonal(near, val=False)
+    return {name: [names[k] for k in np.flatnonzero(row)] for name, row in zip(names, near, strict=True)}

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -26,10 +27,10 @@ class RobotTraffic:
 
 
 @dataclass(slots=True)
-class LinkTraffic:
-    """Payload bytes on all links, since the run began.
+class LinkCounts:
+    """Payload bytes of one kind on one link.
 
-    On each link `sent + repeated == received + lost + under way` at every moment.
+    At every moment `sent + repeated == received + lost + under_way`.
 
     Attributes:
         sent: Given to the radio for one receiver; a broadcast counts once per receiver.
@@ -39,24 +40,63 @@ class LinkTraffic:
         under_way: Has left and is to arrive.
     """
 
-    sent: Counter[Link] = field(default_factory=Counter)
-    received: Counter[Link] = field(default_factory=Counter)
-    lost: Counter[Link] = field(default_factory=Counter)
-    repeated: Counter[Link] = field(default_factory=Counter)
-    under_way: Counter[Link] = field(default_factory=Counter)
+    sent: int = 0
+    received: int = 0
+    lost: int = 0
+    repeated: int = 0
+    under_way: int = 0
+
+    def leave(self, payload_bytes: int, arrivals: int) -> None:
+        """Something was given to the radio, and will arrive so many times."""
+        self.sent += payload_bytes
+        if arrivals == 1:
+            self.under_way += payload_bytes
+        elif arrivals == 0:
+            self.lost += payload_bytes
+        else:
+            self.under_way += payload_bytes * arrivals
+            self.repeated += payload_bytes * (arrivals - 1)
+
+    def arrive(self, payload_bytes: int, taken: bool) -> None:
+        """Something arrived; whether somebody was there."""
+        self.under_way -= payload_bytes
+        if taken:
+            self.received += payload_bytes
+        else:
+            self.lost += payload_bytes
+
+
+@dataclass(slots=True)
+class LinkTraffic:
+    """Payload bytes on all links, since the run began."""
+
+    counts: dict[Link, LinkCounts] = field(default_factory=dict)
+
+    def of(self, link: Link) -> LinkCounts:
+        """What one link carried of one kind."""
+        counts = self.counts.get(link)
+        if counts is None:
+            counts = self.counts[link] = LinkCounts()
+        return counts
 
     def tables(self, robot: str) -> dict[str, dict[str, dict[str, int]]]:
         """One robot's account, as an agent of its own would keep it: by table, peer and kind."""
-        heard = {"received_from": self.received, "lost_from": self.lost, "repeated_from": self.repeated}
-        tables: dict[str, dict[str, dict[str, int]]] = {"sent_to": {}, **{table: {} for table in heard}}
-        for (sender, receiver, kind), count in sorted(self.sent.items()):
+        tables: dict[str, dict[str, dict[str, int]]] = {
+            table: {} for table in ("sent_to", "received_from", "lost_from", "repeated_from")
+        }
+        for (sender, receiver, kind), counts in sorted(self.counts.items()):
             if sender == robot:
-                tables["sent_to"].setdefault(receiver, {})[kind] = count
-        for table, counted in heard.items():
-            for (sender, receiver, kind), count in sorted(counted.items()):
-                if receiver == robot:
-                    tables[table].setdefault(sender, {})[kind] = count
+                _note(tables["sent_to"], receiver, kind, counts.sent)
+            if receiver == robot:
+                _note(tables["received_from"], sender, kind, counts.received)
+                _note(tables["lost_from"], sender, kind, counts.lost)
+                _note(tables["repeated_from"], sender, kind, counts.repeated)
         return tables
+
+
+def _note(table: dict[str, dict[str, int]], peer: str, kind: str, count: int) -> None:
+    if count:
+        table.setdefault(peer, {})[kind] = count
 
 
 class Network:
@@ -80,17 +120,20 @@ class Network:
     def send(self, sender: str, envelope: Envelope, receivers: Iterable[str]) -> None:
         """Send one message to several stations; the bytes are decoded once, since they are the same for all."""
         data = encode(envelope)
-        kind = kind_of(envelope.message)
-        self._traffic(sender).sent[kind] += len(data)
-        packet = _Packet(data)
-        arrivals: dict[float, list[str]] = {}
+        kind, size = kind_of(envelope.message), len(data)
+        self._traffic(sender).sent[kind] += size
+        packet = _Packet(data, kind)
+        arrivals: dict[float, list[tuple[str, LinkCounts]]] = {}
         muted = self.muted.get(kind, 0.0)
         for receiver in receivers:
+            counts = self.links.of((sender, receiver, kind))
             silenced = bool(muted) and self._rng.uniform() < muted
-            for time_s in self._transmit((sender, receiver, kind), len(data), len(data), silenced):
-                arrivals.setdefault(time_s, []).append(receiver)
+            times_s = [] if silenced else self._radio.transmit(sender, receiver, kind, size, self._agenda.now_s)
+            counts.leave(size, len(times_s))
+            for time_s in times_s:
+                arrivals.setdefault(time_s, []).append((receiver, counts))
         for time_s, together in arrivals.items():
-            self._agenda.at(time_s, lambda together=together: self._arrive(sender, together, kind, packet))  # type: ignore[misc]
+            self._agenda.at(time_s, partial(self._arrive, together, packet))
 
     def carry(
         self, sender: str, receiver: str, kind: str, payload_bytes: int, air_bytes: int, arrive: Callable[[], bool]
@@ -107,9 +150,11 @@ class Network:
         """
         if payload_bytes:
             self._traffic(sender).sent[kind] += payload_bytes
-        link = (sender, receiver, kind)
-        for time_s in self._transmit(link, payload_bytes, air_bytes):
-            self._agenda.at(time_s, lambda: self._settle(link, payload_bytes, arrive()))
+        counts = self.links.of((sender, receiver, kind))
+        times_s = self._radio.transmit(sender, receiver, kind, air_bytes, self._agenda.now_s)
+        counts.leave(payload_bytes, len(times_s))
+        for time_s in times_s:
+            self._agenda.at(time_s, lambda: self._settle(receiver, kind, counts, payload_bytes, arrive()))
 
     def used_bytes(self, station: str) -> int:
         """What a robot used of its budget: its messages, sent and received, and the latents that it fetched."""
@@ -121,34 +166,16 @@ class Network:
         rate = self._radio.parameters.of(sender, receiver).bandwidth_bytes_s
         return 0.0 if rate is None else air_bytes / rate
 
-    def _transmit(self, link: Link, payload_bytes: int, air_bytes: int, silenced: bool = False) -> list[float]:
-        """Ask the radio when something arrives, and keep account."""
-        arrivals_s = [] if silenced else self._radio.transmit(*link, air_bytes, self._agenda.now_s)
-        if payload_bytes:
-            self.links.sent[link] += payload_bytes
-            if not arrivals_s:
-                self.links.lost[link] += payload_bytes
-            else:
-                self.links.under_way[link] += payload_bytes * len(arrivals_s)
-                if len(arrivals_s) > 1:
-                    self.links.repeated[link] += payload_bytes * (len(arrivals_s) - 1)
-        return arrivals_s
-
-    def _arrive(self, sender: str, receivers: list[str], kind: str, packet: "_Packet") -> None:
-        for receiver in receivers:
+    def _arrive(self, together: list[tuple[str, LinkCounts]], packet: "_Packet") -> None:
+        for receiver, counts in together:
             taken = self._receive(receiver, packet.envelope())
-            self._settle((sender, receiver, kind), len(packet.data), taken)
+            self._settle(receiver, packet.kind, counts, len(packet.data), taken)
 
-    def _settle(self, link: Link, payload_bytes: int, taken: bool) -> None:
+    def _settle(self, receiver: str, kind: str, counts: LinkCounts, payload_bytes: int, taken: bool) -> None:
         """Something arrived."""
-        if not payload_bytes:
-            return
-        self.links.under_way[link] -= payload_bytes
-        if taken:
-            self.links.received[link] += payload_bytes
-            self._traffic(link[1]).received[link[2]] += payload_bytes
-        else:
-            self.links.lost[link] += payload_bytes
+        counts.arrive(payload_bytes, taken)
+        if taken and payload_bytes:
+            self._traffic(receiver).received[kind] += payload_bytes
 
     def _traffic(self, station: str) -> RobotTraffic:
         traffic = self.traffic.get(station)
@@ -162,6 +189,7 @@ class _Packet:
     """Bytes on the way, and what they say once somebody asked."""
 
     data: bytes
+    kind: str
     decoded: Envelope | None = None
 
     def envelope(self) -> Envelope:

@@ -64,7 +64,12 @@ class Playback:
             return None
         stamps_s = self.truth.stamps_s
         stamp_s = min(max(since_start_s + self.first_stamp_s, float(stamps_s[0])), float(stamps_s[-1]))
-        return np.array([np.interp(stamp_s, stamps_s, self.truth.T_fixed_body[:, k, 3]) for k in range(3)])
+        after = int(np.searchsorted(stamps_s, stamp_s, side="right"))
+        if after in (0, len(stamps_s)):
+            return np.array(self.truth.T_fixed_body[min(after, len(stamps_s) - 1), :3, 3])
+        before, share = after - 1, (stamp_s - stamps_s[after - 1]) / (stamps_s[after] - stamps_s[after - 1])
+        here, there = self.truth.T_fixed_body[before, :3, 3], self.truth.T_fixed_body[after, :3, 3]
+        return np.asarray(here + share * (there - here))
 
     def lasts_s(self) -> float:
         """Time from the first frame to the end of the truth, 0 where it is not known."""

@@ -37,6 +37,8 @@ logger = logging.getLogger(__name__)
 STATUS_PERIOD_S = 0.5
 RETRY_S = 5.0
 """A disk that took no event is tried again so often."""
+LOOK_PERIOD_S = 5.0
+"""How often it is asked whether the file of events is still where it was."""
 EXIT_BAD_INPUT = 2
 
 
@@ -70,7 +72,8 @@ class ToldOfMap:
 class Lines:
     """The agent's own `events.jsonl`, written line by line so that a kill loses nothing that was reported.
 
-    A disk that fails costs lines, not the robot. It is said once; every `RETRY_S` the file is tried again.
+    A disk that fails costs lines, not the robot. It is said once; every `RETRY_S` the file is tried again. A file that
+    was moved away or removed is begun anew.
     """
 
     def __init__(self, path: Path | None, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -78,7 +81,7 @@ class Lines:
         self._clock_s = clock_s
         self._file: FileIO | None = None
         self._lost = 0
-        self._retry_s = float("-inf")
+        self._retry_s = self._look_s = float("-inf")
 
     def write(self, event: Reported[Fact]) -> None:
         """Append one event, or count it as lost."""
@@ -102,14 +105,27 @@ class Lines:
 
     def _append(self, path: Path, line: str) -> None:
         """Write a line whole or not at all."""
+        if self._file is not None and self._is_elsewhere(path):
+            self.close()
         if self._file is None:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
+            self._look_s = self._clock_s() + LOOK_PERIOD_S
         data = line.encode() + b"\n"
         written = self._file.write(data)
         if written != len(data):
             self._file.truncate(self._file.tell() - written)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _is_elsewhere(self, path: Path) -> bool:
+        """Whether somebody moved the file away (logrotate does) or removed it; asked now and then."""
+        if self._file is None or self._clock_s() < self._look_s:
+            return False
+        self._look_s = self._clock_s() + LOOK_PERIOD_S
+        try:
+            return not os.path.samestat(path.stat(), os.fstat(self._file.fileno()))
+        except FileNotFoundError:
+            return True
 
     def close(self) -> None:
         """Close the file."""

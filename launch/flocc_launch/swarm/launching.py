@@ -178,7 +178,9 @@ class _Launch:
 
     def _agents(self) -> list[AgentProcess]:
         names = self._scenario.names()
-        keys = make_keys(self._folder.path / "keys", self._scenario.name, names) if self._secure else None
+        classes = {name: self._scenario.robot(name).compute_class for name in names}
+        folder = self._folder.path / "keys"
+        keys = make_keys(folder, self._scenario.name, names, compute_classes=classes) if self._secure else None
         transports = loopback_transports(names, keys)
         agents = []
         for name in names:
@@ -299,9 +301,8 @@ class _Launch:
             self._lines.write(Reported(self._now_s(), agent.name, death))
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
             self._note(f"{agent.name} died ({how})" + (f": {agent.last_words()}" if code > 0 else ""))
-        died = [agent for agent in self._watch.agents if agent.exit_code not in (None, 0) and agent.status is None]
-        if died and self._now_s() < START_S:
-            raise LaunchError(f"robot {died[0].name} could not start: {_sentence(died[0].last_words())}")
+            if code != 0 and not scripted and agent.status is None and self._now_s() < START_S:
+                raise LaunchError(f"robot {agent.name} could not start: {_sentence(agent.last_words())}")
 
     # Files
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.corrected import CorrectedLog, RecordedOdometry
-from flocc_agent.core.gossip import LogCopy
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.geometry import Float, inverse, pose, pose7, se3_exp, twists_of_poses
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId, Term
@@ -26,7 +26,7 @@ def recorded(copy: LogCopy, *indices: int) -> None:
     """Keyframes one metre and two seconds apart, with closures in between that are none of its business."""
     for index in indices:
         record = KeyframeRecord(index, 2.0 * index, pose7(at(float(index))), None)
-        copy.append(record, encode_record(record))
+        copy.append(encode_record(record))
 
 
 def correction(first: int, step: int, *T_map_camera: Float) -> LogCorrection:

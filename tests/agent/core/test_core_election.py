@@ -55,6 +55,32 @@ def test_a_higher_compute_class_outranks_a_lower_log() -> None:
     assert {term.split(":")[1] for term in robots.leaders().values()} == {"server"}
 
 
+def test_a_compute_class_that_the_list_of_members_does_not_know_outranks_nobody() -> None:
+    machine = LeaderElection(R2, 0, 0, ElectionParameters(), 0.0, {"server": 9})
+    machine.on_heartbeat(R3, heartbeat(LeaderAdvert(Term(1, R3), 9, 1, 0), 1, compute_class=9), 1.0)
+    assert claims(machine.tick(2.0)) == [Term(2, R2)]
+    server = LogId("server")
+    machine.on_heartbeat(server, heartbeat(LeaderAdvert(Term(3, server), 0, 1, 0), 3), 3.0)
+    assert machine.term == Term(3, server)
+
+
+def test_a_leader_that_is_not_believed_is_not_followed() -> None:
+    machine = election(R2)
+    machine.on_coordinator(R1, Coordinator(LeaderAdvert(Term(1, R1), 0, 0, 0)), 0.0)
+    machine.on_distrusted("r3", 1.0)
+    assert machine.term == Term(1, R1)
+    machine.on_distrusted("r1", 1.0)
+    machine.tick(1.0 + ANSWER_TIMEOUT_S)
+    assert machine.term == Term(2, R2)
+
+
+def test_a_leader_claims_anew_when_somebody_speaks_in_its_term() -> None:
+    machine = election(R2)
+    assert claims(machine.tick(2.0)) == [Term(1, R2)]
+    machine.on_applied(R3, Term(1, R2))
+    assert claims(machine.tick(2.1)) == [Term(2, R2)]
+
+
 def test_a_better_robot_that_comes_later_takes_over() -> None:
     robots = Robots()
     robots.add("r2")

@@ -43,7 +43,7 @@ def fix(x_m: float) -> Fix:
 
 
 def own_log(robots: Robots, name: str = "r1") -> list[Record]:
-    return robots.cores[name].gossip.logs[LogId(name)].records
+    return list(robots.cores[name].gossip.logs[LogId(name)].records)
 
 
 def kinds(robots: Robots) -> list[tuple[str, int]]:

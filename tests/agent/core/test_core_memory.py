@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.events import MessageReceived
-from flocc_agent.core.gossip import decoded
+from flocc_agent.core.log_copy import decoded
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import direction
+from flocc_agent.core.place_recognition import comparable
 from flocc_agent.core.robot import Robot
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId
@@ -48,7 +48,7 @@ def test_a_keyframe_costs_its_bytes_a_row_of_floats_and_little_more(dimension: i
     tracemalloc.start()
     try:
         record_bytes = grow(1, KEYFRAMES)
-        for cache in (direction, decoded):  # of a fixed size
+        for cache in (comparable, decoded):  # of a fixed size
             cache.cache_clear()
         gc.collect()
         cost_bytes = tracemalloc.get_traced_memory()[0] / (KEYFRAMES * len(LOGS))

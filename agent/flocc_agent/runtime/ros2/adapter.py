@@ -25,7 +25,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.hearing import KINDS, Hearing
 from flocc_agent.runtime.ros2.markers import KnownClosure
 from flocc_agent.runtime.ros2.merged_maps import MergedMaps
-from flocc_agent.runtime.ros2.node import RosNode, open_node
+from flocc_agent.runtime.ros2.node import RosNode, ignore, open_node
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes
 from flocc_agent.runtime.ros2.synchroniser import PosedImage
@@ -44,6 +44,18 @@ INBOX_BYTES_MAX = 64 * 1024 * 1024
 WATCH_PERIOD_S = 1.0
 PATIENCE_S = 5.0
 SERVICE_TIMEOUT_S = 5.0
+MISSED = ("odometry", "fix", "image")
+"""Kinds of which each message counts."""
+LOST_MIN, LOST_RATIO_MAX = 10, 0.01
+"""Fewer lost messages are not worth a sentence."""
+LOST_BEFORE = (
+    "messages are lost before they reach this node, by best effort or too short a queue; where they matter: "
+    "--ros-args -p qos_overrides (docs/ros2.md)"
+)
+TOO_FAST = (
+    "messages come faster than this machine takes them in, and the oldest are left out; "
+    "play slower, or take fewer keyframes"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +165,9 @@ class Ros2Adapter:
         grids = MergedMaps(config, self._robot, self._types, node, self._problems)
         teller = self._teller = Teller(config, self._types, node, self._bodies, self._host, grids)
         for kind, (topic, type_name, qos) in hearing.wanted().items():
-            hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind))
+            lost = partial(self._counter.count_dropped, f"{kind} lost before this node")
+            missing = lost if kind in MISSED else ignore
+            hearing.subscribed[kind] = node.subscribe(topic, type_name, qos, partial(_enqueue, inbox, kind), missing)
         node.watch_offers(lambda offer: _on_loop(loop, partial(self._compare, offer)))
         node.serve("save_map", partial(_answered, loop, self._save_map))
         node.serve("reset_odometry", partial(_answered, loop, self._reset_odometry))
@@ -243,7 +257,19 @@ class Ros2Adapter:
                 hearing.complain("router", node.advice)
             if waited_s % PATIENCE_S == 0 and connected:
                 hearing.say_what_is_missing()
+                self._say_what_is_lost(hearing)
                 hearing.compare_clocks(node.now_ns())
+
+    def _say_what_is_lost(self, hearing: Hearing) -> None:
+        """Say of images and odometry that more than a few do not make it into the agent; counts go on in `refused`."""
+        dropped = self._counter.snapshot().dropped
+        for kind in ("image", "odometry"):
+            before = dropped.get(f"{kind} lost before this node", 0)
+            if before > max(LOST_MIN, LOST_RATIO_MAX * (hearing.heard[kind] + before)):
+                hearing.complain(kind, LOST_BEFORE)
+            late = hearing.synchroniser.dropped[f"{kind} not taken in time"] + dropped.get(f"inbox-full-{kind}", 0)
+            if late:
+                hearing.complain(kind, TOO_FAST)
 
 
 def _enqueue(inbox: Inbox, kind: str, payload: bytes) -> None:

@@ -17,8 +17,14 @@ from flocc_agent.runtime.ros2.types import MessageTypes, Ros2Error, domain_of
 logger = logging.getLogger(__name__)
 
 OnPayload = Callable[[bytes], None]
+OnMissing = Callable[[int], None]
+"""Told how many messages of a publisher are missing before the one that came."""
 Act = Callable[[], tuple[bool, str]]
 """What a service does: whether it worked, and a sentence. Called on the node's own thread."""
+
+
+def ignore(_: int) -> None:
+    """Where nobody asks what is missing."""
 
 
 class RosPublisher(Protocol):
@@ -46,7 +52,9 @@ class RosNode(Protocol):
     def publisher(self, topic: str, type_name: str, qos: Qos) -> RosPublisher:
         """Declare a publisher; relative topics lie in the node's namespace."""
 
-    def subscribe(self, topic: str, type_name: str, qos: Qos, on_payload: OnPayload) -> Topic:
+    def subscribe(
+        self, topic: str, type_name: str, qos: Qos, on_payload: OnPayload, on_missing: OnMissing = ignore
+    ) -> Topic:
         """Declare a subscription; of a transient local topic the last messages come first."""
 
     def serve(self, name: str, act: Act) -> None:

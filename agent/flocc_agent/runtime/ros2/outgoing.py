@@ -1,4 +1,4 @@
-"""Corrections as ROS messages: `map` to `odom` on /tf (REP 105), the corrected path, the pose with its covariance.
+"""Corrections as ROS messages: `map` to `odom` and `earth` to `map` on /tf (REP 105), the path, the pose.
 
 A covariance of flocc is that of a tangent vector, rotation first, in the frame of the pose that it belongs to. ROS
 wants translation first, then rotations about the fixed axes of the parent frame.
@@ -14,6 +14,9 @@ from flocc_agent.runtime.ros2.types import PATH, POSE, TEXT, TF, MessageTypes
 
 Float = NDArray[np.float64]
 
+EARTH = "earth"
+"""REP 105's name of the Earth-centred frame."""
+
 
 class Outgoing:
     """Makes the messages that a robot's correction is told with."""
@@ -23,22 +26,27 @@ class Outgoing:
         self._map_frame = map_frame
         self._odom_frame = odom_frame
 
-    def transform(self, T_map_odom: Float, stamp_ns: int) -> Any:
-        """TFMessage with `map` to `odom`."""
+    def transforms(self, T_map_odom: Float, T_earth_map: Float | None, stamp_ns: int) -> Any:
+        """TFMessage with `map` to `odom`, and `earth` to `map` where that is known."""
+        moved = [self._transform(self._map_frame, self._odom_frame, T_map_odom, stamp_ns)]
+        if T_earth_map is not None:
+            moved.append(self._transform(EARTH, self._map_frame, T_earth_map, stamp_ns))
+        return self._types.new(TF, transforms=moved)
+
+    def _transform(self, parent: str, child: str, T: Float, stamp_ns: int) -> Any:
         new = self._types.new
-        q_w, q_x, q_y, q_z = (float(q) for q in q_wxyz_from_R(T_map_odom[:3, :3]))
-        t_x, t_y, t_z = (float(t) for t in T_map_odom[:3, 3])
-        moved = new(
+        q_w, q_x, q_y, q_z = (float(q) for q in q_wxyz_from_R(T[:3, :3]))
+        t_x, t_y, t_z = (float(t) for t in T[:3, 3])
+        return new(
             "geometry_msgs/msg/TransformStamped",
-            header=self.header(stamp_ns),
-            child_frame_id=self._odom_frame,
+            header=self.header(stamp_ns, parent),
+            child_frame_id=child,
             transform=new(
                 "geometry_msgs/msg/Transform",
                 translation=new("geometry_msgs/msg/Vector3", x=t_x, y=t_y, z=t_z),
                 rotation=new("geometry_msgs/msg/Quaternion", x=q_x, y=q_y, z=q_z, w=q_w),
             ),
         )
-        return new(TF, transforms=[moved])
 
     def path(self, T_map_body: Float, stamps_ns: list[int], stamp_ns: int) -> Any:
         """Path of (N, 4, 4) body poses, each with its own time."""
@@ -68,11 +76,11 @@ class Outgoing:
         """String."""
         return self._types.new(TEXT, data=words)
 
-    def header(self, stamp_ns: int) -> Any:
-        """Header in the map frame."""
+    def header(self, stamp_ns: int, frame: str | None = None) -> Any:
+        """Header in a frame, that of the map where none is said."""
         sec, nanosec = divmod(stamp_ns, 10**9)
         stamp = self._types.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-        return self._types.new("std_msgs/msg/Header", stamp=stamp, frame_id=self._map_frame)
+        return self._types.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame or self._map_frame)
 
     def placed(self, T: Float) -> Any:
         """Pose of a (4, 4) matrix."""

@@ -23,7 +23,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from flocc_agent.config import Ros2Config, validated
-from flocc_agent.runtime.ros2.node import Act, OnPayload
+from flocc_agent.runtime.ros2.missed import SequenceGaps
+from flocc_agent.runtime.ros2.node import Act, OnMissing, OnPayload, ignore
 from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import MessageTypes, Ros2Error
 
@@ -140,18 +141,24 @@ class RclpyNode:
         made = kind and self._node.create_publisher(kind, topic, profile(qos), qos_overriding_options=overrides)
         return RclpyPublisher(self._node, made, self._types)
 
-    def subscribe(self, topic: str, type_name: str, qos: Qos, on_payload: OnPayload) -> Topic:
+    def subscribe(
+        self, topic: str, type_name: str, qos: Qos, on_payload: OnPayload, on_missing: OnMissing = ignore
+    ) -> Topic:
         """Declare a subscription; while the node is inactive only transient local messages pass."""
         kind = self._kind(type_name, f"{topic} is not read")
         named = Topic(self._node.resolve_topic_name(topic), type_name, self._types.hash(type_name), qos)
 
         made: Any = None
+        gaps = SequenceGaps()
 
-        def take(payload: bytes) -> None:
+        def take(payload: bytes, info: Any) -> None:
             """Pass a message on, and those behind it: the executor gives one each time it has waited, which is slow."""
-            waiting, taken = DRAIN_MAX, cast(tuple[bytes, Any] | None, (payload, None))
+            waiting, taken = DRAIN_MAX, cast(tuple[bytes, Any] | None, (payload, info))
             while taken is not None:
+                missing = gaps.missing_before(*_sender_of(taken[1]))
                 if self._node.is_active or qos.transient_local:
+                    if missing:
+                        on_missing(missing)
                     on_payload(taken[0])
                 waiting -= 1
                 taken = made.handle.take_message(kind, True) if waiting else None
@@ -214,6 +221,13 @@ class RclpyNode:
                 node = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
                 known = hashed if hashed.startswith("RIHS01_") else topic.hash
                 self._on_offer(Offer(node, topic.name, end.topic_type, known, misfit))
+
+
+def _sender_of(info: Any) -> tuple[bytes | None, int | None]:
+    """Who published a message, and its number; None where the middleware, or an older rclpy, does not say it."""
+    told = info if isinstance(info, dict) else {}
+    gid = told.get("publisher_gid") or {}
+    return gid.get("data"), told.get("publication_sequence_number")
 
 
 def profile(qos: Qos) -> QoSProfile:

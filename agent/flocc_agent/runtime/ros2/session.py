@@ -13,7 +13,8 @@ import zenoh
 import zenoh.ext
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.runtime.ros2.node import Act
+from flocc_agent.runtime.ros2.missed import SequenceGaps
+from flocc_agent.runtime.ros2.node import Act, OnMissing, OnPayload, ignore
 from flocc_agent.runtime.ros2.topics import (
     EntityRole,
     Node,
@@ -25,6 +26,7 @@ from flocc_agent.runtime.ros2.topics import (
     full_name,
     offers_of,
     read_offer,
+    sender_of,
 )
 from flocc_agent.runtime.ros2.types import TRIGGER, TRIGGER_HASH, MessageTypes, domain_of, gid_of, trigger_response
 from flocc_agent.runtime.zenoh_session import open_session
@@ -108,10 +110,16 @@ class Ros2Session:
         token = self._token(EntityRole.PUBLISHES, described)
         return Publisher(self._session, described, self._node.domain_id, token, self._types)
 
-    def subscribe(self, topic: str, type_name: str, qos: Qos, on_payload: Callable[[bytes], None]) -> Topic:
+    def subscribe(
+        self, topic: str, type_name: str, qos: Qos, on_payload: OnPayload, on_missing: OnMissing = ignore
+    ) -> Topic:
         """Declare a subscription; of a transient local topic the last messages come first."""
+        gaps = SequenceGaps()
 
         def take(sample: zenoh.Sample) -> None:
+            missing = gaps.missing_before(*sender_of(sample.attachment.to_bytes() if sample.attachment else None))
+            if missing:
+                on_missing(missing)
             on_payload(sample.payload.to_bytes())
 
         described = self._topic(topic, type_name, qos)

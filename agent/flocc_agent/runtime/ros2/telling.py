@@ -1,4 +1,4 @@
-"""Corrections as they go out: transform and pose with the odometry, path and frame when they change."""
+"""Corrections as they go out: transforms and pose with the odometry, path and frame when they change."""
 
 import asyncio
 import time
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
 from flocc_agent.core.corrected import CorrectedLog, Correction
+from flocc_agent.core.earth_frame import T_earth_map
 from flocc_agent.runtime.ros2.diagnostics import diagnostics
 from flocc_agent.runtime.ros2.markers import KnownClosure, Markers
 from flocc_agent.runtime.ros2.merged_maps import MergedMaps
@@ -92,6 +93,7 @@ class Teller:
         self._graph = node.publisher(GRAPH_TOPIC, MARKERS, LATCHED)
         self._diagnostics = node.publisher(DIAGNOSTICS_TOPIC, DIAGNOSTICS, RELIABLE)
         self._correction: Correction | None = None
+        self._T_earth_map: Float | None = None
         self._tf_last_ns: int | None = None
         self.path_changed = False
 
@@ -99,6 +101,7 @@ class Teller:
         """Take corrections until they end."""
         while (correction := await corrections.get()) is not None:
             self._correction = correction
+            self._T_earth_map = None if correction.frame_changed else self._T_earth_map
             self._map_frame.put(self._outgoing.text(correction.map_frame))
             self.path_changed = True
 
@@ -130,6 +133,7 @@ class Teller:
             if path_changed:
                 await asyncio.to_thread(_put_one, self._path, self._drawn)
                 await asyncio.to_thread(_put_one, self._graph, partial(self._swarm, logs))
+                await self._place_on_earth(logs)
             if self._grids.is_due(logs):
                 await asyncio.to_thread(self._merge, logs)
                 self._grids.complain()
@@ -142,6 +146,13 @@ class Teller:
             connected, now_ns = await asyncio.to_thread(lambda: (self._node.is_connected(), self._node.now_ns()))
             self._diagnostics.put(diagnostics(self._types, status, warnings, heard, connected, now_ns))
             await asyncio.sleep(DIAGNOSTICS_PERIOD_S)
+
+    async def _place_on_earth(self, logs: Mapping[str, CorrectedLog]) -> None:
+        """See where the map lies on Earth; where it became another one meanwhile, it is not known."""
+        before = self._correction
+        found = await asyncio.to_thread(T_earth_map, logs.values())
+        same = before is not None and self._correction is not None and before.map_frame == self._correction.map_frame
+        self._T_earth_map = found if same else None
 
     def _swarm(self, logs: Mapping[str, CorrectedLog]) -> Any:
         """All robots of the map with their closures; None before the first correction."""
@@ -168,7 +179,7 @@ class Teller:
 
     def _put_transform(self, correction: Correction, stamp_ns: int) -> None:
         ahead_ns = round(self._config.tf_tolerance_s * 1e9)
-        self._tf.put(self._outgoing.transform(correction.T_map_odom, stamp_ns + ahead_ns))
+        self._tf.put(self._outgoing.transforms(correction.T_map_odom, self._T_earth_map, stamp_ns + ahead_ns))
 
 
 def _put_one(publisher: RosPublisher, make: Callable[[], Any]) -> None:

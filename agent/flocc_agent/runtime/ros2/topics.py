@@ -160,6 +160,14 @@ def attachment(number: int, source_stamp_ns: int, gid: bytes) -> bytes:
     return _ATTACHMENT.pack(number, source_stamp_ns, GID_BYTES, gid)
 
 
+def sender_of(attached: bytes | None) -> tuple[bytes, int] | tuple[None, None]:
+    """Who published a sample, and its number, by what is attached to it; None where that does not say it."""
+    if attached is None or len(attached) != _ATTACHMENT.size:
+        return None, None
+    number, _, _, gid = _ATTACHMENT.unpack(attached)
+    return gid, number
+
+
 def answer_attachment(asked: bytes, source_stamp_ns: int) -> bytes | None:
     """What is attached to the answer of a service: the question's number and asker; None where that said neither."""
     if len(asked) != _ATTACHMENT.size:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_agent.lenses.lens_names import NONE, RATIONAL, READ, kind_of, plain_name, with_distortion
+from flocc_agent.lenses.lens_names import NONE, RATIONAL, READ, ZEROED, kind_of, plain_name, with_distortion
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import checked_pose
 from flocc_launch.datasets.calibrations.document import TwiceError
@@ -36,10 +36,19 @@ CAMERA_MODEL = (
 DISTORTION_MODEL = ("distortion_model", "distortion_type", "dist_model")
 COEFFICIENTS = (
     "distortion_coefficients", "distortion_coeffs", "distortion", "dist_coeffs", "dist_coef", "distCoef",
-    "camera_dist_coeffs",
+    "camera_dist_coeffs", "coeffs", "DistCoeff",
     "distortion_coeff", "distortion_params", "distortionCoeff", "D",
 )  # fmt: skip
-MATRIX = ("camera_matrix", "camera_intrinsic", "cam_matrix", "K", "camera_intrinsics", "intrinsic_matrix", "cam_K")
+MATRIX = (
+    "camera_matrix",
+    "CameraMat",
+    "camera_intrinsic",
+    "cam_matrix",
+    "K",
+    "camera_intrinsics",
+    "intrinsic_matrix",
+    "cam_K",
+)
 BODY_CAMERA = (
     "T_BS", "T_body_camera", "T_body_cam", "T_BC", "T_B_C", "T_SC", "T_imu_cam", "T_imu_camera", "T_IC", "T_b_c1",
     "Tbc", "body_T_cam", "body_T_cam0", "imu_T_cam", "local_transform",
@@ -71,7 +80,7 @@ _MATTERS = re.compile(
 """Plain names of keys that say something about a camera; one that is not understood is refused."""
 HARMLESS_UNITS = ("", "m", "meter", "meters", "metre", "metres", "px", "pixel", "pixels")
 HARMLESS = re.compile(
-    r"^(camera(1|2)?(fps|rgb|bf|newwidth|newheight|id|name|label)|imu.*|acc.*|gyr.*|orbextractor.*|viewer.*|stereo.*|"
+    r"^(lidar.*|camera(1|2)?(fps|rgb|bf|newwidth|newheight|id|name|label)|imu.*|acc.*|gyr.*|orbextractor.*|viewer.*|stereo.*|"
     r"loopclosing.*|system.*|rgbd.*|tn?cncnm1|timeshift.*|rectificationmatrix|projectionmatrix|p|r|header|seq|stamp|"
     r"averageviewdistance|avgreprojectionerror|reprojectionerror.*|rms.*|boardwidth|boardheight|squaresize|depthmapfactor|"
     r"depthscale|depthfactor|thdepth|thfarpoints|aabbscale|applied(transform|scale)|perviewreprojectionerrors|imagepoints|"
@@ -160,7 +169,7 @@ def _distortion_name(kind: LensKind | None, camera: str | None, distortion: str 
         return "equidistant"
     if distortion is not None:
         return distortion if plain_name(distortion) not in NONE or plain_name(distortion) else None
-    return camera if camera is not None and plain_name(camera) in RATIONAL else None
+    return camera if camera is not None and plain_name(camera) in RATIONAL | ZEROED else None
 
 
 def _wants_coefficients(distortion: str | None, camera: str | None) -> bool:

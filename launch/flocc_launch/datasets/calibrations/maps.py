@@ -46,6 +46,10 @@ def _is_camera(key: str, value: Any) -> bool:
     return re.fullmatch(r"(cam|camera)_?\d+", key.lower()) is not None and isinstance(value, dict)
 
 
+OKVIS_PICTURES = ("gray", "rgb", "gray+depth", "rgb+depth")
+"""What OKVIS 2 calls `camera_type`: of the pictures, not of the lens."""
+
+
 def _listed_cameras(document: Map) -> Cameras:
     """SVO and maplab (a map `camera` beside `T_B_C`), OKVIS (all in one map)."""
     found: Cameras = {}
@@ -62,6 +66,8 @@ def _listed_cameras(document: Map) -> Cameras:
             camera["distortion"] = distortion.get("parameters") or []
             camera["distortion_model"] = distortion["type"]
         camera.pop("id", None)
+        if camera.get("camera_type") in OKVIS_PICTURES:
+            del camera["camera_type"]
         found[str(camera.pop("label", f"cam{number}"))] = camera
     return found
 
@@ -99,8 +105,8 @@ CAMODOCAL = {"pinhole": "radtan", "pinholefull": "rational_polynomial", "mei": "
 
 def _camodocal(document: Map) -> Cameras:
     """VINS-Mono and VINS-Fusion, by camodocal: parameters in maps of their own, whose names depend on the model."""
-    mask = "fisheye"  # whether VINS puts a round mask on features
-    camera = {key: value for key, value in document.items() if not key.endswith("_parameters") and key != mask}
+    mask = ("fisheye", "fisheye_mask")  # whether, and by what file, VINS puts a round mask on features
+    camera = {key: value for key, value in document.items() if not key.endswith("_parameters") and key not in mask}
     model = plain(str(document.get("model_type", "")))
     if model in ("scaramuzza", "ocam"):
         raise ValueError(
@@ -130,6 +136,9 @@ def _basalt(document: Map) -> Cameras:
         numbers.pop("rpmax", None)
         if kind == "fov":
             numbers["omega"] = numbers.pop("w", None)
+        if kind == "ucm":
+            numbers["beta"] = 1.0  # the unified model is the extended one with this
+            entry = {**entry, "camera_type": "eucm"}
         camera: Map = {**rest, **numbers, "camera_model": {"pinhole": "none"}.get(kind, entry.get("camera_type"))}
         for name, listed in (("T_imu_cam", extrinsics), ("resolution", sizes)):
             if listed is not None and len(listed) != len(value["intrinsics"]):
@@ -257,14 +266,21 @@ def _depthai(document: Map) -> Cameras:
 
 
 def _stereo(document: Map) -> Cameras:
-    """OpenCV's stereo sample: M1 D1 of the left camera, M2 D2 of the right one, and what lies between them."""
-    between = ("M1", "D1", "M2", "D2", "R", "T", "E", "F", "R1", "R2", "P1", "P2", "Q")
+    """OpenCV's stereo samples: M1 (or K1) D1 of the left camera, M2 D2 of the right one, and what lies between them.
+
+    Raises:
+        ValueError: K1 has four coefficients, which OpenCV's fisheye sample writes in the same way.
+    """
+    between = ("M1", "K1", "D1", "M2", "K2", "D2", "R", "T", "E", "F", "R1", "R2", "P1", "P2", "Q")
     rest = {key: value for key, value in document.items() if key not in between}
+    M = "M" if "M1" in document else "K"
+    if M == "K" and "distortion_model" not in rest and len(flat_numbers(document["D1"], "D1")) == 4:
+        raise ValueError("nothing says whether the four numbers of D1 are of a fisheye: add distortion_model")
     sides = {"left": "1", "right": "2"}
     return {
-        side: {**rest, "camera_matrix": document[f"M{n}"], "distortion": document[f"D{n}"]}
+        side: {**rest, "camera_matrix": document[f"{M}{n}"], "distortion": document[f"D{n}"]}
         for side, n in sides.items()
-        if f"M{n}" in document and f"D{n}" in document
+        if f"{M}{n}" in document and f"D{n}" in document
     }
 
 
@@ -336,10 +352,20 @@ def _tidied(document: Map) -> Map:
     if isinstance(fisheye := camera.get("fisheye_model"), int | bool):
         del camera["fisheye_model"]
         camera |= {"distortion_model": "fisheye"} if fisheye else {}
+    if plain(str(camera.get("distortion_model"))) in ("fisheye", "equidistant"):
+        camera = _without_tangential(camera)
     flags = camera.get("flags")
     if isinstance(flags, str) and "fisheye" in flags.lower() and "distortion_model" not in camera:
         camera["distortion_model"] = "fisheye"
     return camera
+
+
+def _without_tangential(camera: Map) -> Map:
+    """A fisheye's k1 k2 0 0 k3 k4, as RTAB-Map writes it, as k1 k2 k3 k4."""
+    name = "distortion_coefficients"
+    given = flat_numbers(camera[name], name) if name in camera else []
+    is_padded = len(given) == 6 and not any(given[2:4])
+    return {**camera, name: [*given[:2], *given[4:]]} if is_padded else camera
 
 
 FORMS: tuple[Form, ...] = (
@@ -353,7 +379,7 @@ FORMS: tuple[Form, ...] = (
     Form("Kalibr camchain", lambda d: any(_is_camera(key, value) for key, value in d.items()), _kalibr),
     Form("camodocal (VINS)", lambda d: "model_type" in d or "projection_parameters" in d, _camodocal),
     Form("ORB-SLAM settings", lambda d: any(re.match(r"(Camera\d?|LEFT)\.", key) for key in d), _orb),
-    Form("OpenCV stereo", _has("M1", "D1"), _stereo),
+    Form("OpenCV stereo", lambda d: "D1" in d and ("M1" in d or "K1" in d), _stereo),
     Form(
         "OpenSfM",
         lambda d: bool(d) and all(isinstance(value, dict) and "projection_type" in value for value in d.values()),
@@ -367,5 +393,13 @@ REFUSED_MAPS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], str], ...] =
     ("a Kalibr target", lambda d: "target_type" in d, "give the camchain file that Kalibr writes"),
     ("Kalibr's IMU file", lambda d: "accelerometer_noise_density" in d and "fx" not in d and "intrinsics" not in d,
      "give the camchain file that Kalibr writes"),
+    ("Azure Kinect's calibration", lambda d: "CalibrationInformation" in d,
+     "its numbers are of a part of the sensor; write those of k4a's colour mode as YAML"),
+    ("calib.io's calibration", lambda d: isinstance(d.get("Calibration"), dict) and "cameras" in d["Calibration"],
+     "export OpenCV's form from it"),
+    ("Project Aria's calibration", lambda d: "CameraCalibrations" in d,
+     "rectify the images, and write that camera as YAML"),
+    ("EasyMocap's intri.yml", lambda d: "names" in d and any(re.match(r"K_\w", key) for key in d),
+     "write K and dist of one camera as YAML"),
     ("a COCO or other annotation", lambda d: "annotations" in d and "images" in d, "give a calibration"),
 )  # fmt: skip

@@ -209,17 +209,45 @@ ZED_SIZES = {"2K": [2208, 1242], "FHD": [1920, 1080], "FHD1200": [1920, 1200], "
              "VGA": [672, 376]}  # fmt: skip
 
 
+ZED_OTHERS = ("STEREO", "MISC")
+"""Sections of ZED's files that are not of one camera."""
+
+
 def _zed(text: str) -> Cameras:
-    """SNxxxx.conf of ZED cameras: sections LEFT_CAM_HD and so on, with fx fy cx cy k1 k2 p1 p2 k3."""
-    cameras: Cameras = {}
-    pattern = r"^\[((?:LEFT|RIGHT)_CAM_\w+)\]\s*$(.*?)(?=^\[|\Z)"
-    for name, body in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
-        size = ZED_SIZES.get(name.partition("_CAM_")[2])
-        if size is None:
-            continue
+    """SNxxxx.conf of ZED cameras: sections LEFT_CAM_HD and so on; distortion stands there or in LEFT_DISTO."""
+    sections: dict[str, Map] = {}
+    for name, body in re.findall(r"^\[(\w+)\]\s*$(.*?)(?=^\[|\Z)", text, re.MULTILINE | re.DOTALL):
         values = dict(line.split("=", 1) for line in _lines(body) if "=" in line)
-        cameras[name] = {"resolution": size} | {key.strip(): float(value) for key, value in values.items()}
+        sections[name] = {key.strip(): float(value) for key, value in values.items() if name not in ZED_OTHERS}
+    cameras: Cameras = {}
+    for name, values in sections.items():
+        side, is_camera, size = name.partition("_CAM_")
+        if is_camera and size in ZED_SIZES:
+            lens = sections.get(f"{side}_DISTO", {})
+            twice = next((key for key in lens if values.get(key, lens[key]) != lens[key]), None)
+            if twice is not None:
+                raise ValueError(f"the sections {name} and {side}_DISTO give {twice} twice, and differ")
+            cameras[name] = {"resolution": ZED_SIZES[size], **lens, **values}
+        elif not is_camera and not name.endswith("_DISTO") and name not in ZED_OTHERS:
+            raise ValueError(f"the section {name!r} is not understood and may be about the camera")
     return cameras
+
+
+def _scanned(text: str) -> Cameras:
+    """ScanNet's scene....txt and BundleFusion's _info.txt: the colour camera of `name = numbers`."""
+    rows = {key.strip(): row.strip() for key, row in (line.split("=", 1) for line in _lines(text) if "=" in line)}
+
+    def numbers(*names: str) -> list[float]:
+        found = next((rows[name] for name in names if name in rows), None)
+        if found is None or not _are_numbers(found):
+            raise ValueError(f"has no {names[0]} with numbers")
+        return [float(word) for word in found.split()]
+
+    size = [*numbers("colorWidth", "m_colorWidth"), *numbers("colorHeight", "m_colorHeight")]
+    if "m_calibrationColorIntrinsic" in rows:
+        return {"camera": {"K": numbers("m_calibrationColorIntrinsic"), "resolution": size}}
+    names = ("fx_color", "fy_color", "mx_color", "my_color")
+    return {"camera": {"intrinsics": [number for name in names for number in numbers(name)], "resolution": size}}
 
 
 TEXT_FORMS: tuple[TextForm, ...] = (
@@ -228,6 +256,11 @@ TEXT_FORMS: tuple[TextForm, ...] = (
         "KITTI calibration", lambda text: re.search(r"^(P\d|P_rect_\d+):", text, re.MULTILINE) is not None, _kitti
     ),
     TextForm("ZED conf", lambda text: re.search(r"^\[LEFT_CAM_\w+\]", text, re.MULTILINE) is not None, _zed),
+    TextForm(
+        "ScanNet and BundleFusion",
+        lambda text: re.search(r"^(m_calibrationColorIntrinsic|fx_color)\s*=", text, re.MULTILINE) is not None,
+        _scanned,
+    ),
     TextForm("ROS camera_calibration_parsers INI", _matches(r"\[image\]"), _ini),
     TextForm("DSO camera.txt", _is_dso, _dso),
     TextForm("numbers", _matches(rf"{_NUMBER}([\s,;]+{_NUMBER})*[\s,;]*$", every=True), _numbers),
@@ -253,5 +286,9 @@ REFUSED_TEXTS: tuple[tuple[re.Pattern[str], str], ...] = (
     (re.compile(r"\A\s*NVM_V"), "is VisualSFM's NVM; export COLMAP's text form"),
     (re.compile(r"\A\s*# Bundle file"), "is a Bundler file; export COLMAP's text form"),
     (re.compile(r"\A\s*<launch"), "is a ROS launch file; give the calibration that it names"),
+    (re.compile(r"\A\s*Pix4D"), "is of Pix4D, in millimetres of the sensor; export OpenCV's or COLMAP's form"),
+    (re.compile(r"^cam0\s*=\s*\[", re.MULTILINE), "is Middlebury's calib.txt of a stereo pair; write cam0 as YAML"),
+    (re.compile(r"\A\s*\[CAMERA_PARAMS\]"), "is MRPT's INI; write its resolution, fx, fy, cx, cy and dist as YAML"),
+    (re.compile(r'\A\s*\[\s*\{\s*"version"'), "is an EDEX of cuVSLAM; write its camera as YAML"),
     (re.compile(r"\A# Image list"), "is COLMAP's images.txt; give cameras.txt"),
 )

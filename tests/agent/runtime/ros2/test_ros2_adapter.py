@@ -5,10 +5,12 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.agent.core.test_core_earth_frame import BENT, log_of
 from tests.agent.runtime.loopback import free_ports, until
 from tests.agent.runtime.ros2 import cdr_by_hand
 from tests.agent.runtime.ros2.cdr_by_hand import Stamped
@@ -16,8 +18,9 @@ from tests.agent.runtime.ros2.raw_node import RawNode, gid, open_router
 
 from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.core.corrected import CorrectedLog, Correction, RecordedOdometry
-from flocc_agent.core.gossip import LogCopy
+from flocc_agent.core.geodesy import place_of
 from flocc_agent.core.interfaces import Image
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.core.measurements import GeodeticFix, Measurement, OdometryCovariance
 from flocc_agent.core.reports import Fact
 from flocc_agent.geometry import Float, pose, pose7, so3_exp, tq_from_pose
@@ -91,6 +94,7 @@ class Agent:
         self.facts: list[Fact] = []
         self.resets: list[None] = []
         self.corrections: asyncio.Queue[Correction | None] = asyncio.Queue()
+        self.logs: dict[str, CorrectedLog] = {}
         self.poses = [(EPOCH_S + 0.25, np.eye(4)), (EPOCH_S + 1.0, T_MAP_ODOM)]
 
     async def add_keyframe(self, image: Image, T_odom_camera: Float, stamp_s: float) -> None:
@@ -110,7 +114,7 @@ class Agent:
             lambda: self.resets.append(None),
             lambda: [],
             lambda: (AgentStatus(robot="r-1"), ()),
-            dict,
+            lambda: self.logs,
         )
 
     def problems(self) -> list[str]:
@@ -263,6 +267,31 @@ async def test_a_correction_goes_out_as_transform_pose_path_and_frame() -> None:
     assert {identifier for *_, identifier in attached} == {gid(token)}
 
 
+async def test_a_map_with_fixes_is_placed_on_earth_with_each_transform() -> None:
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        robot.node.subscribe("/tf", TF)
+        async with adapted(port) as (agent, _):
+            agent.logs["r1"] = log_of(BENT)
+            agent.corrections.put_nowait(correction())
+            await drive(robot, agent, 1)
+            times = iter(range(100_000, 200_000, 20))
+
+            def told() -> list[list[Stamped]]:
+                return [cdr_by_hand.read_transforms(each.payload) for each in robot.node.received["/tf"]]
+
+            await until(lambda: [len(each) for each in told()[-2:]] == [2, 2], act=lambda: robot.odometry(next(times)))
+            agent.corrections.put_nowait(replace(correction(), map_frame="map/r0", frame_changed=True))
+            agent.logs.clear()
+            await until(lambda: len(told()[-1]) == 1, act=lambda: robot.odometry(next(times)))
+    both = next(each for each in told() if len(each) == 2)
+    assert [(each.frame, each.child) for each in both] == [("map", "odom"), ("earth", "map")]
+    assert both[0].stamp == both[1].stamp
+    place = place_of(np.array(both[1].position))
+    assert place[:2] == pytest.approx((48.1, 11.5), abs=1e-3)
+    assert place.altitude_m == pytest.approx(500.0, abs=10.0)
+
+
 async def test_a_program_that_feeds_the_agent_gets_transforms_by_the_clock_and_a_thinned_path() -> None:
     (port,) = free_ports(1)
     with ros(port) as robot:
@@ -358,6 +387,23 @@ async def test_what_cannot_be_used_is_said_once_counted_and_left_out() -> None:
     assert "are no nav_msgs/msg/Odometry" in said
     assert "odometry jumps out of reach (faster than 1000 m/s)" in said
     assert len(agent.problems()) == len(set(agent.problems())) == 7
+
+
+async def test_messages_that_a_publisher_numbered_and_that_never_came_are_said_and_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flocc_agent.runtime.ros2.adapter.PATIENCE_S", 1.0)
+    (port,) = free_ports(1)
+    with ros(port) as robot:
+        async with adapted(port) as (agent, adapter):
+            await drive(robot, agent, 1)
+            robot.node._publishers["/r1/camera/image_raw"][1][0] += 30  # as if the network had lost them
+            times = iter(range(200_000, 300_000, 50))
+            await until(lambda: bool(agent.problems()), act=lambda: robot.image(next(times)))
+            lost = adapter.counters()["ros2 image lost before this node"]
+    assert lost == 30
+    assert len(agent.problems()) == 1
+    assert agent.problems()[0].startswith("/r1/camera/image_raw: messages are lost before they reach this node")
 
 
 async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.corrected import CorrectedLog, RecordedOdometry
-from flocc_agent.core.gossip import LogCopy
+from flocc_agent.core.log_copy import LogCopy
 from flocc_agent.geometry import pose, pose7, so3_exp
 from flocc_agent.runtime.ros2.diagnostics import ERROR, OK, WARN, diagnostics, judged
 from flocc_agent.runtime.ros2.markers import ABOVE_M, KEYFRAMES_MAX, KnownClosure, Markers
@@ -15,7 +15,7 @@ from flocc_agent.runtime.ros2.types import MessageTypes
 from flocc_agent.runtime.status import AgentStatus
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import LogCorrection
-from flocc_protocol.records import KeyframeRecord
+from flocc_protocol.records import KeyframeRecord, encode_record
 
 TYPES = MessageTypes()
 T_MAP_ODOM = {
@@ -30,7 +30,7 @@ def corrected_log(robot: str, keyframes: int, incarnation: int = 0) -> Corrected
     copy = LogCopy()
     for k in range(keyframes):
         T = pose7(pose(np.eye(3), np.array([float(k), 0.0, 0.0])))
-        copy.records.append(KeyframeRecord(k, float(k), T, None))
+        copy.append(encode_record(KeyframeRecord(k, float(k), T, None)))
     term = Term(1, LogId("r2"))
     correction = LogCorrection(log, term, 1, term.leader, pose7(T_MAP_ODOM[robot]))
     return CorrectedLog(correction, RecordedOdometry(copy))

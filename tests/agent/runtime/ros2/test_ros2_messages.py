@@ -40,7 +40,7 @@ def read_by_rosbags(payload: bytes, name: str) -> Any:
 
 
 def test_the_transform_places_odom_in_the_map() -> None:
-    payload = TYPES.written(OUTGOING.transform(T_MAP_ODOM, STAMP_NS))
+    payload = TYPES.written(OUTGOING.transforms(T_MAP_ODOM, None, STAMP_NS))
     position, quaternion = numbers_of(T_MAP_ODOM)
     assert cdr_by_hand.read_transforms(payload) == [Stamped(STAMP, "map", "r1/odom", position, quaternion)]
     (moved,) = read_by_rosbags(payload, TF).transforms

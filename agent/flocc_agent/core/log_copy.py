@@ -1,0 +1,218 @@
+"""A prefix of one robot's log, as every robot holds it: the records' bytes, decoded when somebody asks.
+
+Rules: what a record says is not kept as objects; whoever derives something from records does so as they come. Full
+blocks of records never change, so copies of one log in one process share them; the last few records are kept singly.
+The chained checksum is one of all bytes so far: it is known after each block, and found again from there.
+"""
+
+import zlib
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import overload
+from weakref import WeakValueDictionary
+
+from flocc_protocol.records import KEYFRAME_CODE, KeyframeRecord, Record, UnknownRecord, chain, decode_record
+
+BLOCK_RECORDS = 64
+"""Records of a block: some 15 kB, so that a checksum within it takes microseconds."""
+DECODED_MAX = 1024
+CODE_AT = 1
+"""Where a record says of what kind it is."""
+
+
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
+class _Block:
+    """`BLOCK_RECORDS` records in one piece, and where each ends."""
+
+    data: bytes
+    ends: "array[int]"
+
+    def record(self, k: int) -> bytes:
+        return self.data[self.ends[k - 1] if k else 0 : self.ends[k]]
+
+
+_blocks: "WeakValueDictionary[tuple[bytes, bytes], _Block]" = WeakValueDictionary()
+
+
+def _block_of(records: Sequence[bytes]) -> _Block:
+    """A block of these records; one that somebody in this process holds already."""
+    data, ends, end = b"".join(records), array("I"), 0
+    for record in records:
+        end += len(record)
+        ends.append(end)
+    key = (data, ends.tobytes())
+    block = _blocks.get(key)
+    if block is None:
+        block = _blocks[key] = _Block(data, ends)
+    return block
+
+
+class EncodedRecords(Sequence[bytes]):
+    """Records' bytes, in order; only ever longer, but for `truncate`."""
+
+    def __init__(self, records: Iterable[bytes] = ()) -> None:
+        self._full: list[_Block] = []
+        self._tail: list[bytes] = []
+        for record in records:
+            self.append(record)
+
+    def __len__(self) -> int:
+        return len(self._full) * BLOCK_RECORDS + len(self._tail)
+
+    def __iter__(self) -> Iterator[bytes]:
+        for block in self._full:
+            yield from map(block.record, range(BLOCK_RECORDS))
+        yield from self._tail
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[bytes]: ...
+
+    def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
+        if isinstance(index, slice):
+            return [self._at(k) for k in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"record {index} of {len(self)}")
+        return self._at(index % len(self))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment]  # it grows
+
+    def _at(self, index: int) -> bytes:
+        number, k = divmod(index, BLOCK_RECORDS)
+        return self._tail[k] if number == len(self._full) else self._full[number].record(k)
+
+    def append(self, data: bytes) -> None:
+        """Add the next record."""
+        self._tail.append(data)
+        if len(self._tail) == BLOCK_RECORDS:
+            self._full.append(_block_of(self._tail))
+            self._tail = []
+
+    def truncate(self, count: int) -> None:
+        """Keep so many records."""
+        number, k = divmod(min(count, len(self)), BLOCK_RECORDS)
+        self._tail = self[number * BLOCK_RECORDS : number * BLOCK_RECORDS + k]
+        del self._full[number:]
+
+    def block_checksum(self, number: int, k: int, before: int) -> int:
+        """Checksum after the first `k` records of a full block, of that before it."""
+        block = self._full[number]
+        return zlib.crc32(memoryview(block.data)[: block.ends[k - 1]], before) if k else before
+
+
+class _DecodedRecords(Sequence[Record]):
+    """What records say, decoded when it is asked for, without descriptors."""
+
+    def __init__(self, encoded: EncodedRecords, seal_bytes: int) -> None:
+        self._encoded = encoded
+        self._seal_bytes = seal_bytes
+
+    def __len__(self) -> int:
+        return len(self._encoded)
+
+    def __iter__(self) -> Iterator[Record]:
+        return map(self._decoded, self._encoded)
+
+    @overload
+    def __getitem__(self, index: int) -> Record: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Record]: ...
+
+    def __getitem__(self, index: int | slice) -> Record | list[Record]:
+        if isinstance(index, slice):
+            return [self._decoded(data) for data in self._encoded[index]]
+        return self._decoded(self._encoded[index])
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    __hash__ = None  # type: ignore[assignment]  # it grows
+
+    def _decoded(self, data: bytes) -> Record:
+        return decoded(data[: len(data) - self._seal_bytes])[1]
+
+
+class LogCopy:
+    """A prefix of one robot's log.
+
+    Attributes:
+        encoded: The records' bytes, each with its writer's seal where the swarm seals records.
+        keyframes: How many of them are keyframes.
+    """
+
+    __slots__ = ("_block_checksums", "_seal_bytes", "_tail_checksums", "encoded", "keyframes")
+
+    def __init__(self) -> None:
+        self.encoded = EncodedRecords()
+        self.keyframes = 0
+        self._seal_bytes = 0
+        self._block_checksums = array("I")
+        self._tail_checksums = [0]
+
+    def __len__(self) -> int:
+        return len(self.encoded)
+
+    @property
+    def records(self) -> Sequence[Record]:
+        """The records without descriptors, decoded when they are looked at."""
+        return _DecodedRecords(self.encoded, self._seal_bytes)
+
+    @property
+    def checksum(self) -> int:
+        """Chained checksum of all records."""
+        return self._tail_checksums[-1]
+
+    def checksum_at(self, count: int) -> int:
+        """Chained checksum of the first so many records."""
+        number, k = divmod(count, BLOCK_RECORDS)
+        if number == len(self._block_checksums):
+            return self._tail_checksums[k]
+        return self.encoded.block_checksum(number, k, self._block_checksums[number])
+
+    def append(self, data: bytes, seal_bytes: int = 0) -> None:
+        """Add the next record, the last so many bytes of which are its seal."""
+        assert seal_bytes == self._seal_bytes or not len(self), "all records of a log are sealed, or none"
+        self._seal_bytes = seal_bytes
+        self.encoded.append(data)
+        self._tail_checksums.append(chain(self._tail_checksums[-1], data))
+        if len(self._tail_checksums) > BLOCK_RECORDS:
+            self._block_checksums.append(self._tail_checksums[0])
+            del self._tail_checksums[:-1]
+        self.keyframes += data[CODE_AT] == KEYFRAME_CODE
+
+    def agrees(self, first: int, checksum_before: int, records: Sequence[bytes]) -> bool:
+        """Whether records from a number on, which this copy holds or could go on with, are what it has there."""
+        if self.checksum_at(first) != checksum_before:
+            return False
+        held = self.encoded[first : first + len(records)]
+        return held == list(records[: len(held)])
+
+    def accepts(self, record: Record) -> bool:
+        """Whether the record can be next: keyframes are numbered without gaps."""
+        return not isinstance(record, KeyframeRecord) or record.index == self.keyframes
+
+
+@lru_cache(maxsize=DECODED_MAX)
+def decoded(data: bytes) -> tuple[Record, Record]:
+    """A record, and what is kept of it, decoded once where several copies of a log live in one process."""
+    record = decode_record(data)
+    return record, kept(record)
+
+
+def kept(record: Record) -> Record:
+    """A record without what is held elsewhere: place recognition has the descriptor, the log the record's bytes."""
+    match record:
+        case KeyframeRecord():
+            return replace(record, descriptor=None)
+        case UnknownRecord(code):
+            return UnknownRecord(code, b"")
+        case _:
+            return record
