@@ -41,6 +41,7 @@ from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_faults import found_by, network_faults
 from flocc_agent.runtime.new_journeys import began_anew, last_body
+from flocc_agent.runtime.page_file import PageFile
 from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
@@ -452,6 +453,7 @@ class Agent:
             sealer,
             distributed,
             None if sealer is None else sealer.compute_classes,
+            PageFile(config.folder),
         )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s

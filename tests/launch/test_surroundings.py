@@ -21,6 +21,7 @@ import pytest
 from flocc_agent.config import TransportConfig
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.core.reports import Fact
+from flocc_agent.perception.learned.weight_sources import weights_folder
 from flocc_agent.runtime import network_faults as network
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentStopped
@@ -277,3 +278,43 @@ def test_no_network_but_the_machines_own_is_said(monkeypatch: pytest.MonkeyPatch
     assert fault == "no interface for multicast is up (there is lo); nobody is found until one is"
     assert network.network_faults(config(interface="lo"), "a") == []
     assert network.network_faults(config(multicast=False), "a") == []
+
+
+def test_weights_of_a_user_without_a_home_are_in_the_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    homeless(monkeypatch, tmp_path)
+    assert weights_folder() == tmp_path / f"flocc-{os.getuid()}" / "weights"
+
+
+@pytest.mark.parametrize("words", [("launch", "corridor"), ("demo", "--small")])
+def test_a_run_folder_that_cannot_be_made_is_said_before_anything_is_prepared(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    out = tmp_path / "runs" / "a"
+    assert run(monkeypatch, *words, "--out", str(out)) == 2
+    assert f"error: {out}: cannot be made: {tmp_path} cannot be written" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_weights_that_do_not_fit_on_the_disk_end_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch = pytest.importorskip("torch")
+
+    def full(*_: object) -> None:
+        raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 64 vs 0")
+
+    monkeypatch.setattr(torch, "save", full)
+    assert run(monkeypatch, "weights", "synthesize", str(tmp_path), "--network", "tiny") == 2
+    assert "cannot be written; is the disk full?" in capsys.readouterr().err
+
+
+def test_a_text_is_no_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torch")
+    (tmp_path / "agent.toml").write_text('robot = "r1"\n')
+    assert run(monkeypatch, "weights", "check", str(tmp_path / "agent.toml")) == 2
+    assert "is truncated, damaged or no torch checkpoint" in capsys.readouterr().err

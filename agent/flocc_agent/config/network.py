@@ -60,8 +60,6 @@ class TlsConfig(Section):
 
     folder: Path
     """Holds ca.crt, robot.crt, robot.key, signing.key and members.json."""
-    names_verified: bool = False
-    """True also demands that the dialled address stands in the peer's certificate."""
 
 
 class TransportConfig(Section):

@@ -26,6 +26,7 @@ REMOVED: dict[str, str] = {
     "core.rounds.correction_keyframes_max": "a correction has as many knots as it takes",
     "core.rounds.translation_tolerance_m": "always 0.01",
     "core.rounds.rotation_tolerance_rad": "always 0.1 degrees",
+    "transport.tls.names_verified": "always false: a certificate says who a robot is, not at which address",
     "transport.bulk_send_buffer_bytes": "always 65536",
     "core.distributed": "distributed mode has no keys beside backend.mode",
     "perception.classical.contrast_threshold": "always 0.02",

@@ -13,6 +13,7 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, groups_of
@@ -32,17 +33,23 @@ from flocc_protocol.records import (
 
 Float = NDArray[np.float64]
 
+POSES_OF_A_PIECE = 64
+"""Poses that leave memory together: some 4 kB."""
+
 
 class _Odometry:
     """One log's keyframes as columns: poses as its records give them, stamps, and whether each was described.
 
-    The place of a keyframe that a later version wrote is taken by the pose of the next one; nothing is tied to it.
+    The place of a keyframe that a later version wrote is taken by the pose of the next one; nothing is tied to it. Full
+    pieces of old poses leave memory where there is a cold storage, and with them what was made of them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cold: ColdPieces | None = None) -> None:
         self.stamps_s = array("d")
         self.encoded = bytearray()
         self.unread: set[int] = set()
+        self._cold = cold
+        self._pieces: list[bytes | int] = []
         self._poses = array("d")
         self._matrices: Float = np.empty((0, 4, 4))
 
@@ -54,18 +61,56 @@ class _Odometry:
         self.stamps_s.append(stamp_s)
         self._poses.extend(T_odom_keyframe)
         self.encoded.append(is_described)
+        if len(self._poses) == 7 * POSES_OF_A_PIECE and self._cold is not None:
+            self._pieces.append(self._poses.tobytes())
+            self._poses = array("d")
+            self._cold.add(self, len(self._pieces) - 1)
+
+    def cool(self, number: int) -> None:
+        """Move a piece out of memory, where there is room for it elsewhere."""
+        piece = self._pieces[number]
+        if isinstance(piece, bytes) and self._cold is not None:
+            place = self._cold.put(piece)
+            if place is not None:
+                self._pieces[number] = place
+                self._matrices = np.empty((0, 4, 4))
 
     def matrices(self) -> Float:
-        """All poses (N, 4, 4), T_odom_keyframe."""
+        """All poses (N, 4, 4), T_odom_keyframe; held as long as all that they are made of is."""
         known = len(self._matrices)
-        if known < len(self):
-            added = np.array(self._poses[7 * known :]).reshape(-1, 7)
-            self._matrices = np.concatenate([self._matrices, poses_from_tq(added)])
-        return self._matrices
+        if known == len(self):
+            return self._matrices
+        found = np.concatenate([self._matrices, poses_from_tq(self._rows(known))])
+        if not any(isinstance(piece, int) for piece in self._pieces):
+            self._matrices = found
+        return found
+
+    def _rows(self, first: int) -> Float:
+        """Poses (N, 7) from a keyframe on, as records give them."""
+        number, k = divmod(first, POSES_OF_A_PIECE)
+        if number >= len(self._pieces):
+            return np.array(self._poses[7 * (first - len(self._pieces) * POSES_OF_A_PIECE) :]).reshape(-1, 7)
+        parts = [self._piece(n) for n in range(number, len(self._pieces))]
+        parts[0] = parts[0][k:]
+        return np.concatenate([*parts, np.array(self._poses).reshape(-1, 7)])
+
+    def _piece(self, number: int) -> Float:
+        piece = self._pieces[number]
+        if isinstance(piece, int):
+            assert self._cold is not None
+            piece = self._cold.get(piece, 7 * 8 * POSES_OF_A_PIECE)
+        return np.frombuffer(piece).reshape(-1, 7)
+
+    def _row(self, index: int) -> Float:
+        number, k = divmod(index, POSES_OF_A_PIECE)
+        if number < len(self._pieces):
+            return np.asarray(self._piece(number)[k])
+        k = index - len(self._pieces) * POSES_OF_A_PIECE
+        return np.array(self._poses[7 * k : 7 * k + 7])
 
     def pose(self, index: int) -> Float:
         """`T_odom_keyframe` (4, 4)."""
-        return np.asarray(self.matrices()[index])
+        return pose_from_tq(self._row(index))
 
     def stamp_s(self, index: int) -> float:
         """When a keyframe was taken."""
@@ -88,8 +133,7 @@ class _Odometry:
 
     def between(self, index: int, other: int) -> Pose7:
         """Pose of one keyframe in the frame of another, `T_other_index`."""
-        T_odom_other, T_odom_index = (pose_from_tq(np.array(self._poses[7 * k : 7 * k + 7])) for k in (other, index))
-        return pose7(between(T_odom_other, T_odom_index))
+        return pose7(between(self.pose(other), self.pose(index)))
 
 
 class GraphAssembly:
@@ -100,14 +144,21 @@ class GraphAssembly:
         revision: Grows when a solution is out of date: a new log, closure or fix, or a keyframe that one waited for.
     """
 
-    def __init__(self, saved: SavedMap | None = None, record_at: Callable[[LogId, int], Record] | None = None) -> None:
+    def __init__(
+        self,
+        saved: SavedMap | None = None,
+        record_at: Callable[[LogId, int], Record] | None = None,
+        cold: ColdPieces | None = None,
+    ) -> None:
         """Start with nothing.
 
         Args:
             saved: The opened map, where there is one.
             record_at: Gives a record again by its log and number, when closures are built; None: nobody else keeps
                 them.
+            cold: Where pieces of old odometry go; None: all stay in memory.
         """
+        self._cold = cold
         self.keyframes = 0
         self.revision = 0
         self._saved = saved
@@ -228,7 +279,7 @@ class GraphAssembly:
         """A new log, or a keyframe that a closure was waiting for, makes the last solution out of date."""
         odometry = self._odometry.get(log)
         if odometry is None:
-            odometry = self._odometry[log] = _Odometry()
+            odometry = self._odometry[log] = _Odometry(self._cold)
         while len(odometry) < record.index:
             odometry.unread.add(len(odometry))
             odometry.add(record.stamp_s, record.T_odom_camera, is_described=False)

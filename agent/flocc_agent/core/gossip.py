@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.parameters import GossipParameters
@@ -91,6 +92,7 @@ class Gossip:
         parameters: GossipParameters,
         sealer: Sealer | None = None,
         near: Callable[[str, float], bool] = lambda robot, now: False,  # noqa: ARG005
+        cold: ColdPieces | None = None,
     ) -> None:
         """Start with an empty log.
 
@@ -99,12 +101,14 @@ class Gossip:
             parameters: Limits and times.
             sealer: Signs and checks records, where the swarm has keys.
             near: Whether a robot of this name was in range when it wrote what it broadcasts at that time.
+            cold: Where old blocks of records go; None: all stay in memory.
         """
+        self._cold = cold
         self._own = own
         self._parameters = parameters
         self._sealer = sealer
         self.failed_signers: set[str] = set()
-        self.logs: dict[LogId, LogCopy] = {own: LogCopy()}
+        self.logs: dict[LogId, LogCopy] = {own: LogCopy(cold)}
         self._pulls = Pulls(self._held, near, parameters)
         self._forked: dict[tuple[LogId, str], None] = {}
         self._told: dict[tuple[str, str], None] = {}
@@ -118,6 +122,7 @@ class Gossip:
             **self._pulls.sizes(),
             "forked": (len(self._forked), REMEMBERED_MAX),
             "refused": (len(self._told), REMEMBERED_MAX),
+            **({} if self._cold is None else {"warm_record_blocks": self._cold.size()}),
             "doubted": (len(self._doubted_until_s), REMEMBERED_MAX),
         }
 
@@ -129,7 +134,7 @@ class Gossip:
         """
         opened = self._opened(log, self._held(log), data)
         record = decode_record(opened)
-        copy = self.logs.setdefault(log, LogCopy())
+        copy = self.logs.setdefault(log, LogCopy(self._cold))
         copy.append(data, len(data) - len(opened))
         self._announce(log, copy)
         return NewRecord(log, len(copy) - 1, record)
@@ -238,7 +243,7 @@ class Gossip:
             return [], self._own_log_elsewhere(peer, batch, now)
         copy = self.logs.get(batch.log)
         if copy is None:
-            copy = LogCopy()
+            copy = LogCopy(self._cold)
         if batch.first > len(copy):
             return [], self._behind(peer, batch.log, batch.first + len(batch.records))
         if not copy.agrees(batch.first, batch.checksum_before, batch.records):

@@ -1,7 +1,8 @@
 """A prefix of one robot's log, as every robot holds it: the records' bytes, decoded when somebody asks.
 
 Rules: what a record says is not kept as objects; whoever derives something from records does so as they come. Full
-blocks of records never change, so copies of one log in one process share them; the last few records are kept singly.
+blocks of records never change, so copies of one log in one process share them, and old ones leave memory where there
+is a cold storage; the last few records are kept singly.
 The chained checksum is one of all bytes so far: it is known after each block, and found again from there.
 """
 
@@ -13,6 +14,7 @@ from functools import lru_cache
 from typing import overload
 from weakref import WeakValueDictionary
 
+from flocc_agent.core.cold_storage import ColdPieces
 from flocc_protocol.records import KEYFRAME_CODE, KeyframeRecord, Record, UnknownRecord, chain, decode_record
 
 BLOCK_RECORDS = 64
@@ -31,6 +33,14 @@ class _Block:
 
     def record(self, k: int) -> bytes:
         return self.data[self.ends[k - 1] if k else 0 : self.ends[k]]
+
+
+@dataclass(frozen=True, slots=True)
+class _ColdBlock:
+    """Where a block is that left memory."""
+
+    place: int
+    size_bytes: int
 
 
 _blocks: "WeakValueDictionary[tuple[bytes, bytes], _Block]" = WeakValueDictionary()
@@ -52,9 +62,11 @@ def _block_of(records: Sequence[bytes]) -> _Block:
 class EncodedRecords(Sequence[bytes]):
     """Records' bytes, in order; only ever longer, but for `truncate`."""
 
-    def __init__(self, records: Iterable[bytes] = ()) -> None:
-        self._full: list[_Block] = []
+    def __init__(self, records: Iterable[bytes] = (), cold: ColdPieces | None = None) -> None:
+        """Start with these; with a cold storage, old blocks leave memory."""
+        self._full: list[_Block | _ColdBlock] = []
         self._tail: list[bytes] = []
+        self._cold = cold
         for record in records:
             self.append(record)
 
@@ -62,8 +74,8 @@ class EncodedRecords(Sequence[bytes]):
         return len(self._full) * BLOCK_RECORDS + len(self._tail)
 
     def __iter__(self) -> Iterator[bytes]:
-        for block in self._full:
-            yield from map(block.record, range(BLOCK_RECORDS))
+        for number in range(len(self._full)):
+            yield from map(self._block(number).record, range(BLOCK_RECORDS))
         yield from self._tail
 
     @overload
@@ -86,7 +98,25 @@ class EncodedRecords(Sequence[bytes]):
 
     def _at(self, index: int) -> bytes:
         number, k = divmod(index, BLOCK_RECORDS)
-        return self._tail[k] if number == len(self._full) else self._full[number].record(k)
+        return self._tail[k] if number == len(self._full) else self._block(number).record(k)
+
+    def _block(self, number: int) -> _Block:
+        block = self._full[number]
+        if isinstance(block, _Block):
+            return block
+        assert self._cold is not None
+        piece, ends = self._cold.get(block.place, block.size_bytes), array("I")
+        ends.frombytes(piece[: BLOCK_RECORDS * ends.itemsize])
+        return _Block(piece[BLOCK_RECORDS * ends.itemsize :], ends)
+
+    def cool(self, number: int) -> None:
+        """Move a full block out of memory, where there is room for it elsewhere."""
+        block = self._full[number]
+        if isinstance(block, _Block) and self._cold is not None:
+            piece = block.ends.tobytes() + block.data
+            place = self._cold.put(piece)
+            if place is not None:
+                self._full[number] = _ColdBlock(place, len(piece))
 
     def append(self, data: bytes) -> None:
         """Add the next record."""
@@ -94,6 +124,8 @@ class EncodedRecords(Sequence[bytes]):
         if len(self._tail) == BLOCK_RECORDS:
             self._full.append(_block_of(self._tail))
             self._tail = []
+            if self._cold is not None:
+                self._cold.add(self, len(self._full) - 1)
 
     def truncate(self, count: int) -> None:
         """Keep so many records."""
@@ -103,8 +135,10 @@ class EncodedRecords(Sequence[bytes]):
 
     def block_checksum(self, number: int, k: int, before: int) -> int:
         """Checksum after the first `k` records of a full block, of that before it."""
-        block = self._full[number]
-        return zlib.crc32(memoryview(block.data)[: block.ends[k - 1]], before) if k else before
+        if not k:
+            return before
+        block = self._block(number)
+        return zlib.crc32(memoryview(block.data)[: block.ends[k - 1]], before)
 
 
 class _DecodedRecords(Sequence[Record]):
@@ -150,8 +184,8 @@ class LogCopy:
 
     __slots__ = ("_block_checksums", "_seal_bytes", "_tail_checksums", "encoded", "keyframes")
 
-    def __init__(self) -> None:
-        self.encoded = EncodedRecords()
+    def __init__(self, cold: ColdPieces | None = None) -> None:
+        self.encoded = EncodedRecords(cold=cold)
         self.keyframes = 0
         self._seal_bytes = 0
         self._block_checksums = array("I")

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 _FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 
+KEYFRAMES_HELD = 20_000
 CROWD = 32
 """Robots in range up to which the heartbeat's period is the shortest."""
 INNER = "inner"
@@ -135,6 +136,20 @@ class LoopClosingParameters:
 
 
 @dataclass(frozen=True, slots=True)
+class MemoryParameters:
+    """What a robot holds in memory."""
+
+    __pydantic_config__ = _FORBID
+
+    keyframes_held: int = KEYFRAMES_HELD
+    """Keyframes of all robots held in memory in full; of older ones the records are on disk, and one descriptor stands
+    for each place. Less saves memory, about 1 kB each."""
+
+    def __post_init__(self) -> None:
+        _require(self.keyframes_held >= 1, "keyframes_held must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
 class RoundParameters:
     """The leader's optimisation rounds."""
 
@@ -185,6 +200,7 @@ class CoreParameters:
     place_recognition: PlaceRecognitionParameters = field(default_factory=PlaceRecognitionParameters)
     loop_closing: LoopClosingParameters = field(default_factory=LoopClosingParameters)
     rounds: RoundParameters = field(default_factory=RoundParameters)
+    memory: MemoryParameters = field(default_factory=MemoryParameters)
     distributed: DistributedParameters = field(default_factory=DistributedParameters, metadata={INNER: True})
 
     def under(self, bandwidth_bytes_s: float | None) -> "CoreParameters":

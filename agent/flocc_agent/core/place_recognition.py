@@ -3,6 +3,9 @@
 Descriptors are compared as they came: int8 rows with one number each that makes them of unit length. Products of such
 rows are whole numbers that a float32 holds exactly up to 1,040 numbers, so a similarity is the same whether it is found
 alone or in a batch.
+
+Of old keyframes the fewest stay that stand for all: one whose place another one of its log shows, is left out, whether
+that was a moment before or on an earlier visit. What a log has of one place does not grow with how often it is there.
 """
 
 import math
@@ -14,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.parameters import PlaceRecognitionParameters
+from flocc_agent.core.parameters import KEYFRAMES_HELD, PlaceRecognitionParameters
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
@@ -23,6 +26,12 @@ Floats = NDArray[np.float32]
 
 CAPACITY_FIRST = 64
 DESCRIPTORS_MAX = 1024
+THINNED_AT_ONCE = 64
+"""Old rows that are looked through at one time."""
+SAME_PLACE_SIMILARITY = 0.9
+"""An old keyframe with a more similar one in its log is represented by that one."""
+SAME_PLACE_STEP = 0.05
+"""Where the representatives are too many, less similar ones stand for each other."""
 ROWS_AT_ONCE = 256
 """int8 rows that are compared at one time: as floats they stay in a processor's cache."""
 
@@ -62,6 +71,8 @@ class _Rows:
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
+        self._thinned = 0
+        self._same_place = SAME_PLACE_SIMILARITY
 
     def __len__(self) -> int:
         return self._count
@@ -89,6 +100,46 @@ class _Rows:
         self._logs[self._count] = log
         self._indices[self._count] = index
         self._count += 1
+
+    def thin(self, held: int) -> None:
+        """Keep the newest so many rows, and at most so many that stand for the older ones."""
+        while self._count - self._thinned >= held + THINNED_AT_ONCE:
+            self._thin(self._thinned, self._thinned + THINNED_AT_ONCE)
+            while self._thinned > held and self._same_place > -1.0:
+                self._same_place -= SAME_PLACE_STEP
+                until, self._thinned = self._thinned, 0
+                while self._thinned < until:
+                    done = min(THINNED_AT_ONCE, until - self._thinned)
+                    until -= self._thin(self._thinned, self._thinned + done)
+
+    def _thin(self, first: int, end: int) -> int:
+        """Leave out rows between two places that a row before `first`, or a later one that stays, stands for.
+
+        Returns:
+            How many were left out.
+        """
+        rows = self._units(slice(first, end))
+        logs = self._logs[first:end]
+        stays = np.ones(end - first, dtype=bool)
+        for begin in range(0, first, ROWS_AT_ONCE):
+            before = slice(begin, min(begin + ROWS_AT_ONCE, first))
+            alike = (rows @ self._units(before).T >= self._same_place) & (logs[:, None] == self._logs[before])
+            stays &= ~alike.any(axis=1)
+        among = (rows @ rows.T >= self._same_place) & (logs[:, None] == logs)
+        for k in np.flatnonzero(stays).tolist():
+            stays[k] = not np.any(among[k, :k] & stays[:k])
+        chosen = first + np.flatnonzero(stays)
+        fewer = end - first - len(chosen)
+        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
+            values[first : end - fewer] = values[chosen]
+            values[end - fewer : self._count - fewer] = values[end : self._count].copy()
+        self._count -= fewer
+        self._thinned = end - fewer
+        return fewer
+
+    def _units(self, places: slice) -> Floats:
+        """Rows (K, D) of unit length."""
+        return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
 
     def similarities(self, descriptors: Sequence[Descriptor]) -> Floats:
         """Cosine similarities (B, N) of B descriptors with all rows."""
@@ -125,9 +176,22 @@ class PlaceRecognition:
     """
 
     def __init__(
-        self, own: LogId, parameters: PlaceRecognitionParameters, closed: frozenset[LogId] = frozenset()
+        self,
+        own: LogId,
+        parameters: PlaceRecognitionParameters,
+        closed: frozenset[LogId] = frozenset(),
+        keyframes_held: int = KEYFRAMES_HELD,
     ) -> None:
+        """Start without any.
+
+        Args:
+            own: The log that this robot writes.
+            parameters: What is a candidate.
+            closed: Earlier logs of its own.
+            keyframes_held: Keyframes that are compared whole, the newest ones; older ones are thinned.
+        """
         self._own = own
+        self._keyframes_held = keyframes_held
         self._closed = closed
         self._parameters = parameters
         self._numbers: dict[LogId, int] = {}
@@ -142,6 +206,11 @@ class PlaceRecognition:
     def similarity_threshold(self) -> float:
         """From which on two keyframes are candidates."""
         return self._parameters.similarity_threshold
+
+    @property
+    def rows(self) -> int:
+        """Descriptors that are held."""
+        return len(self._own_rows or ()) + sum(map(len, self._others.values()))
 
     @property
     def best_similarities(self) -> dict[str, float]:
@@ -184,11 +253,13 @@ class PlaceRecognition:
             if self._own_rows is None:
                 self._own_rows = _Rows(dimension, np.float32)
             self._own_rows.append(number, keyframe.index, descriptor)
+            self._own_rows.thin(self._keyframes_held)
         elif self._is_compared(log):
             rows = self._others.get(dimension)
             if rows is None:
                 rows = self._others[dimension] = _Rows(dimension, np.int8)
             rows.append(number, keyframe.index, descriptor)
+            rows.thin(self._keyframes_held)
         return True
 
     def _among_all(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:

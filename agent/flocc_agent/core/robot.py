@@ -8,8 +8,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import assert_never
 
-from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
+from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, DistributedOptimisation
@@ -37,6 +38,7 @@ from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
 from flocc_agent.core.in_map import InMap
 from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
+from flocc_agent.core.log_copy import BLOCK_RECORDS
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.measurements import (
     WAITING_MAX,
@@ -163,6 +165,7 @@ class Robot:
         sealer: Sealer | None = None,
         distributed: bool = False,
         compute_classes: Mapping[str, int] | None = None,
+        cold: ColdStorage | None = None,
     ) -> None:
         restored = restored or Restored()
         self.log = log
@@ -177,13 +180,16 @@ class Robot:
         self._served = frozenset(restored.latents if restored.saved is not None else ())
         self._partnered: set[tuple[KeyframeId, LogId]] = set()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
-        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near)
+        held = parameters.memory.keyframes_held
+        cold_records = None if cold is None else ColdPieces(cold, max(1, held // BLOCK_RECORDS))
+        cold_odometry = None if cold is None else ColdPieces(cold, max(1, held // POSES_OF_A_PIECE))
+        self.gossip = Gossip(log, parameters.gossip, sealer, self.neighbours.was_near, cold_records)
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
         self._answers = AnswerBudget()
         self._muted = Muted()
-        self.assembly = GraphAssembly(restored.saved, self._record_at)
+        self.assembly = GraphAssembly(restored.saved, self._record_at, cold_odometry)
         closed = restored.closed()
-        self.recognition = PlaceRecognition(log, parameters.place_recognition, closed)
+        self.recognition = PlaceRecognition(log, parameters.place_recognition, closed, held)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
         comes_back = any(each not in closed for each, _ in restored.records)
         listens_until_s = now + parameters.election.startup_s if comes_back else float("-inf")

@@ -15,6 +15,7 @@ class Straightener:
     Attributes:
         model: How the pictures were taken.
         camera: The agent's camera of what `apply` gives.
+        is_needed: Whether `apply` changes anything.
     """
 
     def __init__(self, model: CameraModel, view_rad: float | None = None) -> None:
@@ -29,12 +30,8 @@ class Straightener:
         """
         self.model = model
         self.camera: Camera = straight_camera(model, view_rad)
+        self.is_needed = model.agent_camera() is None
         self._map: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-
-    @property
-    def is_needed(self) -> bool:
-        """Whether `apply` changes anything."""
-        return self.model.agent_camera() is None
 
     def apply(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Remap a picture of the model's size, grey or in colour, of 8 or 16 bits."""

@@ -1,5 +1,6 @@
 """The command line. Commands import what they need when they run, so that `--help` stays fast."""
 
+import os
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -123,6 +124,7 @@ def demo(
     from flocc_launch.scenarios.small_demo import small_demo
 
     speech = Speech(json_out, quiet, verbose)
+    _check_place(out)
     if not small:
         _launch(read_shipped("demo", {"world.robots": robots, "world.seed": seed}), out, speech)
         return
@@ -342,6 +344,20 @@ def _map_use(folder: Path | None, fixed: bool) -> "MapUse | None":
     return None if folder is None else MapUse(folder, fixed)
 
 
+def _check_place(out: Path) -> None:
+    """See, before anything is prepared for minutes, that a run's folder can be made.
+
+    Raises:
+        RunFolderError: It cannot.
+    """
+    from flocc_launch.runs.run_folder import RunFolderError
+
+    whole = out.absolute()
+    there = next(place for place in (whole, *whole.parents) if place.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise RunFolderError(f"{out}: cannot be made: {there} cannot be written")
+
+
 def _launch(
     scenario: "Scenario",
     out: Path,
@@ -359,6 +375,7 @@ def _launch(
     from flocc_launch.scenarios.recordings import recordings
     from flocc_launch.swarm.launching import launch as run
 
+    _check_place(out)
     with progress_bar("preparing data") as progress:
         paths = recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)

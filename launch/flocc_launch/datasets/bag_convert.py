@@ -2,6 +2,7 @@
 
 import json
 import logging
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -95,11 +96,11 @@ def convert_bag(path: Path, out: Path, options: BagOptions | None = None, progre
         layout = Layout.of(bag)
         robots = _wanted(layout, options)
         if len(robots) == 1:
-            _convert_robot(layout, robots[0], out, options, progress)
+            _convert_robots(layout, {out: robots[0]}, options, progress)
             return out
         for robot in robots:
             logger.warning("%s: %s", path, robot)
-            _convert_robot(layout, robot, out / robot_name(robot.name), options, progress)
+        _convert_robots(layout, {out / robot_name(robot.name): robot for robot in robots}, options, progress)
     return out
 
 
@@ -133,9 +134,54 @@ def _wanted(layout: Layout, options: BagOptions) -> list[RobotTopics]:
     return robots
 
 
-def _convert_robot(
-    layout: Layout, robot: RobotTopics, out: Path, options: BagOptions, progress: Progress | None
+def _convert_robots(
+    layout: Layout, robots: dict[Path, RobotTopics], options: BagOptions, progress: Progress | None
 ) -> None:
+    """Convert robots in one pass over the bag; what is wrong with one costs no other.
+
+    Raises:
+        DatasetError: Something is wrong with the recording of a robot; of several such, the first is raised.
+    """
+    runs = [_conversion(layout, robot, out, options) for out, robot in robots.items()]
+    _pass_over(layout.bag, runs, progress)
+    faults = []
+    for run in runs:
+        try:
+            run.judge()
+        except DatasetError as error:
+            faults.append(error)
+            continue
+        for note in run.notes:
+            logger.warning("%s", note)
+    for fault in faults[1:]:
+        logger.warning("%s", fault)
+    if faults:
+        raise faults[0]
+
+
+def _pass_over(bag: Bag, runs: list["_Conversion"], progress: Progress | None) -> None:
+    """Read the bag once, to its end; a message that cannot be used costs itself."""
+    takers: dict[str, list[_Conversion]] = {}
+    for run in runs:
+        for name in run.topics():
+            takers.setdefault(name, []).append(run)
+    with ExitStack() as opened:
+        for run in runs:
+            run.begin()
+            opened.callback(run.leave)
+        starts_ns = [run.start_ns for run in runs if run.start_ns is not None]
+        total = sum(run.robot.image.count or 0 for run in runs)
+        for topic, bag_ns, raw in bag.raw(list(takers), min(starts_ns) if len(starts_ns) == len(runs) else None):
+            for run in takers[topic.name]:
+                run.take(topic, bag_ns, raw)
+            if progress is not None and topic.type in IMAGE_TYPES:
+                seen = sum(run.images.seen for run in runs)
+                progress(seen, max(total, seen))
+        for run in runs:
+            run.close()
+
+
+def _conversion(layout: Layout, robot: RobotTopics, out: Path, options: BagOptions) -> "_Conversion":
     lens, notes = _lens(layout, robot, options)
     lens = lens if options.view_rad is None else replace(lens, view_rad=options.view_rad)
     clock = choose_clock(layout, robot)
@@ -143,10 +189,8 @@ def _convert_robot(
     others = layout.other_poses(robot)
     if others:
         notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
-    run = _Conversion(layout.bag, robot, lens, options, clock, out, identity)
-    run.convert(progress)
-    for note in (*notes, *([clock.note] if clock.note else []), *run.notes):
-        logger.warning("%s", note)
+    notes += [clock.note] if clock.note else []
+    return _Conversion(layout.bag, robot, lens, options, clock, out, identity, notes=notes)
 
 
 def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens, list[str]]:
@@ -214,7 +258,11 @@ class Tally:
 
 @dataclass(slots=True, eq=False)
 class _Conversion:
-    """One pass over one robot's topics of a bag."""
+    """What one robot's topics of a bag become, message by message: `begin`, `take` each, `close`, `judge`.
+
+    Attributes:
+        start_ns: Bag time of the first message to take, where an earlier attempt was cut short.
+    """
 
     bag: Bag
     robot: RobotTopics
@@ -231,6 +279,10 @@ class _Conversion:
     notes: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     kept: int = 0
+    start_ns: int | None = None
+    _taken: int = 0
+    _decoder: "PoseDecoder | TransformDecoder | None" = None
+    _info: BagTopic | None = None
     _writer: RecordingWriter = field(init=False)
     _log: PoseWriter = field(init=False)
     _done_s: float | None = field(init=False, default=None)
@@ -241,36 +293,37 @@ class _Conversion:
     _image_span_s: tuple[float, float] | None = None
     _pose_span_s: tuple[float, float] | None = None
 
-    def convert(self, progress: Progress | None) -> None:
-        """Read to the end; a message that cannot be used costs itself."""
-        start_ns = self._restored()
+    def topics(self) -> list[str]:
+        """Names of the topics of which messages are wanted."""
         source = self.robot.poses
-        decoder = None if source is None else _decoder(self.bag, source)
         info = self.robot.info if self.options.camera is None else None
-        names = [topic.name for topic in (self.robot.image, source and source.topic, info) if topic]
-        image_topic, total = self.robot.image, self.robot.image.count or 0
+        return [topic.name for topic in (self.robot.image, source and source.topic, info) if topic]
+
+    def begin(self) -> None:
+        """Open the recording, and go on where an earlier attempt was cut short."""
+        self.start_ns = self._restored()
+        source, image_topic = self.robot.poses, self.robot.image
+        self._decoder = None if source is None else _decoder(self.bag, source)
+        self._info = self.robot.info if self.options.camera is None else None
         levels = sampled_levels(self.bag, image_topic)
         if levels != FULL:
             self.notes.append(f"{self.bag.path}: topic {image_topic.name}: {levels_note(levels)}")
         self._pictures = ImageWriter(self.lens, levels)
         self._open()
-        try:
-            for number, (topic, bag_ns, raw) in enumerate(self.bag.raw(names, start_ns)):
-                if number % CHECKPOINT_MESSAGES == 0:
-                    self._save(bag_ns)
-                if topic is image_topic:
-                    self._add_image(raw, bag_ns)
-                    if progress is not None:
-                        progress(self.images.seen, max(total, self.images.seen))
-                elif topic is info:
-                    self._see_info(raw)
-                elif decoder is not None:
-                    self._add_poses(decoder, raw, bag_ns)
-        except BaseException:
-            self._leave()
-            raise
-        self._close()
-        self._judge()
+
+    def take(self, topic: BagTopic, bag_ns: int, raw: bytes) -> None:
+        """Take one message of a wanted topic."""
+        if self.start_ns is not None and bag_ns < self.start_ns:
+            return
+        if self._taken % CHECKPOINT_MESSAGES == 0:
+            self._save(bag_ns)
+        self._taken += 1
+        if topic is self.robot.image:
+            self._add_image(raw, bag_ns)
+        elif topic is self._info:
+            self._see_info(raw)
+        elif self._decoder is not None:
+            self._add_poses(self._decoder, raw, bag_ns)
 
     def _open(self) -> None:
         """Open the recording of the journey that runs."""
@@ -281,12 +334,12 @@ class _Conversion:
         self._writer.write_lens(self._pictures.lens)
         self._done_s = self._writer.last_stamp_s
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
         """Close the files, for a later attempt to go on."""
         self._writer.__exit__(None, None, None)
         self._log.__exit__(None, None, None)
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Finish the recording of the journey that runs."""
         writer, log = self._writer, self._log
         try:
@@ -294,7 +347,7 @@ class _Conversion:
             log.finish(self.zero_ns)
             self._write_beside(writer)
         finally:
-            self._leave()
+            self.leave()
         log.forget()
         (self.out / "bag_state.json").unlink(missing_ok=True)
         self.kept += writer.count
@@ -335,7 +388,7 @@ class _Conversion:
 
     def _begin_journey(self, stamp_ns: int, bag_ns: int) -> None:
         """Go on in another recording, since odometry is of another frame from here."""
-        self._close()
+        self.close()
         self.journey += 1
         self._open()
         self._save(bag_ns)
@@ -411,7 +464,7 @@ class _Conversion:
         self.notes.extend(notes)
         return _shifted(trajectory, self.zero_ns)
 
-    def _judge(self) -> None:
+    def judge(self) -> None:
         """Tell what was left out, and raise where it was too much."""
         if self.watch.outliers:
             jumps = f"{self.watch.outliers} single poses jump, and were left out"

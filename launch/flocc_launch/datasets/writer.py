@@ -26,6 +26,12 @@ Float = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 PENDING_MAX = 8
+BATCH_BYTES, BATCH_IMAGES = 1 << 20, 32
+"""Small images are handed to the thread that writes them so many at a time: a hand-over costs as much as a file."""
+LINES_MAX = 1000
+"""Poses that are kept before they are written."""
+Entry = tuple[str, bytes, str]
+"""Name of an image's file, its bytes, and its line."""
 
 
 class RecordingWriter:
@@ -58,6 +64,8 @@ class RecordingWriter:
         self._file = listing.open("a", encoding="utf-8")
         self._thread = ThreadPoolExecutor(1)
         self._pending: deque[Future[None]] = deque()
+        self._batch: list[Entry] = []
+        self._batch_bytes = 0
 
     def __enter__(self) -> "RecordingWriter":
         return self
@@ -73,12 +81,20 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Wait until every image that was added stands in the recording, also for whoever comes after a `kill -9`."""
+        self._hand_over()
         while self._pending:
             self._pending.popleft().result()
 
-    def _write(self, name: str, encoded: bytes, line: str) -> None:
-        _write(f"{self.path}/{name}", encoded)
-        self._file.write(line)
+    def _hand_over(self) -> None:
+        """Let the thread write the images that have come together."""
+        if self._batch:
+            self._pending.append(self._thread.submit(self._write, self._batch))
+        self._batch, self._batch_bytes = [], 0
+
+    def _write(self, batch: list[Entry]) -> None:
+        for name, encoded, _ in batch:
+            _write(f"{self.path}/{name}", encoded)
+        self._file.write("".join(line for _, _, line in batch))
         self._file.flush()
 
     def add(self, stamp_s: float, encoded: bytes, suffix: str) -> None:
@@ -97,7 +113,10 @@ class RecordingWriter:
         while len(self._pending) >= PENDING_MAX:
             self._pending.popleft().result()
         name = f"images/{self.count:06d}{suffix}"
-        self._pending.append(self._thread.submit(self._write, name, encoded, f"{stamp_s:.9f} {name}\n"))
+        self._batch.append((name, encoded, f"{stamp_s:.9f} {name}\n"))
+        self._batch_bytes += len(encoded)
+        if self._batch_bytes >= BATCH_BYTES or len(self._batch) >= BATCH_IMAGES:
+            self._hand_over()
         self.count, self.last_stamp_s = self.count + 1, stamp_s
 
     def write_lens(self, lens: Lens) -> None:
@@ -142,6 +161,7 @@ class PoseWriter:
         self._path = path
         self._partial = path.with_suffix(".part")
         self._wanted = wanted
+        self._lines: list[str] = []
         self.last_ns = -1
         if wanted and path.exists() and not self._partial.exists():
             path.unlink()
@@ -156,20 +176,27 @@ class PoseWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._wanted:
-            self._file.close()
+        if self._wanted and not self._file.closed:
+            try:
+                self.flush()
+            finally:
+                self._file.close()
 
     def add(self, stamp_ns: int, numbers: tuple[float, ...]) -> bool:
         """Append `tx ty tz qx qy qz qw`; one that is before the last one is left out, and the return value False."""
         if stamp_ns > self.last_ns:
             line = "%d.%09d %.9f %.9f %.9f %.12f %.12f %.12f %.12f\n"
-            self._file.write(line % (*divmod(stamp_ns, 10**9), *numbers))
+            self._lines.append(line % (*divmod(stamp_ns, 10**9), *numbers))
             self.last_ns = stamp_ns
+            if len(self._lines) >= LINES_MAX:
+                self.flush()
         return stamp_ns >= self.last_ns
 
     def flush(self) -> None:
         """Hand every pose that was added to the system."""
         if self._wanted:
+            self._file.write("".join(self._lines))
+            self._lines.clear()
             self._file.flush()
 
     def finish(self, zero_ns: int = 0) -> None:

@@ -61,7 +61,7 @@ def make_keys(
         swarm: Name of the swarm; one authority certifies one swarm.
         robots: Names of robots to admit.
         operators: Names of people who may ask for status and inject faults.
-        addresses: IP addresses or host names of each robot, for `names_verified`.
+        addresses: IP addresses or host names of each robot, written into its certificate.
         now: Begin of validity; None is the clock's time.
         compute_classes: Of robots; where any was ever given, all others have 0 and nobody can claim another one.
 
@@ -86,7 +86,7 @@ def make_keys(
         members["compute_classes"] |= compute_classes or {}
         return _publish(folder, swarm, members, authority)
     except OSError as error:
-        raise KeysError(f"{error.filename}: cannot be written: {error.strerror}") from error
+        raise KeysError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
 
 
 def _publish(folder: Path, swarm: str, members: dict[str, dict[str, Any]], authority: Authority) -> dict[str, Path]:

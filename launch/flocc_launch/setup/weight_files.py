@@ -231,6 +231,9 @@ def synthesize(
 
     Returns:
         Path of each file.
+
+    Raises:
+        WeightsError: A file cannot be written.
     """
     import torch
 
@@ -248,9 +251,20 @@ def synthesize(
         mast3r, place = Mast3r(NAMED_SIZES[network]), CosPlace(backbone, dimension)
     arguments = argparse.Namespace(model=MODEL_STRING)
     state = keyed_state(mast3r, MAST3R_SEED if seed is None else seed)
-    torch.save({"model": state, "args": arguments}, paths["mast3r"])
-    torch.save(keyed_state(place, COSPLACE_SEED if seed is None else seed), paths["cosplace"])
+    _save({"model": state, "args": arguments}, paths["mast3r"])
+    _save(keyed_state(place, COSPLACE_SEED if seed is None else seed), paths["cosplace"])
     return paths
+
+
+def _save(content: object, path: Path) -> None:
+    """Write a file of torch's, which tells of full disks by RuntimeError."""
+    import torch
+
+    try:
+        torch.save(content, path)
+    except (RuntimeError, OSError) as error:
+        path.unlink(missing_ok=True)
+        raise WeightsError(f"{path}: cannot be written; is the disk full?") from error
 
 
 def fetch(url: str, target: Path, accepted: bool, sha256: str | None = None) -> Path:

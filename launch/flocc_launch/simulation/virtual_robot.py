@@ -31,6 +31,7 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose7
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
 from flocc_agent.runtime.measurement_file import Stamped
+from flocc_agent.runtime.page_file import PageFile
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture, Playback
@@ -133,7 +134,14 @@ class Station:
         self.workers.restart()
         restored = self.disk.restored()
         self.core = Robot(
-            self.log, self.compute_class, boot, parameters, self.now_s(), restored, distributed=distributed
+            self.log,
+            self.compute_class,
+            boot,
+            parameters,
+            self.now_s(),
+            restored,
+            distributed=distributed,
+            cold=PageFile(),
         )
         self._given = GivenKeyframes.of(self.core)
         self._tick_s = self._due_s = float("inf")

@@ -52,6 +52,10 @@ def write_mcap(folder: RunFolder, path: Path) -> Path:
         path.with_suffix(LAYOUT_SUFFIX).write_text(layout(list(loaded.robots)), encoding="utf-8")
     except OSError as error:
         raise McapError(f"{path}: cannot be written ({error.strerror or error})") from error
+    except RuntimeError as error:  # as the SDK says it, FoxgloveError, which is none of its public names
+        if "Mcap" not in str(error) and "MCAP" not in str(error):
+            raise
+        raise McapError(f"{path}: cannot be written ({error}); is the disk full?") from error
     except OverflowError as error:
         raise McapError(f"{folder.path}: holds a time that MCAP cannot (1970 to 2106)") from error
     finally:

@@ -5,6 +5,7 @@ Knows nothing of torch, so that the command line can tell about them without it.
 
 import hashlib
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,10 +73,19 @@ WEIGHT_FILES = (ALIKED_N16, ALIKED_N16ROT, ALIKED_LIGHTGLUE, XFEAT_FEATURES, XFE
 
 
 def weights_folder() -> Path:
-    """Where the files are kept: `weights` under FLOCC_CACHE, or under flocc's folder in the user's cache."""
-    given = os.environ.get("FLOCC_CACHE")
-    cache = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "flocc"
-    return cache / "weights"
+    """Where the files are kept: `weights` under FLOCC_CACHE, or under flocc's folder in the user's cache.
+
+    A user without a home has that of the temporary folder.
+    """
+    given, usual = os.environ.get("FLOCC_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if given:
+        return Path(given) / "weights"
+    if usual:
+        return Path(usual) / "flocc" / "weights"
+    try:
+        return Path.home() / ".cache" / "flocc" / "weights"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"flocc-{os.getuid()}" / "weights"
 
 
 def checked(file: WeightFile, folder: Path) -> Path:

@@ -80,7 +80,7 @@ def _read_pth(path: Path) -> Checkpoint:
             loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path) or None)
     except pickle.UnpicklingError as error:
         raise BadCheckpoint(f"{path}: {_unpickling_complaint(str(error))}") from error
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+    except (RuntimeError, EOFError, OSError, ValueError, LookupError, AttributeError, TypeError) as error:
         raise BadCheckpoint(f"{path}: is truncated, damaged or no torch checkpoint ({_line(error)})") from error
     model = ""
     if isinstance(loaded, Mapping) and isinstance(loaded.get("model"), Mapping):
