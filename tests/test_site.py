@@ -72,3 +72,10 @@ def test_links_lead_to_pages_of_the_site_and_code_stays_as_it_is() -> None:
     assert rewritten(text, ROOT / "docs/report.md", pages(), ROOT) == (
         "[a](index.md#x) ![b](images/r.png) c (`Makefile`) [d](https://x.y)\n```\n[e](../README.md)\n```\n[f](gone.md)"
     )
+
+
+def test_a_picture_beside_the_text_stands_behind_it_on_the_site() -> None:
+    picture = '<img align="right" width="420" src="docs/images/report.png" alt="x">'
+    text = f'# flocc\n\n{picture}\n\nWords.\n\n<br clear="right">\n\nMore.'
+    wanted = '# flocc\n\nWords.\n\n<img src="images/report.png" alt="x">\n\nMore.'
+    assert rewritten(text, ROOT / "README.md", pages(), ROOT) == wanted

@@ -111,7 +111,7 @@ class ClosureRecord:
 
 @dataclass(frozen=True, slots=True)
 class RejectionRecord:
-    """A candidate that was registered and refused, with the reason; nobody registers it again."""
+    """A candidate that was refused, with the reason: registered, or unseen where no counts are given."""
 
     query: KeyframeId
     match: KeyframeId

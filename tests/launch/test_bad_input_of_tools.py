@@ -141,6 +141,31 @@ def test_a_run_folder_of_another_version_or_cut_off_is_named(
     assert said in sentence(capsys)
 
 
+@pytest.mark.parametrize("name", ["report.json.partial", "pose_graph.g2o", "trajectories/r1.tum", "odometry"])
+def test_a_run_is_not_evaluated_through_links(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = synthetic_run.write(tmp_path / "run").path
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir() if name == "odometry" else elsewhere.write_text("mine")
+    link = path / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(elsewhere)
+    assert run(monkeypatch, "evaluate", str(path)) == 2
+    assert f"{link}: is a link" in sentence(capsys)
+    assert list(elsewhere.iterdir()) == [] if name == "odometry" else elsewhere.read_text() == "mine"
+
+
+@pytest.mark.parametrize("file", ["run.json", "robots/r2/result.json"])
+def test_a_robots_name_is_no_path(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = synthetic_run.write(tmp_path / "run").path
+    (path / file).write_text((path / file).read_text().replace('"r2"', '"../../r2"'))
+    assert run(monkeypatch, "evaluate", str(path)) == 2
+    assert file in sentence(capsys)
+
+
 def test_a_run_folder_without_events_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,7 @@
 """What the command line says to a slip of the keyboard, and of itself."""
 
+import os
+import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -56,6 +58,7 @@ def test_a_misspelt_key_is_answered_with_the_nearest(
     ("words", "wanted"),
     [
         (("simulate", "meeting", "--loss", "30"), "'--loss'"),
+        (("simulate", "meeting", "--duration", "0"), "'--duration'"),
         (("launch", "meeting", "--latency", "-1"), "'--latency'"),
         (("simulate", "meeting", "--los", "0.3"), "--loss"),
         (("simlate",), "simulate"),
@@ -67,3 +70,15 @@ def test_a_bad_option_is_named_and_so_is_what_was_meant(
     code, text = said(monkeypatch, capsys, *words)
     assert code == 2
     assert wanted in text
+
+
+def test_a_reader_that_leaves_is_no_missed_expectation() -> None:
+    """As `flocc --version | true`, but with a reader that has surely left."""
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        command = [sys.executable, "-m", "flocc_launch.commands.main", "--version"]
+        ran = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    finally:
+        os.close(write)
+    assert (ran.returncode, ran.stderr) == (141, "")

@@ -15,6 +15,7 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.runtime.few_connections import CONNECTIONS_MAX
 from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard, server
 from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.snapshot import LinkView, MapGroup, RobotView, Said, Snapshot
@@ -176,9 +177,9 @@ def test_idle_connections_are_few_and_short(tmp_path: Path, monkeypatch: pytest.
     threads = threading.active_count()
     with Dashboard(synthetic_run.write(tmp_path / "run", Synthetic()), port=0) as dashboard:
         host, port = dashboard.url.removeprefix("http://").strip("/").split(":")
-        idle = [socket.create_connection((host, int(port)), timeout=10.0) for _ in range(3 * server.CONNECTIONS_MAX)]
+        idle = [socket.create_connection((host, int(port)), timeout=10.0) for _ in range(3 * CONNECTIONS_MAX)]
         assert idle[-1].recv(1) == b""
-        assert threading.active_count() <= threads + 1 + server.CONNECTIONS_MAX
+        assert threading.active_count() <= threads + 1 + CONNECTIONS_MAX
         assert [connection.recv(1) for connection in idle] == [b""] * len(idle)
         assert urllib.request.urlopen(dashboard.url, timeout=10.0).status == 200
     for connection in idle:

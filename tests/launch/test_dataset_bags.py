@@ -2,6 +2,7 @@
 
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
 import tracemalloc
@@ -19,8 +20,9 @@ from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_tum
+from flocc_lab.bench import bag_speed
 from flocc_launch.commands.data import dataset
-from flocc_launch.datasets.bag_convert import convert_bag
+from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
 from flocc_launch.datasets.commands import convert, info, split
 from flocc_launch.datasets.presets import GRACO_GROUND, S3E_ALPHA, Team, convert_graco, convert_s3e, convert_team
 from flocc_launch.datasets.source import DatasetError
@@ -505,3 +507,42 @@ def test_a_bag_of_a_wide_lens_becomes_a_pinhole(tmp_path: Path) -> None:
         recording.camera.height,
         recording.camera.width,
     )
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("zeros", [False, True])
+def test_a_damaged_chunk_of_an_mcap_costs_itself(tmp_path: Path, compressed: bool, zeros: bool) -> None:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    jpeg = cv2.imencode(".jpg", np.random.default_rng(1).integers(0, 255, (60, 80, 3), dtype=np.uint8))[1].ravel()
+    writer = Writer(tmp_path / "run", version=9, storage_plugin=StoragePlugin.MCAP)
+    if compressed:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    kinds = {"/odom": "nav_msgs/msg/Odometry", "/image/compressed": "sensor_msgs/msg/CompressedImage"}
+    with writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        for k in range(5000):
+            topic = "/odom" if k % 5 else "/image/compressed"
+            make = bag_speed.odometry if k % 5 else bag_speed.image
+            stamp_ns = 10**18 + k * 10**7
+            raw = bytes(store.serialize_cdr(make(store, stamp_ns, jpeg), kinds[topic]))
+            writer.write(connections[topic], stamp_ns, raw)
+    file = next((tmp_path / "run").glob("*.mcap"))
+    data = bytearray(file.read_bytes())
+    chunks, at = [], 8
+    while at + 9 <= len(data) - 8:
+        operation, length = struct.unpack_from("<BQ", data, at)
+        chunks += [(at + 9, length)] if operation == 6 else []
+        at += 9 + length
+    assert len(chunks) >= 6
+    begin, length = chunks[len(chunks) // 2]
+    start, size = (begin, length) if zeros else (begin + length // 2, 400)
+    data[start : start + size] = bytes(size) if zeros else b"\xff" * size
+    file.write_bytes(data)
+    (tmp_path / "camera.yaml").write_text("width: 80\nheight: 60\nfx: 60\nfy: 60\ncx: 40\ncy: 30\n")
+    convert_bag(tmp_path / "run", tmp_path / "out", BagOptions(camera=tmp_path / "camera.yaml"))
+    frames = Recording.open(tmp_path / "out").frames
+    assert len(frames) >= 1000 * (1 - 1.5 / len(chunks))
+    assert frames[-1].stamp_s == pytest.approx(10**9 + 49.95)

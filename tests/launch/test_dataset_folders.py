@@ -20,7 +20,7 @@ from flocc_agent.runtime.recording import Recording, write_camera
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.commands import convert, info, info_lines, split
+from flocc_launch.datasets.commands import convert, info, info_lines, infos, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.datasets.intrinsics import read_lens
@@ -566,3 +566,24 @@ def test_a_frame_without_matrix_is_not_taken_for_two(tmp_path: Path) -> None:
     write_image(tmp_path / "images" / "0.png")
     with pytest.raises(DatasetError, match=r"the transform_matrix of images/0\.png is no matrix"):
         read_source(tmp_path)
+
+
+def test_intrinsics_of_bundlefusion_are_not_those_of_sevenscenes(tmp_path: Path) -> None:
+    for k in range(3):
+        write_image(tmp_path / f"frame-{k:06d}.color.jpg")
+        rows = "\n".join(" ".join(map(str, row)) for row in moving(3)[k].tolist())
+        (tmp_path / f"frame-{k:06d}.pose.txt").write_text(rows)
+    (tmp_path / "_info.txt").write_text(
+        "m_versionNumber = 4\nm_colorWidth = 32\nm_colorHeight = 24\n"
+        "m_calibrationColorIntrinsic = 31 0 15 0 0 30 11 0 0 0 1 0 0 0 0 1\n"
+    )
+    lens = read_source(tmp_path).lens
+    assert lens is not None
+    assert (lens.camera.fx, lens.camera.fy, lens.camera.cx, lens.camera.cy) == (31.0, 30.0, 15.0, 11.0)
+
+
+def test_a_folder_that_is_refused_by_name_is_no_team(tmp_path: Path) -> None:
+    write_image(tmp_path / "keyframes" / "images" / "0.jpg")
+    (tmp_path / "mesh_info.json").write_text("{}")
+    with pytest.raises(DatasetError, match="is Polycam's raw export, which flocc does not read"):
+        list(infos(tmp_path))

@@ -161,6 +161,7 @@ def of_a_run(cause: str, path: Path) -> list[Finding]:
 SWARMS = {
     "merged": [row("r1", "r2"), row("r2", "r1")],
     "no-answer": [row("r1", "r2"), row("r2", state=NO_ANSWER)],
+    "duplicate-name": [row("r1", "r2"), row("r2", "r1", doubles=("r1",), map_frame="map/r2")],
     "no-peer": [row("r1"), row("r2", map_frame="map/r2")],
     "one-way-link": [row("r1", "r2 r3"), row("r2", "r3"), row("r3", "r1 r2", map_frame="map/r2")],
     "no-keyframes": [row("r1", "r2"), row("r2", "r1", keyframes=0, map_frame=None)],

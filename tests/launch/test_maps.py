@@ -41,6 +41,7 @@ from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.setup.credentials import make_keys
 from flocc_launch.simulation.sessions import map_of_sessions
 from flocc_launch.simulation.simulate import simulate
+from flocc_launch.swarm.launching import launch
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import LogId
 
@@ -579,6 +580,11 @@ def test_a_map_of_another_front_end_is_named(block: Path, tmp_path: Path) -> Non
     other = spoilt(block, tmp_path, front_end=front_end)
     with pytest.raises(BadMap, match="its latents are of 'synthetic/0', and this front end makes 'synthetic/1'"):
         simulate(scenario(AGAIN), tmp_path / "run2", use=MapUse(other))
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier/run.json").write_text("{}")
+    with pytest.raises(BadMap, match="its latents are of 'synthetic/0'"):
+        launch(scenario(AGAIN), tmp_path / "earlier", use=MapUse(other))
+    assert (tmp_path / "earlier/run.json").exists(), "the earlier run stays"
 
 
 def test_a_much_wider_lens_is_said_and_allowed(block: Path) -> None:

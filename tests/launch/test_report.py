@@ -18,7 +18,7 @@ from flocc_agent.runtime.facts import AgentDied, KilledByOrder
 from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.commands.common import show_report
 from flocc_launch.report import RunReport, evaluate, finish, read_report
-from flocc_launch.report.build import judged
+from flocc_launch.report.build import judged, told_of
 from flocc_launch.report.text import sentences
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.plain_numbers import plain
@@ -297,3 +297,11 @@ def test_a_result_names_the_order_of_its_poses(tmp_path: Path) -> None:
     assert fields["pose_order"] == "x y z qw qx qy qz"
     result = folder.results()["r1"]
     assert np.allclose(result.T_odom_body()[3], pose_from_tq(np.array(fields["keyframes"][3]["T_odom_body"])))
+
+
+def test_closures_that_wait_are_told_a_few_times_and_other_warnings_each() -> None:
+    held = [f"closure r1/{k} - r2/{k}: held until another one agrees with it, because it would turn" for k in range(9)]
+    told = told_of(["the scale collapsed", *held, "a gap"])
+    assert told[:5] == ["the scale collapsed", *held[:3], "a gap"]
+    assert told[5:] == ["6 more closures are held until others agree with them (events.jsonl names them)"]
+    assert told_of(held[:3]) == held[:3]

@@ -81,6 +81,7 @@ def test_a_swarm_that_nobody_is_in_is_one_sentence() -> None:
     [
         ([row("r1", "r2"), row("r2", "r1")], ["merged"]),
         ([row("r1"), row("r2")], ["merged", "no-peer"]),
+        ([row("r1", "r2", doubles=("r1",)), row("r2", "r1", doubles=("r1",))], ["merged", "duplicate-name"]),
         ([row("r1", "r2 r3"), row("r2", "r3"), row("r3", "r1 r2")], ["merged", "one-way-link"]),
         ([row("r1", "r2"), row("r2", "r1", keyframes=0, map_frame=None)], ["no-keyframes"]),
         ([row("r1", "r2", leader=None), row("r2", "r1", map_frame="map/r2")], ["no-leader"]),

@@ -4,7 +4,8 @@ import pytest
 
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.simulation.campaign import Campaign, SeedOutcome, campaign, prepared, shrink
-from flocc_launch.simulation.generator import FAULTS_END_S, drawn_scenario
+from flocc_launch.simulation.coverage import table
+from flocc_launch.simulation.generator import FAMILIES, FAULTS_END_S, calm_s, drawn_scenario
 from flocc_launch.simulation.invariants import Violation
 
 
@@ -51,3 +52,23 @@ def test_the_json_of_a_campaign_names_seed_invariant_and_time() -> None:
     fields = Campaign((outcome, SeedOutcome(10, (), 2.5))).as_json()
     assert fields["runs"] == 2
     assert fields["violations"] == [{"seed": 9, "invariant": "agreement", "at_s": 92.5, "detail": "two lead"}]
+
+
+def test_a_campaign_tells_which_messages_arrived_during_which_faults() -> None:
+    found = campaign(range(51000000, 51000003), processes=1)
+    coverage = found.coverage()
+    assert coverage["heartbeat", "mute"] > 0
+    assert coverage["records", "older copy"] > 0
+    rows = table(coverage).splitlines()
+    assert any(row.startswith("heartbeat") for row in rows)
+    cell = {"message": "heartbeat", "fault": "mute", "count": coverage["heartbeat", "mute"]}
+    assert cell in found.as_json()["coverage"]  # type: ignore[operator]
+
+
+def test_a_large_family_has_20_robots_and_ten_minutes_with_faults_to_their_end() -> None:
+    drawn = [drawn_scenario(seed, FAMILIES["large"]) for seed in range(20)]
+    assert {len(scenario.names()) for scenario in drawn} == {20}
+    assert {calm_s(scenario) for scenario in drawn} == {540.0}
+    assert max(fault.at_s for scenario in drawn for fault in scenario.faults if fault.kind is FaultKind.KILL) > 500.0
+    flapping = [sum(fault.kind is FaultKind.RESTART for fault in scenario.faults) for scenario in drawn]
+    assert max(flapping) >= 6

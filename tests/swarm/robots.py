@@ -30,7 +30,7 @@ class RobotProcess:
         """Start, or start again after a kill."""
         self._folder.mkdir(parents=True, exist_ok=True)
         path = self._folder / f"{self.config.name}.json"
-        path.write_text(self.config.model_dump_json(), encoding="utf-8")
+        path.write_text(self.config.model_dump_json(exclude_unset=True), encoding="utf-8")
         with (self._folder / f"{self.config.name}.log").open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
                 *self._prefix,

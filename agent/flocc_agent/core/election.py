@@ -8,7 +8,8 @@ Rules:
   that learns of one not below its own claims anew, so that what it says is never older than what followers applied.
 - A counter is used when its leader says so itself, or a correction of it is here. What others say of counters proves
   nothing. Each proof raises the known counter by at most `COUNTER_JUMP_MAX`, so that no lie puts it out of reach for
-  the others; a robot that knows of none yet takes the first one as it is, up to `FIRST_COUNTER_MAX`.
+  the others; a robot that knows of none yet takes the first one as it is, up to `FIRST_COUNTER_MAX`. All proofs
+  together raise it by at most `RISE_PER_S`, once `RISE_MAX` is used up.
 
 `TRANSITIONS` is the whole machine: what may happen in which role, and which role follows. `LeaderElection.tick` says
 what a role does when its time is up.
@@ -42,6 +43,9 @@ COUNTER_JUMP_MAX = 1000
 """One proof raises the known counter by at most this; a robot that was away for longer needs several."""
 FIRST_COUNTER_MAX = 2**16
 """What a robot that knows of no term yet believes at once; the rest of a greater one comes as for everybody."""
+RISE_MAX, RISE_PER_S = FIRST_COUNTER_MAX + COUNTER_JUMP_MAX, 200.0
+"""By how much all proofs together raise it at once, and over time, beyond one step each: so a flood of claims, each of
+them signed, leaves counters that a robot which was away learns in as long as the flood lasted."""
 LOST_MAX = 64
 PEERS_MAX = 512
 
@@ -137,6 +141,8 @@ class LeaderElection:
         self._rank = rank(compute_class, own)
         self._parameters = parameters
         self._counter_max = counter_max
+        self._rise = float(RISE_MAX)
+        self._rise_s = now
         self._peers: dict[str, _Peer] = {}
         self._lost: dict[Term, int] = {}
         self._leader: LeaderAdvert | None = None
@@ -180,7 +186,7 @@ class LeaderElection:
         advert = heartbeat.leader
         if advert is None:
             return self._renew_if_overtaken(now)
-        refused = self._learn_counter(sender, advert.term.counter) if _is_first_hand(sender, advert) else []
+        refused = self._learn_counter(sender, advert.term.counter, now) if _is_first_hand(sender, advert) else []
         return [*refused, *self._on_advert(advert, now), *self._renew_if_overtaken(now)]
 
     def class_of(self, robot: str, claimed: int) -> int:
@@ -219,7 +225,7 @@ class LeaderElection:
         advert = message.advert
         if not _is_first_hand(sender, advert):
             return [_refused(sender, "claims a term for another robot")]
-        refused = self._learn_counter(sender, advert.term.counter)
+        refused = self._learn_counter(sender, advert.term.counter, now)
         return [*refused, *self._on_advert(advert, now), *self._renew_if_overtaken(now)]
 
     def on_handover(self, sender: LogId, message: Handover, now: float) -> list[Effect]:
@@ -229,13 +235,13 @@ class LeaderElection:
             return []
         return self._lose_leader("handed over", now, beat=COUNTER_MAX)
 
-    def on_applied(self, sender: LogId, term: Term) -> list[Effect]:
+    def on_applied(self, sender: LogId, term: Term, now: float) -> list[Effect]:
         """Somebody gave a correction of this term that its leader made; what is refused must not be applied here.
 
         A leader whose own term is older claims anew with its next `tick`, since nobody would apply what it says; so it
         does where somebody else spoke in its term.
         """
-        refused = self._learn_counter(sender, term.counter)
+        refused = self._learn_counter(sender, term.counter, now)
         if not refused and self._leader is not None and self.leading and term >= self._leader.term:
             self._due_s = float("-inf")
         return refused
@@ -362,10 +368,15 @@ class LeaderElection:
         outranks = self._rank < rank(self._leader.compute_class, self._leader.term.leader)
         return self._start(now) if outranks and self._role is Role.FOLLOWING else []
 
-    def _learn_counter(self, sender: LogId, counter: int) -> list[Effect]:
+    def _learn_counter(self, sender: LogId, counter: int, now: float) -> list[Effect]:
         """A counter is proven to be used; what is far above all that is known is refused, and still raises it a bit."""
-        reach = self._counter_max + COUNTER_JUMP_MAX if self._counter_max else FIRST_COUNTER_MAX
-        self._counter_max = max(self._counter_max, min(counter, reach))
+        self._rise = min(RISE_MAX, self._rise + RISE_PER_S * max(now - self._rise_s, 0.0))
+        self._rise_s = now
+        jump = max(1, min(COUNTER_JUMP_MAX, int(self._rise)))
+        reach = self._counter_max + jump if self._counter_max else FIRST_COUNTER_MAX
+        raised = max(0, min(counter, reach) - self._counter_max)
+        self._rise -= raised if self._counter_max else 0
+        self._counter_max += raised
         return [_refused(sender, "a term counter far above all others")] if counter > reach else []
 
 

@@ -1,6 +1,7 @@
 """Judgement: whether a registration becomes a loop closure, by the ratio of Eq. (1) (Sec. III-B)."""
 
 from flocc_agent.core.parameters import LoopClosingParameters
+from flocc_agent.core.prospects import UNLIKELY
 from flocc_agent.core.registration import Registration, RegistrationFailed, match_ratio
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected
 from flocc_agent.geometry import is_rigid, pose7, upper_triangle
@@ -62,6 +63,8 @@ def _closure(query: KeyframeId, match: KeyframeId, result: Registration, ratio: 
 
 def told(record: ClosureRecord | RejectionRecord, by: LogId) -> ClosureAccepted | ClosureRejected:
     """An accepted or refused registration, for people; `by` is the log that its record stands in."""
+    if isinstance(record, RejectionRecord) and record.reason == UNLIKELY:
+        return ClosureRejected(query=record.query, match=record.match, by=by.robot, reason=record.reason)
     if isinstance(record, RejectionRecord):
         ratio = round(match_ratio(record.correspondences, record.odometry_correspondences), 4)
         return ClosureRejected(

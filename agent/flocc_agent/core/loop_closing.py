@@ -4,15 +4,16 @@ Who registers a pair: one of its two owners, by a checksum of the pair, so that 
 work is halved between them. A robot that has a neighbour of a higher compute class hands its pairs to it. Whoever
 found a pair that is another's to register tells it so until the record shows. When the other is out of range for
 `TAKEOVER_S`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
-exists no more is rejected, by a record like any other. A robot that comes back does not know what it handed over
-before: it listens who is there before it decides about any pair.
+exists no more is rejected, by a record like any other; so is one that is hardly worth its latent (`prospects.py`).
+A robot that comes back does not know what it handed over before: it listens who is there before it decides about any
+pair.
 
 Robots of closed logs (an opened map's, and this robot's own earlier journeys) register nothing: the other owner does.
 Nor are their keyframes queries, so that of their latents only the matching one is needed.
 """
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
@@ -21,6 +22,7 @@ from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Rea
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.reports import CandidateFound
 from flocc_agent.core.work import OdometryPairOf, WorkTable
@@ -29,6 +31,8 @@ from flocc_protocol.messages import CandidateOffer, CandidatePair
 
 REGISTRATION_TIMEOUT_S = 120.0
 """A registration that gave no answer for this long is tried again; networks on a CPU need much of it."""
+UNLIKELY_AT_ONCE_MAX = 16
+"""Pairs that are refused unseen in one step: each is a record, and a burst of them would hold up others."""
 
 
 def registrar_of(pair: CandidatePair) -> LogId:
@@ -48,6 +52,7 @@ class LoopClosing:
         spectral: SpectralOrder | None = None,
         closed: frozenset[LogId] = frozenset(),
         listens_until_s: float = float("-inf"),
+        agreement: Agreement = lambda _: None,
     ) -> None:
         """Start without pairs.
 
@@ -59,6 +64,7 @@ class LoopClosing:
             spectral: Orders pairs by what they add to the pose graph; None: by similarity.
             closed: Logs that nobody writes any more, and whose latents are here.
             listens_until_s: Pairs wait undecided until then.
+            agreement: How well the surroundings of a pair agree.
         """
         self.latents = Latents(own, parameters)
         self.dropped = 0
@@ -71,6 +77,8 @@ class LoopClosing:
         self._offers = Offers(self.latents)
         self._spectral = spectral
         self._front_ends = FrontEnds()
+        self._prospects = Prospects(agreement)
+        self._unlikely: list[CandidatePair] = []
         self._chosen: list[CandidatePair] | None = None
         self._resolved: set[CandidatePair] = set()
         self._undecided: dict[CandidatePair, Candidate] = {}
@@ -97,6 +105,7 @@ class LoopClosing:
             "offers": (len(self._offers), candidates_max),
             "undecided": (len(self._undecided), candidates_max),
             **self.latents.sizes(),
+            **self._prospects.sizes(),
         }
 
     # Pairs
@@ -131,22 +140,38 @@ class LoopClosing:
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
+        self._prospects.on_resolved(pair)
         self._undecided.pop(pair, None)
         if pair in self._work or pair in self._offers:
             self._work.remove(pair)
             self._offers.remove(pair)
             self._chosen, self._changed = None, True
 
-    def on_closure(self, pair: CandidatePair) -> None:
-        """A record of this pair is in a log, and it is a closure."""
+    def on_closure(self, pair: CandidatePair, now: float) -> None:
+        """A record of this pair is in a log, and it is a closure; what was refused unseen beside it has a chance."""
         if self._spectral is not None:
             self._spectral.on_closure(pair)
         self._front_ends.on_closure(pair)
         self.on_resolved(pair)
+        self._changed = True
+        for other in self._prospects.on_judged(pair, is_closure=True):
+            self._resolved.discard(other)
+            if self._owner(other) == self._own:
+                self._assign(Candidate(other, 0.0), now)
 
-    def on_rejection(self, pair: CandidatePair, reason: str) -> bool:
-        """A record of this pair is in a log, and it is none; whether its logs' front ends turned out to differ."""
+    def on_rejection(self, pair: CandidatePair, reason: str, was_seen: bool = True) -> bool:
+        """A record of this pair is in a log, and it is none; whether its logs' front ends turned out to differ.
+
+        Args:
+            pair: Of keyframes.
+            reason: Why.
+            was_seen: Whether a registration says so, whose odometry pair had correspondences.
+        """
         self.on_resolved(pair)
+        if reason == UNLIKELY:
+            self._prospects.on_unlikely(pair)
+        elif was_seen:
+            self._prospects.on_judged(pair, is_closure=False)
         if not self._front_ends.on_rejection(pair, reason):
             return False
         for other in filter(self._front_ends.are_apart, self.open_pairs()):
@@ -251,16 +276,22 @@ class LoopClosing:
             self._hand_on_or_add(candidate, now)
         effects = self._offers.tell(self._reach, now)
         if self.latents.free() > 0:
-            effects += self.latents.fetch(self._fetchable(), self._reach, now)
+            effects += self.latents.fetch(self._worth_fetching(now), self._reach, now)
         effects += self._register(now)
-        self._changed = False
+        self._changed = bool(self._unlikely)
         heard_s = self._listens_until_s if self._undecided else float("inf")
-        self._due_s = min(self._offers.due_s(), self._work.due_s(), self.latents.due_s(now), heard_s)
+        held_s = self._prospects.due_s(now)
+        self._due_s = min(self._offers.due_s(), self._work.due_s(), self.latents.due_s(now), heard_s, held_s)
         return effects
 
     def deadline(self) -> float:
         """When `tick` is due next."""
         return self._due_s
+
+    def take_unlikely(self) -> list[CandidatePair]:
+        """Pairs that are to be refused unseen, each given once."""
+        unlikely, self._unlikely = self._unlikely, []
+        return unlikely
 
     # Assignment
 
@@ -354,6 +385,18 @@ class LoopClosing:
         """Latents that can be had and that a pair lacks, the first pair's first."""
         chosen = [keyframe for pair in self._choice() if (work := self._work.get(pair)) for keyframe in work.lacking]
         return chosen or self._fetchable_by_similarity()
+
+    def _worth_fetching(self, now: float) -> Iterator[KeyframeId]:
+        """The same without those of which no pair is likely; pairs that stay so are to be refused, a few at a time."""
+        for keyframe in self._fetchable():
+            prospects = {pair: self._prospects.of(pair, now) for pair in self._work.using(keyframe)}
+            if keyframe.log == self._own or Prospect.LIKELY in prospects.values():
+                yield keyframe
+                continue
+            if len(self._unlikely) >= UNLIKELY_AT_ONCE_MAX:
+                return
+            unlikely = (pair for pair, prospect in prospects.items() if prospect is Prospect.UNLIKELY)
+            self._unlikely += [pair for pair in unlikely if pair not in self._unlikely]
 
     def _fetchable_by_similarity(self) -> list[KeyframeId]:
         lacking = self._work.lacking

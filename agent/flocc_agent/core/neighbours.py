@@ -77,6 +77,10 @@ class Neighbours:
         """Whether two robots were heard under this name."""
         return name in self._duplicates
 
+    def doubles(self) -> tuple[str, ...]:
+        """Names under which two robots were heard, this robot's own among them, sorted."""
+        return tuple(sorted(self._duplicates))
+
     def names(self) -> list[str]:
         """Names of all robots in range, sorted."""
         return sorted(self._by_name)

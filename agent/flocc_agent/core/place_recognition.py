@@ -34,6 +34,9 @@ SAME_PLACE_STEP = 0.05
 """Where the representatives are too many, less similar ones stand for each other."""
 ROWS_AT_ONCE = 256
 """int8 rows that are compared at one time: as floats they stay in a processor's cache."""
+RUN_REACH = 2
+"""Keyframes to either side that a run has; 1 and 3 tell as much on `street`."""
+RUN_MIN = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,42 +105,54 @@ class _Rows:
         self._count += 1
 
     def thin(self, held: int) -> None:
-        """Keep the newest so many rows, and at most so many that stand for the older ones."""
+        """Keep the newest so many rows whole, and at most so many that stand for the older ones.
+
+        A log is looked through in blocks of its own rows, so that robots which hold it find the same ones to stay, and
+        ask for the same pairs.
+        """
         while self._count - self._thinned >= held + THINNED_AT_ONCE:
-            self._thin(self._thinned, self._thinned + THINNED_AT_ONCE)
+            unthinned = self._logs[self._thinned : self._count]
+            longest = int(np.bincount(unthinned).argmax())
+            oldest = self._thinned + np.flatnonzero(unthinned == longest)[:THINNED_AT_ONCE]
+            if len(oldest) < THINNED_AT_ONCE:
+                return
+            self._keep(oldest[self._stays(oldest, self._thinned)], oldest)
             while self._thinned > held and self._same_place > -1.0:
                 self._same_place -= SAME_PLACE_STEP
-                until, self._thinned = self._thinned, 0
-                while self._thinned < until:
-                    done = min(THINNED_AT_ONCE, until - self._thinned)
-                    until -= self._thin(self._thinned, self._thinned + done)
+                self._thin_again()
 
-    def _thin(self, first: int, end: int) -> int:
-        """Leave out rows between two places that a row before `first`, or a later one that stays, stands for.
+    def _thin_again(self) -> None:
+        """Look through the rows that stand for others with the present bound."""
+        until, self._thinned = self._thinned, 0
+        while self._thinned < until:
+            block = np.arange(self._thinned, min(self._thinned + THINNED_AT_ONCE, until))
+            stay = block[self._stays(block, self._thinned)]
+            until -= len(block) - len(stay)
+            self._keep(stay, block)
 
-        Returns:
-            How many were left out.
-        """
-        rows = self._units(slice(first, end))
-        logs = self._logs[first:end]
-        stays = np.ones(end - first, dtype=bool)
+    def _stays(self, block: NDArray[np.intp], first: int) -> NDArray[np.bool_]:
+        """Which of these rows neither a row before `first` nor one before it in the block stands for."""
+        rows, logs = self._units(block), self._logs[block]
+        stays = np.ones(len(block), dtype=bool)
         for begin in range(0, first, ROWS_AT_ONCE):
-            before = slice(begin, min(begin + ROWS_AT_ONCE, first))
+            before = np.arange(begin, min(begin + ROWS_AT_ONCE, first))
             alike = (rows @ self._units(before).T >= self._same_place) & (logs[:, None] == self._logs[before])
             stays &= ~alike.any(axis=1)
         among = (rows @ rows.T >= self._same_place) & (logs[:, None] == logs)
         for k in np.flatnonzero(stays).tolist():
             stays[k] = not np.any(among[k, :k] & stays[:k])
-        chosen = first + np.flatnonzero(stays)
-        fewer = end - first - len(chosen)
-        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
-            values[first : end - fewer] = values[chosen]
-            values[end - fewer : self._count - fewer] = values[end : self._count].copy()
-        self._count -= fewer
-        self._thinned = end - fewer
-        return fewer
+        return stays
 
-    def _units(self, places: slice) -> Floats:
+    def _keep(self, stay: NDArray[np.intp], block: NDArray[np.intp]) -> None:
+        """Of a block of rows that are not thinned yet these stay, and are thinned from now on."""
+        others = np.setdiff1d(np.arange(self._thinned, self._count), block, assume_unique=True)
+        order = np.concatenate([stay, others])
+        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
+            values[self._thinned : self._thinned + len(order)] = values[order]
+        self._count = self._thinned + len(order)
+        self._thinned += len(stay)
+
+    def _units(self, places: NDArray[np.intp]) -> Floats:
         """Rows (K, D) of unit length."""
         return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
 
@@ -151,6 +166,15 @@ class _Rows:
         else:
             found *= np.array([[each.inverse_norm] for each in descriptors], dtype=np.float32)
         return found
+
+    def around(self, log: int, index: int, reach: int) -> tuple[Floats, int] | None:
+        """Unit descriptors (K, D) of a log's keyframes up to `reach` from one, and which is its; None without it."""
+        near = (self.logs == log) & (np.abs(self.indices - index) <= reach)
+        rows = np.flatnonzero(near)
+        at = np.flatnonzero(self.indices[rows] == index)
+        if not len(at):
+            return None
+        return self._rows[rows] * self._inverse_norms[rows, None], int(at[0])
 
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
@@ -238,6 +262,20 @@ class PlaceRecognition:
                 others = []
         return found + self._among_own(others)
 
+    def agreement(self, pair: CandidatePair) -> float | None:
+        """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""
+        one, other = self._around(pair.low, RUN_REACH), self._around(pair.high, RUN_REACH + 1)
+        if one is None or other is None or one[0].shape[1] != other[0].shape[1]:
+            return None
+        return run_agreement(one[0] @ other[0].T, one[1], other[1])
+
+    def _around(self, keyframe: KeyframeId, reach: int) -> tuple[Floats, int] | None:
+        number = self._numbers.get(keyframe.log)
+        if number is None:
+            return None
+        rows = self._own_rows if keyframe.log == self._own else self._others.get(self._dimensions[number])
+        return None if rows is None else rows.around(number, keyframe.index, reach)
+
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
         log, dimension = keyframe.log, len(descriptor.row)
@@ -319,6 +357,29 @@ class PlaceRecognition:
             for k in best
             if similarities[k] >= self._parameters.similarity_threshold
         ]
+
+
+def run_agreement(similarities: Floats, row: int, column: int) -> float | None:
+    """The mean similarity of two runs of keyframes through a pair, in the same or in opposite directions.
+
+    Each keyframe of one run is compared with the one across and those beside it, since robots differ in pace.
+
+    Args:
+        similarities: (M, N) of keyframes around the pair's.
+        row: Of the pair.
+        column: Of the pair.
+    """
+    best: float | None = None
+    for way in (1, -1):
+        means = []
+        for step in range(-RUN_REACH, RUN_REACH + 1):
+            across = column + way * step
+            if 0 <= row + step < len(similarities):
+                near = similarities[row + step, max(across - 1, 0) : max(across + 2, 0)]
+                means += [float(near.max())] if near.size else []
+        if len(means) >= RUN_MIN:
+            best = max(float(np.mean(means)), -1.0 if best is None else best)
+    return best
 
 
 def _sorted(found: list[Found]) -> list[Found]:

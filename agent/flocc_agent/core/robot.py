@@ -53,6 +53,7 @@ from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.peer_budgets import AnswerBudget, Muted
 from flocc_agent.core.place_recognition import PlaceRecognition
+from flocc_agent.core.prospects import UNLIKELY
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
     EncodingFailed,
@@ -195,7 +196,14 @@ class Robot:
         listens_until_s = now + parameters.election.startup_s if comes_back else float("-inf")
         pair_of = self.assembly.odometry_pair
         self.closing = LoopClosing(
-            log, compute_class, pair_of, parameters.loop_closing, spectral, closed, listens_until_s
+            log,
+            compute_class,
+            pair_of,
+            parameters.loop_closing,
+            spectral,
+            closed,
+            listens_until_s,
+            self.recognition.agreement,
         )
         self.in_map = None if restored.saved is None else InMap(restored.saved, now)
         self.corrections = Corrections(
@@ -387,7 +395,7 @@ class Robot:
             return self._overtaken(sender, message, now)
         if not self.corrections.is_news(message, now):
             return []
-        refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term)
+        refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term, now)
         return refused or self.corrections.take(message, now)
 
     def _reconsider(self, now: float) -> list[Effect]:
@@ -416,7 +424,7 @@ class Robot:
             return []
         self._overtaken_s = now
         refused = self.corrections.refused(sender.robot, message)
-        return refused or self.election.on_applied(sender, message.term)
+        return refused or self.election.on_applied(sender, message.term, now)
 
     def _is_distrusted(self, leader: LogId, now: float) -> bool:
         return self._distrusted.is_muted(leader.robot, leader.robot, now)
@@ -553,9 +561,10 @@ class Robot:
                     if descriptor is not None and self._may_match(KeyframeId(new.log, index)):
                         described.append((KeyframeId(new.log, index), descriptor))
                 case ClosureRecord(query, match):
-                    self.closing.on_closure(CandidatePair.of(query, match))
-                case RejectionRecord(query, match, reason):
-                    if self.closing.on_rejection(CandidatePair.of(query, match), reason):
+                    self.closing.on_closure(CandidatePair.of(query, match), now)
+                case RejectionRecord(query, match, reason, _, odometry_correspondences):
+                    was_seen = odometry_correspondences > 0
+                    if self.closing.on_rejection(CandidatePair.of(query, match), reason, was_seen):
                         effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     assert_never(record)
@@ -661,6 +670,9 @@ class Robot:
     def _settle(self, now: float) -> list[Effect]:
         """Let the machines act on what changed."""
         effects = self.closing.tick(now)
+        for pair in self.closing.take_unlikely():
+            record = RejectionRecord(pair.low, pair.high, UNLIKELY, 0, 0)
+            effects += [*self._append(record, now), Report(told(record, self.log))]
         for keyframe in self.closing.own_lost():
             if self._has(keyframe):
                 pairs = self.closing.on_latent_lost(keyframe, now)

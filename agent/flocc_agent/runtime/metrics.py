@@ -7,12 +7,16 @@ agent that does not answer in time gives an error to that scrape and is not dist
 
 import asyncio
 import errno
+import socket
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from flocc_agent.config import MetricsConfig
 from flocc_agent.extras import to_install
+from flocc_agent.runtime.few_connections import IDLE_S, FewConnections
 from flocc_agent.runtime.transport import ByPeer, TransportCounters
 from flocc_agent.stages import BOUNDS_S, Histogram
 from flocc_protocol.errors import FloccError
@@ -63,16 +67,20 @@ class MetricsServer:
             MetricsError: The port is in use, the host is none of this machine, or the extra is missing.
         """
         try:
-            from prometheus_client import CollectorRegistry, start_http_server
+            from prometheus_client import CollectorRegistry, make_wsgi_app
         except ImportError as error:
             raise MetricsError(f"metrics need prometheus-client: {to_install('metrics')}") from error
         assert config.port is not None
         registry = CollectorRegistry()
         registry.register(_Collector(asyncio.get_running_loop(), look))
         try:
-            self._server, self._thread = start_http_server(config.port, config.host, registry)
+            self._server = make_server(
+                config.host, config.port, make_wsgi_app(registry), _server_of(config.host), _Silent
+            )
         except OSError as error:
             raise MetricsError(f"robot {whose}: {_sentence(config, error)}") from error
+        self._thread = threading.Thread(target=self._server.serve_forever, name=f"{whose}-metrics", daemon=True)
+        self._thread.start()
         self.port: int = self._server.server_port
 
     async def close(self) -> None:
@@ -83,6 +91,29 @@ class MetricsServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+
+class _Silent(WSGIRequestHandler):
+    """Logs nothing, and waits for nobody."""
+
+    timeout = IDLE_S
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing."""
+
+
+class _Server4(FewConnections, WSGIServer):
+    """At an address of IPv4."""
+
+
+class _Server6(_Server4):
+    """At an address of IPv6."""
+
+    address_family = socket.AF_INET6
+
+
+def _server_of(host: str) -> type[WSGIServer]:
+    return _Server6 if ":" in host else _Server4
 
 
 def _sentence(config: MetricsConfig, error: OSError) -> str:

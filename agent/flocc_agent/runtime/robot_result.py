@@ -13,13 +13,17 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flocc_agent.geometry import pose_from_tq
-from flocc_protocol.ids import KeyframeId
+from flocc_protocol.ids import NAME_PATTERN, KeyframeId
 
 Float = NDArray[np.float64]
 
 Numbers = TypeVar("Numbers", bound=Sequence[float])
 
 QUATERNION_TOLERANCE = 1e-3
+
+
+RobotName = Annotated[str, Field(pattern=f"^(?:{NAME_PATTERN.pattern})$")]
+"""It becomes the name of files."""
 
 
 def with_direction(pose7: Numbers) -> Numbers:
@@ -77,7 +81,7 @@ class ClosureKnown(Record):
 class RobotResult(Record):
     """`robots/ROBOT/result.json`: what a robot knew at its end, or what its store held."""
 
-    robot: str
+    robot: RobotName
     incarnation: int = 0
     pose_order: str = POSE_ORDER
     """What the seven numbers of each pose `T_*` are."""

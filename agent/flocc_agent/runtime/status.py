@@ -47,6 +47,7 @@ class AgentStatus(BaseModel):
         busy: Images, fetches, registrations or rounds are under way, or its recording goes on.
         playing: Its recording goes on.
         disk_failure: Why it can no longer write to its disk, None while it can.
+        doubles: Names under which it heard two robots, its own among them.
         in_map: Whether it has found itself in the map that it opened, a sentence; None where it opened none.
     """
 
@@ -78,6 +79,7 @@ class AgentStatus(BaseModel):
     playing: bool = False
     disk_failure: str | None = None
     in_map: str | None = None
+    doubles: tuple[str, ...] = ()
 
 
 class PairStatus(BaseModel):

@@ -120,6 +120,7 @@ class Telemetry:
             refused=self.refused(),
             busy=busy,
             in_map=self._in_map(),
+            doubles=robot.neighbours.doubles(),
         )
 
     def _in_map(self) -> str | None:

@@ -24,6 +24,8 @@ ELSEWHERE = {
 """Pages whose place in the site is not that in `docs/`."""
 LINK = re.compile(r"(?<!!)\[(?P<text>[^\]]*)\]\((?P<path>[^)#\s]+)(?P<anchor>#[^)]*)?\)")
 PICTURE = re.compile(r"(?P<before>!\[[^\]]*\]\(|<img [^>]*src=\")(?P<path>[^)\"]+)")
+BESIDE = re.compile(r'<img align="right" width="\d+"(?P<rest>[^>]*>)\n*(?P<text>.*?)<br clear="right">\n?', re.S)
+"""A picture beside the text: the site's columns have no room for that, so there it stands behind the text."""
 FENCE = re.compile(r"^```.*?^```", re.M | re.S)
 
 
@@ -46,7 +48,8 @@ def gather(out: Path, root: Path = ROOT) -> list[str]:
 
 def rewritten(text: str, page: Path, names: dict[Path, str], root: Path) -> str:
     """A page's text with links as the site has them; blocks of code stay as they are."""
-    return "".join(part if is_code else _linked(part, page, names, root) for part, is_code in pieces(text))
+    alone = BESIDE.sub(lambda found: f"{found['text']}<img{found['rest']}\n", text)
+    return "".join(part if is_code else _linked(part, page, names, root) for part, is_code in pieces(alone))
 
 
 def pieces(text: str) -> Iterator[tuple[str, bool]]:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
 EXIT_TRY_AGAIN = 75
+EXIT_READER_LEFT = 141
+"""As any program ends that writes into a pipe whose reader has left (`| head`): 128 + SIGPIPE."""
 """An agent's disk or machine was at its end: systemd starts it again, which it does not after bad input."""
 
 

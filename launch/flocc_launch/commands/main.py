@@ -10,6 +10,7 @@ import typer
 
 from flocc_launch.commands.common import (
     EXIT_BAD_INPUT,
+    EXIT_READER_LEFT,
     EXIT_TRY_AGAIN,
     Json,
     Quiet,
@@ -71,7 +72,7 @@ Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of mes
 Latency = Annotated[float | None, typer.Option(min=0.0, help="Delay on every link, seconds.")]
 Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a link and budget of a robot, kB/s.")]
 Range = Annotated[float | None, typer.Option("--range", min=0.0, help="Communication range by true position, metres.")]
-Duration = Annotated[float | None, typer.Option(min=0.0, help="End after so many seconds, not when all is settled.")]
+Duration = Annotated[float | None, typer.Option(min=0.001, help="End after so many seconds, not when all is settled.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of links, boots and worker answers.")]
 Map = Annotated[Path | None, typer.Option("--map", help="A saved map in which the robots find themselves.")]
 MapFixed = Annotated[bool, typer.Option("--map-fixed", help="The map does not move, whatever is measured in it.")]
@@ -83,6 +84,10 @@ def main() -> None:
     speak_utf8()
     try:
         app(with_ros_args(sys.argv[1:]), prog_name="flocc")
+    except SystemExit:
+        if type(sys.stdout).__name__ == "PacifyFlushWrapper":  # put there where a pipe's reader has left
+            sys.exit(EXIT_READER_LEFT)
+        raise
     except KeyboardInterrupt:
         sys.exit(130)
     except Exception as error:
@@ -187,6 +192,9 @@ def simulate(
     duration: Duration = None,
     sets: Set = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Instead: so many drawn scenarios under checkers.")] = None,
+    family: Annotated[
+        str, typer.Option(help="Of the drawn ones: small, large (20 robots, ten minutes) or hour (20 robots).")
+    ] = "small",
     shrink: Annotated[bool, typer.Option("--shrink", help="Find a smaller scenario for each failing seed.")] = False,
     json_out: Json = False,
     quiet: Quiet = False,
@@ -206,7 +214,7 @@ def simulate(
     if seeds is not None and given:
         fail(f"a campaign draws its scenarios; {given[0]} is for one of your own, without --seeds")
     if seeds is not None:
-        run_campaign(seeds, seed or 0, shrink, out, speech)
+        run_campaign(seeds, seed or 0, shrink, out, speech, family)
         return
     if scenario is None:
         fail("simulate needs a scenario, or --seeds for a campaign of drawn ones")
@@ -223,7 +231,7 @@ def simulate(
         paths = recordings(read, progress)
     check_measurable(read, paths)
     if use is not None:
-        use.checked(read)  # before the earlier run goes
+        use.check_fully(read)  # before the earlier run goes
     fresh_folder(out, use)
     show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 

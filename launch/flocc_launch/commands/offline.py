@@ -75,17 +75,21 @@ def optimise(
     typer.echo(f"result: {(out / 'result.json').resolve()}")
 
 
-def run_campaign(seeds: int, first: int, shrink: bool, out: Path, speech: Speech) -> None:
+def run_campaign(seeds: int, first: int, shrink: bool, out: Path, speech: Speech, family: str) -> None:
     """Simulate drawn scenarios under all checkers; leave with exit code 1 when an invariant was violated."""
     from flocc_launch.simulation.campaign import SeedOutcome, campaign, write_campaign
     from flocc_launch.simulation.campaign import shrink as smaller
-    from flocc_launch.simulation.generator import drawn_scenario
+    from flocc_launch.simulation.coverage import table
+    from flocc_launch.simulation.generator import FAMILIES, drawn_scenario
+
+    if family not in FAMILIES:
+        raise BadOption(f"--family {family!r} is not one of {', '.join(FAMILIES)}")
 
     def tell(outcome: SeedOutcome) -> None:
         for violation in outcome.violations:
             speech.tell(f"seed {outcome.seed}: {violation.invariant} at {violation.at_s:.2f} s")
 
-    found = campaign(range(first, first + seeds), PROCESSES, tell)
+    found = campaign(range(first, first + seeds), PROCESSES, tell, family)
     out.mkdir(parents=True, exist_ok=True)
     path = out / "campaign.json"
     write_campaign(found, path)
@@ -93,10 +97,13 @@ def run_campaign(seeds: int, first: int, shrink: bool, out: Path, speech: Speech
     if speech.as_json:
         typer.echo(path.read_text(encoding="utf-8"))
     else:
+        speech.tell(f"messages that arrived, by kind, while something was wrong:\n{table(found.coverage())}")
         typer.echo(f"{seeds} runs, {len(failed)} with violations: {path.resolve()}")
     for seed in failed if shrink else ():
         small = out / f"seed-{seed}.json"
-        small.write_text(smaller(drawn_scenario(seed)).model_dump_json(indent=1) + "\n", encoding="utf-8")
+        small.write_text(
+            smaller(drawn_scenario(seed, FAMILIES[family])).model_dump_json(indent=1) + "\n", encoding="utf-8"
+        )
         speech.tell(f"smaller scenario: {small.resolve()}")
     if failed:
         sys.exit(EXIT_MISSED)

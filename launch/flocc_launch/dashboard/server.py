@@ -5,11 +5,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib.resources import files
 from types import TracebackType
 from typing import Any, TypeVar
 
+from flocc_agent.runtime.few_connections import IDLE_S, FewConnections
 from flocc_launch.dashboard.page_source import RunSource, SnapshotSource
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_protocol.errors import FloccError
@@ -20,10 +21,6 @@ W = TypeVar("W")
 
 PORT = 8642
 PORT_MAX = 65535
-CONNECTIONS_MAX = 32
-"""Open at one time; a further one is closed at once, so that idle ones cannot use up the agent's threads and files."""
-IDLE_S = 10.0
-"""A connection that says nothing, or takes nothing, for so long is closed."""
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -36,32 +33,11 @@ class DashboardError(FloccError):
     """The page cannot be served; one sentence says why."""
 
 
-class _Server(ThreadingHTTPServer):
-    """Answers each connection from a thread of its own, a bounded number of them."""
-
-    daemon_threads = True
+class _Server(FewConnections, HTTPServer):
+    """Answers nothing by itself."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         super().__init__(address, BaseHTTPRequestHandler)
-        self._free = threading.BoundedSemaphore(CONNECTIONS_MAX)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Give a connection a thread, or close it."""
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer one connection, then make room for another."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._free.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
-        """Whoever hangs up or is silent is no news."""
-        logger.debug("a connection from %s ended early", client_address, exc_info=True)
 
 
 class Dashboard:

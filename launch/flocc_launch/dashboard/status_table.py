@@ -51,6 +51,7 @@ class RobotStatus(MergeStatus):
     logs: dict[str, tuple[int, int]] = Field(default_factory=dict)
     loss: dict[str, float] = Field(default_factory=dict)
     queues: dict[str, int] = Field(default_factory=dict)
+    doubles: tuple[str, ...] = ()
 
 
 def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0) -> list[RobotStatus]:
@@ -92,7 +93,10 @@ def why_silent(found: "Survey", config: TransportConfig, timeout_s: float) -> st
         )
     where = f"{len(config.roster)} robots of the roster" if config.roster else "anybody that scouting finds"
     there = f" (there: swarm {', '.join(found.others)})" if found.others else ""
-    return f"nobody is there: in {timeout_s:g} s no agent of it was found{there}; asked {where}"
+    return (
+        f"nobody is there: in {timeout_s:g} s no agent of it was found{there}; asked {where}; "
+        "a machine under load is found late: give a longer --timeout"
+    )
 
 
 def status_from(robot: str, answer: bytes) -> RobotStatus:

@@ -485,10 +485,19 @@ class _Conversion:
         apart = self._apart()
         if apart is not None:
             self.faults.append(apart)
+        if self.bag.gap is not None:
+            self._judge_gap(self.bag.gap, [tally_of for tally_of in tallies if tally_of[1].count is not None])
         if self.bag.damage is not None:
             self.faults.append(self.bag.damage)
         if self.faults:
             raise DatasetError(f"{self.faults[0]}; {self.kept} images were kept in {self.out}")
+
+    def _judge_gap(self, gap: str, tallies: list[tuple[Tally, BagTopic]]) -> None:
+        """Tell how many messages a damaged part of the bag cost; it is a fault where they are too many."""
+        lost = [(topic, (topic.count or 0) - tally.seen) for tally, topic in tallies]
+        told = ", ".join(f"{count} of {topic.count} of {topic.name}" for topic, count in lost if count > 0)
+        too_many = any(count > DAMAGED_RATIO_MAX * (topic.count or 0) for topic, count in lost)
+        (self.faults if too_many else self.notes).append(f"{gap}; lost: {told or 'nothing'}")
 
     def _apart(self) -> str | None:
         """A sentence where no image lies within odometry's time."""

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from flocc_launch.datasets.bag_salvage import Salvage, decompression_errors
 from flocc_launch.datasets.foxglove import ROS_TYPES, ForeignMcap, as_ros, is_foreign, short_name
 from flocc_launch.datasets.source import DatasetError
 
@@ -109,6 +110,7 @@ class Bag:
         self.path = path
         self.topics: dict[str, BagTopic] = {}
         self.damage: str | None = None
+        self.gap: str | None = None
         self.start_ns: int | None = None
         self.end_ns: int | None = None
         self._stack = ExitStack()
@@ -167,16 +169,34 @@ class Bag:
         if not connections:
             return
         stream = self._reader.messages(connections=connections, start=start_ns)
-        topics = self.topics
+        topics, last_ns = self.topics, start_ns or 0
+        damage: tuple[type[Exception], ...] = (*self._known_errors, *decompression_errors(), LookupError)
         while True:
             try:
                 connection, stamp_ns, message = next(stream)
             except StopIteration:
                 return
-            except self._known_errors as error:
-                self.damage = f"{self.path}: is damaged or cut off: {' '.join(str(error).split())}"
-                return
+            except damage as error:
+                said = " ".join(str(error).split())
+                break
             yield topics[connection.topic], stamp_ns, message
+            last_ns = max(last_ns, stamp_ns)
+        storage = self._only_mcap()
+        if storage is None:
+            self.damage = f"{self.path}: is damaged or cut off: {said}"
+            return
+        self.gap = f"{self.path}: is damaged behind {last_ns * 1e-9:.3f} s, and what is whole was read: {said}"
+        try:
+            for name, stamp_ns, message in Salvage(storage).messages(list(names)):
+                if stamp_ns > last_ns:
+                    yield topics[name], stamp_ns, message
+        except SALVAGE_ERRORS as error:
+            self.damage = f"{self.path}: is damaged or cut off: {error}"
+
+    def _only_mcap(self) -> Path | None:
+        """The one file of an MCAP bag, which can be read without its index; None where it is another kind."""
+        files = _storages(self.path) if self.path.is_dir() else [self.path]
+        return files[0] if len(files) == 1 and files[0].suffix == ".mcap" else None
 
     def _salvaged(self, names: Sequence[str], start_ns: int | None) -> Iterator[tuple[BagTopic, int, bytes]]:
         try:
@@ -231,8 +251,6 @@ class Bag:
         return [found[0]]
 
     def _open_damaged(self, path: Path, reason: str) -> None:
-        from flocc_launch.datasets.bag_salvage import Salvage
-
         file = path if path.is_file() else next(iter(_storages(path)), None)
         if file is None:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}")

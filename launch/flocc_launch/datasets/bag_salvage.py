@@ -24,6 +24,8 @@ Record = tuple[str, str, str, int, bytes]
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MCAP_CHUNK = 0x06
+RECORD_BYTES_MAX = 1 << 32
+"""A record that says to be longer is damaged."""
 
 
 class Salvage:
@@ -173,6 +175,8 @@ def _mcap_record(read: Any) -> tuple[int, bytes] | None:
     if len(head) < 9:
         return None
     operation, length = struct.unpack("<BQ", head)
+    if length > RECORD_BYTES_MAX:
+        return None
     body = read(length)
     return (operation, body) if len(body) == length or (operation == MCAP_CHUNK and len(body) > 64) else None
 
@@ -203,9 +207,15 @@ def _messages_of(
         length = struct.unpack_from("<I", body, 28)[0]
         compression = body[32 : 32 + length].decode()
         size = struct.unpack_from("<Q", body, 32 + length)[0]
-        inner = BytesIO(_decompressed(compression or "none", body[40 + length : 40 + length + size]))
-        while (record := _mcap_record(inner.read)) is not None:
-            yield from _messages_of(*record, schemas, channels)
+        try:
+            inner = BytesIO(_decompressed(compression or "none", body[40 + length : 40 + length + size]))
+        except decompression_errors():
+            return  # a chunk that is damaged costs itself
+        try:
+            while (record := _mcap_record(inner.read)) is not None:
+                yield from _messages_of(*record, schemas, channels)
+        except (struct.error, UnicodeDecodeError):
+            return
 
 
 def _mcap_bytes(body: bytes, at: int) -> tuple[bytes, int]:
@@ -232,6 +242,16 @@ def _sqlite_records(path: Path) -> Iterator[Record]:
             return
         finally:
             database.close()
+
+
+def decompression_errors() -> tuple[type[Exception], ...]:
+    """What bytes raise that are none of what they are said to be."""
+    errors: tuple[type[Exception], ...] = (ValueError, RuntimeError, EOFError, OSError, OverflowError, struct.error)
+    try:
+        zstd: Any = import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    except ImportError:
+        return errors
+    return (*errors, zstd.ZstdError)
 
 
 def _decompressed(compression: str, data: bytes) -> bytes:

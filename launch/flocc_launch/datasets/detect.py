@@ -18,7 +18,7 @@ from flocc_launch.datasets.folders import (
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
 from flocc_launch.datasets.names import robot_name
-from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder
+from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder, marked_kind
 from flocc_launch.datasets.pixels import size_of, usable_images
 from flocc_launch.datasets.plain import is_plain, read_plain
 from flocc_launch.datasets.reconstructions import (
@@ -95,7 +95,7 @@ def team_folder(path: Path) -> dict[str, Path]:
     Raises:
         DatasetError: Two would have one name.
     """
-    if not path.is_dir() or is_bag(path) or is_dataset(path):
+    if not path.is_dir() or is_bag(path) or is_dataset(path) or marked_kind(path) is not None:
         return {}
     entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
     found: dict[str, Path] = {}

@@ -182,9 +182,13 @@ def _sevenscenes_pose(path: Path) -> Float:
     return checked_pose(np.array(rows), str(path))
 
 
+SEVENSCENES_LENSES = ("camera-intrinsics.txt", "_info.txt")
+"""Where 7-Scenes and BundleFusion, which names its files alike, say the intrinsics."""
+
+
 def _sevenscenes_lens(path: Path, image: Path) -> Lens:
     width, height = image_size(image)
-    file = path / "camera-intrinsics.txt"
-    if not file.exists():
+    file = next((path / name for name in SEVENSCENES_LENSES if (path / name).exists()), None)
+    if file is None:
         return Lens(CameraModel(width, height, 585.0, 585.0, width / 2, height / 2))
     return read_lens(file, (width, height))

@@ -20,6 +20,18 @@ FOLDERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ADVIO", ("iphone", "ground-truth"), "cut iphone/frames.mov into images named by iphone/frames.csv"),
     ("Argoverse", ("sensors", "city_SE3_egovehicle.feather"), "export one camera's images and poses as a plain folder"),
     ("an ASL sequence's parent", ("calibration", "state_groundtruth_estimate0"), "name the folder that holds mav0"),
+    ("ARKitScenes", ("lowres_wide", "lowres_wide.traj"),
+     "make groundtruth.tum of lowres_wide.traj and camera.yaml of a .pincam"),
+    ("a NeRF scene of Blender", ("transforms_train.json",),
+     "write transforms.json with w, h and fl_x, of the frames of one path"),
+    ("ScanNet of 2023, of an iPhone", ("pose_intrinsic_imu.json",),
+     "make groundtruth.tum and camera.yaml of pose_intrinsic_imu.json"),
+    ("ICL-NUIM", ("associations.txt", "traj0.gt.freiburg"),
+     "write rgb.txt of associations.txt and groundtruth.txt of traj0"),
+    ("Virtual KITTI 2", ("extrinsic.txt", "intrinsic.txt"),
+     "make groundtruth.tum of extrinsic.txt, which is world to camera"),
+    ("Spectacular AI's recording", ("data.jsonl", "calibration.json"),
+     "make odometry.tum of the output, and name frames/ by stamps"),
     ("a KITTI-360 sequence", ("data_2d_raw",), "name images by stamps and make groundtruth.tum of data_poses/"),
 )  # fmt: skip
 FILES: dict[str, tuple[str, str]] = {
@@ -68,11 +80,18 @@ def is_trajectory(path: Path) -> bool:
         return False
 
 
-def kind_of_folder(path: Path) -> str | None:
-    """What a folder is and what to convert, or None where it is no kind that is known."""
+def marked_kind(path: Path) -> str | None:
+    """What a folder is by the files that mark a data set of a kind, and what to convert, or None."""
     for name, markers, advice in FOLDERS:
         if all((path / marker).exists() for marker in markers):
             return f"is {name}, which flocc does not read; {advice}"
+    return None
+
+
+def kind_of_folder(path: Path) -> str | None:
+    """What a folder is and what to convert, or None where it is no kind that is known."""
+    if (marked := marked_kind(path)) is not None:
+        return marked
     files = [entry for entry in sorted(path.iterdir()) if entry.is_file()]
     graphs = [file.name for file in files if file.suffix.lower() in GRAPHS]
     if graphs:

@@ -25,7 +25,7 @@ def late(silent: Sequence[str]) -> list[Finding]:
 
 
 def _answered(rows: Sequence[RobotStatus]) -> list[Finding]:
-    checks = (lonely, unheard, without_keyframes, leaderless, refusing)
+    checks = (shared, lonely, unheard, without_keyframes, leaderless, refusing)
     found = [finding for check in checks for finding in check(rows)]
     first = merging(rows, any(finding.cause != "refused" for finding in found))
     if any(finding.cause == "merged" for finding in first):
@@ -52,6 +52,16 @@ def not_merged_yet(rows: Sequence[RobotStatus], maps: int) -> Finding:
     sentence = f"{maps} maps, {closures} closures known so far, and all robots hear and follow each other."
     advice = "Give it time; once the run is over, flocc doctor on its run folder names the step that failed."
     return Finding("not-merged-yet", Severity.NOTE, sentence, advice)
+
+
+def shared(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Names under which two robots run, a copied disk most often; only one of them answers for both."""
+    advice = "Give every robot a name and a folder of its own; a copied disk (SD card) carries both along."
+    return [
+        blocked("duplicate-name", f"Two agents run with the name {name}, as {named(heard)} heard.", advice, name)
+        for name in sorted({name for row in rows for name in row.doubles})
+        for heard in [[row.robot for row in rows if name in row.doubles]]
+    ]
 
 
 def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:

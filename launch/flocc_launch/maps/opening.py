@@ -6,6 +6,7 @@ from pathlib import Path
 from flocc_agent.config import BackendMode
 from flocc_agent.config.agent_config import NO_MAPS
 from flocc_agent.core.interfaces import Perception
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.map_folder import BadMap, MapFolder
 from flocc_launch.scenarios.scenario import Scenario
 
@@ -47,6 +48,16 @@ class MapUse:
             name: max((log.incarnation + 1 for log in held if log.robot == name), default=0)
             for name in scenario.names()
         }
+
+    def check_fully(self, scenario: Scenario) -> None:
+        """Whether the scenario's robots can work in it, their front end's own latents included.
+
+        Raises:
+            BadMap: They cannot.
+            FloccError: There is no such front end here.
+        """
+        self.checked(scenario)
+        opened_for(self, scenario, build_perception(scenario.perception, scenario.seed))
 
     def settings(self) -> dict[str, object]:
         """What a run folder says of it."""

@@ -1,7 +1,7 @@
 """From a loaded run to its report: the numbers of report.json."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -257,6 +257,10 @@ def total_bytes(by_robot: Mapping[str, RobotBytes]) -> dict[str, int]:
     return dict(sorted(total.items()))
 
 
+HELD, HELD_TOLD_MAX = "held until another one agrees", 3
+"""What the back end says of a lone closure, and how many of them a reader wants to see."""
+
+
 def warnings_of(loaded: LoadedRun) -> list[str]:
     """What a reader should see: deaths, refusals, missing results, odd truths, unknown events, the solver's last."""
     events = loaded.events
@@ -271,7 +275,17 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
     for name, count in sorted(unknown.items()):
         found.append(f"This version does not know events of the kind {name} ({count} in this run).")
     rounds = of_kind(events, RoundSolved)
-    return found + ([f"Last optimisation: {text}" for text in rounds[-1].fact.warnings] if rounds else [])
+    return found + ([f"Last optimisation: {text}" for text in told_of(rounds[-1].fact.warnings)] if rounds else [])
+
+
+def told_of(warnings: Sequence[str]) -> list[str]:
+    """A solver's warnings, of which those of closures that wait for another one are told a few times only."""
+    held = [text for text in warnings if HELD in text]
+    more = held[HELD_TOLD_MAX:]
+    rest = (
+        [f"{len(more)} more closures are held until others agree with them (events.jsonl names them)"] if more else []
+    )
+    return [text for text in warnings if text not in more] + rest
 
 
 def registered_by(loaded: LoadedRun) -> Counter[str]:

@@ -26,6 +26,7 @@ def finish(folder: RunFolder, pairs_max: int = PAIRS_SHOWN, progress: Progress |
     Raises:
         RunFolderError: The folder is cut off or damaged.
     """
+    folder.refuse_links()
     loaded = load(folder)
     report = build(loaded)
     write_trajectories(folder.path, loaded)

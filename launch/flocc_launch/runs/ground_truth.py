@@ -49,8 +49,8 @@ def is_given(path: Path) -> bool:
 
 
 def write_truth(path: Path, truth: Trajectory) -> None:
-    """Write ground truth into a run, unless a person put some there."""
-    if len(truth) and not is_given(path):
+    """Write ground truth into a run, unless a person put some there, or a link."""
+    if len(truth) and not is_given(path) and not path.is_symlink() and not path.parent.is_symlink():
         path.parent.mkdir(parents=True, exist_ok=True)
         lines = [tum_line(s, T) for s, T in zip(truth.stamps_s, truth.T_fixed_body, strict=True)]
         path.write_text(MADE + HEADER + "".join(line + "\n" for line in lines), encoding="utf-8")

@@ -29,6 +29,10 @@ __all__ = ["Run", "RobotResult", "RunFolder", "RunFolderError"]
 R = TypeVar("R", bound=Record)
 
 
+WRITTEN = frozenset({"odometry", "trajectories", "report", "pose_graph", "errors"})
+"""Files and folders, by the first part of their names, that are made of what a run left."""
+
+
 class RunFolderError(FloccError):
     """A run folder that cannot be read or written; the message names the file."""
 
@@ -70,6 +74,18 @@ class RunFolder:
         if version != RUN_VERSION:
             raise RunFolderError(f"{path / 'run.json'}: is of version {version}, this flocc reads {RUN_VERSION}")
         return folder
+
+    def refuse_links(self) -> None:
+        """Check that what is written into the folder again stays in it.
+
+        Raises:
+            RunFolderError: A file or folder that is written is a link, by which something elsewhere would be.
+        """
+        written = [path for path in self.path.iterdir() if path.name.split(".")[0] in WRITTEN]
+        written += [path for folder in written if folder.is_dir() for path in folder.iterdir()]
+        for path in sorted(written):
+            if path.is_symlink():
+                raise RunFolderError(f"{path}: is a link; a run is evaluated in its own folder only")
 
     def write_run(self, run: Run) -> None:
         """Write `run.json`; call it again at the end to add what was measured."""

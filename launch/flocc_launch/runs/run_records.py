@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from flocc_agent.runtime.robot_result import Record
+from flocc_agent.runtime.robot_result import Record, RobotName
 
 RUN_VERSION = 1
 
@@ -19,7 +19,7 @@ class Run(Record):
     """Name of the scenario."""
     seed: int | None = None
     """Seed of everything that is drawn; null where nothing was seeded."""
-    robots: list[str]
+    robots: list[RobotName]
     """Robot names."""
     servers: list[str] = Field(default_factory=list)
     """Those of them without a camera: they take no keyframes, so they are in no map."""

@@ -5,10 +5,11 @@ ends early. A seed that fails replays exactly; `shrink` looks for fewer faults t
 """
 
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 
 from flocc_agent.config import KeyframeConfig
@@ -16,9 +17,10 @@ from flocc_agent.perception.backends import build_perception
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.runs.run_folder import write_json
 from flocc_launch.scenarios.scenario import FaultKind, Scenario, SensorsScenario, TracksScenario
+from flocc_launch.simulation.coverage import Coverage, CoverageWatch
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
-from flocc_launch.simulation.generator import FAULTS_END_S, ROBOTS_MAX, drawn_scenario
+from flocc_launch.simulation.generator import FAMILIES, ROBOTS_MAX, calm_s, drawn_scenario
 from flocc_launch.simulation.hardships import Hardship, HardshipKind, drawn_hardships, endure
 from flocc_launch.simulation.invariants import Invariant, InvariantWatch, Violation
 from flocc_launch.simulation.rigid_alignment import Alignment
@@ -49,11 +51,13 @@ class SeedOutcome:
         seed: It.
         violations: What did not hold.
         settled_after_s: Time from the end of the faults until everything was as it must be, None if never.
+        coverage: Which messages arrived while something was wrong.
     """
 
     seed: int
     violations: tuple[Violation, ...]
     settled_after_s: float | None
+    coverage: Coverage = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,22 +66,30 @@ class Campaign:
 
     outcomes: tuple[SeedOutcome, ...]
 
+    def coverage(self) -> Coverage:
+        """Of all runs together."""
+        return sum((Counter(outcome.coverage) for outcome in self.outcomes), Counter())
+
     def as_json(self) -> dict[str, object]:
         """What `campaign.json` holds."""
         settled = sorted(o.settled_after_s for o in self.outcomes if o.settled_after_s is not None)
         return {
             "runs": len(self.outcomes),
             "violations": [{"seed": o.seed, **asdict(violation)} for o in self.outcomes for violation in o.violations],
+            "coverage": [{"message": m, "fault": f, "count": n} for (m, f), n in sorted(self.coverage().items())],
             "settled_after_s": {"median": settled[len(settled) // 2], "max": settled[-1]} if settled else None,
         }
 
 
 def campaign(
-    seeds: Iterable[int], processes: int = 2, on_outcome: Callable[[SeedOutcome], None] | None = None
+    seeds: Iterable[int],
+    processes: int = 2,
+    on_outcome: Callable[[SeedOutcome], None] | None = None,
+    family: str = "small",
 ) -> Campaign:
     """Run every seed, in several processes; `on_outcome` hears of each run in the order of the seeds."""
     outcomes: list[SeedOutcome] = []
-    for outcome in _outcomes(list(seeds), processes):
+    for outcome in _outcomes(list(seeds), processes, family):
         if on_outcome is not None:
             on_outcome(outcome)
         outcomes.append(outcome)
@@ -89,33 +101,36 @@ def write_campaign(result: Campaign, path: Path) -> None:
     write_json(path, result.as_json())
 
 
-def _outcomes(seeds: list[int], processes: int) -> Iterator[SeedOutcome]:
+def _outcomes(seeds: list[int], processes: int, family: str) -> Iterator[SeedOutcome]:
+    run_one = partial(run_seed, family=family)
     if processes == 1:
-        yield from map(run_seed, seeds)
+        yield from map(run_one, seeds)
         return
     with ProcessPoolExecutor(processes) as pool:
-        yield from pool.map(run_seed, seeds, chunksize=SEEDS_PER_TASK)
+        yield from pool.map(run_one, seeds, chunksize=SEEDS_PER_TASK if family == "small" else 1)
 
 
-def run_seed(seed: int) -> SeedOutcome:
-    """One seed of the default campaign."""
-    scenario = drawn_scenario(seed)
-    return run_checked(scenario, drawn_hardships(seed, scenario.names(), FAULTS_END_S))
+def run_seed(seed: int, family: str = "small") -> SeedOutcome:
+    """One seed of a campaign."""
+    drawn = FAMILIES[family]
+    scenario = drawn_scenario(seed, drawn)
+    return run_checked(scenario, drawn_hardships(seed, scenario.names(), drawn.faults_end_s))
 
 
 def run_checked(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> SeedOutcome:
     """Run a scenario under all checkers; a crash of the core is a violation like any other."""
     swarm = prepared(scenario, hardships)
     watch = InvariantWatch(swarm, invariants_of(scenario, hardships))
+    seen = CoverageWatch(swarm, scenario, hardships)
     try:
-        settled_after_s = _run(swarm, watch)
+        settled_after_s = _run(swarm, watch, calm_s(scenario))
     except Exception:  # noqa: BLE001 - whatever the core throws is what the campaign looks for
         last = traceback.format_exc().strip().splitlines()[-8:]
         crash = Violation("no crash", swarm.agenda.now_s, " | ".join(line.strip() for line in last))
-        return SeedOutcome(scenario.seed, (crash, *watch.violations), None)
+        return SeedOutcome(scenario.seed, (crash, *watch.violations), None, seen.counts)
     lacking = watch.lacking() if settled_after_s is None else []
     first = {violation.invariant: violation for violation in reversed([*watch.violations, *lacking])}
-    return SeedOutcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s)
+    return SeedOutcome(scenario.seed, tuple(first[name] for name in sorted(first)), settled_after_s, seen.counts)
 
 
 def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> list[Invariant]:
@@ -151,7 +166,7 @@ def prepared(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> Swarm:
 
 def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     assert scenario.tracks is not None
-    tracks = scenario.tracks.model_copy(update={"robots": ROBOTS_MAX})
+    tracks = scenario.tracks.model_copy(update={"robots": max(ROBOTS_MAX, scenario.tracks.robots)})
     sensors = None if scenario.sensors is None else scenario.sensors.model_dump_json()
     drawn = _walked(tracks.model_dump_json(), scenario.keyframes.model_dump_json(), sensors, is_noiseless(scenario))
     return {name: drawn[name] for name in scenario.names()}
@@ -182,11 +197,11 @@ def shrink(scenario: Scenario, fails: Callable[[Scenario], bool] | None = None) 
     return scenario
 
 
-def _run(swarm: Swarm, watch: InvariantWatch) -> float | None:
+def _run(swarm: Swarm, watch: InvariantWatch, faults_end_s: float) -> float | None:
     """Let the faults happen, then wait for peace."""
-    swarm.run_until(FAULTS_END_S + LOOK_S)
-    while swarm.agenda.now_s <= FAULTS_END_S + LIVENESS_S:
+    swarm.run_until(faults_end_s + LOOK_S)
+    while swarm.agenda.now_s <= faults_end_s + LIVENESS_S:
         if watch.is_settled():
-            return swarm.agenda.now_s - FAULTS_END_S
+            return swarm.agenda.now_s - faults_end_s
         swarm.run_until(swarm.agenda.now_s + LOOK_S)
     return None

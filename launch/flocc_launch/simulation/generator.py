@@ -1,5 +1,7 @@
 """Faults drawn from a seed: a whole scenario that begins with faults and ends in peace."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from flocc_agent.config import KeyframeConfig, LinkOverrideConfig, PerceptionConfig, RadioConfig, SyntheticConfig
@@ -39,10 +41,46 @@ SENSORS = SensorsScenario(
 """What a quarter of the swarms measures besides: at every keyframe, now and then, and before the first one."""
 
 
-def drawn_scenario(seed: int) -> Scenario:
-    """Draw robots, clocks, links and a timeline of faults; from `FAULTS_END_S` on nothing goes wrong any more."""
+@dataclass(frozen=True, slots=True)
+class Family:
+    """How large drawn swarms are.
+
+    Attributes:
+        robots: Fewest and most robots.
+        faults_end_s: From then on nothing goes wrong any more.
+        faults_max: Most faults of one run.
+        lengths_m: Lengths of walks.
+        area_m: Edge of the area.
+        flaps: The best-ranked robot may come and go.
+    """
+
+    robots: tuple[int, int]
+    faults_end_s: float
+    faults_max: int
+    lengths_m: tuple[float, ...]
+    area_m: float = 12.0
+    flaps: bool = False
+
+
+FAMILIES = {
+    "small": Family((2, ROBOTS_MAX), FAULTS_END_S, FAULTS_MAX, LENGTHS_M),
+    "large": Family((20, 20), 540.0, 40, (40.0,), area_m=24.0, flaps=True),
+    "hour": Family((20, 20), 3540.0, 80, (40.0,), area_m=24.0, flaps=True),
+}
+"""`flocc simulate --seeds N --family NAME`: small swarms for half a minute, large ones for ten minutes or an hour."""
+SMALL = FAMILIES["small"]
+FLAPS, FLAP_S = 6, 7.0
+
+
+def calm_s(scenario: Scenario) -> float:
+    """When faults end."""
+    return max((fault.at_s for fault in scenario.faults if fault.kind is FaultKind.CALM), default=0.0)
+
+
+def drawn_scenario(seed: int, family: Family = SMALL) -> Scenario:
+    """Draw robots, clocks, links and a timeline of faults; from a time on nothing goes wrong any more."""
     rng = np.random.default_rng([seed, 0])
-    count = int(rng.integers(2, ROBOTS_MAX + 1))
+    count = int(rng.integers(family.robots[0], family.robots[1] + 1))
     names = [f"r{k + 1}" for k in range(count)]
     return Scenario(
         name="campaign",
@@ -50,9 +88,9 @@ def drawn_scenario(seed: int) -> Scenario:
         tracks=TracksScenario(
             robots=count,
             seed=int(rng.integers(WALKS)),
-            area_m=12.0,
+            area_m=family.area_m,
             speed_m_s=0.8,
-            length_m=float(rng.choice(LENGTHS_M)),
+            length_m=float(rng.choice(family.lengths_m)),
         ),
         robots={name: _robot(rng) for name in names},
         radio=_radio(rng, names),
@@ -61,7 +99,7 @@ def drawn_scenario(seed: int) -> Scenario:
         perception=PerceptionConfig(
             method="synthetic", synthetic=NOISELESS if _draws(seed, 2, NOISELESS_RATIO) else NOISY
         ),
-        faults=_faults(rng, names),
+        faults=_faults(rng, names, family),
         sensors=SENSORS if _draws(seed, 1, SENSING_RATIO) else None,
     )
 
@@ -112,20 +150,29 @@ def _override(rng: np.random.Generator, names: list[str]) -> LinkOverrideConfig:
     return LinkOverrideConfig(sender=sender, receiver=receiver, **link)
 
 
-def _faults(rng: np.random.Generator, names: list[str]) -> tuple[Fault, ...]:
+def _faults(rng: np.random.Generator, names: list[str], family: Family) -> tuple[Fault, ...]:
     drawn: list[Fault] = []
-    for _ in range(int(rng.integers(0, FAULTS_MAX + 1))):
-        drawn += _fault(rng, names, round(float(rng.uniform(1.0, FAULTS_END_S - 2.0)), 3))
-    calm = [Fault(at_s=FAULTS_END_S, kind=FaultKind.CALM)]
+    end_s = family.faults_end_s
+    for _ in range(int(rng.integers(0, family.faults_max + 1))):
+        drawn += _fault(rng, names, round(float(rng.uniform(1.0, end_s - 2.0)), 3), end_s)
+    if family.flaps and rng.uniform() < 0.5:
+        drawn += _flapping(names[0], float(rng.uniform(1.0, end_s - FLAPS * FLAP_S)))
+    calm = [Fault(at_s=end_s, kind=FaultKind.CALM)]
     if rng.uniform() < 0.8:
-        calm += [Fault(at_s=FAULTS_END_S, kind=FaultKind.START, robots=tuple(names))]
+        calm += [Fault(at_s=end_s, kind=FaultKind.START, robots=tuple(names))]
     return (*sorted(drawn, key=lambda fault: fault.at_s), *calm)
 
 
-def _fault(rng: np.random.Generator, names: list[str], at_s: float) -> list[Fault]:
+def _flapping(name: str, at_s: float) -> list[Fault]:
+    """A robot that dies and comes back, again and again; by its name it outranks all of its class."""
+    times_s = [round(at_s + FLAP_S * k, 3) for k in range(FLAPS)]
+    return [Fault(at_s=time_s, kind=FaultKind.RESTART, robots=(name,)) for time_s in times_s]
+
+
+def _fault(rng: np.random.Generator, names: list[str], at_s: float, last_s: float) -> list[Fault]:
     """One fault, with its end where it has one."""
     victim = (str(rng.choice(names)),)
-    end_s = round(min(at_s + float(rng.uniform(0.5, 20.0)), FAULTS_END_S), 3)
+    end_s = round(min(at_s + float(rng.uniform(0.5, 20.0)), last_s), 3)
     kind = rng.choice(["kill", "kill", "restart", "disk", "partition", "blackout", "slow", "loss", "mute", "leave"])
     match kind:
         case "kill":

@@ -25,6 +25,7 @@ from flocc_agent.core.events import (
 from flocc_agent.core.log_copy import decoded
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
 from flocc_agent.core.pose_graph import map_frame
+from flocc_agent.core.prospects import UNLIKELY
 from flocc_agent.core.reports import NeighbourDown, NeighbourUp
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.completeness import Complete
@@ -158,7 +159,7 @@ class Once:
 
     A second registration is excused where the first robot died, or where robots were apart: the one that registers
     took the pair over while the owner in charge, or the first robot, was out of its hearing. It never is where the
-    robot holds a record of the pair already.
+    robot holds a record of the pair already, unless that refused it unseen.
 
     Attributes:
         separated: At times robots cannot hear each other.
@@ -186,7 +187,8 @@ class Once:
 
     def _note_record(self, log: LogId, number: int, data: bytes) -> None:
         record = decoded(data)[0]
-        if isinstance(record, ClosureRecord | RejectionRecord):
+        unseen = isinstance(record, RejectionRecord) and record.reason == UNLIKELY
+        if isinstance(record, ClosureRecord | RejectionRecord) and not unseen:
             self._records[CandidatePair.of(record.query, record.match)].add((log, number, data))
 
     def _registers(self, step: Step, pair: CandidatePair) -> Iterator[str]:

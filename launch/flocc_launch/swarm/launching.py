@@ -97,6 +97,8 @@ def launch(
     served = {} if metrics is None else dict(zip(names, MetricsConfig.at(metrics, len(names)), strict=True))
     paths = recordings(scenario, progress) if paths is None else paths
     check_measurable(scenario, paths)
+    if use is not None:
+        use.check_fully(scenario)  # before the earlier run goes
     folder = fresh_folder(out, use)
     given = on_watch or (lambda _: None)
     return asyncio.run(_Launch(scenario, folder, paths, given, secure, served, use, lives).run())

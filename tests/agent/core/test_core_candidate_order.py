@@ -263,7 +263,7 @@ def test_every_pair_has_its_turn() -> None:
                     machine.on_held(keyframe)
                 case Register(one):
                     done.append(one)
-                    machine.on_closure(one)
+                    machine.on_closure(one, 0.0)
     assert sorted(done) == sorted(own)
 
 

@@ -7,7 +7,16 @@ import pytest
 from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Unicast
-from flocc_agent.core.election import ANSWER_TIMEOUT_S, COUNTER_JUMP_MAX, TRANSITIONS, LeaderElection, Role, Turn
+from flocc_agent.core.election import (
+    ANSWER_TIMEOUT_S,
+    COUNTER_JUMP_MAX,
+    RISE_MAX,
+    RISE_PER_S,
+    TRANSITIONS,
+    LeaderElection,
+    Role,
+    Turn,
+)
 from flocc_agent.core.events import Leaving, MessageReceived
 from flocc_agent.core.parameters import CoreParameters, ElectionParameters
 from flocc_agent.core.reports import PeerRefused
@@ -77,8 +86,22 @@ def test_a_leader_that_is_not_believed_is_not_followed() -> None:
 def test_a_leader_claims_anew_when_somebody_speaks_in_its_term() -> None:
     machine = election(R2)
     assert claims(machine.tick(2.0)) == [Term(1, R2)]
-    machine.on_applied(R3, Term(1, R2))
+    machine.on_applied(R3, Term(1, R2), 2.0)
     assert claims(machine.tick(2.1)) == [Term(2, R2)]
+
+
+def test_a_flood_of_claims_raises_the_counter_slowly() -> None:
+    """A robot that was away learns what is left of an hour of it within little more."""
+    machine, rogue, counter = election(R2, counter=5), LogId("r9"), 5
+    for tick in range(36_000):
+        counter = machine.counter_max + COUNTER_JUMP_MAX
+        machine.on_coordinator(rogue, Coordinator(LeaderAdvert(Term(counter, rogue), 0, tick, 0)), 0.1 * tick)
+    assert machine.counter_max < RISE_MAX + 1.1 * 3600.0 * RISE_PER_S
+    returned, away_s = election(R3, counter=5), 0.0
+    while returned.counter_max < machine.counter_max and away_s < 4000.0:
+        away_s += 0.5
+        returned.on_heartbeat(R2, heartbeat(LeaderAdvert(Term(machine.counter_max, R2), 0, int(2 * away_s), 0)), away_s)
+    assert returned.counter_max == machine.counter_max
 
 
 def test_a_better_robot_that_comes_later_takes_over() -> None:
@@ -229,7 +252,7 @@ def test_a_leader_claims_anew_when_another_leads_with_a_higher_counter() -> None
 def test_a_leader_claims_anew_when_others_applied_an_equal_counter_of_another() -> None:
     machine = election(R1)
     machine.tick(1.5)
-    assert machine.on_applied(R3, Term(1, R3)) == []
+    assert machine.on_applied(R3, Term(1, R3), 0.0) == []
     assert machine.deadline() <= 2.0
     assert claims(machine.tick(2.0)) == [Term(2, R1)]
     assert machine.deadline() == float("inf")
@@ -293,7 +316,7 @@ def test_two_groups_that_merge_agree_on_a_term_above_both() -> None:
         robots.add(name)
     robots.separate("r1 r2", "r3 r4")
     robots.run(6.0)
-    robots.cores["r3"].election.on_applied(LogId("r4"), Term(5, LogId("r3")))
+    robots.cores["r3"].election.on_applied(LogId("r4"), Term(5, LogId("r3")), 0.0)
     robots.run(1.0)
     robots.separate()
     robots.run(5.0)

@@ -3,6 +3,7 @@
 import asyncio
 import re
 import socket
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -12,6 +13,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from flocc_agent.config import ConfigError, MetricsConfig
+from flocc_agent.runtime import metrics
+from flocc_agent.runtime.few_connections import CONNECTIONS_MAX
 from flocc_agent.runtime.metrics import Look, MetricsError, MetricsServer, metrics_of
 from flocc_agent.runtime.transport import TrafficCounter
 from flocc_agent.stages import BOUNDS_S, StageTimes
@@ -116,6 +119,20 @@ async def test_a_look_that_fails_is_an_error_of_that_scrape_alone() -> None:
             await asyncio.to_thread(read, f"http://127.0.0.1:{server.port}/metrics")
     finally:
         await server.close()
+
+
+async def test_idle_connections_are_few_and_leave_room_for_a_scrape(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics._Silent, "timeout", 0.5)
+    server = MetricsServer(MetricsConfig(port=free_port()), "r1", look)
+    threads = threading.active_count()
+    idle = [socket.create_connection(("127.0.0.1", server.port), timeout=10.0) for _ in range(3 * CONNECTIONS_MAX)]
+    ends = [await asyncio.to_thread(connection.recv, 1) for connection in reversed(idle)]
+    assert ends == [b""] * len(idle)
+    assert threading.active_count() <= threads + CONNECTIONS_MAX + 2
+    assert "flocc_" in await asyncio.to_thread(read, f"http://127.0.0.1:{server.port}/metrics")
+    await server.close()
+    for connection in idle:
+        connection.close()
 
 
 async def test_nothing_listens_after_close() -> None:

@@ -129,16 +129,23 @@ def inverse_depths_from(points: Float, T_view_query: Float, observed: Float) -> 
     rays = np.column_stack([points, np.ones(len(points))]) @ T_view_query[:3, :3].T
     seen = np.column_stack([observed, np.ones(len(observed))])
     t = np.broadcast_to(T_view_query[:3, 3], seen.shape)
-    normal, offset = np.cross(seen, t), np.cross(seen, rays)
+    normal, offset = crossed(seen, t), crossed(seen, rays)
     return np.asarray(-(normal * offset).sum(axis=1) / np.maximum((normal * normal).sum(axis=1), 1e-12))
+
+
+def crossed(a: Float, b: Float) -> Float:
+    """Cross products (..., 3), bit for bit `np.cross`'s; that takes twice as long on arrays as small as these."""
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
 def tangent_basis(direction: Float) -> Float:
     """Two orthonormal columns (3, 2) perpendicular to a direction (3,)."""
     axis = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    first = np.cross(direction, axis)
+    first = crossed(direction, axis)
     first /= np.linalg.norm(first)
-    second = np.cross(direction, first)
+    second = crossed(direction, first)
     return np.column_stack([first, second / np.linalg.norm(second)])
 
 
@@ -183,7 +190,7 @@ def _residuals(rays: Float, inverse_depths: Float, view: BundleView, sigma_px: f
     J_P = np.zeros((len(rays), 2, 3))
     J_P[:, 0, 0] = J_P[:, 1, 1] = gain / z
     J_P[:, :, 2] = -projected * (gain / z)[:, None]
-    J_rotation = np.cross(rotated[:, None, :], J_P)
+    J_rotation = crossed(rotated[:, None, :], J_P)
     J_pose = np.concatenate([J_rotation, J_P * inverse_depths[:, None, None]], axis=2)
     return errors, J_pose, J_P @ t
 
