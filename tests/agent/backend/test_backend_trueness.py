@@ -53,7 +53,7 @@ def test_understated_noise_is_found_and_covariances_hold_the_truth() -> None:
     assert all(2.5 < rotation < 6.0 for rotation, _ in component.covariance_factors.values())
     found = uncertainty(component, member.T_world_keyframe)
     assert found is not None
-    assert found.whole < 20.0  # 49 without
+    assert found.whole < 20.0
 
 
 def test_drift_that_keeps_its_direction_is_found_though_every_step_is_within_its_noise() -> None:
