@@ -19,7 +19,7 @@ from flocc_agent.backend.initial import Aligned, component_with, initial_poses
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
-from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scales
+from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scales, with_mean_of_one
 from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
@@ -257,4 +257,7 @@ def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: 
     whole = posed(kept.trajectories, kept.left, Aligned(T, False), config, None).with_scaled(scales)
     start = replace(whole.start, scale=state.scale)
     whole = replace(whole, start=start, trusted=found.posed.trusted)
-    return replace(found, posed=whole, solved=continued(whole.objective, start))
+    solved = continued(whole.objective, start)
+    if not found.estimates.is_metric:
+        solved = replace(solved, state=with_mean_of_one(whole, solved.state))
+    return replace(found, posed=whole, solved=solved)

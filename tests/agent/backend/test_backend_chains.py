@@ -7,7 +7,7 @@ from flocc_agent.backend import chains, optimiser
 from flocc_agent.backend.chains import CHAIN_EDGES_MAX, chains_of, kept_numbers
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation
-from flocc_agent.core.pose_graph import GraphSolution, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import GraphSolution, PoseGraph, Trajectory, stretched
 from flocc_agent.geometry import inverse
 from flocc_lab.bench.generated_graph import GeneratedGraph, generate
 from flocc_protocol.ids import KeyframeId, LogId
@@ -68,6 +68,20 @@ def test_chains_that_are_bent_too_far_are_solved_with_all_keyframes(monkeypatch:
     resolved = solved(graph)
     monkeypatch.setattr(chains, "CHAINED_POSES_MIN", 10**9)
     assert worst_m(resolved, solved(graph)) < 1e-3
+
+
+def test_the_size_of_a_map_whose_scales_are_only_ratios_is_that_of_all_keyframes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    generated = graph_of().graph
+    ratios = dict(zip(sorted(generated.trajectories), (0.9, 1.0, 1.1), strict=True))
+    longer = {log: stretched(Trajectory(t.T_odom_keyframe), ratios[log]) for log, t in generated.trajectories.items()}
+    graph = PoseGraph(longer, generated.closures)
+    monkeypatch.setattr(optimiser, "STRAIN_RATIO_MAX", -1.0)
+    resolved = solved(graph)
+    assert all(scale.is_applied and not scale.is_metric for scale in resolved.components[0].odometry_scales.values())
+    monkeypatch.setattr(chains, "CHAINED_POSES_MIN", 10**9)
+    assert worst_m(resolved, solved(graph)) < 0.5
 
 
 def test_measurements_as_they_are_given_keep_every_keyframe() -> None:
