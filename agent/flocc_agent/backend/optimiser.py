@@ -14,7 +14,6 @@ import numpy as np
 
 from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.chains import STRAIN_RATIO_MAX, Chains, chains_of
-from flocc_agent.backend.far_origins import far_origins
 from flocc_agent.backend.filtering import Filtered, filtered
 from flocc_agent.backend.initial import Aligned, component_with, initial_poses
 from flocc_agent.backend.linear import SingularSystem
@@ -62,10 +61,7 @@ def optimise(
     if graph.saved is not None:
         return _optimise_in_map(graph, graph.saved, config, initial, covariance_of)
     expanded = with_factors(graph, config, initial)
-    origins, begun = far_origins(expanded.graph), expanded.initial
-    near = None if begun is None else origins.near_solution(begun)
-    solution = _optimise(origins.near(expanded.graph), config, near, covariance_of)
-    solution = solution if isinstance(solution, OptimisationFailed) else origins.far_solution(solution)
+    solution = _optimise(expanded.graph, config, expanded.initial, covariance_of)
     return solution if isinstance(solution, OptimisationFailed) else without_factors(solution, graph, expanded)
 
 
