@@ -1,5 +1,7 @@
 """What data cannot decide is said: two places with as many votes. Half turns, where a cost has no slope, are left."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,7 +9,7 @@ from numpy.typing import NDArray
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import inverse, pose, so3_exp, so3_log
+from flocc_agent.geometry import adjoint, inverse, pose, so3_exp, so3_log
 from flocc_lab.graph_family.family_spec import drawn
 from flocc_lab.graph_family.graphs import made
 from flocc_lab.graph_family.methods import settings
@@ -120,3 +122,38 @@ def test_coordinates_in_utm_lose_nothing() -> None:
         first = component.T_map_keyframe[A][0]
         shapes.append(inverse(first) @ np.concatenate([component.T_map_keyframe[log] for log in (A, B)]))
     assert np.abs(shapes[0] - shapes[1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("seed", [66_000_002, 66_000_008])
+def test_drawn_graphs_are_solved_alike_in_utm(seed: int) -> None:
+    """Maps, closures and covariances are those without the offset: a frame's origin is nothing that is measured."""
+    graph = made(drawn(seed)).graph
+    moves = {log: turned(0.0, 6.9e5 + 100.0 * k, 5.3e6) for k, log in enumerate(sorted(graph.trajectories))}
+    far = replace(
+        graph,
+        trajectories={
+            log: replace(each, T_odom_keyframe=moves[log] @ each.T_odom_keyframe)
+            for log, each in graph.trajectories.items()
+        },
+    )
+    asked = [KeyframeId(log, len(each.T_odom_keyframe) - 1) for log, each in sorted(graph.trajectories.items())]
+    one, other = (optimise(each, BackendConfig(), covariance_of=asked) for each in (graph, far))
+    assert isinstance(one, GraphSolution)
+    assert isinstance(other, GraphSolution)
+    again = optimise(far, BackendConfig(), other)
+    assert isinstance(again, GraphSolution)
+    assert [each.state for each in one.closures] == [each.state for each in other.closures]
+    assert [each.logs for each in one.components] == [each.logs for each in other.components]
+    for near, away, warm in zip(one.components, other.components, again.components, strict=True):
+        for log in near.logs:
+            T = moves[near.anchor] @ near.T_map_keyframe[log]
+            assert np.abs(away.T_map_keyframe[log] - T).max() < 1e-3
+            assert np.linalg.norm(warm.T_map_keyframe[log][-1] - T[-1]) < 0.05
+            back = away.T_map_odom[log] @ far.trajectories[log].T_odom_keyframe[-1]
+            assert np.abs(back - away.T_map_keyframe[log][-1]).max() < 1e-3
+            covariance = near.covariance_map_odom[log]
+            if covariance is not None:
+                J = adjoint(moves[log])
+                assert away.covariance_map_odom[log] == pytest.approx(J @ covariance @ J.T, rel=1e-3, abs=1e-6)
+        for keyframe, covariance in near.covariance_keyframe.items():
+            assert away.covariance_keyframe[keyframe] == pytest.approx(covariance, rel=1e-3, abs=1e-9)
