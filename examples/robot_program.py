@@ -47,7 +47,7 @@ async def main() -> None:
     arguments = parser.parse_args()
 
     recording = Recording.open(arguments.recording)
-    config = AgentConfig(name=arguments.name, transport=TransportConfig(interface="lo"))
+    config = AgentConfig(name=arguments.name, swarm="team", transport=TransportConfig(interface="lo"))
     async with Agent(config, recording.camera, recording.T_body_camera) as agent:
         printing = [asyncio.create_task(say(agent)) for say in (print_corrections, print_waiting)]
         stamp_s = recording.frames[0].stamp_s

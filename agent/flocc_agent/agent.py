@@ -39,7 +39,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
-from flocc_agent.runtime.network_faults import found_by, network_faults
+from flocc_agent.runtime.network_faults import found_by, lacks_name, network_faults
 from flocc_agent.runtime.new_journeys import began_anew, last_body
 from flocc_agent.runtime.page_file import PageFile
 from flocc_agent.runtime.persistence import restore
@@ -152,7 +152,7 @@ class Agent:
     async def __aenter__(self) -> "Agent":
         """Open the store and the network, restore what the disk holds, start the loop and the playback."""
         try:
-            logger.info("robot %s: %s", self.config.name, found_by(self.config.transport, self.config.swarm))
+            self._say_how_others_are_found()
             self._driver = await asyncio.to_thread(self._compose)
             if self.config.metrics.port is not None:
                 self._metrics = MetricsServer(self.config.metrics, self.config.name, lambda: self._started.look())
@@ -226,6 +226,12 @@ class Agent:
         logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
         return True
 
+    def _say_how_others_are_found(self) -> None:
+        """A robot that nobody can find is no mere information: a program without logging shows warnings alone."""
+        transport, swarm = self.config.transport, self.config.swarm
+        level = logging.WARNING if lacks_name(transport, swarm) and not transport.roster else logging.INFO
+        logger.log(level, "robot %s: %s", self.config.name, found_by(transport, swarm))
+
     async def _look_at_network(self) -> None:
         """Say once what of the configured network is not there, and when nobody is heard; the agent goes on trying."""
         for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
@@ -236,6 +242,8 @@ class Agent:
             was_silent, is_silent = is_silent, not self._started.robot.neighbours.names()
             if is_silent and not was_silent:
                 logger.warning("%s: hears nobody; 'flocc doctor' looks at the network", self.config.name)
+                if lacks_name(self.config.transport, self.config.swarm):
+                    self._say_how_others_are_found()
                 for fault in await asyncio.to_thread(lambda: [*certificate_faults(self.config.transport.tls)]):
                     logger.warning("%s: %s", self.config.name, fault)
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from tests.doc_props import FOCAL, HEIGHT, WIDTH, photographs, walk
 from tests.launch.bag_fixtures import BagScript
 
+from flocc_agent import AgentConfig
 from flocc_agent.geometry import tq_from_pose
 from flocc_launch.report import read_report
 from flocc_launch.runs.run_folder import RunFolder
@@ -93,13 +95,37 @@ def test_a_map_is_saved_and_opened_again(tmp_path: Path) -> None:
     assert re.search(r"^ok +All \d robots", ran.stdout, re.M), ran.stdout
 
 
-async def test_a_robots_program_says_that_it_waits(capsys: pytest.CaptureFixture[str]) -> None:
-    """Silence would be taken for a fault."""
+def robot_program() -> Any:
     spec = importlib.util.spec_from_file_location("robot_program", EXAMPLES / "robot_program.py")
     assert spec is not None
     assert spec.loader is not None
     program = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(program)
+    return program
+
+
+async def test_two_robots_programs_can_find_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A swarm without a name looks for nobody."""
+    program, made = robot_program(), []
+
+    class Stopped(Exception):
+        pass
+
+    def agent(config: AgentConfig, *_: object) -> None:
+        made.append(config)
+        raise Stopped
+
+    monkeypatch.setattr(program, "Agent", agent)
+    monkeypatch.setattr(program.Recording, "open", lambda _: SimpleNamespace(camera=None, T_body_camera=None))
+    monkeypatch.setattr(sys, "argv", ["robot_program.py", "--name", "r1", "recording"])
+    with pytest.raises(Stopped):
+        await program.main()
+    assert made[0].transport.scouts(made[0].swarm)
+
+
+async def test_a_robots_program_says_that_it_waits(capsys: pytest.CaptureFixture[str]) -> None:
+    """Silence would be taken for a fault."""
+    program = robot_program()
     status = SimpleNamespace(round=None, keyframes=7, neighbours=("r2",))
     saying = asyncio.create_task(program.print_waiting(SimpleNamespace(status=lambda: status), period_s=0.01))
     await asyncio.sleep(0.05)

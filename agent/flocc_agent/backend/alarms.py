@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from flocc_agent.backend.problem import (
-    closure_covariances,
-    diagonal_covariance,
-    initial_scale,
-    prior_sigmas,
+from flocc_agent.backend.pair_closures import PairClosures, Way, measured
+from flocc_agent.backend.relayed import relayed
+from flocc_agent.backend.together import (
+    AGREEING_MIN,
+    Predictions,
+    along,
+    side_by_side,
+    together,
+    with_length,
 )
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
@@ -37,87 +41,13 @@ EXCESS_MAX = 16.0
 """Squared differences are divided by at most so much; where they are larger, closures are wrong, not uncertainties."""
 QUARTER_OF_SIX = 3.455
 """Chi-square of six degrees of freedom: a quarter lies below."""
-COLLAPSED_RATIO = 0.1
-"""A guessed length that becomes shorter than this part of the guess has collapsed; one without a guess, below zero."""
+HALVES_IN_SPACE, HALVES_IN_PLANE = (2.366, 2.366), (0.455, 1.386)
+"""Half of a squared difference lies below these, of rotation and of translation: chi-square of 3 and 3, or 1 and 2."""
+PLANAR_RAD = 1e-6
+"""Robots none of whose closures tilts more have noise in the plane only."""
+AGREEING_PARTNERS_MIN, NO_MISTAKE_RATIO = 2, 0.5
+"""A closure with which so many others agree, and this part of those that speak against it, is not held for them."""
 FIXED_M = 1e-6
-ODOMETRY_LENGTH_SIGMA = 0.05
-"""What odometry's lengths may be off by, beside its noise."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Way:
-    """One robot's odometry, with sums from which the uncertainty of any piece follows.
-
-    Attributes:
-        T: (N, 4, 4) poses.
-        rotation: (N,) variance of rotation up to each keyframe, rad^2.
-        levered: (N, 3) the same of each edge times where it lies, summed up.
-        squared: (N,) the same times the square of where it lies.
-        translation: (N,) variance of translation, m^2.
-    """
-
-    T: Float
-    rotation: Float
-    levered: Float
-    squared: Float
-    translation: Float
-
-    @classmethod
-    def of(cls, trajectory: Trajectory, config: BackendConfig) -> "Way":
-        """Sum up a trajectory's covariances, each taken as isotropic: the largest of its three variances."""
-        T = np.asarray(trajectory.T_odom_keyframe, dtype=float)
-        S = trajectory.edge_covariances
-        if S is None:
-            one = diagonal_covariance(config.odometry_rotation_sigma_rad, config.odometry_translation_sigma_m)
-            S = np.broadcast_to(one, (len(T) - 1, 6, 6))
-        variances = np.diagonal(S, axis1=1, axis2=2)
-        turning, moving = variances[:, :3].max(axis=1), variances[:, 3:].max(axis=1)
-        at = T[1:, :3, 3]
-        levered, squared = turning[:, None] * at, turning * np.einsum("ni,ni->n", at, at)
-        return cls(T, _summed(turning), _summed(levered), _summed(squared), _summed(moving))
-
-    def variances(self, i: Int, j: Int, x: Float) -> tuple[Float, Float]:
-        """Variances (K,) between keyframes i and j (K,): of rotation, and of a point x (K, 3) that is held by j."""
-        low, high = np.minimum(i, j), np.maximum(i, j)
-        rotation = self.rotation[high] - self.rotation[low]
-        lever = self.levered[high] - self.levered[low]
-        squared = self.squared[high] - self.squared[low]
-        swung = squared - 2.0 * np.einsum("ki,ki->k", x, lever) + rotation * np.einsum("ki,ki->k", x, x)
-        stretch = ODOMETRY_LENGTH_SIGMA**2 * np.sum((self.T[i, :3, 3] - self.T[j, :3, 3]) ** 2, axis=1)
-        return rotation, np.maximum(swung, 0.0) + self.translation[high] - self.translation[low] + stretch
-
-
-def _summed(values: Float) -> Float:
-    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairClosures:
-    """Closures of one pair of robots, from the lower keyframe to the higher one.
-
-    Attributes:
-        ids: (K,) numbers in the graph.
-        i: (K,) keyframe of the lower log.
-        j: (K,) keyframe of the higher log.
-        T: (K, 4, 4) pose of j in i, in metres at the initial scale.
-        u: (K, 3) direction of its translation.
-        length_m: (K,) of its translation.
-        length_sigma_m: (K,) standard deviation of that by a free scale.
-        shorter_max_m: (K,) by how much the length may become shorter before its scale has collapsed.
-        rotation: (K,) variance, rad^2.
-        translation: (K,) variance, m^2.
-    """
-
-    ids: Int
-    i: Int
-    j: Int
-    T: Float
-    u: Float
-    length_m: Float
-    length_sigma_m: Float
-    shorter_max_m: Float
-    rotation: Float
-    translation: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +79,10 @@ class Compared:
     allowed_m: Float
     allowed_rad: Float
 
+    def turned_sigmas(self) -> Float:
+        """The difference in rotation over its standard deviation."""
+        return self.apart_rad / self.allowed_rad
+
     def shaped(self, shape: tuple[int, ...]) -> "Compared":
         """The same in another shape."""
         return Compared(*(getattr(self, f.name).reshape(shape) for f in fields(self)))
@@ -167,12 +101,18 @@ class Judges:
         partners: (K, P) places of the nearest others; itself where there are fewer.
         with_partners: (K, P) how they compare.
         with_odometry: (K,) of closures within a robot; None of others.
+        with_all: (K,) how they compare with what the others, odometry and ways by third robots say together.
+        collapse: (K,) by how much that is worse because a length may not become shorter.
+        counts: (K,) whether those agree among themselves.
     """
 
     closures: PairClosures
     partners: Int
     with_partners: Compared
     with_odometry: Compared | None
+    with_all: Compared
+    collapse: Float
+    counts: Bool
 
     @property
     def size(self) -> int:
@@ -196,56 +136,83 @@ def held_closures(
             continue
         low, high = sorted((closure.query, closure.match))
         pairs.setdefault((low.log, high.log), []).append(k)
-    judges = [judges_of(ways[a], ways[b], measured(ids, closures, config), a == b) for (a, b), ids in pairs.items()]
-    excess = excess_of(judges)
-    bound = excess * float(chdtri(6.0, 1.0 - config.inlier_probability))
+    of_pairs = {pair: measured(ids, closures, config) for pair, ids in pairs.items()}
+    bound, bound_of_one = (float(chdtri(freedom, 1.0 - config.inlier_probability)) for freedom in (6.0, 1.0))
+    judges = [judges_of(pair, ways, of_pairs, bound) for pair in of_pairs]
+    excess, of_all = excess_of(judges), excess_with_all(judges)
+    bounds_of_all = of_all * bound, of_all * bound_of_one
     held: dict[int, str] = {}
     for of_pair in judges:
-        for n, reason in alarms(of_pair, bound, excess).items():
+        for n, reason in alarms(of_pair, excess * bound, bounds_of_all, excess).items():
             k = int(of_pair.closures.ids[n])
             named = f"closure {closures[k].query} - {closures[k].match}"
             held[k] = f"{named}: held until another one agrees with it, because {reason}"
     return held
 
 
-def measured(ids: list[int], closures: Mapping[int, LoopClosure], config: BackendConfig) -> PairClosures:
-    """Closures of one pair of robots, turned so that the lower keyframe comes first."""
-    chosen = [closures[k] for k in ids]
-    scale = np.array([initial_scale(c, config) for c in chosen])
-    T = np.array([c.T_query_match_unscaled for c in chosen], dtype=float)
-    T[:, :3, 3] *= scale[:, None]
-    turned = np.array([c.match < c.query for c in chosen], dtype=bool)
-    T[turned] = inverse(T[turned])
-    ends = [sorted((c.query, c.match)) for c in chosen]
-    variances = np.diagonal(closure_covariances(chosen, scale, config), axis1=1, axis2=2)
-    free = np.array([not c.metric for c in chosen], dtype=bool)
-    sigmas = prior_sigmas(chosen, config)
-    length_m = np.linalg.norm(T[:, :3, 3], axis=1)
-    return PairClosures(
-        ids=np.array(ids),
-        i=np.array([low.index for low, _ in ends]),
-        j=np.array([high.index for _, high in ends]),
-        T=T,
-        u=T[:, :3, 3] / np.maximum(length_m, 1e-12)[:, None],
-        length_m=length_m,
-        length_sigma_m=np.where(free, sigmas * length_m, 0.0),
-        shorter_max_m=np.where(sigmas < 1.0, 1.0 - COLLAPSED_RATIO, 1.0) * length_m,
-        rotation=variances[:, :3].max(axis=1),
-        translation=variances[:, 3:].max(axis=1),
-    )
-
-
-def judges_of(a: Way, b: Way, closures: PairClosures, is_own: bool) -> Judges:
+def judges_of(
+    pair: tuple[LogId, LogId],
+    ways: Mapping[LogId, Way],
+    of_pairs: Mapping[tuple[LogId, LogId], PairClosures],
+    bound: float,
+) -> Judges:
     """Compare each closure with its nearest others, and with odometry where both keyframes are one robot's."""
+    a, b, closures = ways[pair[0]], ways[pair[1]], of_pairs[pair]
     count = len(closures.ids)
     at = np.stack([closures.i, closures.j], axis=1)
     partners = own = np.arange(count)[:, None]
     if count > 1:
         partners = cKDTree(at).query(at, k=np.arange(2, min(PARTNERS + 1, count) + 1), p=1)[1]
     k, m = np.repeat(np.arange(count), partners.shape[1]), partners.ravel()
-    by_partners = compared(closures, k, *said_by(a, b, closures, k, m))
-    by_odometry = compared(closures, own[:, 0], *said_by_odometry(a, closures)) if is_own else None
-    return Judges(closures, partners, by_partners.shaped(partners.shape), by_odometry)
+    said = said_by(a, b, closures, k, m)
+    by_partners = compared(closures, k, *said).shaped(partners.shape)
+    said_by_all = [predictions(*said, partners.shape, partners != own)]
+    by_odometry = None
+    if pair[0] == pair[1]:
+        said = said_by_odometry(a, closures)
+        by_odometry = compared(closures, own[:, 0], *said)
+        said_by_all.append(predictions(*said, (count, 1), np.ones((count, 1), dtype=bool)))
+    elif count <= AGREEING_MIN:
+        said_by_all.append(relayed(pair, ways, of_pairs))
+    return Judges(
+        closures, partners, by_partners, by_odometry, *compared_with_all(closures, side_by_side(said_by_all), bound)
+    )
+
+
+def predictions(
+    T: Float, rotation: Float, translation: Float, free: Ray, shape: tuple[int, ...], there: Bool
+) -> Predictions:
+    """What closures or odometry say, one after the other, as predictions (K, P)."""
+    covariance = translation[:, None, None] * np.eye(3) + along(free.u, free.sigma_m)
+    return Predictions(
+        T[:, :3, :3].reshape(*shape, 3, 3),
+        T[:, :3, 3].reshape(*shape, 3),
+        rotation.reshape(shape),
+        covariance.reshape(*shape, 3, 3),
+        translation.reshape(shape),
+        there,
+    )
+
+
+def compared_with_all(c: PairClosures, said: Predictions, bound: float) -> tuple[Compared, Float, Bool]:
+    """Compare closures with what predictions say together; what it costs to hold lengths; whether those count."""
+    all_ = together(said, bound)
+    variance_rad = all_.rotation + c.rotation
+    cosine = 0.5 * (np.einsum("kij,kij->k", c.T[:, :3, :3], all_.R) - 1.0)
+    apart_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+    off = all_.t - c.T[:, :3, 3]
+    covariance = all_.covariance + c.translation[:, None, None] * np.eye(3)
+    squared, collapse, change = with_length(off, covariance, c.u, c.length_sigma_m, c.shorter_max_m)
+    left = off - change[:, None] * c.u
+    by_all = Compared(
+        squared=squared + apart_rad**2 / variance_rad,
+        falls=collapse > 0.0,
+        apart_m=np.linalg.norm(left, axis=1),
+        apart_rad=apart_rad,
+        allowed_m=np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3.0),
+        allowed_rad=np.sqrt(variance_rad),
+    )
+    return by_all, collapse, all_.counts
 
 
 def said_by(a: Way, b: Way, c: PairClosures, k: Int, m: Int) -> tuple[Float, Float, Float, Ray]:
@@ -332,10 +299,25 @@ def excess_of(judges: list[Judges]) -> float:
     return float(np.clip(np.median(np.concatenate(quarter)) / QUARTER_OF_SIX, 1.0, EXCESS_MAX))
 
 
-def alarms(judges: Judges, bound: float, excess: float) -> dict[int, str]:
+def excess_with_all(judges: list[Judges]) -> float:
+    """The same of what closures say together: from the half that fits best, in rotation or in translation."""
+    counted = [of_pair for of_pair in judges if np.any(of_pair.counts)]
+    if not counted:
+        return 1.0
+    squared = np.concatenate([of_pair.with_all.squared[of_pair.counts] for of_pair in counted])
+    turned = np.concatenate([(of_pair.with_all.turned_sigmas() ** 2)[of_pair.counts] for of_pair in counted])
+    tilt = max(float(np.abs(of_pair.closures.T[:, 2, :2]).max()) for of_pair in counted)
+    rotation, translation = HALVES_IN_PLANE if tilt < PLANAR_RAD else HALVES_IN_SPACE
+    worse = max(float(np.median(turned)) / rotation, float(np.median(squared - turned)) / translation)
+    return float(np.clip(worse, 1.0, EXCESS_MAX))
+
+
+def alarms(judges: Judges, bound: float, bounds_of_all: tuple[float, float], excess: float) -> dict[int, str]:
     """Reasons for holding closures of one pair of robots, by place.
 
-    Partners vote with their certainty; against a closure only those with more agreement of their own.
+    Partners vote with their certainty; against a closure only those with more agreement of their own. Where half as
+    many agree it is no single mistake: the solver decides, and says so. The bounds of what all say together are those
+    of the whole difference, and of a length that would have to collapse.
     """
     count, by = judges.size, judges.with_partners
     others = judges.partners != np.arange(count)[:, None]
@@ -344,10 +326,16 @@ def alarms(judges: Judges, bound: float, excess: float) -> dict[int, str]:
     against = others & ~agree & (agreement[judges.partners] > agreement[:, None])
     certainty = 1.0 / by.allowed_m**2
     outvoted = np.sum(certainty * against, axis=1) > np.sum(certainty * agree, axis=1)
+    agreeing = agree.sum(axis=1)
+    outvoted &= (agreeing < AGREEING_PARTNERS_MIN) | (agreeing < NO_MISTAKE_RATIO * against.sum(axis=1))
     reasons = {}
     for n in np.flatnonzero(outvoted).tolist():
         p = int(np.argmax(certainty[n] * against[n]))
         reasons[n] = _reason(by.at((n, p)), bool(by.falls[n, p]), excess, "closures around it")
+    all_ = judges.with_all
+    disagrees = (all_.squared > bounds_of_all[0]) | (judges.collapse > bounds_of_all[1])
+    for n in np.flatnonzero(judges.counts & disagrees).tolist():
+        reasons.setdefault(n, _reason(all_.at(n), bool(all_.falls[n]), excess, "the closures around it"))
     if judges.with_odometry is not None:
         own, alone = judges.with_odometry, ~np.any(agree, axis=1)
         for n in np.flatnonzero(alone & (own.squared > bound)).tolist():

@@ -10,7 +10,7 @@ closures with the robots that are there already as judges, because a robot may b
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,13 @@ class Rays:
     def rotations_a_b(self) -> Float:
         """Rotation (K, 3, 3) of frame b in frame a that each closure proposes."""
         return self.T_i[:, :3, :3] @ self.R_hat @ np.swapaxes(self.T_j[:, :3, :3], 1, 2)
+
+    def moved(self, by_a: Float, by_b: Float) -> "Rays":
+        """The same with the keyframes of each side moved by (3,) in their odom frame."""
+        T_i, T_j = self.T_i.copy(), self.T_j.copy()
+        T_i[:, :3, 3] += by_a
+        T_j[:, :3, 3] += by_b
+        return replace(self, T_i=T_i, T_j=T_j)
 
     def origins(self, R_a_b: Float) -> Float:
         """Start (K, 3) of each ray, for a rotation of frame b in frame a."""
@@ -172,7 +179,19 @@ def rays_from(
 
 
 def align_pair(rays: Rays, hypotheses_max: int = HYPOTHESES_MAX) -> PairAlignment:
-    """Find the pose of frame b in frame a with which the most closures agree, and average those."""
+    """Find the pose of frame b in frame a with which the most closures agree, and average those.
+
+    Frames turn about the middle of their keyframes: about an origin 5,000 km away (UTM) the least difference between
+    two rotations would be kilometres.
+    """
+    middle_a, middle_b = rays.T_i[:, :3, 3].mean(axis=0), rays.T_j[:, :3, 3].mean(axis=0)
+    found = _align_near(rays.moved(-middle_a, -middle_b), hypotheses_max)
+    R, t = found.T_a_b[:3, :3], found.T_a_b[:3, 3]
+    return replace(found, T_a_b=pose(R, middle_a + t - R @ middle_b))
+
+
+def _align_near(rays: Rays, hypotheses_max: int) -> PairAlignment:
+    """The same for frames whose origins are near."""
     R_all = rays.rotations_a_b()
     best_score, best_R, best_t, best_tolerance = -1.0, np.eye(3), np.zeros(3), np.ones(len(R_all))
     judges = evenly(np.arange(len(R_all)), SCORED_MAX)

@@ -9,6 +9,7 @@ from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.problem import Problem
+from flocc_agent.backend.trueness import Inflation
 from flocc_agent.core.pose_graph import Component, Trajectory
 from flocc_agent.geometry import Float, adjoint
 from flocc_protocol.ids import KeyframeId, LogId
@@ -26,8 +27,9 @@ def covariances_of(
     solved: Solved,
     trajectories: Mapping[LogId, Trajectory],
     wanted: Sequence[KeyframeId],
+    larger: Mapping[LogId, Inflation],
 ) -> tuple[dict[LogId, Float | None], dict[KeyframeId, Float]]:
-    """Marginal covariances (6, 6), relative to the anchor's first keyframe.
+    """Marginal covariances (6, 6), relative to the anchor's first keyframe, made larger as residuals say.
 
     Returns:
         Of every log's `T_map_odom` in the tangent space of that pose (None where not configured or computable), and of
@@ -44,6 +46,7 @@ def covariances_of(
     except SingularSystem as error:
         logger.warning("%s: no covariances, the graph is too badly conditioned: %.80s", problem.logs[0], error)
         return of_logs, {}
+    marginals = [larger[keyframe.log].of(S) for keyframe, S in zip(every, marginals, strict=True)]
     for keyframe, S in zip(last, marginals, strict=False):
         Ad = adjoint(np.asarray(trajectories[keyframe.log].T_odom_keyframe[-1], dtype=float))
         of_logs[keyframe.log] = _usable(Ad @ S @ Ad.T)

@@ -13,6 +13,7 @@ from flocc_agent.backend.problem import Problem
 from flocc_agent.backend.scale_report import odometry_warnings, scale_warnings
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
 from flocc_agent.backend.ties import tie_warnings
+from flocc_agent.backend.trueness import inflations, told
 from flocc_agent.config import Solver
 from flocc_agent.core.pose_graph import ClosureResult, ClosureState, Component, LoopClosure, OdometryScale, Trajectory
 from flocc_agent.geometry import Float, inverse
@@ -131,10 +132,12 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         for log in problem.logs
     }
     kept = kept_covariances(objective, problem, solution.earlier, wanted)
+    larger = told(found := inflations(problem, solution.solved))
     if kept is None:
-        of_logs, of_keyframes = covariances_of(problem, objective, solution.solved, trajectories, places)
+        of_logs, of_keyframes = covariances_of(problem, objective, solution.solved, trajectories, places, found)
     else:
         of_logs, of_keyframes = dict(kept), {}
+        larger = dict(solution.earlier.covariance_factors) if solution.earlier is not None else larger
     component = Component(
         logs=problem.logs,
         T_map_keyframe=T_map_keyframe,
@@ -145,6 +148,7 @@ def _component(solution: Solution, wanted: Sequence[KeyframeId]) -> Component:
         covariance_keyframe=of_keyframes,
         covariance_rounds=0 if kept is None or solution.earlier is None else solution.earlier.covariance_rounds + 1,
         odometry_scales=solution.odometry_scales,
+        covariance_factors=larger if objective.config.covariances else {},
     )
     if chains is None:
         return component

@@ -47,6 +47,9 @@ TOLD_MAX = 16
 """Keyframes whose poses people are told with each correction; the report interpolates between them."""
 COVARIANCE_CHANGE_RATIO = 0.1
 """A correction whose covariance changed by more than this is sent again although nothing moved."""
+KNOTS_PAUSE_PER_LOG_S = 0.04
+"""After knots of its log came a robot asks for newer ones only after this for each log that it knows a correction of:
+in a large team every round moves every log, and each question goes over many robots."""
 
 UNTRUE = "a correction that cannot be true"
 
@@ -108,6 +111,7 @@ class Corrections:
         self._newest: dict[LogId, LogCorrection] = {}
         self._whole: dict[LogId, LogCorrection] = {}
         self._requests = KnotRequests(towards)
+        self._knots_s = float("-inf")
         self._follows_all = False
         self._frame_unknown = False
         self._wanted: dict[LogId, _Wanted] = {}
@@ -193,9 +197,15 @@ class Corrections:
         for log in self._newest if self._follows_all else (self._own,):
             short = self._newest.get(log)
             if short is not None and not self._has_knots(short.version) and not self.doubts.knows(short.version):
-                comes_by_itself = self._near(short.term.leader.robot) and log == self._own
-                self._requests.want(short.version, now + (GRACE_S if comes_by_itself else 0.0))
+                self._requests.want(short.version, self._knots_not_before_s(short, now))
         return self._requests.ask(now)
+
+    def _knots_not_before_s(self, short: LogCorrection, now: float) -> float:
+        """When to ask for knots: at once but for the own ones, which may come by themselves, or came just now."""
+        if short.log != self._own:
+            return now
+        grace_s = GRACE_S if self._near(short.term.leader.robot) else 0.0
+        return max(now + grace_s, self._knots_s + KNOTS_PAUSE_PER_LOG_S * len(self._newest))
 
     def on_knot_request(self, peer: str, request: KnotRequest, now: float) -> list[Effect]:
         """Send the knots that are here; ask on for others, and pass them on when they come."""
@@ -255,6 +265,8 @@ class Corrections:
             return []
         held = self._whole.get(message.log)
         self._whole[message.log] = message
+        if message.log == self._own:
+            self._knots_s = now
         effects: list[Effect] = [Unicast(peer, CorrectionBatch((message,))) for peer in passed_on]
         return effects + (self._apply(message, held) if message.log == self._own else [])
 

@@ -60,23 +60,26 @@ def _block_of(records: Sequence[bytes]) -> _Block:
 
 
 class EncodedRecords(Sequence[bytes]):
-    """Records' bytes, in order; only ever longer, but for `truncate`."""
+    """Records' bytes, in order; only ever longer, but for `truncate`. Other threads may read while one appends."""
 
     def __init__(self, records: Iterable[bytes] = (), cold: ColdPieces | None = None) -> None:
         """Start with these; with a cold storage, old blocks leave memory."""
         self._full: list[_Block | _ColdBlock] = []
-        self._tail: list[bytes] = []
+        self._end: tuple[int, list[bytes]] = (0, [])
+        """How many blocks are full, and the records after them; replaced as one, so that readers see both."""
         self._cold = cold
         for record in records:
             self.append(record)
 
     def __len__(self) -> int:
-        return len(self._full) * BLOCK_RECORDS + len(self._tail)
+        full, tail = self._end
+        return full * BLOCK_RECORDS + len(tail)
 
     def __iter__(self) -> Iterator[bytes]:
-        for number in range(len(self._full)):
+        full, tail = self._end
+        for number in range(full):
             yield from map(self._block(number).record, range(BLOCK_RECORDS))
-        yield from self._tail
+        yield from tail
 
     @overload
     def __getitem__(self, index: int) -> bytes: ...
@@ -85,20 +88,22 @@ class EncodedRecords(Sequence[bytes]):
     def __getitem__(self, index: slice) -> list[bytes]: ...
 
     def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
+        end = self._end
+        count = end[0] * BLOCK_RECORDS + len(end[1])
         if isinstance(index, slice):
-            return [self._at(k) for k in range(*index.indices(len(self)))]
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"record {index} of {len(self)}")
-        return self._at(index % len(self))
+            return [self._at(k, end) for k in range(*index.indices(count))]
+        if not -count <= index < count:
+            raise IndexError(f"record {index} of {count}")
+        return self._at(index % count, end)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Sequence) and list(self) == list(other)
 
     __hash__ = None  # type: ignore[assignment]  # it grows
 
-    def _at(self, index: int) -> bytes:
+    def _at(self, index: int, end: tuple[int, list[bytes]]) -> bytes:
         number, k = divmod(index, BLOCK_RECORDS)
-        return self._tail[k] if number == len(self._full) else self._block(number).record(k)
+        return end[1][k] if number == end[0] else self._block(number).record(k)
 
     def _block(self, number: int) -> _Block:
         block = self._full[number]
@@ -120,17 +125,18 @@ class EncodedRecords(Sequence[bytes]):
 
     def append(self, data: bytes) -> None:
         """Add the next record."""
-        self._tail.append(data)
-        if len(self._tail) == BLOCK_RECORDS:
-            self._full.append(_block_of(self._tail))
-            self._tail = []
+        full, tail = self._end
+        tail.append(data)
+        if len(tail) == BLOCK_RECORDS:
+            self._full.append(_block_of(tail))
+            self._end = (full + 1, [])
             if self._cold is not None:
-                self._cold.add(self, len(self._full) - 1)
+                self._cold.add(self, full)
 
     def truncate(self, count: int) -> None:
         """Keep so many records."""
         number, k = divmod(min(count, len(self)), BLOCK_RECORDS)
-        self._tail = self[number * BLOCK_RECORDS : number * BLOCK_RECORDS + k]
+        self._end = (number, self[number * BLOCK_RECORDS : number * BLOCK_RECORDS + k])
         del self._full[number:]
 
     def block_checksum(self, number: int, k: int, before: int) -> int:
@@ -198,6 +204,11 @@ class LogCopy:
     def records(self) -> Sequence[Record]:
         """The records without descriptors, decoded when they are looked at."""
         return _DecodedRecords(self.encoded, self._seal_bytes)
+
+    def other_records(self) -> Iterator[Record]:
+        """The records that are no keyframes; keyframes are not even decoded."""
+        others = (data for data in self.encoded if data[CODE_AT] != KEYFRAME_CODE)
+        return (decoded(data[: len(data) - self._seal_bytes])[1] for data in others)
 
     @property
     def checksum(self) -> int:

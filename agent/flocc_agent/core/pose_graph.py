@@ -193,6 +193,8 @@ class Component:
         T_map_landmark: (4, 4) pose of each landmark, by name: `tag/NAME`, `world`, `earth` (east, north, up).
         covariance_rounds: How many rounds ago `covariance_map_odom` was computed; 0 for this one.
         odometry_scales: Of each log whose odometry could be compared with something.
+        covariance_factors: What the variances of each log's rotations and translations were multiplied by, because
+            residuals are larger than stated uncertainties or keep their direction; at least 1.
     """
 
     logs: tuple[LogId, ...]
@@ -206,6 +208,7 @@ class Component:
     T_map_landmark: Mapping[str, Float] = field(default_factory=dict)
     covariance_rounds: int = 0
     odometry_scales: Mapping[LogId, OdometryScale] = field(default_factory=dict)
+    covariance_factors: Mapping[LogId, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def anchor(self) -> LogId:

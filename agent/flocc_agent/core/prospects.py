@@ -75,7 +75,7 @@ class Prospects:
         if not is_closure:
             return []
         remember(self._closures, pair, None, UNLIKELY_MAX)
-        again = [other for other in beside(pair) if other in self._unlikely]
+        again = [other for other in beside(pair) if other in self._unlikely] if self._unlikely else []
         for other in again:
             del self._unlikely[other]
         return again

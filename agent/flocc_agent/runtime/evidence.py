@@ -71,7 +71,7 @@ def pairs_of(robot: Robot) -> dict[tuple[str, str], PairEvidence]:
 
 def judgements(robot: Robot) -> Iterator[ClosureRecord | RejectionRecord]:
     """Every judgement in all logs, closures first: what anybody accepted is accepted."""
-    records = [record for _, copy in sorted(robot.gossip.logs.items()) for record in copy.records]
+    records = [record for _, copy in sorted(robot.gossip.logs.items()) for record in copy.other_records()]
     yield from (record for record in records if isinstance(record, ClosureRecord))
     yield from (record for record in records if isinstance(record, RejectionRecord))
 

@@ -22,9 +22,14 @@ def found_by(config: TransportConfig, swarm: str) -> str:
     if config.roster:
         ways.append(f"at the addresses of {len(config.roster)} robots (transport.roster)")
     found = f"swarm {swarm}: " + (f"others are found {' and '.join(ways)}" if ways else "waits for others to dial it")
-    if config.multicast and not config.scouts(swarm):
+    if lacks_name(config, swarm):
         found += '; the swarm has no name (swarm = "..."), so that it looks for nobody by multicast'
     return found
+
+
+def lacks_name(config: TransportConfig, swarm: str) -> bool:
+    """Whether a robot that is to scout does not, since nobody named its swarm."""
+    return config.multicast and not config.scouts(swarm)
 
 
 def network_faults(config: TransportConfig, robot: str) -> list[str]:

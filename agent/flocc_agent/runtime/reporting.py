@@ -117,7 +117,7 @@ def closures_known(robot: Robot, solution: GraphSolution | None) -> list[Closure
     scales = {} if solution is None else {CandidatePair.of(c.query, c.match): c.scale for c in solution.closures}
     found: dict[CandidatePair, ClosureRecord] = {}
     for _, copy in sorted(robot.gossip.logs.items()):
-        for record in copy.records:
+        for record in copy.other_records():
             if isinstance(record, ClosureRecord):
                 found.setdefault(CandidatePair.of(record.query, record.match), record)
     return [

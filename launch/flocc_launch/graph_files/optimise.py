@@ -169,6 +169,11 @@ def report(file: GraphFile, config: BackendConfig, solution: GraphSolution) -> d
         "solve_s": solution.solve_s,
         "timings_s": dict(solution.timings_s),
         "components": [{"map_frame": c.map_frame, "logs": [str(log) for log in c.logs]} for c in solution.components],
+        "covariance_factors": {
+            str(log): [round(factor, 3) for factor in factors]
+            for c in solution.components
+            for log, factors in sorted(c.covariance_factors.items())
+        },
         "closures": len(solution.closures),
         "closures_used": sum(c.state is ClosureState.USED for c in solution.closures),
         "closures_rejected": _named(solution, ClosureState.REJECTED),

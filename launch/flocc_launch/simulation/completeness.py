@@ -104,7 +104,7 @@ def _alike(one: Described, other: Described, threshold: float) -> Iterator[Candi
 
 def resolved_pairs(logs: dict[LogId, LogCopy]) -> set[CandidatePair]:
     """Pairs of which some log has a record."""
-    records = (record for copy in logs.values() for record in copy.records)
+    records = (record for copy in logs.values() for record in copy.other_records())
     return {CandidatePair.of(r.query, r.match) for r in records if isinstance(r, ClosureRecord | RejectionRecord)}
 
 

@@ -80,7 +80,7 @@ def _unused_closures(leader: Station) -> Iterator[str]:
     known = set() if leader.solution is None else {CandidatePair.of(c.query, c.match) for c in leader.solution.closures}
     logs = core(leader).gossip.logs
     keyframes = {log: copy.keyframes for log, copy in logs.items()}
-    for record in (record for copy in logs.values() for record in copy.records):
+    for record in (record for copy in logs.values() for record in copy.other_records()):
         if not isinstance(record, ClosureRecord) or CandidatePair.of(record.query, record.match) in known:
             continue
         if all(end.index < keyframes.get(end.log, 0) for end in (record.query, record.match)):

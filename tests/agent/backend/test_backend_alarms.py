@@ -14,17 +14,18 @@ from flocc_agent.geometry import inverse, pose, so3_exp
 from flocc_lab.graph_family.family_spec import Lengths, drawn
 from flocc_lab.graph_family.graphs import Member, made
 from flocc_lab.graph_family.methods import settings
+from flocc_lab.graph_family.single_false import outcome
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 FIRST, SECOND = LogId("r00"), LogId("r01")
 
 
-def two_robots(lengths: Lengths = Lengths.METRIC, noise_factor: float = 1.0) -> Member:
+def two_robots(lengths: Lengths = Lengths.METRIC, noise_factor: float = 1.0, robots: int = 2) -> Member:
     spec = replace(
         drawn(8),
-        keyframes=(120, 120),
-        scale_off=(1.0, 1.0),
+        keyframes=(120,) * robots,
+        scale_off=(1.0,) * robots,
         lengths=lengths,
         closures=60,
         odometry=(0.002, 0.02),
@@ -118,6 +119,25 @@ def test_a_closure_whose_scale_would_collapse_is_held() -> None:
     false = replace(chosen, query=beside, T_query_match_unscaled=reversed_T, scale_initial=1.0)
     (reason,) = held(member, false).values()
     assert "its scale would collapse" in reason
+
+
+@pytest.mark.parametrize("seed", [78, 80, 91, 109])
+def test_false_closures_that_agree_with_one_other_but_not_with_several_are_held(seed: int) -> None:
+    """One without a length leaves its direction open, and nearly anything agrees with it."""
+    found = outcome(seed)
+    assert found is not None
+    assert (found.damages, found.held, found.held_long) == (True, True, 0)
+
+
+def test_the_only_closure_of_two_robots_is_compared_by_way_of_third_ones() -> None:
+    member = two_robots(robots=3)
+    third = LogId("r02")
+    others = [c for c in member.graph.closures if {c.query.log, c.match.log} != {FIRST, third}]
+    others += [said(member, KeyframeId(SECOND, k), KeyframeId(third, k), np.eye(4)) for k in (50, 60, 70)]
+    member = replace(member, graph=PoseGraph(member.graph.trajectories, others))
+    ends = KeyframeId(FIRST, 60), KeyframeId(third, 60)
+    assert held(member, said(member, *ends, np.eye(4))) == {}
+    assert list(held(member, said(member, *ends, MOVED))) == [len(others)]
 
 
 def test_the_solution_excludes_it_warns_and_is_as_without_it() -> None:

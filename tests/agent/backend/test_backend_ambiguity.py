@@ -66,6 +66,13 @@ def test_two_places_with_as_many_closures_are_named(closures: list[LoopClosure])
     assert "180 degrees away" in sentence
 
 
+def test_one_closure_more_on_one_side_is_a_tie_too_and_nothing_is_held_for_it() -> None:
+    solution = solved(saying(turned(0.0, 5.0), [(k, k + 1) for k in range(5)]) + BEHIND)
+    assert [w for w in solution.warnings if "held until" in w] == []
+    (sentence,) = [w for w in solution.warnings if "look the same" in w]
+    assert sentence.startswith("robots a and b: 5 closures agree on the place that was taken, and 4 others on another")
+
+
 @pytest.mark.parametrize("closures", [IN_FRONT, IN_FRONT + BEHIND[:1], IN_FRONT + SCATTERED])
 def test_closures_that_agree_on_no_other_place_are_no_tie(closures: list[LoopClosure]) -> None:
     assert [w for w in solved(closures).warnings if "look the same" in w] == []

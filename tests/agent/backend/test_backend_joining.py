@@ -73,7 +73,7 @@ def test_right_closures_win_over_a_wrong_one_that_came_first() -> None:
     later = solved([*JOIN_2_3, wrong(R1, 5, R2, 9), *JOIN_1_3], initial=first)
     assert frames(later) == [["r1", "r2", "r3"]]
     states = [result.state for result in later.closures]
-    assert states[len(JOIN_2_3)] is ClosureState.REJECTED
+    assert states[len(JOIN_2_3)] is ClosureState.EXCLUDED  # held: the way through r3 contradicts it
     assert states[len(JOIN_2_3) + 1 :] == [ClosureState.USED] * len(JOIN_1_3)
 
 

@@ -7,7 +7,7 @@ import pytest
 from tests.agent.core.virtual_time import Robots
 from tests.protocol.wire_examples import knots
 
-from flocc_agent.core.corrections import ASKED_MAX, TOLD_MAX, Corrections
+from flocc_agent.core.corrections import ASKED_MAX, KNOTS_PAUSE_PER_LOG_S, TOLD_MAX, Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.election import FIRST_COUNTER_MAX
 from flocc_agent.core.events import MessageReceived
@@ -352,6 +352,18 @@ def test_knots_that_a_leader_in_range_sends_by_itself_are_not_asked_for_at_once(
     assert owner.on_message("r1", short(message), 0.0) == []
     assert owner.ask_knots(GRACE_S) == [Unicast("r1", KnotRequest((message.version,)))]
     assert owner.ask_knots(GRACE_S) == []
+
+
+@pytest.mark.parametrize("logs", [2, 50])
+def test_after_knots_came_the_next_are_asked_for_after_a_pause_that_grows_with_the_team(logs: int) -> None:
+    owner = Corrections(R1, GossipParameters(), towards=lambda term: ["r2"])
+    for k in range(2, logs + 1):
+        owner.on_message("r2", short(correction(Term(1, R2), 1, log=LogId(f"r{k}"))), 0.0)
+    owner.on_message("r2", correction(Term(1, R2), 1), 10.0)
+    message, pause_s = correction(Term(1, R2), 2), KNOTS_PAUSE_PER_LOG_S * logs
+    assert owner.on_message("r2", short(message), 10.0) == []
+    assert owner.ask_knots(10.0 + 0.9 * pause_s) == []
+    assert owner.ask_knots(10.0 + pause_s) == [Unicast("r2", KnotRequest((message.version,)))]
 
 
 def test_knots_of_others_that_nobody_waits_for_are_not_kept() -> None:

@@ -1,0 +1,102 @@
+"""Copies of logs: blocks of bytes that give back every record and checksum, shared within a process."""
+
+import pytest
+
+from flocc_agent.core.log_copy import BLOCK_RECORDS, EncodedRecords, LogCopy
+from flocc_protocol.arrays import Array
+from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.records import KeyframeRecord, RejectionRecord, UnknownRecord, chain, encode_record
+
+COUNT = 2 * BLOCK_RECORDS + 3
+SEAL = bytes(64)
+
+
+def keyframe(index: int, described: bool = True) -> KeyframeRecord:
+    descriptor = Array("i1", (4,), bytes([1, 2, 3, index % 100]), 0.5) if described else None
+    return KeyframeRecord(index, 0.5 * index, (float(index), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), descriptor)
+
+
+DATA = [encode_record(keyframe(k)) for k in range(COUNT)]
+
+
+def copied(data: list[bytes], seal_bytes: int = 0) -> LogCopy:
+    copy = LogCopy()
+    for each in data:
+        copy.append(each, seal_bytes)
+    return copy
+
+
+def test_records_come_back_as_they_were_whatever_part_is_asked_for() -> None:
+    encoded = copied(DATA).encoded
+    assert list(encoded) == DATA
+    assert [encoded[k] for k in range(-COUNT, COUNT)] == DATA + DATA
+    for part in (slice(60, 70), slice(126, None), slice(-3, None), slice(None, None, 50), slice(200, 300)):
+        assert encoded[part] == DATA[part]
+    with pytest.raises(IndexError):
+        encoded[COUNT]
+
+
+def test_the_checksum_of_every_prefix_is_known() -> None:
+    copy, checksum = copied(DATA), 0
+    for count, data in enumerate(DATA):
+        assert copy.checksum_at(count) == checksum
+        checksum = chain(checksum, data)
+    assert copy.checksum == copy.checksum_at(COUNT) == checksum
+
+
+def test_what_records_say_is_decoded_without_descriptors() -> None:
+    copy = copied(DATA)
+    assert copy.records == [keyframe(k, described=False) for k in range(COUNT)]
+    assert copy.keyframes == COUNT
+
+
+def test_what_is_no_keyframe_is_found_without_decoding_the_others() -> None:
+    rejection = RejectionRecord(KeyframeId(LogId("r1"), 0), KeyframeId(LogId("r2"), 0), "no", 0, 0)
+    copy = copied([*DATA[:70], encode_record(rejection), *DATA[70:]])
+    assert list(copy.other_records()) == [rejection]
+
+
+def test_a_reader_sees_a_prefix_while_the_log_grows() -> None:
+    encoded = EncodedRecords()
+    reading = iter(encoded)
+    for number, data in enumerate(DATA):
+        encoded.append(data)
+        assert list(encoded) == DATA[: number + 1]
+    assert list(reading) == DATA
+
+
+def test_a_seal_is_kept_and_not_read() -> None:
+    copy = copied([data + SEAL for data in DATA], len(SEAL))
+    assert copy.encoded[COUNT - 1] == DATA[-1] + SEAL
+    assert copy.records[70] == keyframe(70, described=False)
+
+
+def test_keyframes_of_a_later_version_count_and_other_records_do_not() -> None:
+    rejection = encode_record(RejectionRecord(KeyframeId(LogId("r1"), 0), KeyframeId(LogId("r2"), 0), "no", 0, 0))
+    later = b"\x92\x01\x9f" + b"\xc0" * 15
+    copy = copied([rejection, later])
+    assert copy.keyframes == 1
+    assert copy.records[1] == UnknownRecord(1, b"")
+
+
+def test_two_copies_of_one_log_share_their_full_blocks() -> None:
+    one, other = EncodedRecords(DATA), EncodedRecords(bytes(bytearray(data)) for data in DATA)
+    assert [a is b for a, b in zip(one._full, other._full, strict=True)] == [True, True]
+
+
+@pytest.mark.parametrize("count", [0, 1, BLOCK_RECORDS - 1, BLOCK_RECORDS, BLOCK_RECORDS + 1, COUNT])
+def test_a_disk_that_lost_its_end_goes_on_from_there(count: int) -> None:
+    encoded = EncodedRecords(DATA)
+    encoded.truncate(count)
+    assert encoded == DATA[:count]
+    encoded.append(b"new")
+    assert encoded == [*DATA[:count], b"new"]
+
+
+@pytest.mark.parametrize("first", [0, 5, BLOCK_RECORDS, COUNT - 1, COUNT])
+def test_records_agree_only_where_bytes_and_checksum_do(first: int) -> None:
+    copy = copied(DATA)
+    before = copy.checksum_at(first)
+    assert copy.agrees(first, before, [*DATA[first:], b"more"])
+    assert not copy.agrees(first, before + 1, DATA[first:])
+    assert first == COUNT or not copy.agrees(first, before, [b"other"])

@@ -1,0 +1,72 @@
+"""Rows of descriptors: the same candidates whether keyframes come alone or together, whatever their numbers are."""
+
+import numpy as np
+import pytest
+
+from flocc_agent.core.parameters import PlaceRecognitionParameters
+from flocc_agent.core.place_recognition import Found, PlaceRecognition, direction
+from flocc_protocol.arrays import Array
+from flocc_protocol.ids import KeyframeId, LogId
+
+OWN, OTHERS = LogId("r1"), (LogId("r2"), LogId("r3"))
+KEYFRAMES = 300
+"""More than are compared at one time."""
+
+
+def drawn(dimension: int, dtype: str = "i1") -> list[tuple[KeyframeId, Array]]:
+    """Keyframes of three logs in turn, many of them near one of a few places."""
+    rng = np.random.default_rng(dimension)
+    places = rng.standard_normal((40, dimension))
+    keyframes = []
+    for k in range(KEYFRAMES):
+        for log in (*OTHERS, OWN):
+            values = places[rng.integers(40)] + 0.3 * rng.standard_normal(dimension)
+            array = Array.int8(values) if dtype == "i1" else Array.of(values, dtype)
+            keyframes.append((KeyframeId(log, k), array))
+    return keyframes
+
+
+def found(keyframes: list[tuple[KeyframeId, Array]], together: int) -> list[Found]:
+    recognition = PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.6))
+    parts = [keyframes[k : k + together] for k in range(0, len(keyframes), together)]
+    return [each for part in parts for each in recognition.on_keyframes(part)]
+
+
+def by_hand(keyframes: list[tuple[KeyframeId, Array]]) -> set[tuple[KeyframeId, KeyframeId]]:
+    """Each keyframe and its best partner before it in each log that it is compared with."""
+    pairs = set()
+    seen: dict[LogId, list[tuple[KeyframeId, np.ndarray]]] = {}
+    for keyframe, array in keyframes:
+        unit = direction(array)
+        assert unit is not None
+        for log in (OWN,) if keyframe.log != OWN else OTHERS:
+            rows = seen.get(log, [])
+            similarities = [float(unit @ row) for _, row in rows]
+            if similarities and max(similarities) >= 0.6:
+                pairs.add((keyframe, rows[int(np.argmax(similarities))][0]))
+        seen.setdefault(keyframe.log, []).append((keyframe, unit))
+    return pairs
+
+
+@pytest.mark.parametrize("dtype", ["i1", "f4"])
+def test_alone_every_keyframe_finds_its_best_partner_of_each_log(dtype: str) -> None:
+    keyframes = drawn(32, dtype)
+    assert {(k, c.pair.other(k)) for k, c in found(keyframes, 1)} == by_hand(keyframes)
+
+
+def test_other_robots_keyframes_find_exactly_the_same_in_a_batch() -> None:
+    own = [each for each in drawn(128) if each[0].log == OWN]
+    others = [each for each in drawn(128) if each[0].log != OWN]
+    one = PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.6))
+    many = PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.6))
+    one.on_keyframes(own)
+    many.on_keyframes(own)
+    alone = [each for keyframe in others for each in one.on_keyframes([keyframe])]
+    assert alone == many.on_keyframes(others)
+    assert one.best_similarities == many.best_similarities
+
+
+def test_rows_of_int8_and_of_floats_are_compared_with_each_other() -> None:
+    ints, floats = drawn(32), drawn(32, "f4")
+    mixed = [ints[k] if keyframe.log == OTHERS[0] else floats[k] for k, (keyframe, _) in enumerate(ints)]
+    assert {(k, c.pair.other(k)) for k, c in found(mixed, 1)} == by_hand(mixed)
