@@ -6,7 +6,7 @@ was read off the plot of riMESA (arXiv 2603.01178).
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,9 +192,9 @@ def draw(figure: "Figure", _settings: TeamSizeSettings, rows: Sequence[Row]) -> 
     """Median iATE over the size of the team, published ones dashed."""
     panel = figure.subplots()
     for k, ((arm,), of) in enumerate(grouped(rows, "arm").items()):
-        style = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 5}
+        style: dict[str, Any] = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 5}
         levels = sorted(grouped(of, "robots").items())
-        panel.plot([n for (n,), _ in levels], [middle(group, "iate_mean_m") for _, group in levels], label=arm, **style)
+        panel.plot([n for (n,), _ in levels], [middle(g, "iate_mean_m") or 0.0 for _, g in levels], label=arm, **style)
         known = [(n, value) for (n,), _ in levels if (value := published_m(arm, n)) is not None]
         if known:
             panel.plot(*zip(*known, strict=True), linestyle="--", label=f"{arm}, published", fillstyle="none", **style)
