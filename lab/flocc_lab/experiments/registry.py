@@ -12,6 +12,7 @@ from flocc_lab.experiments.registration_quality import REGISTRATION
 from flocc_lab.experiments.scale import SCALE
 from flocc_lab.experiments.sparse_keyframes import SPARSE_KEYFRAMES
 from flocc_lab.experiments.split_compute import SPLIT_COMPUTE
+from flocc_lab.experiments.team_size import TEAM_SIZE
 
 ALL: tuple[Experiment[Any], ...] = (
     FULL_SYSTEM,
@@ -23,6 +24,7 @@ ALL: tuple[Experiment[Any], ...] = (
     BANDWIDTH,
     CANDIDATE_ORDER,
     DISTRIBUTED,
+    TEAM_SIZE,
 )
 
 
