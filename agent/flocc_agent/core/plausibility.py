@@ -33,6 +33,8 @@ REACH_RATIO, REACH_M = 2.0, 50.0
 """How far apart robots of one map can be: their ways, with odometry half as long as the truth, and a view for each."""
 BENT_RATIO, BENT_M = 0.25, 10.0
 """How much odometry may be changed beyond the length of its own steps: of its way, and always."""
+JUMPS_MAX = 2
+"""Steps that may be of any length: a robot was carried, or its odometry jumped, and a solution says so rightly."""
 VIEW_M, VIEW_STEPS, VIEW_LENGTHS = 10.0, 10.0, 3.0
 """Cameras of one closure are this near: metres, steps of the odometry, lengths of the measured translation."""
 DRIFT_RATIO = 0.3
@@ -138,7 +140,7 @@ def _bent(camera: Float, odometry: Float) -> str | None:
         return None
     steps, told = between(odometry[:-1], odometry[1:])[:, :3, 3], between(camera[:-1], camera[1:])[:, :3, 3]
     lengths_m = np.linalg.norm(steps, axis=1)
-    excess_m = np.maximum(np.linalg.norm(told - steps, axis=1) - lengths_m, 0.0).sum()
+    excess_m = np.sort(np.maximum(np.linalg.norm(told - steps, axis=1) - lengths_m, 0.0))[:-JUMPS_MAX].sum()
     return None if excess_m <= BENT_M + BENT_RATIO * lengths_m.sum() else BENT
 
 
