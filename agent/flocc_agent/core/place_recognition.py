@@ -24,6 +24,8 @@ from flocc_protocol.messages import CandidatePair
 
 Floats = NDArray[np.float32]
 
+NOTHING = -2.0
+"""Similarity with a log of which no row is here: below every threshold."""
 CAPACITY_FIRST = 64
 DESCRIPTORS_MAX = 1024
 THINNED_AT_ONCE = 64
@@ -307,7 +309,7 @@ class PlaceRecognition:
         if others is None:
             return found
         similarities = others.similarities([descriptor])[0]
-        best = np.full(len(self._logs), -1.0, dtype=np.float32)
+        best = np.full(len(self._logs), NOTHING, dtype=np.float32)
         np.maximum.at(best, others.logs, similarities)
         self._best = np.maximum(best, self._best).tolist()
         for number in np.flatnonzero(best >= self._parameters.similarity_threshold).tolist():

@@ -9,6 +9,7 @@ from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 
 OWN, OTHERS = LogId("r1"), (LogId("r2"), LogId("r3"))
+OWN_FIRST = KeyframeId(OWN, 0)
 KEYFRAMES = 300
 """More than are compared at one time."""
 
@@ -70,3 +71,12 @@ def test_rows_of_int8_and_of_floats_are_compared_with_each_other() -> None:
     ints, floats = drawn(32), drawn(32, "f4")
     mixed = [ints[k] if keyframe.log == OTHERS[0] else floats[k] for k, (keyframe, _) in enumerate(ints)]
     assert {(k, c.pair.other(k)) for k, c in found(mixed, 1)} == by_hand(mixed)
+
+
+def test_every_keyframe_has_a_partner_in_each_other_log_where_anything_is_alike_enough() -> None:
+    """A log of which no row is here, the own one among them, has none to give."""
+    keyframes = drawn(32)
+    recognition = PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=-1.0))
+    first, second = (next(each for each in keyframes if each[0].log == log) for log in (OTHERS[0], OWN))
+    assert recognition.on_keyframes([first]) == []
+    assert [candidate.pair.other(OWN_FIRST) for _, candidate in recognition.on_keyframes([second])] == [first[0]]
