@@ -5,7 +5,6 @@ storage is handed in, as the clock is: the core does not know that it is a file.
 """
 
 from collections import OrderedDict, deque
-from threading import Lock
 from typing import Protocol
 
 CACHED_PIECES_MAX = 16
@@ -41,7 +40,6 @@ class ColdPieces:
         self._pieces_held = pieces_held
         self._warm: deque[tuple[Cools, int]] = deque()
         self._cached: OrderedDict[int, bytes] = OrderedDict()
-        self._reading = Lock()
 
     def add(self, owner: Cools, number: int) -> None:
         """A piece is full; the oldest one leaves memory where there are too many."""
@@ -56,15 +54,13 @@ class ColdPieces:
 
     def get(self, place: int, size_bytes: int) -> bytes:
         """A piece that left memory."""
-        with self._reading:
-            piece = self._cached.get(place)
-            if piece is None:
-                piece = self._cached[place] = self._storage.get(place, size_bytes)
-                if len(self._cached) > CACHED_PIECES_MAX:
-                    self._cached.popitem(last=False)
-            else:
-                self._cached.move_to_end(place)
-            return piece
+        piece = self._cached.pop(place, None)  # nobody else has it until it is back, as the newest
+        if piece is None:
+            piece = self._storage.get(place, size_bytes)
+        self._cached[place] = piece
+        if len(self._cached) > CACHED_PIECES_MAX:
+            self._cached.popitem(last=False)
+        return piece
 
     def size(self) -> tuple[int, int]:
         """Full pieces in memory, and at most."""
