@@ -31,7 +31,7 @@ def at_addresses(settings: dict[str, Any], addresses: Addresses) -> dict[str, An
     zenoh looks at interfaces once in the life of a process; a later session has to be told what is there now.
     """
     interface = settings["scouting/multicast/interface"]
-    if _is_address(interface):
+    if is_address(interface):
         return settings
     here = sorted(address for name, address in addresses if interface in ("auto", name) and ":" not in address)
     if not here:
@@ -71,13 +71,14 @@ class AddressWatch:
         return tuple(sorted(address for _, address in added))
 
     def _of_interest(self, addresses: Addresses) -> Addresses:
-        named = any(self._interface == name for name, _ in addresses) or not _is_address(self._interface)
+        named = any(self._interface == name for name, _ in addresses) or not is_address(self._interface)
         if self._interface == "auto" or not named:
             return addresses
         return frozenset(each for each in addresses if each[0] == self._interface)
 
 
-def _is_address(text: str) -> bool:
+def is_address(text: str) -> bool:
+    """Whether a text is an IP address, and not the name of an interface."""
     try:
         ipaddress.ip_address(text)
     except ValueError:

@@ -1,13 +1,13 @@
 """What of a configured network is not there: interfaces and hosts. zenoh goes on trying without a word."""
 
 import fcntl
-import ipaddress
 import re
 import socket
 import struct
 from collections.abc import Iterator
 
 from flocc_agent.config import TransportConfig
+from flocc_agent.runtime.addresses import is_address
 from flocc_agent.runtime.certificate_faults import certificate_faults
 
 _SIOCGIFFLAGS = 0x8913
@@ -41,7 +41,7 @@ def interface_faults(config: TransportConfig) -> Iterator[str]:
     """Interfaces that do not exist, and no interface for multicast but the machine's own."""
     there = {name: _flags(name) for _, name in socket.if_nameindex()}
     told = ", ".join(there) or "none"
-    if config.multicast and config.interface != "auto" and not _is_address(config.interface):
+    if config.multicast and config.interface != "auto" and not is_address(config.interface):
         if config.interface not in there:
             yield f"transport.interface: the interface {config.interface!r} does not exist; there is {told}"
         elif not there[config.interface] & _UP:
@@ -69,14 +69,6 @@ def host_faults(config: TransportConfig, robot: str) -> Iterator[str]:
             except OSError as error:
                 told = error.strerror or error
                 yield f"transport.roster.{name}: the host {host!r} is not known ({told}); it is dialled again and again"
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _carries_multicast(flags: int) -> bool:
