@@ -73,12 +73,23 @@ def flow_of(
     a, b = a[moves], b[moves]
     if len(a) < POINTS_MIN:
         return None
-    _, mask = cv2.findFundamentalMat(a, b, usac_parameters(Geometry(), now.focal_px))
-    kept = np.zeros(0, np.intp) if mask is None else np.flatnonzero(mask.ravel())
+    kept = _of_one_camera(a, b, now.focal_px)
     if len(kept) < POINTS_MIN:
         return None
     kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), POINTS_MAX)).astype(np.intp)]
     return Flow(a[kept], b[kept], now.focal_px, T_odom_before, T_odom_now)
+
+
+def _of_one_camera(before: Float, now: Float, focal_px: float) -> NDArray[np.intp]:
+    """Indices of the matches that agree with one fundamental matrix; none where nothing does.
+
+    OpenCV 5.0 raises on about half of all sets of matches that agree with none.
+    """
+    try:
+        _, mask = cv2.findFundamentalMat(before, now, usac_parameters(Geometry(), focal_px))
+    except cv2.error:
+        mask = None
+    return np.zeros(0, np.intp) if mask is None else np.flatnonzero(mask.ravel())
 
 
 def moves_with_the_scene(before: Float, now: Float, focal_px: float, T_before_now: Float) -> NDArray[np.bool_]:
