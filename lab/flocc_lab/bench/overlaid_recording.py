@@ -37,7 +37,9 @@ def overlay_robot(source: Path, out: Path, cover: Overlay, mask: Overlay | None 
         file.chmod(0o644)
         cv2.imwrite(str(file), cover(pixels, k), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if mask is not None:
-        cv2.imwrite(str(out / "mask.png"), np.where(touched(mask, cv2.imread(str(file)).shape[:2]), 0, 255))
+        cv2.imwrite(
+            str(out / "mask.png"), np.where(touched(mask, cv2.imread(str(file)).shape[:2]), 0, 255).astype(np.uint8)
+        )
 
 
 def touched(cover: Overlay, size: tuple[int, int]) -> NDArray[np.bool_]:
