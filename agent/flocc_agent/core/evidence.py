@@ -22,6 +22,8 @@ VIEW_M, VIEW_STEPS, VIEW_LENGTHS = 10.0, 10.0, 3.0
 """Cameras of one closure are this near: metres, steps of the odometry, lengths of the measured translation."""
 DRIFT_RATIO = 0.3
 """How far a keyframe may be off where only the newest one's correction is known, against the way between the two."""
+WOUND_RATIO = 0.05
+"""The same for two keyframes of one way that winds, whose places are off together, besides the line between the two."""
 WARPED_RATIO = 0.75
 """How far odometry may lead away from where it was measured last, against its own way from there: a wrong scale."""
 BROKEN_M, BROKEN_RAD = 1.0, np.deg2rad(30.0)
@@ -32,6 +34,8 @@ TORN_RUN = 6
 """So many closures one after the other that all say the same are no accident."""
 LINKED = 3
 """A measured keyframe says something of this many before it: one between them may be wrong."""
+DENIED = 1
+"""By so many pairs of measured keyframes more a jump may be denied than demanded: one false one is in several."""
 MADE_BY_JUMPS = 1.2
 """Jumps turn a robot, too: a path is a little longer than the straight line that was measured."""
 
@@ -89,39 +93,26 @@ class _Link:
     off_m: Float
     slack_m: float
 
-    def explain(self, excess_m: Float, jumps_m: Float, left: Float) -> None:
-        """Take jumps (N, 3) between the two that are demanded out of what is left (N,) of their lengths (N,)."""
-        part = slice(self.first, self.last)
-        length_m = float((left[part] * excess_m[part]).sum())
-        if length_m <= 0.0:
-            return
-        jump_m = left[part] @ jumps_m[part]
-        if np.linalg.norm(self.off_m) <= np.linalg.norm(self.off_m - jump_m) + self.slack_m:
-            left[part] *= 1.0 - min(1.0, MADE_BY_JUMPS * float(np.linalg.norm(jump_m)) / length_m)
+    def demands(self, jump_m: Float) -> int:
+        """Whether what was measured demands that the later one jumped by so much: 1, or denies it: -1; 0 if unsure."""
+        with_m, without_m = float(np.linalg.norm(self.off_m)), float(np.linalg.norm(self.off_m - jump_m))
+        slack_m = self.slack_m + BROKEN_M
+        return int(with_m + slack_m < without_m) - int(without_m + slack_m < with_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """Closures of a log in the order of its keyframes, and what else was measured there.
+class _Group:
+    """How far off (K, 3) a correction puts measured keyframes, in their order, and how far that may be (K,).
 
-    Attributes:
-        near: (K,) its keyframes.
-        off_m: (K, 3) where a correction puts their cameras, seen from the other ends.
-        may_m: (K,) how far that may be.
-        pins: (P,) keyframes whose place is known.
-        links: Pairs of keyframes between which something was measured.
-        view_m: How far cameras of one place are apart.
+    Where the other ends are known in short only they may be off together, so that some that agree say nothing.
     """
 
-    near: Int
     off_m: Float
     may_m: Float
-    pins: Int
-    links: Sequence[_Link]
-    view_m: float
+    exact: bool
 
     def is_torn(self) -> bool:
-        """Whether closures agree with each other, and not with the correction.
+        """Whether they agree with each other, and not with the correction.
 
         False ones point anywhere; those of a robot that was put elsewhere point to where it is, all along or in a part.
         """
@@ -135,7 +126,28 @@ class Evidence:
             return True
         ends = np.flatnonzero(~(agree & (np.diff(torn) == 1)))
         runs = np.diff(np.concatenate([[-1], ends, [len(agree)]]))
-        return bool(runs.max() >= TORN_RUN)
+        return bool(runs.max() >= TORN_RUN) and self.exact
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Closures of a log in the order of its keyframes, and what else was measured there.
+
+    Attributes:
+        groups: Measurements that tell of the same: of where this log lies among others, of itself, in one frame.
+        pins: (P,) keyframes whose place is known.
+        links: Pairs of keyframes between which something was measured.
+        view_m: How far cameras of one place are apart.
+    """
+
+    groups: Sequence[_Group]
+    pins: Int
+    links: Sequence[_Link]
+    view_m: float
+
+    def is_torn(self) -> bool:
+        """Whether measurements agree with each other, and not with the correction."""
+        return any(group.is_torn() for group in self.groups)
 
     def explains(self, camera: Float, odometry: Float) -> bool:
         """Whether odometry (N, 4, 4) is broken or warped by poses (N, 4, 4) only where that was measured."""
@@ -146,15 +158,29 @@ class Evidence:
         if excess_m.sum() > self.view_m:
             along = more_m * (excess_m / np.maximum(more, 1e-12))[:, None]
             jumps_m = (camera[:-1, :3, :3] @ along[..., None])[..., 0]
-            left = np.ones(len(excess_m))
-            for link in sorted(self.links, key=lambda link: link.last - link.first):
-                link.explain(excess_m, jumps_m, left)
-            if (left * excess_m).sum() > self.view_m:
+            left = self._unexplained(excess_m, jumps_m)
+            if left @ excess_m > self.view_m:
                 return False
         traces = np.einsum("kii->k", between(steps, told)[:, :3, :3])
         turned = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
         broken = np.flatnonzero((excess_m > BROKEN_M) | (turned > BROKEN_RAD))
         return not self._is_warped(camera, odometry, np.concatenate([[0.0], np.cumsum(lengths_m)]), broken)
+
+    def _unexplained(self, excess_m: Float, jumps_m: Float) -> Float:
+        """Which share (N,) of jumps (N, 3) of these lengths (N,) nothing demands, or more denies than demands.
+
+        Jumps that add up to nothing between two measured keyframes were not measured.
+        """
+        left, votes = np.ones(len(excess_m)), np.zeros(len(excess_m))
+        for link in sorted(self.links, key=lambda link: link.last - link.first):
+            part = slice(link.first, link.last)
+            demanded = link.demands(jumps_m[part].sum(axis=0))
+            votes[part] += demanded
+            length_m = float(left[part] @ excess_m[part])
+            if demanded >= 0 and length_m > BROKEN_M:
+                measured_m = MADE_BY_JUMPS * float(np.linalg.norm(left[part] @ jumps_m[part]))
+                left[part] *= 1.0 - min(1.0, measured_m / length_m)
+        return np.where(votes < -DENIED, 1.0, left)
 
     def _is_warped(self, camera: Float, odometry: Float, way_m: Float, broken: Int) -> bool:
         """Whether anything is farther from the measured keyframe before it than odometry and the next one explain."""
@@ -186,43 +212,63 @@ def evidence_of(
     ties, fixes = by_far_log(own, closures, len(odometry)), dict[LogId, dict[int, Float]]()
     for factor in graph.measured(own):
         _sort_in(factor, own, len(odometry), ties, fixes)
-    ends = [_End(0, np.zeros(3), 0.0, None)] if placed.own.anchor == own else []
-    near, off_m, may_m, links = list[int](), list[Float](), list[float](), list[_Link]()
+    ends = [_End(0, np.zeros(3), 0.0, 0.0, None)] if placed.own.anchor == own else []
+    within = list[_End]()
     for far, of_log in ties.items():
-        for tie, off, sigma_m in _seen(placed, far, of_log, camera, graph):
-            may = near_m + VIEW_LENGTHS * tie.length_m + sigma_m
-            near.append(tie.near)
-            off_m.append(off)
-            may_m.append(may)
-            if np.linalg.norm(off) > may:
-                continue
-            if far == own:
-                links += [_Link(*sorted((tie.near, tie.far)), off if tie.near > tie.far else -off, 0.0)]
-            else:
-                ends.append(_End(tie.near, off, sigma_m, KeyframeId(far, tie.far)))
-    pins = [0] if placed.own.anchor == own else []
-    links += _chained(ends, graph)
-    for of_landmark in fixes.values():
-        links += _chained(_fitted(of_landmark, camera), graph)
-    order = np.argsort(near, kind="stable")
+        found = _seen(placed, far, of_log, camera, graph)
+        made = [
+            _End(tie.near, off, sigma_m, near_m + VIEW_LENGTHS * tie.length_m + sigma_m, KeyframeId(far, tie.far))
+            for tie, off, sigma_m in found
+        ]
+        (within if far == own else ends).extend(made)
+    fitted = [_fitted(of_landmark, camera, near_m) for of_landmark in fixes.values()]
+    links = [end.loop() for end in within if end.holds] + _chained([end for end in ends if end.holds], graph)
+    for each in fitted:
+        links += _chained(each, graph)
+    pins = [end.near for each in (ends, *fitted) for end in each if end.holds]
     return Evidence(
-        near=np.array(near, dtype=np.intp)[order],
-        off_m=np.array(off_m).reshape(-1, 3)[order],
-        may_m=np.array(may_m)[order],
-        pins=np.unique([*pins, *(end.near for end in ends), *(k for link in links for k in (link.first, link.last))]),
+        groups=[_group(each) for each in (ends, [end for end in ends if end.sigma_m == 0.0], within, *fitted) if each],
+        pins=np.unique([*pins, *(k for link in links for k in (link.first, link.last))]).astype(np.intp),
         links=links,
         view_m=near_m,
     )
 
 
+def _group(ends: "list[_End]") -> _Group:
+    ends = sorted(ends, key=lambda end: end.near)
+    exact = all(end.sigma_m == 0.0 for end in ends)
+    return _Group(np.array([end.off_m for end in ends]), np.array([end.may_m for end in ends]), exact)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _End:
-    """A keyframe whose place is known: how far off (3,) it was put, and how far that may be wrong."""
+    """A keyframe whose place is known.
+
+    Attributes:
+        near: It.
+        off_m: (3,) how far off it was put.
+        sigma_m: How far that may be wrong.
+        may_m: How far off it may be.
+        far: From where its place is known, where that is a keyframe.
+    """
 
     near: int
     off_m: Float
     sigma_m: float
+    may_m: float
     far: KeyframeId | None
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is where it should be."""
+        return bool(np.linalg.norm(self.off_m) <= self.may_m)
+
+    def loop(self) -> _Link:
+        """As a link, where its place is known from the same log."""
+        assert self.far is not None
+        later = self.near > self.far.index
+        first, last = sorted((self.near, self.far.index))
+        return _Link(first, last, self.off_m if later else -self.off_m, 0.0)
 
 
 def _chained(ends: list[_End], graph: HeldGraph) -> list[_Link]:
@@ -242,30 +288,37 @@ def _slack_m(one: _End, other: _End, graph: HeldGraph) -> float:
     if slack_m == 0.0 or one.far is None or other.far is None or one.far.log != other.far.log:
         return slack_m
     first, last = sorted((one.far.index, other.far.index))
-    return min(slack_m, DRIFT_RATIO * way_m(graph.odometry(one.far.log)[first : last + 1]))
+    way = graph.odometry(one.far.log)[first : last + 1]
+    return min(slack_m, DRIFT_RATIO * float(np.linalg.norm(way[-1, :3, 3] - way[0, :3, 3])) + WOUND_RATIO * way_m(way))
 
 
 def _sort_in(
-    factor: MeasuredFactor, own: LogId, keyframes: int, ties: dict[LogId, list[Tie]], fixes: dict[LogId, dict[int, Float]]
+    factor: MeasuredFactor,
+    own: LogId,
+    keyframes: int,
+    ties: dict[LogId, list[Tie]],
+    fixes: dict[LogId, dict[int, Float]],
 ) -> None:
     """A measurement is as good as a closure where it tells of another keyframe; else it is a place of its own frame."""
     near, far = (factor.query, factor.match) if factor.query.log == own else (factor.match, factor.query)
     if near.log != own or near.index >= keyframes:
         return
     if not is_landmark(far.log):
-        ties.setdefault(far.log, []).append(Tie(near.index, far.index, float(np.linalg.norm(factor.T_query_match[:3, 3]))))
+        ties.setdefault(far.log, []).append(
+            Tie(near.index, far.index, float(np.linalg.norm(factor.T_query_match[:3, 3])))
+        )
         return
     T = T_earth_enu(factor.place) if factor.place is not None else factor.T_query_match
     fixes.setdefault(far.log, {})[near.index] = (T if far == factor.query else inverse(T))[:3, 3]
 
 
-def _fitted(fixes: Mapping[int, Float], camera: Float) -> list[_End]:
+def _fitted(fixes: Mapping[int, Float], camera: Float, may_m: float) -> list[_End]:
     """Places in a frame of their own, which is laid over those where a correction puts them."""
     near = sorted(fixes)
     places = np.array([fixes[k] for k in near])
     T = umeyama(places - places[0], camera[near, :3, 3])[1]
     off_m = camera[near, :3, 3] - (places - places[0]) @ T[:3, :3].T - T[:3, 3]
-    return [_End(k, off, 0.0, None) for k, off in zip(near, off_m, strict=True)]
+    return [_End(k, off, 0.0, may_m, None) for k, off in zip(near, off_m, strict=True)]
 
 
 def by_far_log(own: LogId, closures: Sequence[ClosureRecord], keyframes: int) -> dict[LogId, list[Tie]]:
@@ -300,9 +353,17 @@ def _seen(
 def missed_m(log: LogId, closures: Sequence[ClosureRecord], graph: HeldGraph) -> float:
     """How much of a log's way its odometry missed, by closures that contradict it, whatever solution is believed."""
     odometry, missed = graph.odometry(log), 0.0
-    for far, ties in by_far_log(log, closures, len(odometry)).items():
+    ties, fixes = by_far_log(log, closures, len(odometry)), dict[LogId, dict[int, Float]]()
+    for factor in graph.measured(log):
+        _sort_in(factor, log, len(odometry), ties, fixes)
+    for places in fixes.values():
+        near = sorted(places)
+        moved_m = np.linalg.norm(np.diff(np.array([places[k] for k in near]), axis=0), axis=1)
+        told_m = np.linalg.norm(np.diff(odometry[near, :3, 3], axis=0), axis=1)
+        missed += float(np.maximum(moved_m - told_m, 0.0).sum())
+    for far, of_log in ties.items():
         there = graph.odometry(far)
-        known = sorted((tie for tie in ties if tie.far < len(there)), key=lambda tie: tie.near)
+        known = sorted((tie for tie in of_log if tie.far < len(there)), key=lambda tie: tie.near)
         if not known:
             continue
         here_m, there_m = odometry[[tie.near for tie in known], :3, 3], there[[tie.far for tie in known], :3, 3]
@@ -310,8 +371,8 @@ def missed_m(log: LogId, closures: Sequence[ClosureRecord], graph: HeldGraph) ->
         if far == log:
             missed += float(np.maximum(np.linalg.norm(here_m - there_m, axis=1) - may_m, 0.0).sum())
             continue
-        moved_m = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (here_m, there_m)]
-        missed += float(np.maximum(np.abs(moved_m[0] - moved_m[1]) - may_m[1:] - may_m[:-1], 0.0).sum())
+        own_m, far_m = (np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (here_m, there_m))
+        missed += float(np.maximum(np.abs(own_m - far_m) - may_m[1:] - may_m[:-1], 0.0).sum())
     return missed
 
 

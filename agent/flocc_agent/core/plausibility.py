@@ -9,7 +9,7 @@ asked is coarse, and each question has an answer that no such surprise gives:
 - Do closures that are not where they should be disagree with each other, as false ones do, or do they all say that the
   robot is elsewhere?
 
-Evidence is counted, not jumps: what is measured may be as odd as it likes, and what nothing demands is a lie. A solution
+Evidence is counted, not jumps: what is measured may be as odd as it likes, what nothing demands is a lie. A solution
 that passes may still be wrong by metres. What fails is held back for a while, since corrections of other logs and
 records may be on their way, and is refused then. See DESIGN.md 5.
 """
@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.evidence import VIEW_M, HeldGraph, Placed, evidence_of, missed_m, way_m
+from flocc_agent.core.evidence import HeldGraph, Placed, evidence_of, missed_m, way_m
 from flocc_agent.core.knots import corrected
 from flocc_agent.geometry import angle_rad, between
 from flocc_protocol.ids import LogId
@@ -94,7 +94,7 @@ def _away(placed: Placed, camera: Float, graph: HeldGraph) -> str | None:
         return None
     if anchor is not None and anchor.anchor == anchor.log:
         drifted_m = corrected(anchor, start[-1:], np.array([len(start) - 1]))[0, :3, 3] - start[-1, :3, 3]
-        beyond_m = float(np.linalg.norm(drifted_m)) - VIEW_M - DRIFTED_RATIO * way_m(start)
+        beyond_m = float(np.linalg.norm(drifted_m)) - REACH_M - DRIFTED_RATIO * way_m(start)
         ties = graph.ties(anchor.log, TIES_OF_JUMPS_MAX) if beyond_m > 0.0 else ()
         if beyond_m > 0.0 and beyond_m > MISSED_RATIO * missed_m(anchor.log, ties, graph):
             return "its anchor is not where it began"
