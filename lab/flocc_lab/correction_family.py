@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.evidence import TIES_MIN, Placed
+from flocc_agent.core.correction_evidence import TIES_MIN, Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import contradiction
 from flocc_agent.core.pose_graph import WORLD, MeasuredFactor, landmark
@@ -67,7 +67,7 @@ def chained(start_m: Float, start_rad: float, steps_m: Float, turns_rad: Float) 
 
 
 @dataclass(eq=False)
-class Member:
+class CorrectedRobot:
     """One robot, what it holds, and where an honest leader puts it."""
 
     rides: int
@@ -108,7 +108,7 @@ def told(log: LogId, anchor: LogId, T_odom: Float, T_map: Float, short: bool = F
     return LogCorrection(log, Term(1, LEADER), 1, anchor, as_told, None if short else knots)
 
 
-def drawn(rng: np.random.Generator, rides: int) -> Member:
+def drawn(rng: np.random.Generator, rides: int) -> CorrectedRobot:
     """One member."""
     step_m = float(rng.uniform(0.4, 2.0))
     n = max(20, int(np.exp(rng.uniform(np.log(20.0), np.log(2000.0))) / step_m))
@@ -136,7 +136,7 @@ def drawn(rng: np.random.Generator, rides: int) -> Member:
     closures = _with_false(rng, closures, {log: len(o) for log, o in odometries.items()})
     solution, tied = _solved(rng, truth, steps, turns, at, tied, closures, fixes)
     noise = 0.2 * np.cumsum(rng.normal(size=(n, 2)), axis=0) / np.sqrt(n)
-    return Member(
+    return CorrectedRobot(
         rides,
         step_m,
         Planar(solution.at_m + noise - noise[0], solution.heading_rad),
@@ -305,7 +305,7 @@ def _spread(found: Planar, steps: Float, turns: Float, pinned: NDArray[np.intege
     return Planar(at, heading)
 
 
-Lie = Callable[[np.random.Generator, Member, float], Planar]
+Lying = Callable[[np.random.Generator, CorrectedRobot, float], Planar]
 
 
 def _towards(rng: np.random.Generator, by_m: float) -> Float:
@@ -313,31 +313,31 @@ def _towards(rng: np.random.Generator, by_m: float) -> Float:
     return by_m * np.array([np.cos(angle), np.sin(angle)])
 
 
-def shifted(rng: np.random.Generator, member: Member, by_m: float) -> Planar:
+def shifted(rng: np.random.Generator, member: CorrectedRobot, by_m: float) -> Planar:
     """All of it."""
     return member.solution.moved(0, len(member.solution.at_m), _towards(rng, by_m))
 
 
-def part_moved(rng: np.random.Generator, member: Member, by_m: float) -> Planar:
+def part_moved(rng: np.random.Generator, member: CorrectedRobot, by_m: float) -> Planar:
     """A part."""
     first, last = np.sort(rng.choice(np.arange(1, len(member.solution.at_m)), 2, replace=False))
     return member.solution.moved(int(first), int(last), _towards(rng, by_m))
 
 
-def end_moved(rng: np.random.Generator, member: Member, by_m: float) -> Planar:
+def end_moved(rng: np.random.Generator, member: CorrectedRobot, by_m: float) -> Planar:
     """The last poses."""
     n = len(member.solution.at_m)
     return member.solution.moved(n - int(rng.integers(1, max(2, n // 3))), n, _towards(rng, by_m))
 
 
-def stretched(rng: np.random.Generator, member: Member, by_m: float) -> Planar:  # noqa: ARG001
+def stretched(rng: np.random.Generator, member: CorrectedRobot, by_m: float) -> Planar:  # noqa: ARG001
     """Longer, from its beginning on, so that the farthest place is moved by so much."""
     at = member.solution.at_m
     far_m = np.linalg.norm(at - at[0], axis=1).max()
     return Planar(at[0] + (1.0 + by_m / far_m) * (at - at[0]), member.solution.heading_rad)
 
 
-def bent(rng: np.random.Generator, member: Member, by_m: float) -> Planar:
+def bent(rng: np.random.Generator, member: CorrectedRobot, by_m: float) -> Planar:
     """More and more to one side, from somewhere on."""
     at, n = member.solution.at_m, len(member.solution.at_m)
     first = int(rng.integers(0, 2 * n // 3))
@@ -345,7 +345,7 @@ def bent(rng: np.random.Generator, member: Member, by_m: float) -> Planar:
     return Planar(at + share[:, None] * _towards(rng, by_m), member.solution.heading_rad)
 
 
-LIES: dict[str, Lie] = {
+LIES: dict[str, Lying] = {
     "moved": shifted,
     "a part moved": part_moved,
     "its end moved": end_moved,
@@ -354,7 +354,7 @@ LIES: dict[str, Lie] = {
 }
 
 
-def unexplained_m(member: Member, lie: Planar) -> float:
+def unexplained_m(member: CorrectedRobot, lie: Planar) -> float:
     """How much farther a lie moves the worst keyframe than what it holds leaves open.
 
     That is a view of each closure, and of the way from the nearest tied keyframe three quarters; the third
@@ -369,12 +369,12 @@ def unexplained_m(member: Member, lie: Planar) -> float:
     return float((moved_m - 2.0 * (10.0 + 10.0 * member.step_m) - 0.75 * to_tie).max())
 
 
-def is_held(member: Member, lie: Planar) -> bool:
+def is_held(member: CorrectedRobot, lie: Planar) -> bool:
     """Whether a lie that comes after an honest correction is not believed."""
     return contradiction(member.placed(lie), member.placed(member.solution), member) is not None
 
 
-def slow_reach_m(rng: np.random.Generator, member: Member, lie: Lie, by_m: float) -> tuple[Planar, bool]:
+def slow_reach_m(rng: np.random.Generator, member: CorrectedRobot, lie: Lying, by_m: float) -> tuple[Planar, bool]:
     """The last that was believed of a lie that grows by little each round, and whether it was stopped."""
     seed, step_m = int(rng.integers(2**32)), float(rng.uniform(*ROUND_M))
     before, last = member.placed(member.solution), member.solution
@@ -388,7 +388,7 @@ def slow_reach_m(rng: np.random.Generator, member: Member, lie: Lie, by_m: float
 
 
 @dataclass
-class Table:
+class ErrorRates:
     """How many of each kind were refused.
 
     Attributes:
@@ -414,9 +414,9 @@ class Table:
             yield f"slow lie, {kind}: {held} of {n} held"
 
 
-def judged(draws: int, first: int = 0, slow: int = 0) -> Table:
+def judged(draws: int, first: int = 0, slow: int = 0) -> ErrorRates:
     """So many draws of each number of rides, with one lie of each kind; slow lies for the first few only."""
-    table = Table()
+    table = ErrorRates()
     for rides in range(6):
         for k in range(draws):
             rng = np.random.default_rng((first, rides, k))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.evidence import HeldGraph, Placed
 from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.knot_requests import GRACE_S, KnotRequests
 from flocc_agent.core.knots import Track, corrected, knots_of, strays

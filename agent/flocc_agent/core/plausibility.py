@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.evidence import HeldGraph, Placed, evidence_of, missed_m, way_m
+from flocc_agent.core.correction_evidence import VIEW_M, HeldGraph, Placed, evidence_of, missed_m, way_m
 from flocc_agent.core.knots import corrected
 from flocc_agent.geometry import angle_rad, between
 from flocc_protocol.ids import LogId
@@ -33,7 +33,7 @@ REACH_RATIO, REACH_M = 2.0, 50.0
 """How far apart robots of one map can be: their ways, with odometry half as long as the truth, and a view for each."""
 DRIFTED_RATIO = 0.5
 """How far a solution moves the newest keyframe of an anchor, against its way."""
-MISSED_RATIO = 1.5
+MISSED_RATIO = 2.0
 """How much farther a robot may be than its odometry says, against what closures say that odometry missed."""
 TIES_MAX, TIES_OF_JUMPS_MAX = 200, 2000
 """Closures that are looked at, the newest ones; where there are jumps that those do not explain, so many."""
@@ -94,7 +94,7 @@ def _away(placed: Placed, camera: Float, graph: HeldGraph) -> str | None:
         return None
     if anchor is not None and anchor.anchor == anchor.log:
         drifted_m = corrected(anchor, start[-1:], np.array([len(start) - 1]))[0, :3, 3] - start[-1, :3, 3]
-        beyond_m = float(np.linalg.norm(drifted_m)) - REACH_M - DRIFTED_RATIO * way_m(start)
+        beyond_m = float(np.linalg.norm(drifted_m)) - VIEW_M - DRIFTED_RATIO * way_m(start)
         ties = graph.ties(anchor.log, TIES_OF_JUMPS_MAX) if beyond_m > 0.0 else ()
         if beyond_m > 0.0 and beyond_m > MISSED_RATIO * missed_m(anchor.log, ties, graph):
             return "its anchor is not where it began"
@@ -164,6 +164,8 @@ class Doubts:
             return None
         why = contradiction(placed, self._before, self._graph)
         if why is None:
+            if self._held is not None and self._held.correction.version == placed.own.version:
+                self._held = None
             return None
         if why in FINAL:
             self._refuse(placed.own)
@@ -179,6 +181,9 @@ class Doubts:
         held = self._held
         if held is None or held.since_s + HELD_BACK_S > now:
             return None
+        if self._before is not None and held.correction.version <= self._before.own.version:
+            self._held = held if held.since_s + 2.0 * HELD_BACK_S > now else None
+            return None
         if held.why == UNTIED:
             self._held = replace(held, told=True)
             return None if held.told else held.why
@@ -190,11 +195,16 @@ class Doubts:
         self.doubted.add(correction.term.leader)
 
     def on_applied(self, placed: Placed) -> None:
-        """A correction was applied: what is older need not be waited for, and what it agrees with was true."""
+        """A correction was applied: what is older need not be waited for, and what it agrees with was true.
+
+        What another leader's corrections lack they lack still: two that lead in turn do not save the one that lies.
+        """
         if self._refused is not None and self._is_confirmed(placed.own):
             self.confirmed.add(self._refused.term.leader)
             self._refused = None
-        self._before, self._held = placed, None
+        self._before = placed
+        if self._held is not None and self._held.correction.term.leader.robot == placed.own.term.leader.robot:
+            self._held = None
 
     def _is_confirmed(self, correction: LogCorrection) -> bool:
         """Whether another robot's refused solution put this one to the same place in the same map."""

@@ -78,7 +78,7 @@ class Tie:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Link:
+class _Between:
     """Two measured keyframes of a log.
 
     Attributes:
@@ -101,7 +101,7 @@ class _Link:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Group:
+class _Agreement:
     """How far off (K, 3) a correction puts measured keyframes, in their order, and how far that may be (K,).
 
     Where the other ends are known in short only they may be off together, so that some that agree say nothing.
@@ -130,7 +130,7 @@ class _Group:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class CorrectionEvidence:
     """Closures of a log in the order of its keyframes, and what else was measured there.
 
     Attributes:
@@ -140,9 +140,9 @@ class Evidence:
         view_m: How far cameras of one place are apart.
     """
 
-    groups: Sequence[_Group]
+    groups: Sequence[_Agreement]
     pins: Int
-    links: Sequence[_Link]
+    links: Sequence[_Between]
     view_m: float
 
     def is_torn(self) -> bool:
@@ -206,7 +206,7 @@ def _apart_m(one: Float, other: Float, first: Int, last: Int) -> Float:
 
 def evidence_of(
     placed: Placed, closures: Sequence[ClosureRecord], camera: Float, odometry: Float, graph: HeldGraph
-) -> Evidence:
+) -> CorrectionEvidence:
     """What closures of a correction's log and its measurements say of it, as far as the other ends are known."""
     own, near_m = placed.own.log, view_m(odometry)
     ties, fixes = by_far_log(own, closures, len(odometry)), dict[LogId, dict[int, Float]]()
@@ -226,18 +226,20 @@ def evidence_of(
     for each in fitted:
         links += _chained(each, graph)
     pins = [end.near for each in (ends, *fitted) for end in each if end.holds]
-    return Evidence(
-        groups=[_group(each) for each in (ends, [end for end in ends if end.sigma_m == 0.0], within, *fitted) if each],
+    return CorrectionEvidence(
+        groups=[
+            _agreement(each) for each in (ends, [end for end in ends if end.sigma_m == 0.0], within, *fitted) if each
+        ],
         pins=np.unique([*pins, *(k for link in links for k in (link.first, link.last))]).astype(np.intp),
         links=links,
         view_m=near_m,
     )
 
 
-def _group(ends: "list[_End]") -> _Group:
+def _agreement(ends: "list[_End]") -> _Agreement:
     ends = sorted(ends, key=lambda end: end.near)
     exact = all(end.sigma_m == 0.0 for end in ends)
-    return _Group(np.array([end.off_m for end in ends]), np.array([end.may_m for end in ends]), exact)
+    return _Agreement(np.array([end.off_m for end in ends]), np.array([end.may_m for end in ends]), exact)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,20 +265,20 @@ class _End:
         """Whether it is where it should be."""
         return bool(np.linalg.norm(self.off_m) <= self.may_m)
 
-    def loop(self) -> _Link:
+    def loop(self) -> _Between:
         """As a link, where its place is known from the same log."""
         assert self.far is not None
         later = self.near > self.far.index
         first, last = sorted((self.near, self.far.index))
-        return _Link(first, last, self.off_m if later else -self.off_m, 0.0)
+        return _Between(first, last, self.off_m if later else -self.off_m, 0.0)
 
 
-def _chained(ends: list[_End], graph: HeldGraph) -> list[_Link]:
+def _chained(ends: list[_End], graph: HeldGraph) -> list[_Between]:
     """Links from each keyframe to some before it."""
     ends = sorted(ends, key=lambda end: end.near)
     pairs = [(one, ends[k + n]) for n in range(1, LINKED + 1) for k, one in enumerate(ends[:-n])]
     return [
-        _Link(one.near, other.near, other.off_m - one.off_m, _slack_m(one, other, graph))
+        _Between(one.near, other.near, other.off_m - one.off_m, _slack_m(one, other, graph))
         for one, other in pairs
         if one.near < other.near
     ]
@@ -372,7 +374,7 @@ def missed_m(log: LogId, closures: Sequence[ClosureRecord], graph: HeldGraph) ->
             missed += float(np.maximum(np.linalg.norm(here_m - there_m, axis=1) - may_m, 0.0).sum())
             continue
         own_m, far_m = (np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (here_m, there_m))
-        missed += float(np.maximum(np.abs(own_m - far_m) - may_m[1:] - may_m[:-1], 0.0).sum())
+        missed += float(np.maximum(np.abs(own_m - far_m) - np.maximum(may_m[1:], may_m[:-1]), 0.0).sum())
     return missed
 
 
