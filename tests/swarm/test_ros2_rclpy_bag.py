@@ -41,8 +41,8 @@ SECONDS = 12
 KEYFRAMES = 2 * SECONDS
 IMAGE_PERIOD_NS, ODOMETRY_PERIOD_NS, CLOCK_PERIOD_NS = 100_000_000, 20_000_000, 25_000_000
 SETTLE_S = 4.0
-UNKNOWN_MAX = 60
-"""Best effort: what was lost before the first that came and behind the last, which no number tells."""
+UNKNOWN_MAX = 20
+"""Best effort: what was lost behind the last that came, which nobody tells, or not by the middleware's word."""
 CAMERA_TOPICS = ("/camera/camera_info", "/camera/image_raw")
 TOPICS = {
     "/odom": "nav_msgs/msg/Odometry",

@@ -462,7 +462,9 @@ async def test_images_that_wait_for_their_camera_are_bounded_and_counted() -> No
         assert hearing.take(kind, payload)
     assert adapter.counters() == {"ros2 image without intrinsics": 6, "ros2 image without mounting": 10}
     waiting = iter(lambda: hearing.next_wanted(adapter._selector), None)
-    assert [round(posed.stamp_ns * 1e-9 - EPOCH_S, 1) for posed in waiting] == [round(0.1 * k, 1) for k in range(16, 80)]
+    assert [round(posed.stamp_ns * 1e-9 - EPOCH_S, 1) for posed in waiting] == [
+        round(0.1 * k, 1) for k in range(16, 80)
+    ]
 
 
 @pytest.mark.parametrize(
