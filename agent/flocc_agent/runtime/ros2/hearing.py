@@ -18,7 +18,7 @@ from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
-from flocc_agent.runtime.ros2.synchroniser import PosedImage, Synchroniser, Waiting
+from flocc_agent.runtime.ros2.synchroniser import HeldImages, PosedImage, Synchroniser
 from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import (
     CAMERA_INFO,
@@ -77,7 +77,7 @@ class Hearing:
         self._mount_camera = mount_camera
         self._static = StaticFrames()
         self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
-        self._wanted = Waiting[PosedImage](IMAGES_MAX, IMAGES_BYTES_MAX)
+        self._wanted = HeldImages[PosedImage](IMAGES_MAX, IMAGES_BYTES_MAX)
         self._compared_ns: int | None = None
         self._were_apart = False
         self.covariances = StepCovariances()

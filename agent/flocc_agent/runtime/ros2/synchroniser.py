@@ -29,7 +29,7 @@ class PosedImage:
 Item = TypeVar("Item")
 
 
-class Waiting(Generic[Item]):
+class HeldImages(Generic[Item]):
     """A queue of images that is bounded in number and bytes; one may always wait."""
 
     def __init__(self, images_max: int, bytes_max: int) -> None:
@@ -75,7 +75,7 @@ class Synchroniser:
         """
         self.dropped = Counter[str]()
         self._gap_max_s = gap_max_s
-        self._images = Waiting[tuple[int, bytes]](images_max, bytes_max)
+        self._images = HeldImages[tuple[int, bytes]](images_max, bytes_max)
         self._odometry: deque[tuple[int, Float]] = deque(maxlen=ODOMETRY_MAX)
         self._image_last_ns: int | None = None
 
