@@ -10,7 +10,7 @@ from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.settled import OPEN_KEYFRAMES
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import pose, se3_exp, so3_exp
+from flocc_agent.geometry import inverse, pose, se3_exp, so3_exp
 from flocc_lab.bench.generated_graph import GeneratedGraph, generate
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -53,7 +53,7 @@ def closure(i: int, j: int, T: np.ndarray) -> LoopClosure:
 
 
 def between_true(drawn: GeneratedGraph, i: int, j: int) -> np.ndarray:
-    return np.linalg.inv(drawn.T_world_keyframe[R00][i]) @ drawn.T_world_keyframe[R01][j]
+    return np.asarray(inverse(drawn.T_world_keyframe[R00][i]) @ drawn.T_world_keyframe[R01][j])
 
 
 def test_what_is_new_is_solved_beside_what_is_settled(drawn: GeneratedGraph, first: GraphSolution) -> None:
