@@ -158,9 +158,9 @@ class Once:
     """Each pair is registered by one robot, and again only where that could not be known.
 
     A second registration is excused where the first robot died, or where robots were apart: the one that registers
-    took the pair over while the owner in charge, or the first robot, was out of its hearing; two robots of one name get what
-    one of them is offered. It never is where the
-    robot holds a record of the pair already, unless that refused it unseen.
+    took the pair over while the owner in charge, or the first robot, was out of its hearing; and two robots of one name
+    get what one of them is offered. It never is where the robot holds a record of the pair already, unless that refused
+    it unseen.
 
     Attributes:
         separated: At times robots cannot hear each other.
