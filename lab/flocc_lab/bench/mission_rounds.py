@@ -1,6 +1,6 @@
 """What rounds cost while a mission grows, and how far a map whose settled part is held lies from one solved whole.
 
-    python -m flocc_lab.bench.mission_rounds --robots 4 --keyframes 5000 --closures 1000 --outliers 0.05 --rounds 20 --seed 1
+    python -m flocc_lab.bench.mission_rounds --robots 4 --keyframes 5000 --closures 1000 --outliers 0.05 --seed 1
 
 A drawn mission is solved from nothing when it has so many keyframes. From then on each round has ten closures more, and
 the keyframes that came meanwhile; all rounds are done twice, solved whole from the round before, and with what the last
