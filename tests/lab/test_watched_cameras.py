@@ -56,7 +56,7 @@ def test_late_and_wrong_names_are_counted_apart() -> None:
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_an_overlay_touches_about_its_share_and_a_seed_is_a_drawing(kind: str) -> None:
     cover = overlay(kind, (640, 480), 0.3, 1)
-    assert 0.1 < np.mean(touched(cover, (480, 640))) < 0.6
+    assert 0.1 < np.mean(touched(cover, (640, 480))) < 0.6
     pixels = picture().pixels
     assert cover(pixels, 3).shape == pixels.shape
     assert np.array_equal(cover(pixels, 3), overlay(kind, (640, 480), 0.3, 1)(pixels, 3))
@@ -71,7 +71,7 @@ def test_overlaid_robots_keep_all_but_their_pictures_lower_part(tmp_path: Path) 
         (folder / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
         cv2.imwrite(str(folder / "images" / "0.png"), picture().pixels)
     main([str(tmp_path / "data"), str(tmp_path / "out"), "--share", "0.5", "--moved", "--mask"])
-    seen = [cv2.imread(str(tmp_path / "out" / robot / "images" / "0.png")) for robot in ("r1", "r2")]
+    seen = [np.asarray(cv2.imread(str(tmp_path / "out" / robot / "images" / "0.png"))) for robot in ("r1", "r2")]
     mask = cv2.imread(str(tmp_path / "out" / "r1" / "mask.png"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None
     assert np.array_equal(np.flatnonzero(np.any(seen[0] != picture().pixels, axis=(1, 2))), np.arange(240, 480))

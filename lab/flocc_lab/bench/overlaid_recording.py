@@ -31,26 +31,24 @@ MOVED_STEP_PX = 12
 def overlay_robot(source: Path, out: Path, cover: Overlay, mask: Overlay | None = None) -> None:
     """Copy one robot's folder with covered pictures, and a mask of what the second overlay touches."""
     shutil.copytree(source, out, ignore=shutil.ignore_patterns("*.npz"))
-    file, k = out, 0
     for k, file in enumerate(sorted((out / "images").iterdir())):
         pixels = np.asarray(cv2.imread(str(file)), np.uint8)
         file.chmod(0o644)
         cv2.imwrite(str(file), cover(pixels, k), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if mask is not None:
-        cv2.imwrite(
-            str(out / "mask.png"), np.where(touched(mask, cv2.imread(str(file)).shape[:2]), 0, 255).astype(np.uint8)
-        )
+        hidden = touched(mask, size_of(out))
+        cv2.imwrite(str(out / "mask.png"), np.where(hidden, np.uint8(0), np.uint8(255)))
 
 
 def touched(cover: Overlay, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(H, W) pixels that an overlay changes in a picture of one colour."""
-    grey = np.full((*size, 3), 128, np.uint8)
+    """(H, W) pixels that an overlay changes in a picture of one colour and this width and height."""
+    grey = np.full((size[1], size[0], 3), 128, np.uint8)
     return np.asarray(np.any(cover(grey, 0) != grey, axis=2))
 
 
 def size_of(robot: Path) -> tuple[int, int]:
     """Width and height of a robot's pictures."""
-    height, width = cv2.imread(str(next(iter(sorted((robot / "images").iterdir()))))).shape[:2]
+    height, width = np.asarray(cv2.imread(str(min((robot / "images").iterdir())))).shape[:2]
     return width, height
 
 

@@ -200,7 +200,8 @@ def test_what_lets_the_scene_through_or_counts_is_found(kind: str) -> None:
     grey = np.full((240, 320, 3), 128, np.uint8)
     written = np.any([cover(grey, k)[..., 0] > 135 for k in range(12)], axis=0)
     for k, T in enumerate(turning(12)):
-        seen = np.repeat(cv2.GaussianBlur(picture(T, _texture(1)), (0, 0), 1)[..., None], 3, axis=2)
+        smooth = np.asarray(cv2.GaussianBlur(picture(T, _texture(1)), (0, 0), 1), np.uint8)
+        seen = np.repeat(smooth[..., None], 3, axis=2)
         finder.add(np.ascontiguousarray(cover(seen, k)[..., 0]), T)
     mask = finder.mask((320, 240))
     assert np.mean(mask[written]) > 0.7

@@ -117,7 +117,9 @@ class OverlayFinder:
         deviation = np.sqrt(np.maximum(self._averaged(reduced * reduced) - mean * mean, 0.0))
         corners = self._at(np.asarray(cv2.cornerMinEigenVal(reduced, WINDOW_PX)))
         has_corners = (deviation > CONTRAST_MIN) & (corners > CORNER_MIN)
-        right, down = (np.asarray(cv2.Sobel(reduced, cv2.CV_32F, *axis, scale=0.125)) for axis in ((1, 0), (0, 1)))
+        right, down = (
+            np.asarray(cv2.Sobel(reduced, cv2.CV_32F, *axis, scale=0.125), np.float32) for axis in ((1, 0), (0, 1))
+        )
         squares = self._averaged(right * right), self._averaged(right * down), self._averaged(down * down)
         return _Picture(reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera)
 
