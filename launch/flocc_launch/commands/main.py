@@ -381,9 +381,11 @@ def _launch(
 
     from flocc_launch.commands.live_table import LiveTable
     from flocc_launch.scenarios.recordings import recordings
+    from flocc_launch.swarm.launching import check_network
     from flocc_launch.swarm.launching import launch as run
 
     _check_place(out)
+    check_network()
     with progress_bar("preparing data") as progress:
         paths = recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)
