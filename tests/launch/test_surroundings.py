@@ -339,6 +339,15 @@ def test_weights_of_a_user_without_a_home_are_in_the_temporary_folder(
     assert weights_folder() == tmp_path / f"flocc-{os.getuid()}" / "weights"
 
 
+def test_an_agent_in_somebody_elses_folder_ends_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "agent.toml").write_text(f'name = "r1"\nfolder = "{tmp_path / "a" / "b"}"\n')
+    monkeypatch.setattr(os, "access", lambda _place, mode, **_: mode != os.W_OK)
+    assert run(monkeypatch, "agent", "--config", str(tmp_path / "agent.toml")) == 2
+    assert f"{tmp_path} cannot be written by this user" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [("launch", "corridor"), ("demo", "--small")])
 def test_a_run_folder_that_cannot_be_made_is_said_before_anything_is_prepared(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
