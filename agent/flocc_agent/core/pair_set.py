@@ -1,4 +1,4 @@
-"""A set of pairs of keyframes that grows with the mission: some 100 bytes a pair instead of 300."""
+"""A set of pairs of keyframes that grows with the mission: some 90 to 140 bytes a pair instead of 300."""
 
 from flocc_protocol.ids import INDEX_MAX, LogId
 from flocc_protocol.messages import CandidatePair
