@@ -154,7 +154,7 @@ class LoopClosing:
         self._front_ends.on_closure(pair)
         is_own = self._concerns(pair)
         self.on_resolved(pair)
-        self._changed = True
+        self._changed |= is_own
         for other in self._prospects.on_judged(pair, is_closure=True, is_own=is_own):
             self._resolved.discard(other)
             if self._owner(other) == self._own:

@@ -357,12 +357,13 @@ class Robot:
         """Take in what is signed, but for what of this sender failed lately."""
         peer, muted = sender.robot, self._muted
         if isinstance(message, Records):
-            batches = tuple(b for b in message.batches if not muted.is_muted(peer, b.log.robot, now))
-            new, effects = self.gossip.on_records(sender, Records(batches), now)
+            batches = tuple([b for b in message.batches if not muted.is_muted(peer, b.log.robot, now)])
+            heard = message if len(batches) == len(message.batches) else Records(batches)
+            new, effects = self.gossip.on_records(sender, heard, now)
             effects += self._take(new, now)
         else:
-            heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
-            effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
+            taken = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
+            effects = [effect for correction in taken for effect in self._on_correction(sender, correction, now)]
         effects += self._reconsider(now)
         for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
             for signer in failed:
