@@ -294,8 +294,11 @@ class Doubts:
         self._before, self._held = placed, None
 
     def _says_the_same(self, correction: LogCorrection) -> bool:
-        """Whether it moves no keyframe far from where what was looked at last had it: that need not be done again."""
-        checked = self._checked
+        """Whether it moves no keyframe far from where what was looked at last had it: that need not be done again.
+
+        While something is held back, leaders contradict each other, and everything is looked at.
+        """
+        checked = None if self._held is not None else self._checked
         if checked is None or self._graph is None or checked.anchor != correction.anchor:
             return False
         odometry = self._graph.odometry(correction.log)
