@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, groups_of
+from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
@@ -220,6 +220,11 @@ class GraphAssembly:
         pairs = (pair for pair in reversed(self._closures) if log in (pair.low.log, pair.high.log))
         records = (self._record_at(*self._closures[pair]) for pair in islice(pairs, ties_max))
         return [record for record in records if isinstance(record, ClosureRecord)]
+
+    def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
+        """What else was measured at a log's keyframes, or of them."""
+        factors = self._measured.factors(self._odometry, self._known)
+        return [factor for factor in factors if log in (factor.query.log, factor.match.log)]
 
     def joined(self, log: LogId, other: LogId) -> bool:
         """Whether closures, other measurements or the opened map lead from one log to the other.

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
 from flocc_agent.core.knot_requests import GRACE_S, KnotRequests
 from flocc_agent.core.knots import Track, corrected, knots_of, strays
 from flocc_agent.core.parameters import GossipParameters
-from flocc_agent.core.plausibility import FINAL, Doubts, HeldGraph, Placed
+from flocc_agent.core.plausibility import FINAL, Doubts
 from flocc_agent.core.pose_graph import Component, GraphSolution, map_frame
 from flocc_agent.core.pulls import REMEMBERED_MAX, REQUEST_TIMEOUT_S, remember
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused, RoundFailed

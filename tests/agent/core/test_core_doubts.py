@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from flocc_agent.core import plausibility
+from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.knots import Track, knots_of
-from flocc_agent.core.plausibility import AGREE_M, Doubts, HeldGraph, Placed
+from flocc_agent.core.plausibility import AGREE_M, Doubts
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import LogCorrection
 
