@@ -14,8 +14,8 @@ from flocc_protocol.messages import LOGS_MAX, DigestRequest, Digests, Heartbeat,
 
 PERIOD_S = 0.4
 """Least pause between two questions; below a heartbeat's period, so that none waits for two."""
-PERIOD_PER_ENTRY_S = 0.05
-"""Further pause for each entry of the last answer: some 20 bytes each, so about 400 bytes per second at most."""
+PERIOD_PER_ENTRY_S = 0.02
+"""Further pause for each entry of the last answer: some 20 bytes each, so about a kilobyte per second at most."""
 PAUSE_MAX_S = 2.0
 """A robot whose answers tell nothing new is asked at most this rarely."""
 AGAIN_S = 30.0
