@@ -179,6 +179,10 @@ class GraphAssembly:
         """Number of closures, each pair once."""
         return len(self._closures)
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        return {} if self._cold is None else {"warm_odometry_pieces": self._cold.size()}
+
     def add(self, new: NewRecord) -> None:
         """Take in one record; records of a log come in their order, those of different logs in any."""
         record = new.record

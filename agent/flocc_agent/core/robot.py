@@ -273,6 +273,7 @@ class Robot:
             **self.election.sizes(),
             **self._answers.sizes(),
             **self._muted.sizes("muted"),
+            **self.assembly.sizes(),
             **self._distrusted.sizes("distrusted"),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
