@@ -25,6 +25,7 @@ from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
+    LatentRecord,
     MeasurementRecord,
     Record,
     RejectionRecord,
@@ -195,7 +196,7 @@ class GraphAssembly:
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
                 self._add_closure(new, record)
-            case RejectionRecord():
+            case RejectionRecord() | LatentRecord():
                 pass
             case UnknownRecord():
                 self._reads_all = False
