@@ -16,6 +16,7 @@ from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, Trajectory, groups_of
+from flocc_agent.core.pulls import remember
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
@@ -31,6 +32,8 @@ from flocc_protocol.records import (
 
 Float = NDArray[np.float64]
 
+ODOMETRY_PAIRS_MAX = 1024
+"""Neighbours that are remembered: those of the pairs that are at work."""
 POSES_OF_A_PIECE = 64
 """Poses that leave memory together: some 4 kB."""
 
@@ -206,8 +209,8 @@ class GraphAssembly:
             index = odometry.neighbour(keyframe.index)
             if index is None:
                 return None
-            T_neighbour_query = odometry.between(keyframe.index, index)
-            found = self._odometry_pairs[keyframe] = (KeyframeId(keyframe.log, index), T_neighbour_query)
+            found = KeyframeId(keyframe.log, index), odometry.between(keyframe.index, index)
+            remember(self._odometry_pairs, keyframe, found, ODOMETRY_PAIRS_MAX)
         return found
 
     def odometry(self, log: LogId) -> Float:

@@ -20,6 +20,7 @@ from flocc_agent.core.effects import Effect, Register, Report
 from flocc_agent.core.front_ends import FrontEnds
 from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.offers import Offers, Recipient
+from flocc_agent.core.pair_set import PairSet
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
@@ -80,7 +81,7 @@ class LoopClosing:
         self._prospects = Prospects(agreement)
         self._unlikely: list[CandidatePair] = []
         self._chosen: list[CandidatePair] | None = None
-        self._resolved: set[CandidatePair] = set()
+        self._resolved = PairSet()
         self._undecided: dict[CandidatePair, Candidate] = {}
         self._listens_until_s = listens_until_s
         self._wanted: tuple[KeyframeId, ...] = ()
