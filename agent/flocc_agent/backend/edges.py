@@ -12,6 +12,15 @@ derivative -R_hat^T t_hat (DESIGN.md section 7), so that Gaussian scales are eli
 - a scale `gamma ~ N(c, sigma^2)` of its own turns the covariance into `Sigma + sigma^2 d d^T` (widened edge);
 - what is left is the cluster's scale c: one variable for many closures, or the constant 1.
 
+That takes the uncertainty of the translation as metres. Where nothing is known of the unit it is known in that unit
+alone: a direction is a direction, however long. There the inverse scale rho multiplies the poses instead,
+
+    e = [ 2 vec(q(R_hat^T R_ij)) ; rho * q - d ],     q = R_hat^T p,
+
+which is linear in rho: the best one is taken at each state, and what q leaves unexplained is the residual. In metres
+such an edge would cost less the nearer its poses are, and many of them together would shrink the map. The prior on the
+length is a residual of its own, along q: `(|q| / |d| - 1) / sigma`.
+
 A scale is kept above `GAMMA_MIN`: an edge whose best scale lies below is held there, and pays for the distance to c.
 Updates are on the right: `R <- R Exp(omega)`, `t <- t + R v`; the tangent order is rotation, translation.
 """
@@ -30,6 +39,7 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 GAMMA_MIN = 1e-3
+TINY = 1e-12
 HALF_TURN_COSINE = 1e-4
 """Cosine of half a rotation error below which that error is a half turn, where its square has no slope."""
 NUDGE_RAD = 3e-3
@@ -86,6 +96,7 @@ class Edges:
         sqrt_information_wide: (E, 6, 6) the same with the edge's own scale eliminated; equal where it has none.
         sigma: (E,) standard deviation of the own scale around c; 0 where it has none.
         cluster: (E,) index of the cluster scale, or -1 for the constant 1.
+        inverse: (E,) whether a scale, the edge's own or that of its cluster, divides poses.
     """
 
     i: Int
@@ -96,6 +107,7 @@ class Edges:
     sqrt_information_wide: Float
     sigma: Float
     cluster: Int
+    inverse: Bool
 
     def __len__(self) -> int:
         return len(self.i)
@@ -111,7 +123,8 @@ class Residuals:
         bound: (E,) whitened distance of a held scale to its cluster's scale, else 0.
         q_error: (E, 4) rotation error, w not negative.
         p: (E, 3) position of the second pose in the first.
-        L: (E, 6, 6) the square-root information that was used.
+        L: (E, 6, 6) the square-root information that was used, by which differences of poses enter.
+        rho: (E,) one over the scale of odometry that is part of it, else 1.
     """
 
     e: Float
@@ -120,6 +133,7 @@ class Residuals:
     q_error: Float
     p: Float
     L: Float
+    rho: Float
 
     def squared(self) -> Float:
         """Squared Mahalanobis norms (E,)."""
@@ -157,19 +171,70 @@ def _unscaled(edges: Edges, state: State) -> tuple[Float, Float, Float]:
 
 
 def residuals(edges: Edges, state: State, hold: bool = True) -> Residuals:
-    """Whitened residuals of all edges, own scales eliminated; without `hold` a scale may pass its lower bound."""
+    """Whitened residuals of all edges, own scales eliminated; without `hold` a scale may pass its lower bound.
+
+    An inverse one never passes zero: what lies behind a keyframe does not agree with a direction ahead.
+    """
     e0, q_error, p = _unscaled(edges, state)
     c = cluster_scales(edges, state)
     e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
     gamma = own_scales(edges, e, c)
-    held = (edges.sigma > 0) & (gamma < GAMMA_MIN) & hold
+    held = (edges.sigma > 0) & (gamma < GAMMA_MIN) & hold & ~edges.inverse
     bound = np.zeros(len(edges))
     L = edges.sqrt_information_wide
     if np.any(held):
         L = np.where(held[:, None, None], edges.sqrt_information, L)
         e[held] = np.einsum("eij,ej->ei", L[held], e0[held] - GAMMA_MIN * edges.d[held])
         bound[held] = (GAMMA_MIN - c[held]) / edges.sigma[held]
-    return Residuals(e, held, bound, q_error, p, L)
+    rho = np.ones(len(edges))
+    if not np.any(edges.inverse):
+        return Residuals(e, held, bound, q_error, p, L, rho)
+    L = L.copy()
+    ways, rows = (np.flatnonzero(edges.inverse & (own == (edges.sigma > 0))) for own in (False, True))
+    if len(ways):
+        rho[ways] = 1.0 / c[ways]
+        e[ways] = np.einsum("eij,ej->ei", L[ways], _times(e0[ways], rho[ways]) - edges.d[ways])
+        L[ways, :, 3:] *= rho[ways, None, None]
+    if len(rows):
+        e[rows], held[rows], L[rows] = _inverse(edges, rows, e0[rows])
+    return Residuals(e, held, bound, q_error, p, L, rho)
+
+
+def _inverse(edges: Edges, rows: Int, e0: Float) -> tuple[Float, Bool, Float]:
+    """Residuals of edges with an inverse scale of their own, whether it is held at zero, and what poses enter by.
+
+    Held are those whose poses lie behind where they should: they pay for how far, at the length they are given.
+    """
+    L, d, q = edges.sqrt_information[rows], edges.d[rows], e0[:, 3:]
+    rho, by_rho = _inverse_scales(edges, rows, e0)
+    behind = rho < 0.0
+    along = by_rho / np.maximum(np.linalg.norm(by_rho, axis=1, keepdims=True), TINY)
+    length_m, measured = np.linalg.norm(q, axis=1), np.linalg.norm(d, axis=1)
+    prior = (length_m / measured - 1.0) / edges.sigma[rows]
+    e = np.einsum("eij,ej->ei", L, _times(e0, rho) - d) + prior[:, None] * along
+    by_pose = L - along[:, :, None] * np.einsum("ei,eij->ej", along, L)[:, None, :]
+    by_pose[:, :, 3:] *= rho[:, None, None]
+    slope = q / np.maximum(length_m * measured * edges.sigma[rows], TINY)[:, None]
+    by_pose[:, :, 3:] += along[:, :, None] * slope[:, None, :]
+    ahead = d[:, :, None] * d[:, None, :] / measured[:, None, None] ** 2
+    ahead[:, :3, :3] = np.eye(3)
+    by_pose[behind] = L[behind] @ ahead[behind]
+    e[behind] = np.einsum("eij,ej->ei", by_pose[behind], e0[behind]) - np.einsum("eij,ej->ei", L[behind], d[behind])
+    return e, behind, by_pose
+
+
+def _times(e0: Float, ratio: Float) -> Float:
+    """Residuals (E, 6) whose translations are so many times (E,) longer."""
+    return np.concatenate([e0[:, :3], ratio[:, None] * e0[:, 3:]], axis=1)
+
+
+def _inverse_scales(edges: Edges, rows: Int, e0: Float) -> tuple[Float, Float]:
+    """Best inverse scales (E,) of edges, and whitened derivatives (E, 6) of their residuals by it."""
+    L = edges.sqrt_information[rows]
+    by_rho = np.einsum("eij,ej->ei", L[:, :, 3:], e0[:, 3:])
+    at_none = np.einsum("eij,ej->ei", L, _times(e0, np.zeros(len(rows))) - edges.d[rows])
+    squared = np.maximum(np.einsum("ei,ei->e", by_rho, by_rho), TINY)
+    return np.asarray(-np.einsum("ei,ei->e", by_rho, at_none) / squared), by_rho
 
 
 def off_half_turns(edges: Edges, state: State) -> State:
@@ -193,11 +258,15 @@ def own_scales(edges: Edges, e_wide: Float, c: Float) -> Float:
 
 
 def scales_at(edges: Edges, state: State) -> Float:
-    """Relative scale (E,) of every edge at a state, not below `GAMMA_MIN`."""
+    """Relative scale (E,) of every edge at a state, not below `GAMMA_MIN`; that where an inverse one is held."""
     e0, _, _ = _unscaled(edges, state)
     c = cluster_scales(edges, state)
     e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
-    return np.where(edges.sigma > 0, np.maximum(own_scales(edges, e, c), GAMMA_MIN), c)
+    scales = np.where(edges.sigma > 0, np.maximum(own_scales(edges, e, c), GAMMA_MIN), c)
+    rows = np.flatnonzero(edges.inverse & (edges.sigma > 0))
+    rho, _ = _inverse_scales(edges, rows, e0[rows])
+    scales[rows] = np.where(rho > 0.0, 1.0 / np.maximum(rho, TINY), GAMMA_MIN)
+    return scales
 
 
 def jacobians(edges: Edges, at: Residuals) -> Jacobians:
@@ -219,8 +288,11 @@ def jacobians(edges: Edges, at: Residuals) -> Jacobians:
 def scale_slopes(edges: Edges, at: Residuals) -> Float:
     """Whitened derivatives (E, 6) of the residuals by the scale of the edge's cluster; zero where it has none."""
     slopes = np.zeros((len(edges), 6))
-    on = np.flatnonzero((edges.cluster >= 0) & ~at.held)
+    on = np.flatnonzero((edges.cluster >= 0) & ~at.held & ~edges.inverse)
     slopes[on] = -np.einsum("eij,ej->ei", at.L[on], edges.d[on])
+    ways = np.flatnonzero((edges.cluster >= 0) & edges.inverse)
+    q = np.einsum("eji,ej->ei", rotations.matrices(edges.q_hat[ways]), at.p[ways])
+    slopes[ways] = -np.einsum("eij,ej->ei", at.L[ways, :, 3:], at.rho[ways, None] * q)
     return slopes
 
 

@@ -69,12 +69,14 @@ def posed(
     config: BackendConfig,
     initial: GraphSolution | None,
     recorded: Mapping[int, LoopClosure] | None = None,
+    lengths_m: Mapping[int, float] | None = None,
 ) -> Posed:
     """The problem of aligned logs and the closures that are left, with all odometry taken as true.
 
     Where the closures' keyframes are named by their places in chains, `recorded` has them under their own numbers.
+    `lengths_m` says how long those without a unit are for their neighbours: the prior around it is wide.
     """
-    problem = build(trajectories, closures, config, recorded)
+    problem = build(trajectories, closures, config, recorded).with_lengths(lengths_m or {})
     in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     says = votes(in_order, config.cluster_keyframes_max)

@@ -17,6 +17,9 @@ from flocc_protocol.ids import KeyframeId, LogId
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+FITTED_SIGMA_RATIO = 5.0
+"""Relative standard deviation of the prior on a length that is fitted to neighbours, where that is wider in metres."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
@@ -62,14 +65,31 @@ class Problem:
         """Scales of odometry at a state."""
         return dict(zip(self.scaled, state.scale[self.clusters :].tolist(), strict=True))
 
+    def with_lengths(self, lengths_m: Mapping[int, float]) -> "Problem":
+        """The same in which closures without a unit are as long as told by number, and at least a metre a unit."""
+        ratio, rows = np.ones(len(self.edges)), self.closure_rows
+        ratio[rows] = [max(lengths_m.get(k, 1.0), 1.0) for k in self.closure_ids]
+        by_column = np.ones((len(ratio), 1, 6))
+        by_column[:, 0, 3:] = 1.0 / ratio[:, None]
+        edges = replace(
+            self.edges,
+            d=self.edges.d * ratio[:, None],
+            sqrt_information=self.edges.sqrt_information * by_column,
+            sqrt_information_wide=self.edges.sqrt_information_wide * by_column,
+            sigma=np.where(ratio > 1.0, np.maximum(self.edges.sigma / ratio, FITTED_SIGMA_RATIO), self.edges.sigma),
+        )
+        return replace(self, edges=edges, scale_initial=self.scale_initial * ratio[rows])
+
     def with_scaled(self, logs: Collection[LogId]) -> "Problem":
         """The same with a scale (true over measured length) for the odometry of these logs and no others."""
         scaled = tuple(log for log in self.logs if log in logs)
         of_log = np.array([self.clusters + scaled.index(log) if log in scaled else NO_CLUSTER for log in self.logs])
-        cluster, starts = self.edges.cluster.copy(), np.array([self.offsets[log] for log in self.logs])
+        cluster, inverse = self.edges.cluster.copy(), self.edges.inverse.copy()
+        starts = np.array([self.offsets[log] for log in self.logs])
         of_odometry = slice(0, self.closure_rows.start)
         cluster[of_odometry] = of_log[np.searchsorted(starts, self.edges.i[of_odometry], side="right") - 1]
-        return replace(self, edges=replace(self.edges, cluster=cluster), scaled=scaled)
+        inverse[of_odometry] = cluster[of_odometry] >= 0
+        return replace(self, edges=replace(self.edges, cluster=cluster, inverse=inverse), scaled=scaled)
 
 
 def build(
@@ -105,7 +125,7 @@ def build(
 
 def concatenate(parts: Sequence[Edges]) -> Edges:
     """Put edges one after the other."""
-    names = ("i", "j", "q_hat", "d", "sqrt_information", "sqrt_information_wide", "sigma", "cluster")
+    names = ("i", "j", "q_hat", "d", "sqrt_information", "sqrt_information_wide", "sigma", "cluster", "inverse")
     return Edges(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -113,7 +133,9 @@ def plain_edges(i: Int, j: Int, T_hat: Float, L: Float) -> Edges:
     """Edges with a metric measurement (E, 4, 4) and square-root information (E, 6, 6)."""
     d = np.zeros((len(i), 6))
     d[:, 3:] = np.einsum("eji,ej->ei", T_hat[:, :3, :3], T_hat[:, :3, 3])
-    return Edges(i, j, quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(len(i)), np.full(len(i), NO_CLUSTER))
+    n = len(i)
+    none = np.zeros(n, dtype=bool)
+    return Edges(i, j, quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(n), np.full(n, NO_CLUSTER), none)
 
 
 def sqrt_informations(covariances: Float) -> Float:
@@ -169,7 +191,8 @@ def closure_edges(
     labels, sigma, clusters = scale_model(recorded or closures, config)
     L = sqrt_informations(covariances)
     wide = sqrt_informations(covariances + sigma[:, None, None] ** 2 * metric.d[:, :, None] * metric.d[:, None, :])
-    return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels), clusters
+    inverse = without_unit(closures, config)
+    return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels, inverse), clusters
 
 
 def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, config: BackendConfig) -> Float:
@@ -205,10 +228,10 @@ def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple
         sigma[free] = prior[free]
         return labels, sigma, 0
     raw = cluster_labels(closures, config.cluster_keyframes_max)
-    raw[~free] = NO_CLUSTER
+    raw[~free | without_unit(closures, config)] = NO_CLUSTER
     sizes = np.bincount(raw[raw >= 0], minlength=1)
     renumbered = np.cumsum(sizes > 1) - 1
-    together = free & (sizes[np.maximum(raw, 0)] > 1)
+    together = (raw >= 0) & (sizes[np.maximum(raw, 0)] > 1)
     labels[together] = renumbered[raw[together]]
     link = np.where(comparable(closures, config), config.scale_link_sigma_ratio, config.scale_link_unknown_sigma_ratio)
     sigma[free] = np.where(together, link, np.hypot(prior, link))[free]
@@ -220,6 +243,15 @@ def prior_sigmas(closures: Sequence[LoopClosure], config: BackendConfig) -> Floa
     known = np.array([c.scale_initial is not None for c in closures], dtype=bool)
     known &= config.scale_initial is not ScaleInitial.RAW
     return np.where(known, config.scale_prior_sigma_ratio, config.scale_prior_unknown_sigma_ratio)
+
+
+def without_unit(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:
+    """Whether nothing is known of each closure's unit (L,), in which its covariance is told."""
+    own = config.formulation in (Formulation.INDEPENDENT, Formulation.SMOOTHED)
+    free = own and config.scale_initial is not ScaleInitial.RAW
+    return np.array(
+        [free and not c.metric and c.scale_initial is None and c.covariance is not None for c in closures], dtype=bool
+    )
 
 
 def comparable(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:

@@ -31,7 +31,7 @@ def edge(rng: np.random.Generator, case: str, sigma: float, cluster: int, scale:
     wide = np.linalg.inv(np.linalg.cholesky(covariance + sigma**2 * np.outer(d, d)))
     edges = Edges(
         np.array([0]), np.array([1]), quaternions(R_hat[None]), d[None], L[None], wide[None],
-        np.array([sigma]), np.array([cluster]),
+        np.array([sigma]), np.array([cluster]), np.array([False]),
     )  # fmt: skip
     state = state_of(np.array([T_i, T_i @ T_ij]))
     return edges, State(state.q, state.t, np.array([scale]))
