@@ -7,7 +7,7 @@ exclusions with a reason; what cannot be solved keeps its odometry. Deterministi
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +24,8 @@ from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.solvers import continued
-from flocc_agent.config import BackendConfig
+from flocc_agent.backend.understated import widened
+from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import (
     ClosureResult,
     ClosureState,
@@ -40,6 +41,9 @@ from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
+
+AWAY_MIN = 10
+"""Fewer closures that are turned away are named one by one, and say nothing of all."""
 
 
 def optimise(
@@ -88,13 +92,17 @@ def _optimise(
     began = time.perf_counter()
     screened = screen(graph)
     left = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    if config.formulation is not Formulation.BASE and config.solver in (Solver.GNC_TLS, Solver.GNC_GM):
+        larger = widened(screened.trajectories, left, config)
+        left, warnings = larger.closures, (*screened.warnings, *larger.warnings)
+        screened = replace(screened, trajectories=larger.trajectories, warnings=warnings)
     held = held_closures(screened.trajectories, left, config)
     screened = replace(screened, excluded={**screened.excluded, **held})
     if not screened.trajectories:
         return OptimisationFailed("; ".join(screened.warnings) or "the pose graph has no odometry")
-    usable = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    usable = {k: c for k, c in left.items() if k not in held}
     after_screening = time.perf_counter()
-    of_held = {k: graph.closures[k] for k in held}
+    of_held = {k: left[k] for k in held}
     outcomes = [
         _solve_group(logs, usable, of_held, screened, config, initial, covariance_of)
         for logs in components_of(list(screened.trajectories), list(usable.values()))
@@ -108,10 +116,26 @@ def _optimise(
     return GraphSolution(
         components=tuple(sorted((c for outcome in outcomes for c in outcome.components), key=lambda c: c.anchor)),
         closures=tuple(results[k] for k in range(len(graph.closures))),
-        warnings=(*screened.warnings, *left_out.values(), *(w for o in outcomes for w in o.warnings)),
+        warnings=(
+            *screened.warnings,
+            *turned_away(results, left),
+            *left_out.values(),
+            *(w for o in outcomes for w in o.warnings),
+        ),
         iterations=sum(outcome.iterations for outcome in outcomes),
         solve_s=time.perf_counter() - began,
         timings_s=timings_s,
+    )
+
+
+def turned_away(results: Mapping[int, ClosureResult], closures: Collection[int]) -> tuple[str, ...]:
+    """A sentence where a solution rests on less than half of the closures that could be used."""
+    away = sum(results[k].state is not ClosureState.USED for k in closures)
+    if away < AWAY_MIN or 2 * away <= len(closures):
+        return ()
+    return (
+        f"{away} of {len(closures)} closures contradict others or odometry and were turned away: most are wrong, "
+        "or covariances are stated too small; robots may be in wrong places",
     )
 
 
