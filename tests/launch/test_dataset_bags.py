@@ -68,6 +68,14 @@ def test_a_storage_file_alone_is_a_bag(tmp_path: Path, kind: str) -> None:
     assert len(Recording.open(convert(next(bag.glob(f"*.{kind}")), tmp_path / "file")).frames) == 5
 
 
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_a_ros2_folder_may_be_named_like_a_file_of_ros1(tmp_path: Path, kind: str) -> None:
+    bag = walking(False).write(tmp_path / "team.bag", kind)
+    found = info(bag)
+    assert (found.format, found.images, found.faults) == ("bag", 5, ())
+    assert len(Recording.open(convert(bag, tmp_path / "out")).frames) == 5
+
+
 @pytest.mark.parametrize("source", ["pose_stamped", "path"])
 def test_odometry_may_be_poses_or_a_path(tmp_path: Path, source: str) -> None:
     script = walking(True, odometry=None)

@@ -26,6 +26,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 RUN_ELSEWHERE = {
     "robot_program.py": "docs/python-api.md, by tests/test_docs.py",
     "saved_map.py": "docs/maps.md, by tests/test_docs.py",
+    "independent_peer.py": "tests/swarm/test_independent_peer.py",
     "own_perception": "tests/swarm/test_own_perception.py",
     "ros2": "tests/agent/runtime/ros2/test_ros2_node.py, as far as it goes without ROS",
 }

@@ -245,6 +245,16 @@ def test_an_environment_that_does_not_fit_is_one_sentence(variable: str, value: 
     assert said in ran.stdout, ran.stderr
 
 
+def test_a_robot_in_another_domain_is_not_seen_and_it_says_what_must_fit(graph: Graph, domain_id: int) -> None:
+    graph.node("driver", "/r1")
+    with opened(domain_id=domain_id + 100) as node:
+        time.sleep(1.0)
+        assert not node.is_connected()
+        assert node.advice == "no other node is seen; do ROS_DOMAIN_ID and RMW_IMPLEMENTATION fit the robot's?"
+    with opened() as node:
+        until(node.is_connected)
+
+
 def test_other_types_and_qualities_of_service_are_told(graph: Graph) -> None:
     plain, offers = graph.node("camera", "/r1"), list[Offer]()
     plain.create_publisher(CompressedImage, "image", 10)

@@ -200,9 +200,14 @@ def _held(graph: PoseGraph, T: Mapping[LogId, Float], anchor: LogId) -> tuple[Ke
 
 def _stiff(mapped: Mapped) -> dict[LogId, Trajectory]:
     """One log of the held keyframes, which does not bend."""
-    poses = np.array([mapped.T_map_camera[node.log][node.index] for node in mapped.nodes])
+    return {stiff_log(mapped.saved): stiff_trajectory(mapped.T_map_camera, mapped.nodes)}
+
+
+def stiff_trajectory(T_map: Mapping[LogId, Float], nodes: Sequence[KeyframeId]) -> Trajectory:
+    """Keyframes one after the other as what does not bend, where they are in a map."""
+    poses = np.array([T_map[node.log][node.index] for node in nodes])
     S = diagonal_covariance(STIFF_ROTATION_SIGMA_RAD, STIFF_TRANSLATION_SIGMA_M)
-    return {stiff_log(mapped.saved): Trajectory(poses, np.broadcast_to(S, (len(poses) - 1, 6, 6)).copy())}
+    return Trajectory(poses, np.broadcast_to(S, (len(poses) - 1, 6, 6)).copy())
 
 
 def _soft(mapped: Mapped, config: BackendConfig) -> tuple[dict[LogId, Trajectory], dict[int, LoopClosure]]:

@@ -23,6 +23,7 @@ from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scal
 from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
+from flocc_agent.backend.settled import settled_round
 from flocc_agent.backend.solvers import continued
 from flocc_agent.backend.understated import widened
 from flocc_agent.config import BackendConfig, Formulation, Solver
@@ -90,6 +91,10 @@ def _optimise(
 ) -> GraphSolution | OptimisationFailed:
     """Optimise a graph of odometry and closures."""
     began = time.perf_counter()
+    settled = None if initial is None or covariance_of else settled_round(graph, config, initial)
+    if settled is not None:
+        solve_s = time.perf_counter() - began
+        return replace(settled, solve_s=solve_s, timings_s={"settled": solve_s})
     screened = screen(graph)
     left = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
     if config.formulation is not Formulation.BASE and config.solver in (Solver.GNC_TLS, Solver.GNC_GM):

@@ -232,6 +232,7 @@ class GraphSolution:
         iterations: Linear solves that were done.
         solve_s: Wall time of the solve (0 on virtual time).
         measured: One result per measured factor of the graph, in its order.
+        whole: The last solution in which everything could move, where this one held what that had settled; else None.
     """
 
     components: tuple[Component, ...]
@@ -241,6 +242,7 @@ class GraphSolution:
     solve_s: float = 0.0
     timings_s: Mapping[str, float] = field(default_factory=dict)
     measured: tuple[FactorResult, ...] = ()
+    whole: "GraphSolution | None" = None
 
 
 @dataclass(frozen=True, slots=True)

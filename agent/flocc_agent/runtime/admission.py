@@ -8,6 +8,8 @@ from flocc_protocol.messages import Envelope, UnknownVersion, decode, kind_of
 
 REFUSED_MAX = 512
 """Refusals that are counted apart, by peer and reason."""
+DETAIL_MAX = 200
+"""Characters; what is refused may be quoted in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +37,8 @@ def admitted(sender: str, kind: str, payload: bytes) -> Envelope | Refusal:
         envelope = decode(payload)
     except UnknownVersion as error:
         return Refusal("another protocol version", str(error))
-    except DecodeError:
-        return Refusal("malformed message")
+    except DecodeError as error:
+        return Refusal("malformed message", f"malformed message, {kind}: {error}"[:DETAIL_MAX])
     if envelope.sender.robot != sender or kind_of(envelope.message) != kind:
         return Refusal("message of another robot or kind than its key")
     return envelope

@@ -24,6 +24,10 @@ class KeyframeSelector:
         moved = float(np.linalg.norm(T_last_body[:3, 3])) >= self._config.distance_m
         return moved or angle_rad(T_last_body[:3, :3]) >= self._config.rotation_rad
 
+    def missed(self) -> None:
+        """What was to become a keyframe could not be used: the next image is wanted wherever it was taken."""
+        self._T_odom_last = None
+
     def took(self, T_odom_body: Float) -> None:
         """A keyframe was taken here."""
         self._T_odom_last = T_odom_body

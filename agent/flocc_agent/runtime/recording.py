@@ -80,15 +80,21 @@ class Recording:
     hidden: NDArray[np.bool_] | None = None
 
     @classmethod
-    def open(cls, path: Path) -> "Recording":
+    def open(cls, path: Path | str) -> "Recording":
         """Read everything but the pixels; an image that is cut off, or of another size, is left out and said.
 
         Raises:
             RecordingError: A file is missing or broken, many images cannot be used, or none lies within the odometry's
                 time.
         """
+        path = Path(path)
         if not path.is_dir():
             raise RecordingError(f"{path}: is not a folder")
+        if not (path / "camera.toml").exists():
+            raise RecordingError(
+                f"{path}: has no camera.toml, no recording in flocc's own form; `flocc dataset convert {path} OUT` "
+                "writes one of a data set or a bag"
+            )
         camera, T_body_camera = read_camera(path / "camera.toml")
         frames = _frames(path, read_tum(path / "odometry.tum"))
         truth_path = path / "groundtruth.tum"

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any
 
@@ -117,7 +118,7 @@ class Bag:
         self._reader: Any = None
         self._salvage: Any = None
         self._known_errors: tuple[type[Exception], ...] = ()
-        self._ros1 = path.suffix == ".bag"
+        self._ros1 = path.suffix == ".bag" and not path.is_dir()
         self._is_foreign = False
         self._foxglove: dict[str, str] = {}
 
@@ -238,8 +239,10 @@ class Bag:
 
     def _paths(self) -> list[Path]:
         """What to open: a ROS 2 folder without its metadata (a recorder that was killed) is opened by its file."""
-        if not self.path.is_dir() or (self.path / "metadata.yaml").exists():
+        if not self.path.is_dir():
             return [self.path]
+        if (self.path / "metadata.yaml").exists():
+            return [self._not_named_as_ros1()]
         parts = ros1_parts(self.path)
         if parts:
             self._ros1 = True
@@ -249,6 +252,14 @@ class Bag:
             raise DatasetError(f"{self.path}: has no metadata.yaml and no db3 or mcap file")
         self.damage = None if len(found) == 1 else f"{self.path}: has no metadata.yaml; only {found[0].name} was read"
         return [found[0]]
+
+    def _not_named_as_ros1(self) -> Path:
+        """The folder under another name where it is called `run.bag`: rosbags takes that for a file of ROS 1."""
+        if self.path.suffix != ".bag":
+            return self.path
+        link = Path(self._stack.enter_context(TemporaryDirectory())) / "bag"
+        link.symlink_to(self.path.resolve())
+        return link
 
     def _open_damaged(self, path: Path, reason: str) -> None:
         file = path if path.is_file() else next(iter(_storages(path)), None)

@@ -107,7 +107,7 @@ class Balanced:
     def step(self, step: Step) -> Iterator[str]:
         """A registration that a stronger robot in range should do, or one owner that does most of the work.
 
-        A name under which two robots seem to run is handed nothing.
+        A name under which two robots seem to run is handed nothing, nor is it asked which of the two does its work.
         """
         life = step.station.name, step.station.life
         for effect in step.effects:
@@ -118,7 +118,7 @@ class Balanced:
                     self._near_since_s[life].pop(peer, None)
                 case Report(CandidateFound(query=query, match=match)):
                     self._known_since_s.setdefault((*life, CandidatePair.of(query, match)), step.at_s)
-                case Register(pair):
+                case Register(pair) if self.classes.get(step.station.log.robot, 0) >= 0:
                     yield from self._registers(step.station, life, pair)
 
     def _registers(self, station: Station, life: tuple[str, int], pair: CandidatePair) -> Iterator[str]:

@@ -158,8 +158,9 @@ class Once:
     """Each pair is registered by one robot, and again only where that could not be known.
 
     A second registration is excused where the first robot died, or where robots were apart: the one that registers
-    took the pair over while the owner in charge, or the first robot, was out of its hearing. It never is where the
-    robot holds a record of the pair already, unless that refused it unseen.
+    took the pair over while the owner in charge, or the first robot, was out of its hearing; and two robots of one name
+    get what one of them is offered. It never is where the robot holds a record of the pair already, unless that refused
+    it unseen.
 
     Attributes:
         separated: At times robots cannot hear each other.
@@ -212,6 +213,8 @@ class Once:
             return True
         if not self.separated or earlier.by is again.station:
             return False
+        if earlier.by.log.robot == again.station.log.robot:
+            return True
         involved = sorted({earlier.by.log.robot, again.station.log.robot, pair.low.log.robot, pair.high.log.robot})
         return any(self._apart(one, other, again) for one in involved for other in involved if one != other)
 

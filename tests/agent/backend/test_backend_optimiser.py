@@ -105,7 +105,7 @@ def test_disconnected_logs_are_components_of_their_own_and_keep_odometry() -> No
     np.testing.assert_array_equal(solution.components[1].T_map_keyframe[C], ODOMETRY[C].T_odom_keyframe)
 
 
-@pytest.mark.parametrize("ratio", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("ratio", [0.1, 0.5])
 def test_the_default_stays_within_twice_the_outlier_free_error(ratio: float) -> None:
     config = BackendConfig(covariances=False, **PLAIN)
     for seed in (1, 3):

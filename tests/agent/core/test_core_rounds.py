@@ -1,6 +1,7 @@
 """Optimisation rounds and the graph they are about."""
 
 import numpy as np
+import pytest
 from tests.agent.core.virtual_time import Robots, answer, descriptor, keyframe
 
 from flocc_agent.core.assembly import GraphAssembly
@@ -123,12 +124,14 @@ def test_a_round_that_is_given_up_is_followed_by_one_with_twice_the_time() -> No
     assert rounds.deadline() == again_s + 2 * TIMEOUT_S
 
 
-def test_the_next_round_pauses_as_long_as_the_last_one_took() -> None:
+@pytest.mark.parametrize(("solve_s", "next_s"), [(0.0, 40.0), (15.0, 35.0), (0.1, 20.1)])
+def test_the_next_round_pauses_as_long_as_the_last_solve_took(solve_s: float, next_s: float) -> None:
+    """Not as long as it took to start the solver's process; on virtual time a solve takes the whole round."""
     rounds, assembly = leading()
     rounds.tick(0.0)
-    rounds.on_solution(TERM, 1, SOLUTION, 20.0)
+    rounds.on_solution(TERM, 1, GraphSolution((), (), solve_s=solve_s), 20.0)
     add_keyframes(assembly, R2, 0, 1)
-    assert rounds.deadline() == 40.0
+    assert rounds.deadline() == next_s
 
 
 def test_a_round_that_gives_no_answer_is_given_up_and_tried_again() -> None:

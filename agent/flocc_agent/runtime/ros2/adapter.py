@@ -207,26 +207,22 @@ class Ros2Adapter:
         while True:
             await self._posed.wait()
             self._posed.clear()
-            while (posed := hearing.synchroniser.next()) is not None:
+            while (posed := hearing.next_wanted(self._selector)) is not None:
                 try:
-                    await self._consider(hearing, posed)
-                except (BadMessage, BadKeyframe, BadMeasurement) as error:
+                    await self._add(hearing, posed)
+                except BadMessage as error:
+                    self._selector.missed()
+                    hearing.refuse("image", str(error))
+                except (BadKeyframe, BadMeasurement) as error:
                     hearing.refuse("image", str(error))
 
-    async def _consider(self, hearing: Hearing, posed: PosedImage) -> None:
-        if not self._selector.wants(posed.T_odom_body):
-            return
-        eye = hearing.eye
-        if eye is None:
-            self._problems.counts["image without intrinsics"] += 1
-            return
+    async def _add(self, hearing: Hearing, posed: PosedImage) -> None:
+        """Make a keyframe of an image whose camera is known."""
+        eye, T_body_camera = hearing.eye, hearing.T_body_camera
+        assert eye is not None
+        assert T_body_camera is not None
         message = self._types.read(posed.payload, hearing.image_type())
-        T_body_camera = hearing.mounting(message.header.frame_id.lstrip("/"))
-        if T_body_camera is None:
-            self._problems.counts["image without mounting"] += 1
-            return
         image = await asyncio.to_thread(eye.image, message)
-        self._selector.took(posed.T_odom_body)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
         step = hearing.covariances.of_keyframe(posed.stamp_ns, posed.T_odom_body)
         if step is not None:

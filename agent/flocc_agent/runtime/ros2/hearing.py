@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
+from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, step_fault
 from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
 from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
 from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
-from flocc_agent.runtime.ros2.synchroniser import Synchroniser
+from flocc_agent.runtime.ros2.synchroniser import HeldImages, PosedImage, Synchroniser
 from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import (
     CAMERA_INFO,
@@ -37,7 +38,7 @@ KINDS = ("tf_static", "camera_info", "odometry", "fix", "image")
 """What is taken in first where much has come at once: images last, since they need all the others."""
 IMAGES_MAX = 64
 IMAGES_BYTES_MAX = 64 * 1024 * 1024
-"""Images that wait for odometry or for the encoder; the oldest gives way."""
+"""Images that wait for odometry, and as many for their camera or the encoder; the oldest gives way."""
 ODOMETRY_GAP_MAX_S = 0.5
 """Images in a longer pause of the odometry are left out: what is between is guessed, not measured."""
 BACK_IN_TIME = (
@@ -76,6 +77,7 @@ class Hearing:
         self._mount_camera = mount_camera
         self._static = StaticFrames()
         self.synchroniser = Synchroniser(IMAGES_MAX, ODOMETRY_GAP_MAX_S, IMAGES_BYTES_MAX)
+        self._wanted = HeldImages[PosedImage](IMAGES_MAX, IMAGES_BYTES_MAX)
         self._compared_ns: int | None = None
         self._were_apart = False
         self.covariances = StepCovariances()
@@ -106,7 +108,7 @@ class Hearing:
         return COMPRESSED_IMAGE if self._config.is_compressed() else IMAGE
 
     def take(self, kind: str, payload: bytes) -> bool:
-        """Take in a message; returns whether it is odometry or an image that counts."""
+        """Take in a message; returns whether images may go on by it."""
         self.heard[kind] += 1
         try:
             match kind:
@@ -116,10 +118,12 @@ class Hearing:
                     return self._take_image(payload)
                 case "camera_info":
                     self._take_camera_info(payload)
+                    return True
                 case "fix":
                     self._take_fix(payload)
                 case "tf_static":
                     self._static.add(self._types.read(payload, TF))
+                    return True
         except BadMessage as error:
             self.refuse(kind, str(error))
         return False
@@ -167,6 +171,28 @@ class Hearing:
         if not self._fixes.add_fix(fix_of(self._types.read(payload, NAV_SAT_FIX))):
             self.complain("fix", BACK_IN_TIME)
 
+    def next_wanted(self, selector: KeyframeSelector) -> PosedImage | None:
+        """The next image that is to become a keyframe and whose camera is known; None where there is none yet.
+
+        Those that come before the camera is known wait for it, as those do that come faster than they are taken.
+        """
+        while (posed := self.synchroniser.next()) is not None:
+            if not selector.wants(posed.T_odom_body):
+                continue
+            selector.took(posed.T_odom_body)
+            self._wanted.add(posed, len(posed.payload))
+            while self._wanted.is_full():
+                lacking = self._lacking(self._wanted.take())
+                self.synchroniser.dropped[f"image without {lacking}" if lacking else "image not taken in time"] += 1
+        return self._wanted.take() if self._wanted and self._lacking(self._wanted.oldest) is None else None
+
+    def _lacking(self, posed: PosedImage) -> str | None:
+        """What is not known yet of an image's camera."""
+        if self.eye is None:
+            return "intrinsics"
+        _, camera_frame = header_of(posed.payload)
+        return "mounting" if self.mounting(camera_frame.lstrip("/")) is None else None
+
     def mounting(self, camera_frame: str) -> Float | None:
         """`T_body_camera`, found once; None while /tf_static does not connect the two."""
         if self.T_body_camera is None:
@@ -196,7 +222,7 @@ class Hearing:
         for kind, topic in self.subscribed.items():
             if not self.heard[kind]:
                 self.complain(kind, f"no {topic.type} has come yet")
-        if self.heard["image"] and self._problems.counts["image without mounting"] and self.T_body_camera is None:
+        if self._wanted and self.eye is not None and self.T_body_camera is None:
             self.complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
 
     def compare_clocks(self, now_ns: int) -> None:

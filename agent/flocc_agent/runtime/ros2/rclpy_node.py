@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import rclpy
 from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -23,7 +24,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from flocc_agent.config import Ros2Config, validated
-from flocc_agent.runtime.ros2.missed import SequenceGaps
+from flocc_agent.runtime.ros2.missed import Missing
 from flocc_agent.runtime.ros2.node import Act, OnMissing, OnPayload, ignore
 from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import MessageTypes, Ros2Error
@@ -149,25 +150,34 @@ class RclpyNode:
         named = Topic(self._node.resolve_topic_name(topic), type_name, self._types.hash(type_name), qos)
 
         made: Any = None
-        gaps = SequenceGaps()
+        missed = Missing()
+
+        def count(missing: int) -> None:
+            if missing and self._node.is_active:
+                on_missing(missing)
 
         def take(payload: bytes, info: Any) -> None:
             """Pass a message on, and those behind it: the executor gives one each time it has waited, which is slow."""
             waiting, taken = DRAIN_MAX, cast(tuple[bytes, Any] | None, (payload, info))
             while taken is not None:
-                missing = gaps.missing_before(*_sender_of(taken[1]))
+                count(missed.heard(*_sender_of(taken[1])))
                 if self._node.is_active or qos.transient_local:
-                    if missing:
-                        on_missing(missing)
                     on_payload(taken[0])
                 waiting -= 1
                 taken = made.handle.take_message(kind, True) if waiting else None
 
-        if kind is not None:
+        def made_with(events: SubscriptionEventCallbacks | None) -> Any:
             overrides = QoSOverridingOptions.with_default_policies()
-            made = self._node.create_subscription(
-                kind, topic, take, profile(qos), raw=True, qos_overriding_options=overrides
+            return self._node.create_subscription(
+                kind, topic, take, profile(qos), event_callbacks=events, raw=True, qos_overriding_options=overrides
             )
+
+        if kind is not None:
+            try:
+                told = SubscriptionEventCallbacks(message_lost=lambda said: count(missed.lost(said.total_count)))
+                made = made_with(told)
+            except UnsupportedEventTypeError:
+                made = made_with(None)
             self._subscribed.append((named, made))
         return named
 

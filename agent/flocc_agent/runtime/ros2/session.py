@@ -13,7 +13,7 @@ import zenoh
 import zenoh.ext
 
 from flocc_agent.config import Ros2Config
-from flocc_agent.runtime.ros2.missed import SequenceGaps
+from flocc_agent.runtime.ros2.missed import Missing
 from flocc_agent.runtime.ros2.node import Act, OnMissing, OnPayload, ignore
 from flocc_agent.runtime.ros2.topics import (
     EntityRole,
@@ -114,10 +114,10 @@ class Ros2Session:
         self, topic: str, type_name: str, qos: Qos, on_payload: OnPayload, on_missing: OnMissing = ignore
     ) -> Topic:
         """Declare a subscription; of a transient local topic the last messages come first."""
-        gaps = SequenceGaps()
+        missed = Missing()
 
         def take(sample: zenoh.Sample) -> None:
-            missing = gaps.missing_before(*sender_of(sample.attachment.to_bytes() if sample.attachment else None))
+            missing = missed.heard(*sender_of(sample.attachment.to_bytes() if sample.attachment else None))
             if missing:
                 on_missing(missing)
             on_payload(sample.payload.to_bytes())

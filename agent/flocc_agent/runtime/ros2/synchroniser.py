@@ -5,6 +5,7 @@ Both queues are bounded. What is lost, and why, is counted; nothing is ever inve
 
 from collections import Counter, deque
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,42 @@ class PosedImage:
     T_odom_body: Float
 
 
+Item = TypeVar("Item")
+
+
+class HeldImages(Generic[Item]):
+    """A queue of images that is bounded in number and bytes; one may always wait."""
+
+    def __init__(self, images_max: int, bytes_max: int) -> None:
+        self._images_max = images_max
+        self._bytes_max = bytes_max
+        self._bytes = 0
+        self._items: deque[tuple[Item, int]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def oldest(self) -> Item:
+        """What has waited for longest."""
+        return self._items[0][0]
+
+    def add(self, item: Item, size: int) -> None:
+        """Let an image of `size` bytes wait; `is_full` then says whether an older one must give way."""
+        self._items.append((item, size))
+        self._bytes += size
+
+    def is_full(self) -> bool:
+        """Whether more wait than may."""
+        return len(self) > self._images_max or (self._bytes > self._bytes_max and len(self) > 1)
+
+    def take(self) -> Item:
+        """The oldest, which waits no longer."""
+        item, size = self._items.popleft()
+        self._bytes -= size
+        return item
+
+
 class Synchroniser:
     """Puts a stream of images and a stream of odometry together."""
 
@@ -36,12 +73,9 @@ class Synchroniser:
             gap_max_s: Longer pauses of odometry are not bridged.
             bytes_max: Of the images that wait; one may always.
         """
-        self._bytes_max = bytes_max
-        self._waiting_bytes = 0
         self.dropped = Counter[str]()
-        self._images_max = images_max
         self._gap_max_s = gap_max_s
-        self._images: deque[tuple[int, bytes]] = deque()
+        self._images = HeldImages[tuple[int, bytes]](images_max, bytes_max)
         self._odometry: deque[tuple[int, Float]] = deque(maxlen=ODOMETRY_MAX)
         self._image_last_ns: int | None = None
 
@@ -64,33 +98,27 @@ class Synchroniser:
             self.dropped["image back in time"] += 1
             return False
         self._image_last_ns = stamp_ns
-        self._images.append((stamp_ns, payload))
-        self._waiting_bytes += len(payload)
-        while len(self._images) > self._images_max or (self._waiting_bytes > self._bytes_max and len(self._images) > 1):
+        self._images.add((stamp_ns, payload), len(payload))
+        while self._images.is_full():
             self.dropped["image without odometry" if self._starved() else "image not taken in time"] += 1
-            self._take_oldest()
+            self._images.take()
         return True
 
     def next(self) -> PosedImage | None:
         """The next image with its pose; None while odometry has not passed it, or there is none."""
         while self._images:
-            stamp_ns, payload = self._images[0]
-            if not self._odometry or self._odometry[-1][0] < stamp_ns:
+            if self._starved():
                 return None
-            self._take_oldest()
+            stamp_ns, payload = self._images.take()
             T_odom_body = self._at(stamp_ns)
             if T_odom_body is not None:
                 return PosedImage(stamp_ns, payload, T_odom_body)
             self.dropped["image without odometry"] += 1
         return None
 
-    def _take_oldest(self) -> None:
-        _, payload = self._images.popleft()
-        self._waiting_bytes -= len(payload)
-
     def _starved(self) -> bool:
         """Whether images wait for odometry rather than for whoever takes them."""
-        return not self._odometry or self._odometry[-1][0] < self._images[0][0]
+        return not self._odometry or self._odometry[-1][0] < self._images.oldest[0]
 
     def _at(self, stamp_ns: int) -> Float | None:
         """Odometry at a time that the newest has reached; None before the oldest and inside of a long pause."""

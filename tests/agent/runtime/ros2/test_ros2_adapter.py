@@ -223,8 +223,8 @@ async def test_what_the_covariance_of_odometry_grew_by_becomes_that_of_the_steps
         sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         hearing.take("odometry", cdr_by_hand.odometry(sample, variance=1e-6 * t_ms))
         hearing.take("image", cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "mono8", bytes(24), 6))
-        while (posed := hearing.synchroniser.next()) is not None:
-            await adapter._consider(hearing, posed)
+        while (posed := hearing.next_wanted(adapter._selector)) is not None:
+            await adapter._add(hearing, posed)
     assert len(agent.keyframes) == 4
     assert [round(1000 * (stamp_s - EPOCH_S)) for _, stamp_s in agent.measured] == [100, 200, 300]
     for measured, _ in agent.measured:
@@ -417,11 +417,12 @@ async def test_without_a_router_it_says_so_and_connects_when_one_comes() -> None
             await until(lambda: linked in agent.facts)
 
 
-async def test_what_an_image_waits_for_is_said() -> None:
+async def test_images_wait_for_their_camera_and_what_they_wait_for_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flocc_agent.runtime.ros2.adapter.PATIENCE_S", 1.0)
     (port,) = free_ports(1)
     with ros(port) as robot:
         async with adapted(port) as (agent, adapter):
-            times = iter(range(0, 100_000, 50))
+            times = iter(range(0, 100_000, 10))
 
             def step() -> None:
                 t = next(times)
@@ -429,15 +430,41 @@ async def test_what_an_image_waits_for_is_said() -> None:
                 robot.odometry(t)
 
             await until(lambda: any("CameraInfo" in said for said in agent.problems()), act=step)
-
-            def calibrated_step() -> None:
-                robot.camera_info()
-                step()
-
-            await until(lambda: "ros2 image without mounting" in adapter.counters(), act=calibrated_step)
+            assert agent.keyframes == []
+            robot.camera_info()
+            await until(lambda: any("does not connect" in said for said in agent.problems()), act=step)
+            assert agent.keyframes == []
+            robot.mounting()
+            await until(lambda: len(agent.keyframes) >= 4)
+            lost = adapter.counters()
     assert "/r1/camera/camera_info: no sensor_msgs/msg/CameraInfo has come yet" in agent.problems()
     assert "/tf_static: no tf2_msgs/msg/TFMessage has come yet" in agent.problems()
-    assert agent.keyframes == []
+    assert "/tf_static: does not connect 'base_link' with the camera's frame" in agent.problems()
+    stamps_s = [stamp_s - EPOCH_S for *_, stamp_s in agent.keyframes]
+    assert stamps_s[0] < 1.0, "from the first image on, also those that came before the camera was known"
+    assert np.all(np.abs(np.diff(stamps_s) - 0.095) < 0.006)
+    assert lost == {}
+
+
+async def test_images_that_wait_for_their_camera_are_bounded_and_counted() -> None:
+    agent, config = Agent(), Ros2Config()
+    adapter = Ros2Adapter(config, "r1", KeyframeSelector(KeyframeConfig(distance_m=0.09)), agent.host())
+    hearing = adapter._hearing = adapter._heard(config)
+    K, P = (5.0, 0, 3.0, 0, 5.0, 2.0, 0, 0, 1), (5.0, 0, 3.0, 0, 0, 5.0, 2.0, 0, 0, 0, 1, 0)
+    info = cdr_by_hand.camera_info(stamp(0), "optical", SIZE, K, [0.0] * 5, P)
+    placed = cdr_by_hand.transforms([Stamped((0, 0), "base_link", "optical", MOUNTING[:3], MOUNTING[3:])])
+    for count, kind, payload in ((70, "camera_info", info), (80, "tf_static", placed)):
+        for t_ms in range(0 if count == 70 else 7000, 100 * count, 100):
+            sample = Stamped(stamp(t_ms), "odom", "base_link", (1e-3 * t_ms, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            hearing.take("odometry", cdr_by_hand.odometry(sample))
+            hearing.take("image", cdr_by_hand.image(stamp(t_ms), "optical", SIZE, "mono8", bytes(24), 6))
+            assert hearing.next_wanted(adapter._selector) is None
+        assert hearing.take(kind, payload)
+    assert adapter.counters() == {"ros2 image without intrinsics": 6, "ros2 image without mounting": 10}
+    waiting = iter(lambda: hearing.next_wanted(adapter._selector), None)
+    assert [round(posed.stamp_ns * 1e-9 - EPOCH_S, 1) for posed in waiting] == [
+        round(0.1 * k, 1) for k in range(16, 80)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -492,9 +519,9 @@ async def test_no_payload_of_any_kind_stops_the_adapter() -> None:
         sent = {"odometry": cdr_by_hand.odometry(sample), "image": picture, "camera_info": info, "tf_static": placed}
         for kind, payload in sent.items():
             adapter._arrived(Incoming("", kind, mutated(payload, rng)))
-        while (posed := hearing.synchroniser.next()) is not None:
+        while (posed := hearing.next_wanted(selector)) is not None:
             with suppress(BadMessage):
-                await adapter._consider(hearing, posed)
+                await adapter._add(hearing, posed)
     assert len(agent.problems()) <= 64
     assert sum(adapter.counters().values()) > 300
     assert all(np.all(np.isfinite(T)) for _, T, _ in agent.keyframes)
