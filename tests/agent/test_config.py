@@ -55,7 +55,9 @@ def test_bulk_sessions_are_found_at_the_port_after_that_of_control() -> None:
     assert [config.multicast_group(control) for control in (True, False)] == ["224.0.0.224:7500", "224.0.0.224:7501"]
 
 
-@pytest.mark.parametrize("address", ["224.0.0.224", ":7446", "224.0.0.224:", "224.0.0.224:0", "224.0.0.224:65535"])
+@pytest.mark.parametrize(
+    "address", ["224.0.0.224", ":7446", "224.0.0.224:", "224.0.0.224:0", "224.0.0.224:65535", "10.0.0.7:7446"]
+)
 def test_a_multicast_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(ValueError, match="is no multicast address"):
         TransportConfig(multicast_address=address)

@@ -27,7 +27,7 @@ def write_plain(path: Path, count: int = 3) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", [LensKind.EQUIDISTANT, LensKind.DOUBLE_SPHERE])
+@pytest.mark.parametrize("kind", [LensKind.EQUIDISTANT, LensKind.DOUBLE_SPHERE, LensKind.EUCM])
 def test_wide_and_back_is_the_same_picture(tmp_path: Path, kind: LensKind) -> None:
     wide = write_wide(write_plain(tmp_path / "narrow"), tmp_path / "wide", kind)
     recording = Recording.open(convert(wide, tmp_path / "out", view_deg=65.0))

@@ -375,3 +375,31 @@ def test_a_fisheye_in_rtabmaps_six_numbers_has_four(tmp_path: Path) -> None:
     assert read(tmp_path, text).camera.distortion == (0.1, 0.02, 0.001, 0.002)
     with pytest.raises(DatasetError, match="has 4 coefficients, but there are 6"):
         read(tmp_path, text.replace("0.02, 0.0, 0.0", "0.02, 0.3, 0.0"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "wanted"),
+    [
+        ("P.txt", "500 0 320 -60\n0 500 240 0\n0 0 1 0\n", [0.12, 0, 0]),
+        ("calib_cam_to_cam.txt#K1", "K_00: 500 0 320 0 500 240 0 0 1\nP_rect_00: 500 0 320 0 0 500 240 0 0 0 1 0\n"
+         "S_01: 640 480\nK_01: 500 0 320 0 500 240 0 0 1\nR_01: 0 1 0 -1 0 0 0 0 1\nT_01: -0.5 0.1 0\n"
+         "P_rect_01: 500 0 320 -60 0 500 240 0 0 0 1 0\n", [0.1, 0.5, 0]),
+    ],
+)  # fmt: skip
+def test_where_a_camera_of_several_sits_is_read(tmp_path: Path, name: str, text: str, wanted: list[float]) -> None:
+    lens = read(tmp_path, text, name, (640, 480))
+    np.testing.assert_allclose(lens.T_body_camera[:3, 3], wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"frames": [], "w": 640, "h": 480, "fl_x": 700, "camera_angle_x": 0.5}', "fl_x is 700, but camera_angle_x"),
+        ('{"calib_dimension": {"w": 640, "h": 480}, "input_horizontal_stretch": 1.333, "fisheye_params":'
+         '{"camera_matrix": [[300, 0, 320], [0, 301, 240], [0, 0, 1]], "distortion_coeffs": [0.1, 0, 0, 0]}}',
+         "is of pictures that are stretched by 1.333 and 1.0 first"),
+    ],
+)  # fmt: skip
+def test_a_lens_that_a_second_key_changes_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(DatasetError, match=said):
+        read(tmp_path, text, "camera.json")

@@ -23,6 +23,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.core.reports import Fact
 from flocc_agent.perception.learned.weight_sources import weights_folder
 from flocc_agent.runtime import network_faults as network
+from flocc_agent.runtime import zenoh_admin
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentStopped
 from flocc_agent.runtime.recording import write_camera
@@ -255,10 +256,61 @@ def test_an_interface_that_does_not_exist_is_named() -> None:
     assert fault.startswith("transport.interface: the interface 'wlan7' does not exist; there is lo")
     (fault,) = network.network_faults(config(multicast=False, control_listen=("tcp/[::]:0#iface=wlan7",)), "a")
     assert "tcp/[::]:0#iface=wlan7: the interface 'wlan7' does not exist" in fault
+    (fault,) = network.network_faults(config(interface="192.0.2.7"), "a")
+    assert fault == "transport.interface: no interface of this machine has the address 192.0.2.7"
+
+
+@pytest.mark.parametrize("words", [("status", "--timeout", "0.2"), ("chaos", "heal")])
+def test_operators_on_an_interface_that_does_not_exist_hear_of_it(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent = tmp_path / "agent.toml"
+    agent.write_text('name = "r1"\nswarm = "alone"\n[transport]\ninterface = "wlan7"\n')
+    monkeypatch.setattr(zenoh_admin, "SCOUT_S", 0.1)
+    assert run(monkeypatch, *words, "--config", str(agent)) == 2
+    assert "the interface 'wlan7' does not exist; there is lo" in capsys.readouterr().err
+
+
+def test_a_host_to_which_no_way_leads_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_route(_family: int, _address: object) -> str:
+        return "Network is unreachable"
+
+    roster = {"b": {"control": ("tcp/192.0.2.7:7450",), "bulk": ()}}
+    monkeypatch.setattr(network, "_no_way", no_route)
+    (fault,) = network.network_faults(config(multicast=False, roster=roster), "a")
+    assert fault.startswith("transport.roster.b: the host '192.0.2.7' cannot be reached (Network is unreachable)")
+
+
+def test_a_launch_without_a_loopback_interface_says_so_before_anything_is_prepared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def down(*_: object) -> None:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    monkeypatch.setattr(socket, "create_connection", down)
+    assert run(monkeypatch, "launch", "corridor", "--out", str(tmp_path / "run")) == 2
+    assert "127.0.0.1, which cannot be reached (Network is unreachable)" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_device_without_an_end_is_no_configuration(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(monkeypatch, "agent", "--config", "/dev/zero") == 2
+    assert "/dev/zero: has more than" in capsys.readouterr().err
+
+
+def test_a_link_that_leads_to_itself_is_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    assert run(monkeypatch, "map", "merge", str(loop), str(loop), "--out", str(tmp_path / "out")) == 2
+    assert f"error: {loop}" in capsys.readouterr().err
 
 
 def test_a_host_that_does_not_resolve_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown(host: str, _: object) -> list[object]:
+    def unknown(host: str, *_: object, **__: object) -> list[object]:
         if host != "127.0.0.1":
             raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
         return []
@@ -285,6 +337,15 @@ def test_weights_of_a_user_without_a_home_are_in_the_temporary_folder(
 ) -> None:
     homeless(monkeypatch, tmp_path)
     assert weights_folder() == tmp_path / f"flocc-{os.getuid()}" / "weights"
+
+
+def test_an_agent_in_somebody_elses_folder_ends_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "agent.toml").write_text(f'name = "r1"\nfolder = "{tmp_path / "a" / "b"}"\n')
+    monkeypatch.setattr(os, "access", lambda _place, mode, **_: mode != os.W_OK)
+    assert run(monkeypatch, "agent", "--config", str(tmp_path / "agent.toml")) == 2
+    assert f"{tmp_path} cannot be written by this user" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [("launch", "corridor"), ("demo", "--small")])

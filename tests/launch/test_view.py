@@ -1,8 +1,10 @@
 """flocc view: a file for rerun's viewer, without a display."""
 
 import builtins
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_shipped
 from flocc_launch.simulation.simulate import simulate
 from flocc_launch.view.live_view import view_growing
-from flocc_launch.view.run_view import ViewError, left_over, residuals, view
+from flocc_launch.view.run_view import ViewError, closed, left_over, residuals, view
 
 ENTITIES = (
     b"before/r1",
@@ -74,6 +76,14 @@ def test_a_run_that_goes_on_is_drawn_as_it_grows(tmp_path: Path) -> None:
     content = (tmp_path / "run.rrd").read_bytes()
     for entity in (b"live/r3/odometry", b"live/r2/here", b"links", b"lost its leader"):
         assert entity in content, entity
+
+
+def test_a_file_that_a_full_disk_cut_off_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    recording = SimpleNamespace(flush=lambda: None)
+    with pytest.raises(ViewError, match="the disk is full, and the file is cut off"):
+        closed(recording, tmp_path / "run.rrd", "shown")
+    assert closed(recording, None, "shown") == "shown"
 
 
 def test_no_display_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

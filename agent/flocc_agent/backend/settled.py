@@ -246,6 +246,7 @@ def _opened(component: Component, graph: PoseGraph, fresh: set[int], seen: Mappi
         k: c
         for k, c in enumerate(graph.closures)
         if c.query.log in bases
+        and c.match.log in bases
         and (
             k in fresh
             or ((some.is_open(c.query) or some.is_open(c.match))

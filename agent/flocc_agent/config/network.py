@@ -1,6 +1,7 @@
 """Addresses: where a robot listens, whom it dials, with which keys, and where its figures are served."""
 
 import re
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,9 +38,16 @@ def checked_group(text: str) -> str:
         ValueError: Not GROUP:PORT, or there is no next port.
     """
     group, _, port = text.rpartition(":")
-    if not group or not port.isdecimal() or not 1 <= int(port) < PORT_MAX:
+    if not _is_multicast(group) or not port.isdecimal() or not 1 <= int(port) < PORT_MAX:
         raise ValueError(f"{text!r} is no multicast address; one looks like 224.0.0.224:7446")
     return text
+
+
+def _is_multicast(group: str) -> bool:
+    try:
+        return ip_address(group.removeprefix("[").removesuffix("]")).is_multicast
+    except ValueError:
+        return False
 
 
 UNNAMED_SWARM = "swarm"

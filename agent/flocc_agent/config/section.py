@@ -106,6 +106,8 @@ def _keys(kind: Any, sections: list[str]) -> list[str]:
     return _keys(below[sections[0]], sections[1:]) if sections[0] in below else []
 
 
+TEXT_BYTES_MAX = 16 * 1024 * 1024
+"""Of a configuration or scenario; a device such as /dev/zero never ends."""
 KEY_PARTS_MAX = 64
 LONG_KEY = re.compile(rf"^\s*\[*(?:[\w-]+\s*\.\s*){{{KEY_PARTS_MAX},}}[\w-]", re.MULTILINE | re.ASCII)
 """The parser's time grows with the square of a key's parts: 50,000 of them take minutes."""
@@ -118,7 +120,7 @@ def read_toml(path: Path) -> dict[str, object]:
         ConfigError: It is missing, unreadable or not TOML; the message names the file (and line).
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = _bounded(path).decode("utf-8-sig")
         if LONG_KEY.search(text):
             raise ConfigError(f"{path}: has a key of more than {KEY_PARTS_MAX} parts")
         return tomllib.loads(text)
@@ -130,6 +132,14 @@ def read_toml(path: Path) -> dict[str, object]:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
 
 
+def _bounded(path: Path) -> bytes:
+    with path.open("rb") as file:
+        content = file.read(TEXT_BYTES_MAX + 1)
+    if len(content) > TEXT_BYTES_MAX:
+        raise ConfigError(f"{path}: has more than {TEXT_BYTES_MAX} bytes, which is no configuration")
+    return content
+
+
 def read_json(path: Path) -> dict[str, object]:
     """Read a JSON file that holds an object.
 
@@ -137,7 +147,7 @@ def read_json(path: Path) -> dict[str, object]:
         ConfigError: It is missing, unreadable or no such file; the message names it.
     """
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(_bounded(path))
     except RecursionError as error:
         raise ConfigError(f"{path}: is nested too deeply") from error
     except (OSError, ValueError) as error:

@@ -77,10 +77,16 @@ class _Rows:
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._thinned = 0
-        self._same_place = SAME_PLACE_SIMILARITY
+        self._unthinned: dict[int, int] = {}
+        self._same_place: dict[int, float] = {}
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def numbers(self) -> list[int]:
+        """Of each log that has rows."""
+        return list(self._unthinned)
 
     @property
     def logs(self) -> NDArray[np.int32]:
@@ -105,54 +111,56 @@ class _Rows:
         self._logs[self._count] = log
         self._indices[self._count] = index
         self._count += 1
+        self._unthinned[log] = self._unthinned.get(log, 0) + 1
 
-    def thin(self, held: int) -> None:
-        """Keep the newest so many rows whole, and at most so many that stand for the older ones.
+    def thin(self, log: int, held: int) -> None:
+        """Keep a log's newest so many rows whole, and at most so many that stand for its older ones.
 
-        A log is looked through in blocks of its own rows, so that robots which hold it find the same ones to stay, and
-        ask for the same pairs.
+        A log is looked through in blocks of its own rows, and no other one's decide, so that robots which hold it find
+        the same ones to stay: they ask for the same pairs then, instead of each for its own.
         """
-        while self._count - self._thinned >= held + THINNED_AT_ONCE:
-            unthinned = self._logs[self._thinned : self._count]
-            longest = int(np.bincount(unthinned).argmax())
-            oldest = self._thinned + np.flatnonzero(unthinned == longest)[:THINNED_AT_ONCE]
-            if len(oldest) < THINNED_AT_ONCE:
-                return
-            self._keep(oldest[self._stays(oldest, self._thinned)], oldest)
-            while self._thinned > held and self._same_place > -1.0:
-                self._same_place -= SAME_PLACE_STEP
-                self._thin_again()
+        while self._unthinned[log] >= held + THINNED_AT_ONCE:
+            oldest = self._thinned + np.flatnonzero(self._logs[self._thinned : self._count] == log)[:THINNED_AT_ONCE]
+            stay = oldest[self._stays(log, oldest, self._standing(log))]
+            others = np.setdiff1d(np.arange(self._thinned, self._count), oldest, assume_unique=True)
+            self._order(self._thinned, np.concatenate([stay, others]))
+            self._thinned += len(stay)
+            self._unthinned[log] -= len(oldest)
+            while len(self._standing(log)) > held and self._same_place.get(log, 0.0) > -1.0:
+                self._thin_again(log)
 
-    def _thin_again(self) -> None:
-        """Look through the rows that stand for others with the present bound."""
-        until, self._thinned = self._thinned, 0
-        while self._thinned < until:
-            block = np.arange(self._thinned, min(self._thinned + THINNED_AT_ONCE, until))
-            stay = block[self._stays(block, self._thinned)]
-            until -= len(block) - len(stay)
-            self._keep(stay, block)
+    def _thin_again(self, log: int) -> None:
+        """Look through a log's rows that stand for others with a lower bound."""
+        self._same_place[log] -= SAME_PLACE_STEP
+        standing, stay = self._standing(log), np.empty(0, dtype=np.intp)
+        for first in range(0, len(standing), THINNED_AT_ONCE):
+            block = standing[first : first + THINNED_AT_ONCE]
+            stay = np.concatenate([stay, block[self._stays(log, block, stay)]])
+        gone = np.setdiff1d(standing, stay, assume_unique=True)
+        self._order(0, np.setdiff1d(np.arange(self._count), gone, assume_unique=True))
+        self._thinned -= len(gone)
 
-    def _stays(self, block: NDArray[np.intp], first: int) -> NDArray[np.bool_]:
-        """Which of these rows neither a row before `first` nor one before it in the block stands for."""
-        rows, logs = self._units(block), self._logs[block]
+    def _standing(self, log: int) -> NDArray[np.intp]:
+        """Places of a log's rows that stand for older ones."""
+        return np.flatnonzero(self._logs[: self._thinned] == log)
+
+    def _stays(self, log: int, block: NDArray[np.intp], before: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which rows (K,) of a log neither one of those before them nor one before it in the block stands for."""
+        bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
+        rows = self._units(block)
         stays = np.ones(len(block), dtype=bool)
-        for begin in range(0, first, ROWS_AT_ONCE):
-            before = np.arange(begin, min(begin + ROWS_AT_ONCE, first))
-            alike = (rows @ self._units(before).T >= self._same_place) & (logs[:, None] == self._logs[before])
-            stays &= ~alike.any(axis=1)
-        among = (rows @ rows.T >= self._same_place) & (logs[:, None] == logs)
+        for first in range(0, len(before), ROWS_AT_ONCE):
+            stays &= ~np.any(rows @ self._units(before[first : first + ROWS_AT_ONCE]).T >= bound, axis=1)
+        among = rows @ rows.T >= bound
         for k in np.flatnonzero(stays).tolist():
             stays[k] = not np.any(among[k, :k] & stays[:k])
         return stays
 
-    def _keep(self, stay: NDArray[np.intp], block: NDArray[np.intp]) -> None:
-        """Of a block of rows that are not thinned yet these stay, and are thinned from now on."""
-        others = np.setdiff1d(np.arange(self._thinned, self._count), block, assume_unique=True)
-        order = np.concatenate([stay, others])
+    def _order(self, first: int, order: NDArray[np.intp]) -> None:
+        """Put these rows after the first so many, and leave out what is not among them."""
         for values in (self._rows, self._inverse_norms, self._logs, self._indices):
-            values[self._thinned : self._thinned + len(order)] = values[order]
-        self._count = self._thinned + len(order)
-        self._thinned += len(stay)
+            values[first : first + len(order)] = values[order]
+        self._count = first + len(order)
 
     def _units(self, places: NDArray[np.intp]) -> Floats:
         """Rows (K, D) of unit length."""
@@ -214,7 +222,7 @@ class PlaceRecognition:
             own: The log that this robot writes.
             parameters: What is a candidate.
             closed: Earlier logs of its own.
-            keyframes_held: Keyframes that are compared whole, the newest ones; older ones are thinned.
+            keyframes_held: Keyframes of other logs that are compared whole, the newest of each; older ones are thinned.
         """
         self._own = own
         self._keyframes_held = keyframes_held
@@ -287,20 +295,32 @@ class PlaceRecognition:
             self._logs.append(log)
             self._dimensions.append(dimension)
             self._best.append(-1.0)
+            self._thin_all()
         elif self._dimensions[number] != dimension:
             return False
         if log == self._own:
             if self._own_rows is None:
                 self._own_rows = _Rows(dimension, np.float32)
             self._own_rows.append(number, keyframe.index, descriptor)
-            self._own_rows.thin(self._keyframes_held)
+            self._own_rows.thin(number, self._share)
         elif self._is_compared(log):
             rows = self._others.get(dimension)
             if rows is None:
                 rows = self._others[dimension] = _Rows(dimension, np.int8)
             rows.append(number, keyframe.index, descriptor)
-            rows.thin(self._keyframes_held)
+            rows.thin(number, self._share)
         return True
+
+    def _thin_all(self) -> None:
+        """With another log each has a smaller share, also one that gets no more keyframes."""
+        for rows in (*self._others.values(), *([] if self._own_rows is None else [self._own_rows])):
+            for number in rows.numbers:
+                rows.thin(number, self._share)
+
+    @property
+    def _share(self) -> int:
+        """Rows of one log that are compared whole: all robots that know the same logs have the same of each."""
+        return self._keyframes_held // max(len(self._logs) - 1, 1)
 
     def _among_all(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
         """Candidates of one of this robot's keyframes, with each other robot's and, if wanted, with its own."""

@@ -5,11 +5,15 @@ import re
 import socket
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.runtime.addresses import is_address
 from flocc_agent.runtime.certificate_faults import certificate_faults
 
+LOOPBACK_S = 5.0
+ROUTE_PORT = 9
+"""Discard; a route does not depend on the port, and nothing is sent."""
 _SIOCGIFFLAGS = 0x8913
 _UP, _LOOPBACK, _MULTICAST = 0x1, 0x8, 0x1000
 
@@ -41,7 +45,10 @@ def interface_faults(config: TransportConfig) -> Iterator[str]:
     """Interfaces that do not exist, and no interface for multicast but the machine's own."""
     there = {name: _flags(name) for _, name in socket.if_nameindex()}
     told = ", ".join(there) or "none"
-    if config.multicast and config.interface != "auto" and not is_address(config.interface):
+    if config.multicast and is_address(config.interface):
+        if not _is_ours(config.interface):
+            yield f"transport.interface: no interface of this machine has the address {config.interface}"
+    elif config.multicast and config.interface != "auto":
         if config.interface not in there:
             yield f"transport.interface: the interface {config.interface!r} does not exist; there is {told}"
         elif not there[config.interface] & _UP:
@@ -56,7 +63,7 @@ def interface_faults(config: TransportConfig) -> Iterator[str]:
 
 
 def host_faults(config: TransportConfig, robot: str) -> Iterator[str]:
-    """Hosts of the roster that this robot dials and that have no address."""
+    """Hosts of the roster that this robot dials and that have no address, or to which no way leads from here."""
     asked: set[str] = set()
     for name, peer in sorted(config.roster.items()):
         for endpoint in (*peer.control, *peer.bulk):
@@ -64,11 +71,50 @@ def host_faults(config: TransportConfig, robot: str) -> Iterator[str]:
             if name == robot or host in asked:
                 continue
             asked.add(host)
+            told = f"transport.roster.{name}: the host {host!r}"
             try:
-                socket.getaddrinfo(host, None)
+                found = socket.getaddrinfo(host, ROUTE_PORT, type=socket.SOCK_DGRAM)
             except OSError as error:
-                told = error.strerror or error
-                yield f"transport.roster.{name}: the host {host!r} is not known ({told}); it is dialled again and again"
+                yield f"{told} is not known ({error.strerror or error}); it is dialled again and again"
+                continue
+            faults = [_no_way(family, address) for family, _, _, _, address in found]
+            if found and None not in faults:
+                yield f"{told} cannot be reached ({faults[0]}); it is dialled again and again"
+
+
+def loopback_fault() -> str | None:
+    """Why programs on this machine do not reach each other over 127.0.0.1; None where they do."""
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            socket.create_connection(server.getsockname(), LOOPBACK_S).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def with_faults(sentence: str, config: TransportConfig) -> str:
+    """A sentence that nobody was found, and what of the network is not there; asks the resolver."""
+    return "; ".join((sentence, *network_faults(config, "")))
+
+
+def _no_way(family: int, address: tuple[Any, ...]) -> str | None:
+    """Why the machine has no route to an address; nothing is sent."""
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect(address)
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def _is_ours(address: str) -> bool:
+    """Whether a socket can be bound to an address, as only those of this machine's interfaces let one."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind((address, 0))
+    except OSError:
+        return False
+    return True
 
 
 def _carries_multicast(flags: int) -> bool:

@@ -204,12 +204,13 @@ def _scouted(config: TransportConfig) -> list[str]:
     zenoh_config = zenoh.Config()
     zenoh_config.insert_json5("scouting/multicast/address", json.dumps(config.multicast_group(True)))
     zenoh_config.insert_json5("scouting/multicast/interface", json.dumps(config.interface))
-    scout = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=zenoh_config)
-    time.sleep(SCOUT_S)
     found: list[str] = []
-    while (hello := scout.try_recv()) is not None:
-        found += map(str, hello.locators)
-    scout.stop()
+    with suppress(zenoh.ZError):  # an interface that is not there
+        scout = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=zenoh_config)
+        time.sleep(SCOUT_S)
+        while (hello := scout.try_recv()) is not None:
+            found += map(str, hello.locators)
+        scout.stop()
     return found
 
 

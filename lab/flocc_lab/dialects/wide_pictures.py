@@ -1,7 +1,8 @@
 """Data sets as a wide lens would have taken them: pinhole images remapped at the same angular resolution.
 
 What a data set's own camera sees is seen whole by the wide one; around it the wide images are black. So a run on what
-flocc makes of them can be held against one on the original: both see the same part of the scene.
+flocc makes of them can be held against one on the original: both see the same part of the scene. The control is EUCM
+with alpha 0, which is a pinhole: its pictures go the same way twice through interpolation, and no lens bends anything.
 
     python -m flocc_lab.dialects.wide_pictures SOURCE OUT --kind equidistant
 """
@@ -26,22 +27,28 @@ from flocc_launch.datasets.source import DatasetError
 Float = NDArray[np.float64]
 MARGIN = 1.06
 """The wide image is so much larger than what it must hold, for the corners of the remapped one."""
+CONTROL_SHIFT_PX = 0.25
+"""Keeps the control's pixels off those of the original and of what is made of it: between equal grids nothing is
+interpolated. A quarter of a pixel dulls as the mean over all shifts does."""
 
 
 def wide_model(camera: Camera, kind: LensKind) -> CameraModel:
     """A wide lens of a camera's angular resolution in the middle that sees all that the camera sees.
 
     Raises:
-        ValueError: Neither Kannala-Brandt nor double sphere is wanted.
+        ValueError: Neither Kannala-Brandt nor double sphere nor the control is wanted.
     """
     shape: tuple[float, ...]
     distortion: tuple[float, ...]
+    shift = 0.0
     if kind is LensKind.EQUIDISTANT:
         shape, distortion, stretch = (), (0.02, -0.01, 0.003, -0.0005), 1.0
     elif kind is LensKind.DOUBLE_SPHERE:
         shape, distortion, stretch = (-0.2, 0.59), (), 0.8
+    elif kind is LensKind.EUCM:
+        shape, distortion, stretch, shift = (0.0, 1.0), (), 1.0, CONTROL_SHIFT_PX
     else:
-        raise ValueError(f"{kind} is not one of the two that are measured")
+        raise ValueError(f"{kind} is not one of those that are measured")
     f = camera.fx * stretch
     model = CameraModel(4096, 4096, f, f, 2048.0, 2048.0, distortion, kind, shape)
     corner = np.array([[-(camera.cx + 0.5) / camera.fx, -(camera.cy + 0.5) / camera.fy, 1.0]])
@@ -49,7 +56,7 @@ def wide_model(camera: Camera, kind: LensKind) -> CameraModel:
     pixels, _ = model.project(edges)
     half = MARGIN * np.abs(pixels - 2048.0).max(axis=0)
     width, height = (2 * math.ceil(side) for side in half)
-    return CameraModel(width, height, f, f, (width - 1) / 2, (height - 1) / 2, distortion, kind, shape)
+    return CameraModel(width, height, f, f, (width - 1) / 2 + shift, (height - 1) / 2 + shift, distortion, kind, shape)
 
 
 def rays_of(model: CameraModel) -> Float:

@@ -270,6 +270,7 @@ def agent(
     read = read.with_map(map_folder)
     if map_fixed and read.map is None:
         fail(FIXED_WHAT)
+    _check_owner(read.folder)
     beginning = Beginning(map_fixed, new_journey)
     try:
         asyncio.run(
@@ -360,10 +361,26 @@ def _check_place(out: Path) -> None:
     """
     from flocc_launch.runs.run_folder import RunFolderError
 
-    whole = out.absolute()
-    there = next(place for place in (whole, *whole.parents) if place.exists())
+    there = _place_of(out)
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise RunFolderError(f"{out}: cannot be made: {there} cannot be written")
+
+
+def _place_of(folder: Path) -> Path:
+    """The folder, or what is there of the way to it."""
+    whole = folder.absolute()
+    return next(place for place in (whole, *whole.parents) if place.exists())
+
+
+def _check_owner(folder: Path | None) -> None:
+    """See that an agent's folder is not somebody else's; a disk that is read-only or full costs it its memory alone."""
+    if folder is None:
+        return
+    there = _place_of(folder)
+    if not os.access(there, os.W_OK) and not os.statvfs(there).f_flag & os.ST_RDONLY:
+        fail(
+            f"{folder}: permission denied: {there} cannot be written by this user; choose another folder (folder = ...)"
+        )
 
 
 def _launch(
@@ -381,9 +398,11 @@ def _launch(
 
     from flocc_launch.commands.live_table import LiveTable
     from flocc_launch.scenarios.recordings import recordings
+    from flocc_launch.swarm.launching import check_network
     from flocc_launch.swarm.launching import launch as run
 
     _check_place(out)
+    check_network()
     with progress_bar("preparing data") as progress:
         paths = recordings(scenario, progress)
     console = Console(stderr=speech.as_json, quiet=speech.quiet)

@@ -141,10 +141,14 @@ def view(
 
     if run is None:
         from flocc_agent.config import BackendConfig
+        from flocc_agent.runtime.network_faults import network_faults
         from flocc_agent.runtime.zenoh_observer import Observer
         from flocc_launch.view.live_view import view_swarm
 
-        shown = view_swarm(Observer(*_reach(config, swarm)), save, BackendConfig().steepness, is_over)
+        transport, name = _reach(config, swarm)
+        for fault in network_faults(transport, ""):
+            typer.echo(f"note: {fault}", err=True)
+        shown = view_swarm(Observer(transport, name), save, BackendConfig().steepness, is_over)
     elif live:
         from flocc_launch.view.live_view import view_growing
 

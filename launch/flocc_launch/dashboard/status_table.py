@@ -93,9 +93,12 @@ def why_silent(found: "Survey", config: TransportConfig, timeout_s: float) -> st
         )
     where = f"{len(config.roster)} robots of the roster" if config.roster else "anybody that scouting finds"
     there = f" (there: swarm {', '.join(found.others)})" if found.others else ""
-    return (
+    from flocc_agent.runtime.network_faults import with_faults
+
+    return with_faults(
         f"nobody is there: in {timeout_s:g} s no agent of it was found{there}; asked {where}; "
-        "a machine under load is found late: give a longer --timeout"
+        "a machine under load is found late: give a longer --timeout",
+        config,
     )
 
 

@@ -63,7 +63,14 @@ def discovery(config: TransportConfig) -> list[Finding]:
         took_s = seconds_until(lambda: by_gossip(config))
         advice = "List all robots under [transport.roster]; gossip alone does not join them on this machine."
         found.append(discovered("gossip", "through a third one that both know", took_s, Severity.HINDERS, advice))
-    advice = "Look for a firewall on the loopback interface."
+    from flocc_agent.runtime.network_faults import loopback_fault
+
+    fault = loopback_fault()
+    advice = (
+        "Look for a firewall on the loopback interface."
+        if fault is None
+        else f"127.0.0.1 cannot be reached ({fault}): bring the loopback interface up (ip link set lo up)."
+    )
     took_s = seconds_until(lambda: two_peers(config, by_multicast=False))
     return [*found, discovered("endpoint", "by endpoint on 127.0.0.1", took_s, Severity.BLOCKS, advice)]
 

@@ -47,6 +47,9 @@ def sentence_of(error: BaseException) -> str | None:
         return str(error)
     if isinstance(error, OSError):
         return _os_sentence(error)
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop from"):  # pathlib before Python 3.13
+        name = str(error).removeprefix("Symlink loop from ").strip("'")
+        return f"{name}: is a symbolic link that leads to itself"
     if isinstance(error, UnicodeError):
         return f"a text cannot be read or written: {error}"
     if type(error).__name__ == "PydanticSerializationError" and "UnicodeEncodeError" in str(error):

@@ -61,11 +61,13 @@ def disturb(config: TransportConfig, swarm: str, order: Order, timeout_s: float 
         ChaosError: Nobody answered.
         TransportError: The network cannot be used as configured.
     """
+    from flocc_agent.runtime.network_faults import with_faults
     from flocc_agent.runtime.zenoh_admin import ask
     from flocc_protocol.keys import Admin
 
     request = order.model_dump_json(exclude_defaults=True).encode()
     answers = asyncio.run(ask(config, swarm, Admin.CHAOS, request, timeout_s=timeout_s))
     if not answers:
-        raise ChaosError(f"swarm {swarm}: no agent took the order; only agents with transport.chaos = true do")
+        nobody = f"swarm {swarm}: no agent took the order; only agents with transport.chaos = true do"
+        raise ChaosError(with_faults(nobody, config))
     return {robot: answer.decode(errors="replace")[:200] for robot, answer in answers.items()}

@@ -19,6 +19,7 @@ from flocc_agent.config import MetricsConfig, RadioConfig, SourceConfig
 from flocc_agent.perception.backends import check_perception
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.facts import AgentDied
+from flocc_agent.runtime.network_faults import loopback_fault
 from flocc_launch.maps.opening import MapUse
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
@@ -90,6 +91,7 @@ def launch(
     Raises:
         FloccError: The data cannot be used, a fault or expectation is not for real processes, or no agent could start.
     """
+    check_network()
     check_faults(scenario)
     check_perception(scenario.perception)
     names = scenario.names()
@@ -117,6 +119,20 @@ def fresh_folder(out: Path, use: MapUse | None = None) -> RunFolder:
             raise LaunchError(f"{out}: is not empty and not an earlier run; choose another --out")
         shutil.rmtree(out)
     return RunFolder.create(out)
+
+
+def check_network() -> None:
+    """See that agents on this machine will reach each other, before minutes are spent on data.
+
+    Raises:
+        LaunchError: They will not.
+    """
+    fault = loopback_fault()
+    if fault is not None:
+        raise LaunchError(
+            f"the agents of a launch talk over 127.0.0.1, which cannot be reached ({fault}): bring the machine's own "
+            "interface up (ip link set lo up); flocc simulate needs no network"
+        )
 
 
 def check_faults(scenario: Scenario) -> None:

@@ -22,7 +22,7 @@ from flocc_launch.dashboard.tail import RunTail
 from flocc_launch.runs.heard import Heard
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.view.drawing import Colour, Drawing
-from flocc_launch.view.run_view import images_of, opened, rerun_module
+from flocc_launch.view.run_view import closed, images_of, opened, rerun_module
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import CorrectionBatch, Envelope, Heartbeat, LogCorrection, RecordBatch, Records
@@ -60,8 +60,7 @@ def view_growing(folder: RunFolder, save: Path | None, is_over: Callable[[], boo
                     drawing.take(event)
             drawn_s = max([drawn_s, *(event.t for event in events)])
             time.sleep(PERIOD_S)
-    recording.flush()
-    return "showed the run" if save is None else str(save)
+    return closed(recording, save, "showed the run")
 
 
 def view_swarm(observer: Observer, save: Path | None, steepness: float, is_over: Callable[[], bool]) -> str:
@@ -95,8 +94,7 @@ def view_swarm(observer: Observer, save: Path | None, steepness: float, is_over:
             if not overheard.anybody and now_s > SILENT_S_MAX:
                 raise NobodyHeard(f"swarm {observer.swarm}: no robot was heard within {SILENT_S_MAX:g} s")
             time.sleep(PERIOD_S)
-    recording.flush()
-    return "showed the swarm" if save is None else str(save)
+    return closed(recording, save, "showed the swarm")
 
 
 class Overheard:

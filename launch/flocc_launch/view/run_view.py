@@ -5,6 +5,7 @@ that is over its trajectories before and after beside ground truth, its errors, 
 """
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,9 @@ from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
+
+
+DISK_BLOCK_BYTES = 4096
 
 
 class ViewError(FloccError):
@@ -55,8 +59,19 @@ def view(folder: RunFolder, save: Path | None = None) -> str:
         log_scene(rr, recording, loaded, scene)
     log_errors(rr, recording, loaded)
     log_residuals(rr, recording, loaded)
+    return closed(recording, save, "opened the viewer")
+
+
+def closed(recording: Any, save: Path | None, shown: str) -> str:
+    """End a rerun recording; what was opened or written.
+
+    Raises:
+        ViewError: The file is cut off, which rerun does not tell.
+    """
     recording.flush()
-    return "opened the viewer" if save is None else str(save)
+    if save is not None and shutil.disk_usage(save.resolve().parent).free < DISK_BLOCK_BYTES:
+        raise ViewError(f"{save}: the disk is full, and the file is cut off: free some room, or choose another --save")
+    return shown if save is None else str(save)
 
 
 def rerun_module() -> Any:

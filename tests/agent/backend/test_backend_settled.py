@@ -104,6 +104,18 @@ def test_closures_that_agree_and_pull_at_the_settled_part_open_it(drawn: Generat
     assert solved(at(drawn, LATER, *pulling), first).whole is None
 
 
+def test_a_robot_that_one_closure_alone_joins_stays_apart(drawn: GeneratedGraph) -> None:
+    alone = Trajectory(drawn.graph.trajectories[R01].T_odom_keyframe[:100])
+    lone = LoopClosure(KeyframeId(R00, WHOLE - 1), KeyframeId(LogId("r09"), 90), np.eye(4), metric=True)
+    before, after = (at(drawn, keyframes, lone) for keyframes in (WHOLE, LATER))
+    before, after = (replace(g, trajectories={**g.trajectories, LogId("r09"): alone}) for g in (before, after))
+    first = solved(before)
+    found = solved(after, first)
+    assert found.whole is first
+    assert [component.logs for component in found.components] == [component.logs for component in first.components]
+    assert found.closures[-1].state is not ClosureState.USED
+
+
 def test_a_new_robot_and_much_that_is_new_are_solved_whole(drawn: GeneratedGraph, first: GraphSolution) -> None:
     graph = at(drawn, LATER)
     more = {**graph.trajectories, LogId("r09"): Trajectory(np.eye(4)[None])}

@@ -24,7 +24,16 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.page_file import PageFile
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import Envelope, LogPosition, RecordBatch, RecordRequest, Records, decode, encode
+from flocc_protocol.messages import (
+    CandidatePair,
+    Envelope,
+    LogPosition,
+    RecordBatch,
+    RecordRequest,
+    Records,
+    decode,
+    encode,
+)
 from flocc_protocol.records import ClosureRecord, KeyframeRecord, Record, chain, encode_record
 
 OWN = LogId("r1")
@@ -177,6 +186,29 @@ def test_few_descriptors_find_what_all_of_them_find(noise: float) -> None:
     print(f"noise {noise}: {found} and {right} of {asked}; {few.rows} of {every.rows} rows")
     assert asked > 0.9 * PLACES
     assert right >= 0.95 * asked
+
+
+def test_both_robots_of_a_pair_ask_for_the_same_old_keyframes() -> None:
+    """Each compares its own log with the other's: where they kept other rows, both register, for one place twice."""
+    rng = np.random.default_rng(4)
+    where = places(rng)
+    parameters = PlaceRecognitionParameters(similarity_threshold=0.6)
+    logs = (OWN, *TEAM)
+    one, other = (PlaceRecognition(log, parameters, keyframes_held=120) for log in logs[:2])
+    pairs: tuple[set[CandidatePair], set[CandidatePair]] = (set(), set())
+    for number in range(3 * PLACES):
+        taken = [
+            (
+                KeyframeId(log, number),
+                Array.int8(where[(number + 70 * k) % PLACES] + 0.03 * rng.standard_normal(DIMENSION)),
+            )
+            for k, log in enumerate(logs)
+        ]
+        for search, found in zip((one, other), pairs, strict=True):
+            of_pair = (c.pair for _, c in search.on_keyframes(taken))
+            found |= {pair for pair in of_pair if {pair.low.log, pair.high.log} == set(logs[:2])}
+    print(f"{len(pairs[0] & pairs[1])} of {len(pairs[0] | pairs[1])} pairs are asked for by both")
+    assert len(pairs[0] & pairs[1]) >= 0.95 * len(pairs[0] | pairs[1]) > 0.0
 
 
 def test_a_full_disk_keeps_pieces_in_memory() -> None:

@@ -63,6 +63,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     Raises:
         BadCheckpoint: Missing, truncated, not a checkpoint, or with pickled code.
     """
+    if path.exists() and not path.is_file():
+        raise BadCheckpoint(f"{path}: is not a file")
     try:
         with path.open("rb") as file:
             start = file.read(16)

@@ -175,14 +175,22 @@ def _nerfstudio(document: Map) -> Cameras:
     return {"camera": _with_angles(camera)}
 
 
+ANGLE_RATIO_MAX = 0.02
+"""By how much a focal length and a field of view may differ, which tools round."""
+
+
 def _with_angles(camera: Map) -> Map:
     """Focal lengths and principal point of files that have only fields of view."""
     angles = {axis: camera.pop(f"camera_angle_{axis}", None) for axis in "xy"}
     sides = {"x": camera.get("w"), "y": camera.get("h")}
     for axis, side in sides.items():
         angle = angles[axis]
-        if f"fl_{axis}" not in camera and angle is not None and side is not None:
-            camera[f"fl_{axis}"] = float(side) / 2 / float(np.tan(float(angle) / 2))
+        if angle is None or side is None:
+            continue
+        told = float(side) / 2 / float(np.tan(float(angle) / 2))
+        length = float(camera.setdefault(f"fl_{axis}", told))
+        if abs(told - length) > ANGLE_RATIO_MAX * length:
+            raise ValueError(f"fl_{axis} is {length:g}, but camera_angle_{axis} and the size say {told:.1f}")
     if angles["x"] is not None and "fl_x" not in camera:
         raise ValueError("has a field of view (camera_angle_x) but no w and h: add them")
     for axis, side in sides.items():
@@ -244,6 +252,9 @@ def _opensfm(document: Map) -> Cameras:
 def _gyroflow(document: Map) -> Cameras:
     """Gyroflow's lens profile: beside the lens, it names products."""
     size, lens = document["calib_dimension"], document["fisheye_params"]
+    stretches = [document.get(f"input_{axis}_stretch") or 1.0 for axis in ("horizontal", "vertical")]
+    if any(float(stretch) != 1.0 for stretch in stretches):
+        raise ValueError(f"is of pictures that are stretched by {stretches[0]} and {stretches[1]} first: stretch yours")
     told = ("camera_brand", "camera_model", "lens_model", "camera_setting", "calib_dimension", "fisheye_params")
     rest = {key: value for key, value in document.items() if key not in told}
     return {"camera": {"distortion_model": "equidistant", **rest, **lens, "width": size["w"], "height": size["h"]}}

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from flocc_launch.datasets.calibrations.maps import Cameras, Map
 
 _COLMAP = {
@@ -118,10 +120,19 @@ def _kitti(text: str) -> Cameras:
         cameras[f"P{found[1]}"] = camera
         if (K := numbers.get(f"K_0{found[1]}")) is not None:
             raw = {"K": K, "distortion": numbers.get(f"D_0{found[1]}", []), "resolution": numbers.get(f"S_0{found[1]}")}
-            cameras[f"K{found[1]}"] = raw
+            R, t = numbers.get(f"R_0{found[1]}"), numbers.get(f"T_0{found[1]}")
+            cameras[f"K{found[1]}"] = raw if R is None or t is None else {**raw, "T_body_camera": _in_camera_0(R, t)}
     if not cameras:
         raise ValueError("has no row P0 to P3, nor P_rect_00 to P_rect_03")
     return cameras
+
+
+def _in_camera_0(R: list[float], t: list[float]) -> list[list[float]]:
+    """Pose of an unrectified camera in camera 0, of `p_i = R p_0 + t`."""
+    if (len(R), len(t)) != (9, 3):
+        raise ValueError(f"rows R_ and T_ must have 9 and 3 numbers, not {len(R)} and {len(t)}")
+    back = np.array(R).reshape(3, 3).T
+    return [[*map(float, row), float(-row @ np.array(t))] for row in back] + [[0.0, 0.0, 0.0, 1.0]]
 
 
 def _are_numbers(row: str) -> bool:
@@ -199,6 +210,8 @@ def _numbers(text: str) -> Cameras:
     if len(rows) > 1 and all(len(row) == 12 for row in rows):
         return _kitti("".join(f"P{k}: {' '.join(map(str, row))}\n" for k, row in enumerate(rows)))
     if len({len(row) for row in rows}) == 1 and (len(rows), len(rows[0])) in ((3, 3), (3, 4), (4, 4)):
+        if len(rows[0]) == 4 and any(row[3] for row in rows[:3]):  # a projection, whose camera sits beside the body
+            return _kitti(f"P0: {' '.join(str(number) for row in rows[:3] for number in row)}\n")
         return {"camera": {"K": [number for row in rows for number in row]}}
     raise ValueError(
         f"has {len(rows)} rows of numbers; flocc knows one row of fx fy cx cy and distortion, or a 3x3 or 4x4 matrix"
