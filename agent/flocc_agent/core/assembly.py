@@ -8,7 +8,6 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
-from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, Trajectory, groups_of
+from flocc_agent.core.pulls import remember
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
@@ -25,7 +25,6 @@ from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
-    MeasurementRecord,
     Record,
     RejectionRecord,
     UnknownRecord,
@@ -33,6 +32,8 @@ from flocc_protocol.records import (
 
 Float = NDArray[np.float64]
 
+ODOMETRY_PAIRS_MAX = 1024
+"""Neighbours that are remembered: those of the pairs that are at work."""
 POSES_OF_A_PIECE = 64
 """Poses that leave memory together: some 4 kB."""
 
@@ -182,10 +183,6 @@ class GraphAssembly:
     def add(self, new: NewRecord) -> None:
         """Take in one record; records of a log come in their order, those of different logs in any."""
         record = new.record
-        if isinstance(record, MeasurementRecord):
-            self.revision += 1
-            self._await(self._measured.add(new))
-            return
         match record:
             case KeyframeRecord():
                 self._add_keyframe(new.log, record)
@@ -196,7 +193,8 @@ class GraphAssembly:
             case UnknownRecord():
                 self._reads_all = False
             case _:
-                assert_never(record)
+                self.revision += 1
+                self._await(self._measured.add(new))
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.
@@ -211,8 +209,8 @@ class GraphAssembly:
             index = odometry.neighbour(keyframe.index)
             if index is None:
                 return None
-            T_neighbour_query = odometry.between(keyframe.index, index)
-            found = self._odometry_pairs[keyframe] = (KeyframeId(keyframe.log, index), T_neighbour_query)
+            found = KeyframeId(keyframe.log, index), odometry.between(keyframe.index, index)
+            remember(self._odometry_pairs, keyframe, found, ODOMETRY_PAIRS_MAX)
         return found
 
     def odometry(self, log: LogId) -> Float:
