@@ -3,6 +3,7 @@
     python -m flocc_lab.measure loss
     python -m flocc_lab.measure gossip
     python -m flocc_lab.measure scale --robots 50 --minutes 10
+    python -m flocc_lab.measure scale --robots 20 --minutes 2 --area-m 76
     python -m flocc_lab.measure twice --seeds 200
 
 Each prints one JSON object. Everything but `cpu_s` and `memory_mb` is the same wherever it runs.
@@ -48,9 +49,9 @@ def gossip(dimension: int = 512) -> dict[str, Any]:
     return {"keyframes": keyframes, "bytes_per_keyframe_and_neighbour": round(received / keyframes / neighbours, 1)}
 
 
-def scale(robots: int, minutes: float) -> dict[str, Any]:
+def scale(robots: int, minutes: float, area_m: float = 120.0) -> dict[str, Any]:
     """A large swarm in a town, radio range 25 m: CPU time of the simulation on one core, bytes by kind, memory."""
-    scenario = _scenario(robots=robots, area_m=120.0, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
+    scenario = _scenario(robots=robots, area_m=area_m, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
     began_s = time.process_time()
     playbacks = playbacks_of(scenario, {})
     drawn_s = time.process_time()
@@ -61,6 +62,7 @@ def scale(robots: int, minutes: float) -> dict[str, Any]:
     held = [len(station.core.gossip.logs) for station in swarm.running() if station.core]
     return {
         "robots": robots,
+        "area_m": area_m,
         "virtual_s": 60.0 * minutes,
         "keyframes": sum(len(playback.captures) for playback in playbacks.values()),
         "logs_held_least": min(held),
@@ -129,6 +131,7 @@ def main() -> None:
     parser.add_argument("what", choices=("loss", "gossip", "scale", "twice"))
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--area-m", type=float, default=120.0)
     parser.add_argument("--seeds", type=int, default=200)
     given = parser.parse_args()
     match given.what:
@@ -139,7 +142,7 @@ def main() -> None:
         case "twice":
             measured = twice(given.seeds)
         case _:
-            measured = scale(given.robots, given.minutes)
+            measured = scale(given.robots, given.minutes, given.area_m)
     sys.stdout.write(json.dumps({**measured, "command": " ".join(sys.argv[1:])}) + "\n")
 
 

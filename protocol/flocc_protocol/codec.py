@@ -83,8 +83,9 @@ class Reader(Generic[T]):
         Raises:
             DecodeError: Too long, something else, or bytes left over.
         """
-        if len(memoryview(data)) > self._bytes_max:
-            raise DecodeError(f"{len(memoryview(data))} bytes are more than {self._bytes_max}")
+        size = len(data if type(data) is bytes else memoryview(data))
+        if size > self._bytes_max:
+            raise DecodeError(f"{size} bytes are more than {self._bytes_max}")
         try:
             raw = self._decode(data)
         except _REFUSALS as error:
@@ -101,7 +102,7 @@ def integer(low: int, high: int) -> Codec[int]:
     """An integer in [low, high]."""
 
     def pack(value: Any) -> int:
-        number = operator.index(value)
+        number = value if type(value) is int else operator.index(value)
         if not low <= number <= high:
             raise DecodeError(f"expected an integer in [{low}, {high}]")
         return number
@@ -177,12 +178,15 @@ def sequence(inner: Codec[T], items_max: int) -> Codec[tuple[T, ...]]:
 def struct(make: Callable[..., T], **fields: Codec[Any]) -> Codec[T]:
     """A dataclass as a list of its fields, in its own order; `make` raises ValueError for what cannot be."""
     assert tuple(fields) == tuple(inspect.signature(make).parameters)
-    names = tuple(fields)
-    packs = tuple(codec.pack for codec in fields.values())
+    get = operator.attrgetter(*fields)
+    packs = tuple((k, codec.pack) for k, codec in enumerate(fields.values()) if codec.pack is not _as_it_is)
     builds = tuple((k, codec.build) for k, codec in enumerate(fields.values()) if codec.build is not None)
 
     def pack(value: T) -> list[Any]:
-        return [pack_field(getattr(value, name)) for name, pack_field in zip(names, packs, strict=True)]
+        values = list(get(value)) if len(fields) > 1 else [get(value)]
+        for k, pack_field in packs:
+            values[k] = pack_field(values[k])
+        return values
 
     def build(raw: Any) -> T:
         values = list(raw)

@@ -10,7 +10,8 @@ import pytest
 from flocc_agent.config import ClassicalConfig
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.classical.encoder import ClassicalEncoder, decode_features
-from flocc_lab.bench.overlaid_recording import covered, overlay_robot
+from flocc_lab.bench.overlaid_recording import main, touched
+from flocc_lab.bench.overlays import KINDS, overlay
 from flocc_lab.bench.watched_cameras import CachedFeatures, Trouble, WatchedDrive, cell, counted, zoomed
 from flocc_lab.bench.watched_drives import drawn_town
 
@@ -52,26 +53,31 @@ def test_late_and_wrong_names_are_counted_apart() -> None:
     assert counted(found, FOCAL) == "2 + 1 late, 1 otherwise"
 
 
-def test_an_overlay_covers_its_share_and_is_the_same_each_time() -> None:
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_an_overlay_touches_about_its_share_and_a_seed_is_a_drawing(kind: str) -> None:
+    cover = overlay(kind, (640, 480), 0.3, 1)
+    assert 0.1 < np.mean(touched(cover, (640, 480))) < 0.6
     pixels = picture().pixels
-    cover = covered(pixels, 0.3, 1)
-    assert cover.shape == pixels.shape
-    assert np.array_equal(cover[:336], pixels[:336])
-    assert np.array_equal(cover[336:], covered(np.asarray(255 - pixels, np.uint8), 0.3, 1)[336:])
-    assert not np.array_equal(cover[336:], covered(pixels, 0.3, 2)[336:])
+    assert cover(pixels, 3).shape == pixels.shape
+    assert np.array_equal(cover(pixels, 3), overlay(kind, (640, 480), 0.3, 1)(pixels, 3))
+    changes = not np.array_equal(cover(pixels, 3), cover(pixels, 4))
+    assert changes == (kind in {"clock", "propeller"})
 
 
-def test_an_overlaid_robot_keeps_all_but_its_pictures_lower_part(tmp_path: Path) -> None:
-    source = tmp_path / "r1"
-    (source / "images").mkdir(parents=True)
-    (source / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
-    cv2.imwrite(str(source / "images" / "0.png"), picture().pixels)
-    overlay_robot(source, tmp_path / "out" / "r1", 0.5, 1, with_mask=True)
-    seen = cv2.imread(str(tmp_path / "out" / "r1" / "images" / "0.png"))
+def test_overlaid_robots_keep_all_but_their_pictures_lower_part(tmp_path: Path) -> None:
+    for robot in ("r1", "r2"):
+        folder = tmp_path / "data" / robot
+        (folder / "images").mkdir(parents=True)
+        (folder / "odometry.txt").write_text("0 0 0 0 0 0 0 1\n")
+        cv2.imwrite(str(folder / "images" / "0.png"), picture().pixels)
+    main([str(tmp_path / "data"), str(tmp_path / "out"), "--share", "0.5", "--moved", "--mask"])
+    seen = [np.asarray(cv2.imread(str(tmp_path / "out" / robot / "images" / "0.png"))) for robot in ("r1", "r2")]
     mask = cv2.imread(str(tmp_path / "out" / "r1" / "mask.png"), cv2.IMREAD_GRAYSCALE)
     assert mask is not None
-    assert np.array_equal(np.flatnonzero(np.any(seen != picture().pixels, axis=(1, 2))), np.arange(240, 480))
-    assert np.array_equal(mask[:, 0] == 0, np.arange(480) >= 240)
+    assert np.array_equal(np.flatnonzero(np.any(seen[0] != picture().pixels, axis=(1, 2))), np.arange(240, 480))
+    assert np.mean(mask[240:] == 0) > 0.95
+    assert mask[:240].all()
+    assert np.array_equal(seen[0][240:, :600], seen[1][240:, 12:612])
     assert (tmp_path / "out" / "r1" / "odometry.txt").read_text() == "0 0 0 0 0 0 0 1\n"
 
 

@@ -24,6 +24,10 @@ READ: dict[str, tuple[Callable[[int], str], float]] = {
     "some without a point": (lambda k: f"{ZERO_S + 0.1 * k:.1f}".removesuffix(".0"), ZERO_S),
     "milliseconds": (lambda k: f"{ZERO_S * 1000 + 100 * k}", ZERO_S),
     "a counter and microseconds": (lambda k: f"{k:04d}_{ZERO_S * 10**6 + 10**5 * k}", ZERO_S),
+    "milliseconds with a point, as RealSense's viewer has": (
+        lambda k: f"dump_Color_{ZERO_S * 1000 + 100 * k}.00",
+        ZERO_S,
+    ),
     "nanoseconds": (lambda k: f"cam0_{ZERO_S * NS + 10**8 * k}", ZERO_S),
     "nanoseconds since a start": (lambda k: f"{5000 * NS + 10**8 * k}", 5000.0),
     "microseconds since a start": (lambda k: f"{5000 * 10**6 + 10**5 * k}", 5000.0),
@@ -69,6 +73,7 @@ def test_numbers_of_images_are_no_stamps(written: Callable[[int], str]) -> None:
         (lambda k: f"20231114_2213{k:02d}_{k}", "can be their fraction or count images"),
         (lambda k: f"20231114_2213{k // 2:02d}" + "_1" * (k % 2), "can be their fraction or count images"),
         (lambda k: f"{10**10 + 4 * k}", "can be seconds or milliseconds"),
+        (lambda k: f"cut_00_{k // 30:02d}_{2 * (k % 30):02d}.500", "can be minutes or count cameras"),
     ],
 )
 def test_two_readings_are_refused_with_both(written: Callable[[int], str], sentence: str) -> None:

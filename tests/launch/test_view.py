@@ -85,6 +85,12 @@ def test_a_file_that_a_full_disk_cut_off_is_said(tmp_path: Path, monkeypatch: py
         closed(recording, tmp_path / "run.rrd", "shown")
     assert closed(recording, None, "shown") == "shown"
 
+    def fail() -> None:
+        raise RuntimeError("File too large")
+
+    with pytest.raises(ViewError, match=r"run.rrd: cannot be written \(File too large\)"):
+        closed(SimpleNamespace(flush=fail), tmp_path / "run.rrd", "shown")
+
 
 def test_no_display_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rerun")

@@ -8,7 +8,6 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
-from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
-    MeasurementRecord,
     Record,
     RejectionRecord,
     UnknownRecord,
@@ -185,10 +183,6 @@ class GraphAssembly:
     def add(self, new: NewRecord) -> None:
         """Take in one record; records of a log come in their order, those of different logs in any."""
         record = new.record
-        if isinstance(record, MeasurementRecord):
-            self.revision += 1
-            self._await(self._measured.add(new))
-            return
         match record:
             case KeyframeRecord():
                 self._add_keyframe(new.log, record)
@@ -199,7 +193,8 @@ class GraphAssembly:
             case UnknownRecord():
                 self._reads_all = False
             case _:
-                assert_never(record)
+                self.revision += 1
+                self._await(self._measured.add(new))
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.

@@ -48,7 +48,7 @@ TOLD_MAX = 16
 """Keyframes whose poses people are told with each correction; the report interpolates between them."""
 COVARIANCE_CHANGE_RATIO = 0.1
 """A correction whose covariance changed by more than this is sent again although nothing moved."""
-KNOTS_PAUSE_PER_LOG_S = 0.04
+KNOTS_PAUSE_PER_LOG_S = 0.1
 """After knots of its log came a robot asks for newer ones only after this for each log that it knows a correction of:
 in a large team every round moves every log, and each question goes over many robots."""
 
@@ -197,7 +197,7 @@ class Corrections:
         """Ask for the knots of newer corrections of this robot's log, and of those that somebody looks at."""
         for log in self._newest if self._follows_all else (self._own,):
             short = self._newest.get(log)
-            if short is not None and not self._has_knots(short.version) and not self.doubts.knows(short.version):
+            if short is not None and not self._has_knots(short) and not self.doubts.knows(short.version):
                 self._requests.want(short.version, self._knots_not_before_s(short, now))
         return self._requests.ask(now)
 
@@ -217,9 +217,9 @@ class Corrections:
         answers: list[Effect] = [Unicast(peer, batch) for batch in CorrectionBatch.batched(held)[:ANSWERS_MAX]]
         return answers + self._requests.ask(now)
 
-    def _has_knots(self, version: CorrectionVersion) -> bool:
+    def _has_knots(self, version: CorrectionVersion | LogCorrection) -> bool:
         whole = self._whole.get(version.log)
-        return whole is not None and whole.version >= version
+        return whole is not None and (whole.term, whole.round) >= (version.term, version.round)
 
     # Corrections that came
 
@@ -229,9 +229,9 @@ class Corrections:
 
     def is_news(self, message: LogCorrection, now: float = 0.0) -> bool:
         """Whether a correction is newer than the one that is held, or brings knots that somebody waits for."""
-        if self._is_newer(message.version) or self._is_shorter(message):
+        if self._is_newer(message) or self._is_shorter(message):
             return True
-        if message.knots is None or self._has_knots(message.version) or self.doubts.knows(message.version):
+        if message.knots is None or self._has_knots(message) or self.doubts.knows(message.version):
             return False
         return message.log == self._own or self._follows_all or self._requests.waits(message.log, now)
 
@@ -250,16 +250,16 @@ class Corrections:
 
     def take(self, message: LogCorrection, now: float = 0.0) -> list[Effect]:
         """Keep a newer correction that was not refused; apply it when it is this robot's, whole, and can be true."""
-        own = message.log == self._own and message.knots is not None and not self._has_knots(message.version)
+        own = message.log == self._own and message.knots is not None and not self._has_knots(message)
         if own:
             why = self.doubts.believes(self._placed(message), now)
             if why is not None:
                 return [_untrue(message, why)] if why in FINAL else []
-        if self._is_newer(message.version) or self._is_shorter(message):
+        if self._is_newer(message) or self._is_shorter(message):
             self._keep(message)
         if message.knots is None:
             return self.ask_knots(now) if message.log == self._own else []
-        if self._has_knots(message.version):
+        if self._has_knots(message):
             return []
         passed_on = self._requests.on_knots(message.version, now)
         if message.log != self._own and not (passed_on or self._follows_all):
@@ -294,7 +294,7 @@ class Corrections:
         why = self.doubts.given_up(now)
         return effects if why is None else [_untrue(held, why)]
 
-    def _is_newer(self, version: CorrectionVersion) -> bool:
+    def _is_newer(self, version: CorrectionVersion | LogCorrection) -> bool:
         held = self._newest.get(version.log)
         return held is None or (version.term, version.round) > (held.term, held.round)
 
@@ -380,7 +380,7 @@ class Corrections:
         return made
 
     def _take_own(self, whole: LogCorrection, short: LogCorrection) -> list[Effect]:
-        if not self._is_newer(short.version) or (short.log not in self._newest and not self._is_room(short.log)):
+        if not self._is_newer(short) or (short.log not in self._newest and not self._is_room(short.log)):
             return []
         self._keep(short)
         held = self._whole.get(whole.log)

@@ -1,6 +1,7 @@
 """What a robot wants done. The driver carries effects out in order: what is persisted comes before what is sent."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from flocc_agent.core.blocks import BlockProblem
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
@@ -99,8 +100,7 @@ class Deliver:
     frame_changed: bool
 
 
-@dataclass(frozen=True, slots=True)
-class PersistRecord:
+class PersistRecord(NamedTuple):
     """Put a record on disk; an own record must be there before it is sent."""
 
     log: LogId

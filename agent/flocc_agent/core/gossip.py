@@ -260,20 +260,20 @@ class Gossip:
         return new, effects
 
     def _take(self, peer: str, copy: LogCopy, batch: RecordBatch) -> tuple[list[NewRecord], list[Effect]]:
-        new: list[NewRecord] = []
+        log, new = batch.log, list[NewRecord]()
         effects: list[Effect] = []
-        for data in batch.records[len(copy) - batch.first :]:
+        held = len(copy)
+        for number, data in enumerate(batch.records[held - batch.first :], held):
             try:
-                opened = self._opened(batch.log, len(copy), data)
+                opened = data if self._sealer is None else self._opened(log, number, data)
                 record, _ = decoded(opened)
             except DecodeError as error:
-                return new, [*effects, *self._refused(peer, f"bad record of {batch.log}: {error}")]
-            if not copy.accepts(record) or len(copy) >= RECORDS_MAX:
-                return new, [*effects, *self._refused(peer, f"record of {batch.log} out of place")]
-            number = len(copy)
+                return new, [*effects, *self._refused(peer, f"bad record of {log}: {error}")]
+            if not copy.accepts(record) or number >= RECORDS_MAX:
+                return new, [*effects, *self._refused(peer, f"record of {log} out of place")]
             copy.append(data, len(data) - len(opened))
-            new.append(NewRecord(batch.log, number, record))
-            effects.append(PersistRecord(batch.log, number, data))
+            new.append(NewRecord(log, number, record))
+            effects.append(PersistRecord(log, number, data))
         return new, effects
 
     def _held(self, log: LogId) -> int:

@@ -119,14 +119,19 @@ def _between(knots: Float | NDArray[np.integer], twists: Float, numbers: NDArray
     return np.stack([np.interp(numbers, knots, column) for column in twists.T], axis=1)
 
 
-def _errors(T_a: Float, T_b: Float) -> Float:
-    """Distances of poses (N, 4, 4), in bounds of translation or rotation, whichever is more.
+def distances(T_a: Float, T_b: Float) -> tuple[Float, Float]:
+    """How far poses (N, 4, 4) are apart: metres (N,) and angles (N,).
 
     Two rotations by an angle apart differ by 8 sin^2(angle / 2) in the sum of their squared entries.
     """
     squares = np.square(T_a[:, :3] - T_b[:, :3]).sum(axis=1)
-    shift_m = np.sqrt(squares[:, 3])
     turn_rad = 2.0 * np.arcsin(np.minimum(np.sqrt(squares[:, :3].sum(axis=1) / 8.0), 1.0))
+    return np.sqrt(squares[:, 3]), turn_rad
+
+
+def _errors(T_a: Float, T_b: Float) -> Float:
+    """Distances of poses (N, 4, 4), in bounds of translation or rotation, whichever is more."""
+    shift_m, turn_rad = distances(T_a, T_b)
     return np.asarray(np.maximum(shift_m / TRANSLATION_BOUND_M, turn_rad / ROTATION_BOUND_RAD))
 
 

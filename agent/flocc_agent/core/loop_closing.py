@@ -153,9 +153,10 @@ class LoopClosing:
         if self._spectral is not None:
             self._spectral.on_closure(pair)
         self._front_ends.on_closure(pair)
+        is_own = self._concerns(pair)
         self.on_resolved(pair)
-        self._changed = True
-        for other in self._prospects.on_judged(pair, is_closure=True):
+        self._changed |= is_own
+        for other in self._prospects.on_judged(pair, is_closure=True, is_own=is_own):
             self._resolved.discard(other)
             if self._owner(other) == self._own:
                 self._assign(Candidate(other, 0.0), now)
@@ -168,11 +169,12 @@ class LoopClosing:
             reason: Why.
             was_seen: Whether a registration says so, whose odometry pair had correspondences.
         """
+        is_own = self._concerns(pair)
         self.on_resolved(pair)
         if reason == UNLIKELY:
             self._prospects.on_unlikely(pair)
         elif was_seen:
-            self._prospects.on_judged(pair, is_closure=False)
+            self._prospects.on_judged(pair, is_closure=False, is_own=is_own)
         if not self._front_ends.on_rejection(pair, reason):
             return False
         for other in filter(self._front_ends.are_apart, self.open_pairs()):
@@ -298,6 +300,10 @@ class LoopClosing:
 
     def _knows(self, pair: CandidatePair) -> bool:
         return pair in self._resolved or pair in self._work or pair in self._offers or pair in self._undecided
+
+    def _concerns(self, pair: CandidatePair) -> bool:
+        """Whether a pair is of this robot's keyframes, or registered here."""
+        return self._own in (pair.low.log, pair.high.log) or pair in self._work
 
     def _decide(self, now: float) -> None:
         """Listening is over: assign what was found meanwhile."""

@@ -9,6 +9,8 @@ that was a moment before or on an earlier visit. What a log has of one place doe
 """
 
 import math
+from array import array
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -76,6 +78,7 @@ class _Rows:
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
+        self._by_log: dict[int, array[int]] = {}
         self._thinned = 0
         self._unthinned: dict[int, int] = {}
         self._same_place: dict[int, float] = {}
@@ -110,6 +113,8 @@ class _Rows:
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
+        if log in self._by_log:
+            self._by_log[log].append(self._count)
         self._count += 1
         self._unthinned[log] = self._unthinned.get(log, 0) + 1
 
@@ -158,6 +163,7 @@ class _Rows:
 
     def _order(self, first: int, order: NDArray[np.intp]) -> None:
         """Put these rows after the first so many, and leave out what is not among them."""
+        self._by_log.clear()
         for values in (self._rows, self._inverse_norms, self._logs, self._indices):
             values[first : first + len(order)] = values[order]
         self._count = first + len(order)
@@ -179,12 +185,21 @@ class _Rows:
 
     def around(self, log: int, index: int, reach: int) -> tuple[Floats, int] | None:
         """Unit descriptors (K, D) of a log's keyframes up to `reach` from one, and which is its; None without it."""
-        near = (self.logs == log) & (np.abs(self.indices - index) <= reach)
-        rows = np.flatnonzero(near)
-        at = np.flatnonzero(self.indices[rows] == index)
-        if not len(at):
+        rows = self._rows_of(log)
+        first = bisect_left(rows, index - reach, key=self._indices.item)
+        near = rows[first : first + 2 * reach + 1]
+        indices = self._indices[near].tolist()
+        if index not in indices:
             return None
-        return self._rows[rows] * self._inverse_norms[rows, None], int(at[0])
+        near = near[: bisect_right(indices, index + reach)]
+        return self._rows[near] * self._inverse_norms[near, None], indices.index(index)
+
+    def _rows_of(self, log: int) -> "array[int]":
+        """Rows of a log, in the order of its keyframes."""
+        rows = self._by_log.get(log)
+        if rows is None:
+            rows = self._by_log[log] = array("i", np.flatnonzero(self.logs == log).tolist())
+        return rows
 
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
@@ -392,15 +407,15 @@ def run_agreement(similarities: Floats, row: int, column: int) -> float | None:
         column: Of the pair.
     """
     best: float | None = None
+    table = similarities.tolist()
     for way in (1, -1):
-        means = []
-        for step in range(-RUN_REACH, RUN_REACH + 1):
-            across = column + way * step
-            if 0 <= row + step < len(similarities):
-                near = similarities[row + step, max(across - 1, 0) : max(across + 2, 0)]
-                means += [float(near.max())] if near.size else []
-        if len(means) >= RUN_MIN:
-            best = max(float(np.mean(means)), -1.0 if best is None else best)
+        highest = []
+        for number in range(max(row - RUN_REACH, 0), min(row + RUN_REACH + 1, len(table))):
+            across = column + way * (number - row)
+            near = table[number][max(across - 1, 0) : max(across + 2, 0)]
+            highest += [max(near)] if near else []
+        if len(highest) >= RUN_MIN:
+            best = max(sum(highest) / len(highest), -1.0 if best is None else best)
     return best
 
 

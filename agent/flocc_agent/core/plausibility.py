@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.correction_evidence import VIEW_M, HeldGraph, Placed, evidence_of, missed_m, way_m
-from flocc_agent.core.knots import corrected
+from flocc_agent.core.knots import corrected, distances
 from flocc_agent.geometry import angle_rad, between
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import CorrectionVersion, LogCorrection
@@ -49,7 +49,7 @@ TORN = "it tears most of this robot's closures"
 FINAL = (MOVED,)
 """What no message that is on its way can change is refused at once."""
 AGREE_M, AGREE_RAD = 2.0, np.deg2rad(5.0)
-"""Two leaders put a robot to the same place."""
+"""Two corrections put a keyframe to the same place."""
 
 
 def contradiction(placed: Placed, before: Placed | None, graph: HeldGraph) -> str | None:
@@ -139,6 +139,7 @@ class Doubts:
         self.confirmed: set[LogId] = set()
         self._graph = graph
         self._before: Placed | None = None
+        self._checked: LogCorrection | None = None
         self._held: _HeldBack | None = None
         self._refused: LogCorrection | None = None
         self._next_look_s = float("-inf")
@@ -160,10 +161,11 @@ class Doubts:
 
         What another robot's solution says as well is believed in the end.
         """
-        if self._graph is None or self._is_confirmed(placed.own):
+        if self._graph is None or self._is_confirmed(placed.own) or self._says_the_same(placed.own):
             return None
         why = contradiction(placed, self._before, self._graph)
         if why is None:
+            self._checked = placed.own
             if self._held is not None and self._held.correction.version == placed.own.version:
                 self._held = None
             return None
@@ -206,6 +208,19 @@ class Doubts:
         if self._held is not None and self._held.correction.term.leader.robot == placed.own.term.leader.robot:
             self._held = None
 
+    def _says_the_same(self, correction: LogCorrection) -> bool:
+        """Whether it moves no keyframe far from where what was looked at last had it: that need not be done again.
+
+        While something is held back, leaders contradict each other, and everything is looked at.
+        """
+        checked = None if self._held is not None else self._checked
+        if checked is None or self._graph is None or checked.anchor != correction.anchor:
+            return False
+        odometry = self._graph.odometry(correction.log)
+        knots = [each.knots.keyframes.numpy() for each in (checked, correction) if each.knots is not None]
+        numbers = np.unique(np.concatenate([*knots, [len(odometry) - 1]]).astype(np.intp))
+        return _agree(checked, correction, odometry, numbers[(numbers >= 0) & (numbers < len(odometry))])
+
     def _is_confirmed(self, correction: LogCorrection) -> bool:
         """Whether another robot's refused solution put this one to the same place in the same map."""
         refused = self._refused
@@ -214,10 +229,13 @@ class Doubts:
         odometry = self._graph.odometry(correction.log)
         if refused.anchor != correction.anchor or not len(odometry):
             return False
-        last = np.array([len(odometry) - 1])
-        one, other = (corrected(each, odometry[last], last)[0] for each in (refused, correction))
-        moved = between(one, other)
-        return bool(np.linalg.norm(moved[:3, 3]) <= AGREE_M and angle_rad(moved[:3, :3]) <= AGREE_RAD)
+        return _agree(refused, correction, odometry, np.array([len(odometry) - 1]))
+
+
+def _agree(one: LogCorrection, other: LogCorrection, odometry: Float, numbers: NDArray[np.intp]) -> bool:
+    """Whether two corrections put keyframes (K,) of their log to the same places."""
+    shift_m, turn_rad = distances(*(corrected(each, odometry[numbers], numbers) for each in (one, other)))
+    return bool(shift_m.max(initial=0.0) <= AGREE_M and turn_rad.max(initial=0.0) <= AGREE_RAD)
 
 
 @dataclass(frozen=True, slots=True)

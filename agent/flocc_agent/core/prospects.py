@@ -29,6 +29,9 @@ HOLD_S = 5.0
 BESIDE = 2
 """Keyframes to either side that lie beside a closure."""
 JUDGED_MAX = 512
+TAUGHT_BY_OTHERS_MAX = 128
+"""Pairs of others teach as long as fewer are known; then own ones do, so that a robot's work does not grow with the
+pairs of its team."""
 UNLIKELY_MAX = 4000
 
 Agreement = Callable[[CandidatePair], float | None]
@@ -68,10 +71,17 @@ class Prospects:
             "held": (len(self._held_since_s), UNLIKELY_MAX),
         }
 
-    def on_judged(self, pair: CandidatePair, is_closure: bool) -> list[CandidatePair]:
-        """A pair was registered; those refused unseen that lie beside it and are to be taken up again."""
+    def on_judged(self, pair: CandidatePair, is_closure: bool, is_own: bool = True) -> list[CandidatePair]:
+        """A pair was registered; those refused unseen that lie beside it and are to be taken up again.
+
+        Args:
+            pair: Of keyframes.
+            is_closure: What became of it.
+            is_own: Whether it is of this robot's keyframes, or was registered here.
+        """
         self._unlikely.pop(pair, None)
-        remember(self._fresh, pair, is_closure, JUDGED_MAX)
+        if is_own or len(self._fresh) + len(self._judged) < TAUGHT_BY_OTHERS_MAX:
+            remember(self._fresh, pair, is_closure, JUDGED_MAX)
         if not is_closure:
             return []
         remember(self._closures, pair, None, UNLIKELY_MAX)

@@ -6,7 +6,6 @@ order. Same seed and same events give the same effects, on virtual time and on a
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import assert_never
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
@@ -95,10 +94,8 @@ from flocc_protocol.messages import (
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
-    MeasurementRecord,
     Record,
     RejectionRecord,
-    UnknownRecord,
 )
 
 NOBODY = -1
@@ -357,12 +354,13 @@ class Robot:
         """Take in what is signed, but for what of this sender failed lately."""
         peer, muted = sender.robot, self._muted
         if isinstance(message, Records):
-            batches = tuple(b for b in message.batches if not muted.is_muted(peer, b.log.robot, now))
-            new, effects = self.gossip.on_records(sender, Records(batches), now)
+            batches = tuple([b for b in message.batches if not muted.is_muted(peer, b.log.robot, now)])
+            heard = message if len(batches) == len(message.batches) else Records(batches)
+            new, effects = self.gossip.on_records(sender, heard, now)
             effects += self._take(new, now)
         else:
-            heard = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
-            effects = [effect for correction in heard for effect in self._on_correction(sender, correction, now)]
+            taken = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
+            effects = [effect for correction in taken for effect in self._on_correction(sender, correction, now)]
         effects += self._reconsider(now)
         for failed in (self.gossip.failed_signers, self.corrections.failed_signers):
             for signer in failed:
@@ -552,14 +550,12 @@ class Robot:
         effects: list[Effect] = []
         for new in new_records:
             self.assembly.add(new)
-            record = new.record
-            if isinstance(record, MeasurementRecord | UnknownRecord):
-                continue
-            match record:
+            match new.record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
-                    if descriptor is not None and self._may_match(KeyframeId(new.log, index)):
-                        described.append((KeyframeId(new.log, index), descriptor))
+                    keyframe = KeyframeId(new.log, index)
+                    if descriptor is not None and self._may_match(keyframe):
+                        described.append((keyframe, descriptor))
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match), now)
                 case RejectionRecord(query, match, reason, _, odometry_correspondences):
@@ -567,7 +563,7 @@ class Robot:
                     if self.closing.on_rejection(CandidatePair.of(query, match), reason, was_seen):
                         effects += self._front_ends_differ(query.log, match.log)
                 case _:
-                    assert_never(record)
+                    pass  # what was measured, and what a later version says, concerns the graph only
         return effects + (self._recognise(described, now) if described else [])
 
     def _may_match(self, keyframe: KeyframeId) -> bool:

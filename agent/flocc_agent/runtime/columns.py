@@ -38,8 +38,17 @@ _REVERSED = re.compile(
     r"|(?:world|map|odom|global|w|g)_?(?:to|2|in)_?(?:cam|camera|body|imu|base|[bcis])(?:_?link)?)(?:_|$)"
 )
 """A pose of the fixed frame in the moving one: `q_cw_x`, `p_BW_y`, `t_world_to_cam_z`."""
-_LABEL = re.compile(r"(.*[._/])?(child_frame(_id)?|frame_id|device(_id)?|robot(_id|_name)?|vehicle(_id)?|sensor(_id)?)")
-"""Columns that say what a row's pose is of."""
+_REVERSED_WORDS = re.compile(
+    r"(?:^|_)(?:t_?[bci][wg]|t_?(?:cam|camera|body|imu)_?(?:world|global)|w2c"
+    r"|(?:world|global)_?(?:to|2)_?(?:cam|camera|body|imu))(?:_|$)"
+)
+"""The same in a comment, whose words mean less: `T_body_world`, `world to camera`."""
+_JPL = re.compile(r"(?:^|_)jpl(?:_|$)")
+_LABEL = re.compile(
+    r"(.*[._/])?(child_frame(_id)?|frame_id|(device|vehicle|sensor|marker|tag|body|object|track|map)(_?id)?"
+    r"|robot(_id|_name)?|id)"
+)
+"""Columns that say what a row's pose is of; a number of its own in each row says nothing."""
 _PX4 = ("timestamp_sample", "q_offset[")
 """What a header of PX4's logs has, as `ulog2csv` writes it: arrays x y z and w x y z, stamps in microseconds."""
 _OTHER_PARTS = ("cov", "twist", "veloc", "accel", "gyro", "bias", "sigma", "std", "error", "imu", "mag")
@@ -68,6 +77,16 @@ class Columns:
 
 class HeaderError(ValueError):
     """A line names columns, but not those of a trajectory; the message says why."""
+
+
+def contradiction(comment: str) -> str | None:
+    """What a comment or header says that makes poses something else than they would be read as; None where nothing."""
+    words = re.sub(r"[^a-z0-9]+", "_", comment.lower())
+    if (turned := _REVERSED_WORDS.search(words)) is not None:
+        return f"the poses are said to be of the world in the body or camera ({turned[0].strip('_')}): invert them"
+    if _JPL.search(words):
+        return "the quaternions are said to be JPL's, which turn the other way: write Hamilton's"
+    return None
 
 
 def columns_of(header: str, count: int | None = None) -> Columns | None:

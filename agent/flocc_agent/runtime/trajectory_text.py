@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
-from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of
+from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of, contradiction
 from flocc_agent.runtime.dated_rows import dated
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
@@ -137,6 +137,8 @@ def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns |
     if form is not None:
         return _named_form(form, table.path)
     for line, header in reversed(table.headers):
+        if (fault := contradiction(header)) is not None:
+            raise RecordingError(f"{table.path}:{line}: {fault}; {WAY_OUT}")
         try:
             found = columns_of(header, count)
         except HeaderError as error:

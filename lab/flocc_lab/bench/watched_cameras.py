@@ -24,12 +24,11 @@ from flocc_agent.perception.classical.features import FeatureExtractor, Features
 from flocc_agent.perception.classical.sift_registrar import classical_registrar
 from flocc_agent.perception.multiview.picture import rays_of
 from flocc_agent.perception.watch.camera_watch import CameraWatch
-from flocc_lab.bench.overlaid_recording import covered
+from flocc_lab.bench.overlays import overlay
 from flocc_lab.bench.registration_scenes import SceneView
 from flocc_lab.bench.watched_drives import Drive, drawn_drives, recorded_drives
 
 Float = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
 WITHIN_KEYFRAMES = 20
 """A fault is to be named by then."""
@@ -38,7 +37,8 @@ WATCHED_KEYFRAMES = 40
 TURNED_RAD = float(np.radians(5.0))
 FACTORS = (0.5, 0.8, 0.9, 1.1, 1.25)
 FROZEN_FROM = 4
-BUMPER_SEED = 99
+OVERLAY_SEED = 99
+OVERLAYS = ("bumper", "watermark", "clock")
 SIDE_PX = 1000
 """Focal length of the camera, without centre and distortion, that cached features are kept for."""
 
@@ -52,7 +52,8 @@ class Trouble:
         doubt: What is to be named; empty: nothing.
         camera: What the calibration says, of the true camera.
         T_wrong_camera: (4, 4) the true camera in the one that the calibration says.
-        pixels: What the picture becomes, of its number and the true one.
+        is_mirrored: Whether pictures are turned left to right.
+        overlay: What lies over the pictures, and on how much of them.
         amount: That is to be told; None: not looked at.
     """
 
@@ -60,7 +61,8 @@ class Trouble:
     doubt: str
     camera: Callable[[Camera], Camera] = lambda camera: camera
     T_wrong_camera: Float = field(default_factory=lambda: np.eye(4))
-    pixels: Callable[[Bytes], Bytes] = lambda pixels: pixels
+    is_mirrored: bool = False
+    overlay: tuple[str, float] | None = None
     frozen_from: int | None = None
     amount: float | None = None
 
@@ -88,20 +90,16 @@ def troubles() -> Iterator[Trouble]:
     for axis, name in enumerate("xyz"):
         T = pose(so3_exp(TURNED_RAD * np.eye(3)[axis]), np.zeros(3))
         yield Trouble(f"5 deg {name}", "mounting", T_wrong_camera=T, amount=5.0)
-    yield Trouble("mirrored", "mirrored", pixels=lambda pixels: np.ascontiguousarray(pixels[:, ::-1]))
+    yield Trouble("mirrored", "mirrored", is_mirrored=True)
     yield Trouble("frozen", "frozen", frozen_from=FROZEN_FROM)
-    for share in (0.1, 0.3, 0.5):
-        yield Trouble(f"overlay {100 * share:.0f} %", "overlay", pixels=overlaid(share))
+    for kind in OVERLAYS:
+        for share in (0.1, 0.3, 0.5):
+            yield Trouble(f"{kind} {100 * share:.0f} %", "overlay", overlay=(kind, share))
 
 
 def zoomed(factor: float) -> Callable[[Camera], Camera]:
     """A calibration whose focal lengths are `factor` times the true ones."""
     return lambda camera: replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
-
-
-def overlaid(share: float) -> Callable[[Bytes], Bytes]:
-    """Pictures whose lower part shows the robot itself."""
-    return lambda pixels: covered(pixels, share, BUMPER_SEED)
 
 
 class CachedFeatures:
@@ -171,8 +169,13 @@ def watched(drive: Drive, trouble: Trouble, eyes: CachedFeatures) -> WatchedDriv
 def troubled(views: Sequence[SceneView], k: int, trouble: Trouble) -> Image:
     """The k-th picture as the agent gets it."""
     shown = k if trouble.frozen_from is None else min(k, trouble.frozen_from)
-    image = views[shown].image()
-    return Image(trouble.pixels(image.pixels), trouble.camera(views[k].camera))
+    pixels = views[shown].image().pixels
+    if trouble.is_mirrored:
+        pixels = np.ascontiguousarray(pixels[:, ::-1])
+    if trouble.overlay is not None:
+        kind, share = trouble.overlay
+        pixels = overlay(kind, (pixels.shape[1], pixels.shape[0]), share, OVERLAY_SEED)(pixels, k)
+    return Image(pixels, trouble.camera(views[k].camera))
 
 
 def cell(found: WatchedDrive, trouble: Trouble) -> str:

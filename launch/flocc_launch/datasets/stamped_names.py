@@ -147,7 +147,9 @@ def _one_number(columns: list[tuple[str, ...]], stems: Sequence[str], folder: ob
     decimal = [column for column in columns if _are_decimal(column) and _varies(column)]
     if len(decimal) == 1:
         _check_padding(decimal[0], folder)
-        return [float(word) for word in decimal[0]], "seconds"
+        _check_minutes(columns, decimal[0], stems, folder)
+        unit = since_1970(float(decimal[0][0])) or "seconds"
+        return [float(word) / round(1 / UNITS_S[unit]) for word in decimal[0]], unit
     long = [c for c in columns if all(word.isdigit() and _is_long(word) for word in c) and _varies(c)]
     if not long:
         return None, "numbers of images"
@@ -186,6 +188,20 @@ def _in_unit(column: Sequence[str], folder: object) -> tuple[list[float], str]:
         raise DatasetError(f"{folder}: numbers in names such as {column[0]} can be {readings}; {WAY_OUT}")
     unit_s = round(1 / UNITS_S[units[0]])
     return [int(word) / unit_s for word in column], units[0]
+
+
+def _check_minutes(
+    columns: list[tuple[str, ...]], seconds: tuple[str, ...], stems: Sequence[str], folder: object
+) -> None:
+    """Refuse seconds below a minute behind a number that changes now and then: it can be minutes, or a camera's."""
+    before = columns[: columns.index(seconds)]
+    if not before or not _varies(before[-1]) or any(float(word) >= 60 for word in (*seconds, *before[-1])):
+        return
+    if len(set(before[-1])) < len(stems):
+        raise DatasetError(
+            f"{folder}: names such as {stems[-1]} have {before[-1][-1]} before the seconds, which can be minutes or "
+            f"count cameras; {WAY_OUT}"
+        )
 
 
 def _check_padding(words: Sequence[str], folder: object) -> None:

@@ -66,9 +66,12 @@ def closed(recording: Any, save: Path | None, shown: str) -> str:
     """End a rerun recording; what was opened or written.
 
     Raises:
-        ViewError: The file is cut off, which rerun does not tell.
+        ViewError: The file is cut off, which rerun does not always tell.
     """
-    recording.flush()
+    try:
+        recording.flush()
+    except (RuntimeError, OSError) as error:
+        raise ViewError(f"{save or 'the viewer'}: cannot be written ({error})") from error
     if save is not None and shutil.disk_usage(save.resolve().parent).free < DISK_BLOCK_BYTES:
         raise ViewError(f"{save}: the disk is full, and the file is cut off: free some room, or choose another --save")
     return shown if save is None else str(save)

@@ -15,6 +15,7 @@ from flocc_agent.core.prospects import (
     HOLD_S,
     PROBED_EVERY,
     REFUSED_MIN,
+    TAUGHT_BY_OTHERS_MAX,
     UNLIKELY,
     Prospect,
     Prospects,
@@ -99,6 +100,18 @@ def test_what_lies_beside_a_closure_is_taken_up_again_and_likely_from_then_on() 
     assert prospects.on_judged(one, is_closure=True) == [near]
     assert prospects.on_judged(one, is_closure=True) == []
     assert not is_unlikely(prospects, near)
+
+
+def test_pairs_of_others_teach_a_robot_only_as_long_as_it_knows_little() -> None:
+    asked: list[CandidatePair] = []
+    prospects = Prospects(lambda one: asked.append(one) or 0.5)  # type: ignore[func-returns-value]
+    for k in range(3 * TAUGHT_BY_OTHERS_MAX):
+        prospects.on_judged(pair(10 * k), is_closure=False, is_own=False)
+    own = [pair(10 * k, 5000) for k in range(20)]
+    for one in own:
+        prospects.on_judged(one, is_closure=False)
+    prospects.of(of_own(1)[0], 0.0)
+    assert asked[1:] == [*(pair(10 * k) for k in range(TAUGHT_BY_OTHERS_MAX)), *own]
 
 
 def test_tables_stay_within_their_maximum() -> None:

@@ -11,17 +11,21 @@ from numpy.typing import NDArray
 from tests.agent.perception.classical_scenes import camera_at, seen_from, wall
 
 from flocc_agent.config import ClassicalConfig, PerceptionConfig
-from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.core.interfaces import Camera, Image, OdometryPair
+from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
 from flocc_agent.core.reports import CameraDoubted
 from flocc_agent.geometry import angle_rad, inverse, pose, so3_exp
 from flocc_agent.perception.backends import build_perception
-from flocc_agent.perception.classical.features import FeatureExtractor
+from flocc_agent.perception.classical.encoder import encode_features
+from flocc_agent.perception.classical.features import FeatureExtractor, Features
 from flocc_agent.perception.classical.patches import dense_patches
+from flocc_agent.perception.classical.sift_registrar import classical_registrar
 from flocc_agent.perception.multiview.registrar import without_overlay
 from flocc_agent.perception.watch.camera_verdict import CameraFault, CameraVerdict, WatchedPair, camera_verdict
 from flocc_agent.perception.watch.camera_watch import CameraWatch
 from flocc_agent.perception.watch.overlay import OverlayFinder, place_of
-from flocc_agent.perception.watch.seen_motion import Flow, moves_with_the_scene
+from flocc_agent.perception.watch.seen_motion import Flow, flow_of, moves_with_the_scene
+from flocc_lab.bench.overlays import overlay
 
 Float = NDArray[np.float64]
 
@@ -189,6 +193,33 @@ def test_a_bumper_is_found_and_little_else(share: float) -> None:
     assert place_of(finder.cells()) == "bottom" or share > 0.3
 
 
+@pytest.mark.parametrize("kind", ["watermark", "clock"])
+def test_what_lets_the_scene_through_or_counts_is_found(kind: str) -> None:
+    """A rule that asks whether a window as a whole stays finds 0 and 0.53 of the writing here."""
+    finder, cover = OverlayFinder(CAMERA), overlay(kind, (320, 240), 0.3, 1)
+    grey = np.full((240, 320, 3), 128, np.uint8)
+    written = np.any([cover(grey, k)[..., 0] > 135 for k in range(12)], axis=0)
+    for k, T in enumerate(turning(12)):
+        smooth = np.asarray(cv2.GaussianBlur(picture(T, _texture(1)), (0, 0), 1), np.uint8)
+        seen = np.repeat(smooth[..., None], 3, axis=2)
+        finder.add(np.ascontiguousarray(cover(seen, k)[..., 0]), T)
+    mask = finder.mask((320, 240))
+    assert np.mean(mask[written]) > 0.7
+    assert np.mean(mask[cv2.dilate(written.astype(np.uint8), np.ones((25, 25), np.uint8)) == 0]) < 0.12
+
+
+def test_pictures_without_a_match_that_is_right_show_no_motion() -> None:
+    """OpenCV 5.0 raises on about half of these."""
+    rng = np.random.default_rng(8)
+    motions = pose(so3_exp(np.array([0.0, 0.1, 0.0])), np.zeros(3))
+    found = []
+    for _ in range(10):
+        points = rng.uniform(-0.5, 0.5, (2, 20, 2)).astype(np.float32)
+        features = [Features(one, np.zeros((20, 128), np.uint8), FOCAL_PX) for one in points]
+        found.append(flow_of(features[0], features[1], (np.arange(20), np.arange(20)), np.eye(4), motions))
+    assert sum(flow is not None for flow in found) <= 1
+
+
 def test_nothing_stays_where_nothing_is_on_the_lens() -> None:
     finder = OverlayFinder(CAMERA)
     assert not any(finder.add(picture(T, _texture(2)), T) for T in turning(20))
@@ -257,6 +288,36 @@ def test_a_robot_that_does_not_turn_keeps_matches_that_stay() -> None:
     straight, turned = pose(np.eye(3), np.array([0, 0, 1.0])), pose(so3_exp(np.array([0, 0.1, 0])), np.zeros(3))
     assert moves_with_the_scene(points, points, FOCAL_PX, straight).all()
     assert not moves_with_the_scene(points, points, FOCAL_PX, turned).any()
+
+
+def test_what_goes_straight_hides_what_stays_beside_its_way() -> None:
+    beside, ahead = np.array([[0.4, 0.3]]), np.array([[0.05, 0.0]])
+    straight = pose(np.eye(3), np.array([0.0, 0.0, 2.4]))
+    assert not moves_with_the_scene(beside, beside, FOCAL_PX, straight).any()
+    assert moves_with_the_scene(ahead, ahead, FOCAL_PX, straight).all()
+
+
+def test_what_two_robots_of_one_make_show_at_other_pixels_is_no_closure() -> None:
+    """The first keyframes are encoded before anybody knows what moves with the camera."""
+    rng = np.random.default_rng(9)
+    part = np.column_stack([rng.uniform(-0.6, 0.6, 120), rng.uniform(0.1, 0.45, 120)])
+    looks = rng.integers(0, 256, (120, 128), dtype=np.uint8)
+
+    def shown(offset_px: tuple[float, float], changed: int) -> bytes:
+        """120 features of the robot, some of which count, and 60 of a place that nobody else sees."""
+        points = np.concatenate([part + np.array(offset_px) / FOCAL_PX, rng.uniform(-0.5, 0.5, (60, 2))])
+        points[:120] += rng.normal(0.0, 0.3 / FOCAL_PX, (120, 2))
+        descriptors = np.concatenate([looks, rng.integers(0, 256, (60, 128), dtype=np.uint8)])
+        descriptors[:changed] = rng.integers(0, 256, (changed, 128), dtype=np.uint8)
+        return encode_features(Features(points.astype(np.float32), descriptors, FOCAL_PX), {})
+
+    turned = pose(so3_exp(np.array([0.0, 0.1, 0.0])), np.array([0.5, 0.0, 0.0]))
+    query, match = shown((0.0, 0.0), 0), shown((12.0, 6.0), 0)
+    registrar = classical_registrar(ClassicalConfig())
+    assert registrar.register(query, match, None).correspondences > 100
+    beside = registrar.register(query, match, OdometryPair(shown((0.0, 0.0), 40), turned, "own"))
+    assert isinstance(beside, RegistrationFailed)
+    assert beside.failure is RegistrationFailure.FEW_CORRESPONDENCES
 
 
 @pytest.mark.data

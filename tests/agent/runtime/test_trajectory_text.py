@@ -169,6 +169,17 @@ REFUSED = {
         r"redwood.log:1: has 4 columns \(matrices in blocks of four rows\)",
     ),
     "empty.tum": ("", "empty.tum: holds no pose"),
+    "turned.tum": (
+        "# T_body_world: timestamp tx ty tz qx qy qz qw\n" + GOOD,
+        "turned.tum:1: .*in the body.*t_body_world",
+    ),
+    "w2c.tum": ("# poses are world-to-camera\n" + GOOD, "w2c.tum:1: .*in the body or camera .world_to_camera"),
+    "jpl.tum": ("# timestamp tx ty tz qx qy qz qw (JPL)\n" + GOOD, "jpl.tum:1: the quaternions are said to be JPL's"),
+    "tags.csv": (
+        "tag_id,timestamp,x,y,z,qx,qy,qz,qw\n"
+        + "".join(f"{k % 3},{line.replace(' ', ',')}\n" for k, line in enumerate(GOOD.splitlines())),
+        r"tags.csv: holds poses of 3 different tag_id \(0, 1, 2\)",
+    ),
 }
 
 

@@ -11,6 +11,7 @@ evidence a wrong one never has depends on the features (`acceptance.py`).
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -23,15 +24,15 @@ from flocc_agent.core.registration import (
     RegistrationFailure,
     odometry_scale,
 )
-from flocc_agent.geometry import angle_rad, inverse
+from flocc_agent.geometry import inverse
 from flocc_agent.perception.latent import BadLatent, failed_by
 from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, evidence_of, evidence_of_neighbour
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
 from flocc_agent.perception.multiview.three_view import three_view
 from flocc_agent.perception.multiview.two_view import TwoView, two_view
-from flocc_agent.perception.multiview.view_parameters import Geometry, LocalFeatures, Matched
-from flocc_agent.perception.watch.seen_motion import STAYS_MAX_PX, TURN_MIN_PX, Flow, flow_of
+from flocc_agent.perception.multiview.view_parameters import Geometry, Indices, LocalFeatures, Matched
+from flocc_agent.perception.watch.seen_motion import STAYS_MAX_PX, Flow, flow_of, moves_with_the_scene
 from flocc_agent.stages import stage
 
 BASELINE_MIN_M = 1e-3
@@ -47,6 +48,26 @@ ODOMETRY_PAIRS_MAX = 256
 Float = NDArray[np.float64]
 F = TypeVar("F", bound=LocalFeatures)
 Result = Registration | RegistrationFailed
+
+
+AMONG_PX = 40.0
+AMONG_MIN = 3
+"""A feature with so many that move with the camera within that many pixels moves with it, too."""
+NOTHING = np.zeros(0, np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnPair:
+    """What a query and its odometry neighbour show together.
+
+    Attributes:
+        pair: Verified, or how many matches were.
+        hidden: Features of query and of neighbour among those that stay at their pixel though the robot moved: they
+            are on the lens, or on the robot.
+    """
+
+    pair: TwoView | int = 0
+    hidden: tuple[Indices, Indices] = (NOTHING, NOTHING)
 
 
 class PairRegistrar(Generic[F]):
@@ -70,7 +91,7 @@ class PairRegistrar(Generic[F]):
         self._match = match
         self._geometry = geometry
         self._acceptance = acceptance
-        self._odometry_pairs: OrderedDict[str, TwoView | int] = OrderedDict()
+        self._own_pairs: OrderedDict[str, OwnPair] = OrderedDict()
         self._lock = threading.Lock()
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Result:
@@ -97,17 +118,17 @@ class PairRegistrar(Generic[F]):
         with stage("decode"):
             query_features, match_features = self._read(query), self._read(match)
         with stage("match"):
-            odometry_pair = self._odometry_pair(query_features, odometry)
-            loop_pair = self._pair(query_features, match_features)
+            own = self._own_pair(query_features, odometry)
+            loop_pair = self._loop_pair(query_features, match_features, own.hidden[0])
         with stage("pose"):
-            result = self._posed(query_features, loop_pair, odometry_pair, odometry)
+            result = self._posed(query_features, loop_pair, own.pair, odometry)
         if isinstance(result, RegistrationFailed):
             return result, None
         evidence = evidence_of(result)
         rule = self._acceptance
         if odometry is not None and (always or (rule is not None and rule.needs_neighbour(evidence))):
             with stage("match"):
-                neighbour_pair = self._pair(self._read(odometry.latent), match_features)
+                neighbour_pair = self._loop_pair(self._read(odometry.latent), match_features, own.hidden[1])
             evidence = evidence_of_neighbour(evidence, neighbour_pair, result, odometry.T_neighbour_query)
         return (result if rule is None else rule.judged(result, evidence)), evidence
 
@@ -139,11 +160,11 @@ class PairRegistrar(Generic[F]):
         points = query_features.points[matched[0]], match_features.points[matched[1]]
         return SeenMatches(points[0].astype(np.float64), points[1].astype(np.float64), agree)
 
-    def _pair(self, first: F, second: F, prior: DirectionPrior | None = None) -> TwoView | int:
-        matched = self._match(first, second)
-        if prior is None or angle_rad(prior.T_view_query[:3, :3]) * first.focal_px > TURN_MIN_PX:
-            matched = without_overlay(first, second, matched)
-        return two_view(first, second, matched, self._geometry, prior)
+    def _loop_pair(self, first: F, second: F, hidden: Indices) -> TwoView | int:
+        """Verify the matches of two robots' pictures, without the first one's features that move with its camera."""
+        matched = without_overlay(first, second, self._match(first, second))
+        seen = ~np.isin(matched[0], hidden)
+        return two_view(first, second, (matched[0][seen], matched[1][seen]), self._geometry)
 
     def _posed(
         self, query: F, loop_pair: TwoView | int, odometry_pair: TwoView | int, odometry: OdometryPair | None
@@ -164,28 +185,49 @@ class PairRegistrar(Generic[F]):
             return RegistrationFailed(RegistrationFailure.DEGENERATE, reason, *counts)
         return registration(loop_pair.refined, 0, counts, None)
 
-    def _odometry_pair(self, query: F, odometry: OdometryPair | None) -> TwoView | int:
+    def _own_pair(self, query: F, odometry: OdometryPair | None) -> OwnPair:
         """Verify the odometry pair, or look it up."""
         if odometry is None:
-            return 0
+            return OwnPair()
         with self._lock:
-            known = self._odometry_pairs.get(odometry.key)
+            known = self._own_pairs.get(odometry.key)
         if known is not None:
             return known
-        T = odometry.T_neighbour_query
+        own = self._verified(query, self._read(odometry.latent), odometry.T_neighbour_query)
+        with self._lock:
+            self._own_pairs[odometry.key] = own
+            while len(self._own_pairs) > ODOMETRY_PAIRS_MAX:
+                self._own_pairs.popitem(last=False)
+        return own
+
+    def _verified(self, query: F, neighbour: F, T_neighbour_query: Float) -> OwnPair:
+        matched = self._match(query, neighbour)
+        rays = neighbour.points[matched[1]].astype(np.float64), query.points[matched[0]].astype(np.float64)
+        moves = moves_with_the_scene(*rays, query.focal_px, T_neighbour_query)
+        hidden = (
+            features_among(query, matched[0][~moves]),
+            features_among(neighbour, matched[1][~moves]),
+        )
+        moves &= ~np.isin(matched[0], hidden[0])
         prior = None
-        if float(np.linalg.norm(T[:3, 3])) > BASELINE_MIN_M:
+        if float(np.linalg.norm(T_neighbour_query[:3, 3])) > BASELINE_MIN_M:
             rotation_rad, direction_rad = (
                 self._geometry.odometry_rotation_sigma_rad,
                 self._geometry.odometry_direction_sigma_rad,
             )
-            prior = DirectionPrior(T, rotation_rad, direction_rad)
-        pair = self._pair(query, self._read(odometry.latent), prior)
-        with self._lock:
-            self._odometry_pairs[odometry.key] = pair
-            while len(self._odometry_pairs) > ODOMETRY_PAIRS_MAX:
-                self._odometry_pairs.popitem(last=False)
-        return pair
+            prior = DirectionPrior(T_neighbour_query, rotation_rad, direction_rad)
+        scene = matched[0][moves], matched[1][moves]
+        return OwnPair(two_view(query, neighbour, scene, self._geometry, prior), hidden)
+
+
+def features_among(features: LocalFeatures, those: Indices) -> Indices:
+    """All features that have several of those close by: what changes on an overlay lies among what does not."""
+    if len(those) < AMONG_MIN:
+        return those
+    points = features.points * np.float32(features.focal_px)
+    squares = (points**2).sum(axis=1)
+    distances = squares[:, None] - 2.0 * points @ points[those].T + squares[those]
+    return np.union1d(those, np.flatnonzero((distances < AMONG_PX**2).sum(axis=1) >= AMONG_MIN))
 
 
 def without_overlay(first: LocalFeatures, second: LocalFeatures, matched: Matched) -> Matched:

@@ -1,9 +1,10 @@
 """What moves with the camera is not the scene: parts of the picture that stay at their pixel while the robot turns.
 
 The picture is looked at in small cells. A cell is tested against an earlier picture where the turn between the two, by
-odometry, must have moved whatever is out there by several pixels, however far it is; it stays where the two cells
-look the same without any shift. Only cells with corners are tested: along an edge, such as a horizon, a shift does not
-show. A robot that only drives straight shows nothing, and nothing is hidden.
+odometry, must have moved whatever is out there by several pixels, however far it is. Compared are the gradients along
+that shift, so that an edge in its direction, such as a horizon, counts for nothing. What is out there correlates with
+nothing on average; what moves with the camera always does, if it lets the scene shine through, or if a part of it
+changes, only a little less. A robot that only drives straight shows nothing, and nothing is hidden.
 
 Two pictures whose cells all stay are one picture: the camera is frozen.
 """
@@ -33,7 +34,8 @@ CORNER_MIN = 2.0
 """Smaller eigenvalue of a window's gradients: with less it is an edge at best."""
 SHIFT_MIN_PX = 4.0
 """A turn that moves a cell by less tests nothing."""
-STAYS_NCC = 0.85
+GRADIENT_MIN = 1.25
+"""Grey levels a pixel, root mean square in a window along the shift, below which noise decides."""
 MOVED_MIN_M = 0.05
 SAME_NCC = 0.97
 SAME_SHARE = 0.95
@@ -42,9 +44,11 @@ CELLS_MIN = 12
 EARLIER_MAX = 6
 """Earlier pictures kept to compare with."""
 TESTS_MIN = 6
-STAYED_SHARE = 0.75
-SUPPORT_MIN = 2.0
-"""Cells that stay, of the nine around one, itself among them: a single one is chance."""
+STAYED_MIN = 0.3
+STAYED_CHANCE = 2.0
+"""Mean correlation of a cell that stays: at least the first, and the second over the number of tests more."""
+SUPPORT_MIN = 3.0
+"""Cells that stay, of the nine around one, itself among them: one or two are chance."""
 TESTS_MAX = 40
 """Old tests fade beyond this: dirt may be wiped off."""
 
@@ -57,6 +61,8 @@ class _Picture:
     mean: Float32
     deviation: Float32
     has_corners: Mask
+    gradient: tuple[Float32, Float32]
+    squares: tuple[Float32, Float32, Float32]
     T_odom_camera: Float
 
 
@@ -100,7 +106,7 @@ class OverlayFinder:
 
     def cells(self) -> Mask:
         """(rows, columns) cells that stay, with those around them."""
-        stays = (self._tests >= TESTS_MIN) & (self._stayed >= STAYED_SHARE * self._tests)
+        stays = (self._tests >= TESTS_MIN) & (self._stayed >= STAYED_MIN * self._tests + STAYED_CHANCE)
         near = cv2.filter2D(stays.astype(np.float32), -1, np.ones((3, 3), np.float32), borderType=cv2.BORDER_CONSTANT)
         stays &= near >= SUPPORT_MIN
         return np.asarray(cv2.dilate(stays.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
@@ -111,17 +117,26 @@ class OverlayFinder:
         deviation = np.sqrt(np.maximum(self._averaged(reduced * reduced) - mean * mean, 0.0))
         corners = self._at(np.asarray(cv2.cornerMinEigenVal(reduced, WINDOW_PX)))
         has_corners = (deviation > CONTRAST_MIN) & (corners > CORNER_MIN)
-        return _Picture(reduced, mean, deviation, has_corners, T_odom_camera)
+        right, down = (
+            np.asarray(cv2.Sobel(reduced, cv2.CV_32F, *axis, scale=0.125), np.float32) for axis in ((1, 0), (0, 1))
+        )
+        squares = self._averaged(right * right), self._averaged(right * down), self._averaged(down * down)
+        return _Picture(reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera)
 
     def _test(self, now: _Picture, earlier: _Picture) -> None:
-        """Count which cells stay between two pictures, of those that the turn must have moved."""
+        """Add how much of each cell stays between two pictures, of those that the turn must have moved."""
         rays = self._rays @ between(now.T_odom_camera, earlier.T_odom_camera)[:3, :3].T
         depth = np.maximum(rays[..., 2], 1e-3)
         shift = (rays[..., :2] / depth[..., None] - self._rays[..., :2]) * self._focal_px
-        tested = (np.linalg.norm(shift, axis=-1) > SHIFT_MIN_PX) & (now.has_corners | earlier.has_corners)
-        stays = self._similarity(now, earlier) > STAYS_NCC
+        length = np.linalg.norm(shift, axis=-1)
+        along = shift / np.maximum(length, 1e-6)[..., None]
+        (right, down), (right_before, down_before) = now.gradient, earlier.gradient
+        crossed = self._averaged(right * down_before + down * right_before)
+        both = _along(along, (self._averaged(right * right_before), 0.5 * crossed, self._averaged(down * down_before)))
+        squares = _along(along, now.squares), _along(along, earlier.squares)
+        tested = (length > SHIFT_MIN_PX) & (np.maximum(*squares) > GRADIENT_MIN**2)
         self._tests += tested
-        self._stayed += tested & stays
+        self._stayed += tested * both / np.maximum(np.sqrt(squares[0] * squares[1]), 0.5 * GRADIENT_MIN**2)
         fades = self._tests > TESTS_MAX
         self._tests[fades] *= 0.5
         self._stayed[fades] *= 0.5
@@ -150,6 +165,17 @@ class OverlayFinder:
     def _at(self, values: NDArray[np.generic]) -> Float32:
         columns, rows = self._centres
         return np.asarray(values[np.ix_(rows, columns)], np.float32)
+
+
+def _along(direction: Float, products: tuple[Float32, Float32, Float32]) -> Float:
+    """The mean product (rows, columns) of two gradients' parts in a direction.
+
+    Args:
+        direction: (rows, columns, 2) right and down, of length one.
+        products: Mean products of both parts to the right, of right and down, and of both down.
+    """
+    right, down = direction[..., 0], direction[..., 1]
+    return np.asarray(products[0] * right**2 + 2.0 * products[1] * right * down + products[2] * down**2)
 
 
 def _centres(size: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import angle_rad, between, so3_log
+from flocc_agent.geometry import between, so3_log
 from flocc_agent.perception.multiview.bundle import BundleView, covariance_of_view, inverse_depths_from, refine
 from flocc_agent.perception.multiview.degeneracy import rotation_share
 from flocc_agent.perception.multiview.two_view import essential_pose, usac_parameters
@@ -26,8 +26,9 @@ POINTS_MIN = 15
 ROTATION_ONLY_SHARE = 0.8
 """Where a rotation explains this share of the matches, the direction of motion is not looked at."""
 DIRECTION_SIGMA_MAX_RAD = 0.15
-TURN_MIN_PX = 3.0
-"""A turn, by odometry, that moves the whole picture by so much leaves no point of the scene where it was."""
+FAR_M = 60.0
+MOVES_MIN_PX = 6.0
+"""A motion, by odometry, that moves a point that far away by so much leaves no point of the scene where it was."""
 STAYS_MAX_PX = 1.5
 
 
@@ -73,19 +74,37 @@ def flow_of(
     a, b = a[moves], b[moves]
     if len(a) < POINTS_MIN:
         return None
-    _, mask = cv2.findFundamentalMat(a, b, usac_parameters(Geometry(), now.focal_px))
-    kept = np.zeros(0, np.intp) if mask is None else np.flatnonzero(mask.ravel())
+    kept = _of_one_camera(a, b, now.focal_px)
     if len(kept) < POINTS_MIN:
         return None
     kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), POINTS_MAX)).astype(np.intp)]
     return Flow(a[kept], b[kept], now.focal_px, T_odom_before, T_odom_now)
 
 
+def _of_one_camera(before: Float, now: Float, focal_px: float) -> NDArray[np.intp]:
+    """Indices of the matches that agree with one fundamental matrix; none where nothing does.
+
+    OpenCV 5.0 raises on about half of all sets of matches that agree with none.
+    """
+    try:
+        _, mask = cv2.findFundamentalMat(before, now, usac_parameters(Geometry(), focal_px))
+    except cv2.error:
+        mask = None
+    return np.zeros(0, np.intp) if mask is None else np.flatnonzero(mask.ravel())
+
+
 def moves_with_the_scene(before: Float, now: Float, focal_px: float, T_before_now: Float) -> NDArray[np.bool_]:
-    """(N,) which matches of two own pictures do not stay at their pixel while the robot turns."""
-    if angle_rad(T_before_now[:3, :3]) * focal_px < TURN_MIN_PX:
-        return np.ones(len(before), np.bool_)
-    return np.asarray(np.linalg.norm(now - before, axis=1) * focal_px > STAYS_MAX_PX)
+    """(N,) which matches of two own pictures do not stay at their pixel though the robot's motion must move them.
+
+    Args:
+        before: (N, 2) rays x/z, y/z in the earlier picture.
+        now: (N, 2) rays in the later one.
+        focal_px: Of the picture.
+        T_before_now: (4, 4) later camera in the earlier one, by odometry, metres.
+    """
+    far = np.column_stack([now, np.ones(len(now))]) @ T_before_now[:3, :3].T + T_before_now[:3, 3] / FAR_M
+    must_px = np.linalg.norm(far[:, :2] / np.maximum(far[:, 2:], 1e-3) - now, axis=1) * focal_px
+    return np.asarray((must_px < MOVES_MIN_PX) | (np.linalg.norm(now - before, axis=1) * focal_px > STAYS_MAX_PX))
 
 
 def seen_motion(flow: Flow, focal_factor: float = 1.0, mirrored: bool = False) -> SeenMotion | None:
