@@ -12,6 +12,9 @@ derivative -R_hat^T t_hat (DESIGN.md section 7), so that Gaussian scales are eli
 - a scale `gamma ~ N(c, sigma^2)` of its own turns the covariance into `Sigma + sigma^2 d d^T` (widened edge);
 - what is left is the cluster's scale c: one variable for many closures, or the constant 1.
 
+A scale of odometry is asked for in another form: what was measured is noisy, and a factor of it is found too small, as
+in any regression on what is noisy. There c divides the poses, `e = [ 2 vec(q(R_hat^T R_ij)) ; R_hat^T p / c - d ]`.
+
 A scale is kept above `GAMMA_MIN`: an edge whose best scale lies below is held there, and pays for the distance to c.
 Updates are on the right: `R <- R Exp(omega)`, `t <- t + R v`; the tangent order is rotation, translation.
 """
@@ -86,6 +89,7 @@ class Edges:
         sqrt_information_wide: (E, 6, 6) the same with the edge's own scale eliminated; equal where it has none.
         sigma: (E,) standard deviation of the own scale around c; 0 where it has none.
         cluster: (E,) index of the cluster scale, or -1 for the constant 1.
+        divides: (E,) whether that scale divides the poses, instead of multiplying the measurement; sigma is 0 there.
     """
 
     i: Int
@@ -96,6 +100,7 @@ class Edges:
     sqrt_information_wide: Float
     sigma: Float
     cluster: Int
+    divides: Bool
 
     def __len__(self) -> int:
         return len(self.i)
@@ -111,7 +116,8 @@ class Residuals:
         bound: (E,) whitened distance of a held scale to its cluster's scale, else 0.
         q_error: (E, 4) rotation error, w not negative.
         p: (E, 3) position of the second pose in the first.
-        L: (E, 6, 6) the square-root information that was used.
+        L: (E, 6, 6) the square-root information that was used, over the scale where that divides the poses.
+        rho: (E,) one over the scale that divides the poses, else 1.
     """
 
     e: Float
@@ -120,6 +126,7 @@ class Residuals:
     q_error: Float
     p: Float
     L: Float
+    rho: Float
 
     def squared(self) -> Float:
         """Squared Mahalanobis norms (E,)."""
@@ -169,7 +176,14 @@ def residuals(edges: Edges, state: State, hold: bool = True) -> Residuals:
         L = np.where(held[:, None, None], edges.sqrt_information, L)
         e[held] = np.einsum("eij,ej->ei", L[held], e0[held] - GAMMA_MIN * edges.d[held])
         bound[held] = (GAMMA_MIN - c[held]) / edges.sigma[held]
-    return Residuals(e, held, bound, q_error, p, L)
+    rho = np.ones(len(edges))
+    rows = np.flatnonzero(edges.divides)
+    if len(rows):
+        L, rho[rows] = L.copy(), 1.0 / c[rows]
+        L[rows, :, 3:] *= rho[rows, None, None]
+        measured = np.einsum("eij,ej->ei", edges.sqrt_information[rows], edges.d[rows])
+        e[rows] = np.einsum("eij,ej->ei", L[rows], e0[rows]) - measured
+    return Residuals(e, held, bound, q_error, p, L, rho)
 
 
 def off_half_turns(edges: Edges, state: State) -> State:
@@ -219,8 +233,11 @@ def jacobians(edges: Edges, at: Residuals) -> Jacobians:
 def scale_slopes(edges: Edges, at: Residuals) -> Float:
     """Whitened derivatives (E, 6) of the residuals by the scale of the edge's cluster; zero where it has none."""
     slopes = np.zeros((len(edges), 6))
-    on = np.flatnonzero((edges.cluster >= 0) & ~at.held)
+    on = np.flatnonzero((edges.cluster >= 0) & ~at.held & ~edges.divides)
     slopes[on] = -np.einsum("eij,ej->ei", at.L[on], edges.d[on])
+    rows = np.flatnonzero(edges.divides)
+    q = np.einsum("eji,ej->ei", rotations.matrices(edges.q_hat[rows]), at.p[rows])
+    slopes[rows] = -at.rho[rows, None] * np.einsum("eij,ej->ei", at.L[rows, :, 3:], q)
     return slopes
 
 

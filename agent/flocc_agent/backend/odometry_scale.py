@@ -186,14 +186,19 @@ def settled(posed: Posed, solved: Solved) -> SolvedWithScales:
 
 
 def estimated(posed: Posed, solved: Solved) -> Estimates:
-    """What a solution says of all scales, applied or not: one step with all of them free."""
+    """What a solution says of all scales, applied or not: one step with all of them free.
+
+    Here they divide the poses: as a factor of noisy steps they make odometry seem too long, and the shorter the steps
+    the more.
+    """
     problem, rows = posed.problem, posed.problem.closure_rows
     if problem.poses > ASKED_POSES_MAX:
         return Estimates()
     now = dict.fromkeys(scalable(posed), 1.0) | problem.scales_applied(solved.state)
-    free = replace(posed, start=solved.state).with_scaled(now)
+    free = replace(posed, start=solved.state).with_scaled(now, divides=True)
     weights, edges = asked(solved.weights, rows), free.problem.edges
     at = residuals(edges, free.start)
+    cost = free.objective.cost_at(at, free.start, solved.weights)
     try:
         information, right = free.objective.linear.scales_alone(edges, free.start, at, weights, problem.clusters)
         covariance = np.linalg.inv(information)
@@ -206,7 +211,7 @@ def estimated(posed: Posed, solved: Solved) -> Estimates:
     scale = free.start.scale[problem.clusters :] + moved
     if not is_metric:
         scale, covariance = relative_to_mean(scale, np.asarray(covariance))
-    unexplained = solved.cost - 0.5 * float(moved @ right)
+    unexplained = cost - 0.5 * float(moved @ right)
     bodies = len(problem.logs) - 1
     freedom = float(np.sum(np.where(free_lengths(posed), 5.0, 6.0)[used])) - 6.0 * bodies
     excess = max(1.0, 2.0 * unexplained / max(freedom, 1.0))

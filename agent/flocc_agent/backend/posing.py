@@ -45,11 +45,11 @@ class Posed:
         chosen = solved.weights[self.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
         return self.trusted is not None and np.array_equal(chosen, self.trusted)
 
-    def with_scaled(self, scales: Mapping[LogId, float]) -> "Posed":
+    def with_scaled(self, scales: Mapping[LogId, float], divides: bool = False) -> "Posed":
         """The same in which the odometry of these logs, and of no others, has a scale that starts as given."""
         if not scales and not self.problem.scaled:
             return self
-        problem, config = self.problem.with_scaled(scales), self.objective.config
+        problem, config = self.problem.with_scaled(scales, divides), self.objective.config
         sigmas = np.full(problem.scales, config.scale_prior_unknown_sigma_ratio)
         sigmas[problem.clusters :] = ODOMETRY_SCALE_SIGMA
         started = [*self.start.scale[: problem.clusters].tolist(), *(scales[log] for log in problem.scaled)]

@@ -62,14 +62,19 @@ class Problem:
         """Scales of odometry at a state."""
         return dict(zip(self.scaled, state.scale[self.clusters :].tolist(), strict=True))
 
-    def with_scaled(self, logs: Collection[LogId]) -> "Problem":
-        """The same with a scale (true over measured length) for the odometry of these logs and no others."""
+    def with_scaled(self, logs: Collection[LogId], divides: bool = False) -> "Problem":
+        """The same with a scale (true over measured length) for the odometry of these logs and no others.
+
+        It multiplies what was measured, or divides the poses.
+        """
         scaled = tuple(log for log in self.logs if log in logs)
         of_log = np.array([self.clusters + scaled.index(log) if log in scaled else NO_CLUSTER for log in self.logs])
         cluster, starts = self.edges.cluster.copy(), np.array([self.offsets[log] for log in self.logs])
+        of_poses = np.zeros(len(self.edges), dtype=bool)
         of_odometry = slice(0, self.closure_rows.start)
         cluster[of_odometry] = of_log[np.searchsorted(starts, self.edges.i[of_odometry], side="right") - 1]
-        return replace(self, edges=replace(self.edges, cluster=cluster), scaled=scaled)
+        of_poses[of_odometry] = divides & (cluster[of_odometry] >= 0)
+        return replace(self, edges=replace(self.edges, cluster=cluster, divides=of_poses), scaled=scaled)
 
 
 def build(
@@ -105,7 +110,7 @@ def build(
 
 def concatenate(parts: Sequence[Edges]) -> Edges:
     """Put edges one after the other."""
-    names = ("i", "j", "q_hat", "d", "sqrt_information", "sqrt_information_wide", "sigma", "cluster")
+    names = ("i", "j", "q_hat", "d", "sqrt_information", "sqrt_information_wide", "sigma", "cluster", "divides")
     return Edges(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -113,7 +118,9 @@ def plain_edges(i: Int, j: Int, T_hat: Float, L: Float) -> Edges:
     """Edges with a metric measurement (E, 4, 4) and square-root information (E, 6, 6)."""
     d = np.zeros((len(i), 6))
     d[:, 3:] = np.einsum("eji,ej->ei", T_hat[:, :3, :3], T_hat[:, :3, 3])
-    return Edges(i, j, quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(len(i)), np.full(len(i), NO_CLUSTER))
+    n = len(i)
+    none = np.zeros(n, dtype=bool)
+    return Edges(i, j, quaternions(T_hat[:, :3, :3]), d, L, L, np.zeros(n), np.full(n, NO_CLUSTER), none)
 
 
 def sqrt_informations(covariances: Float) -> Float:
@@ -169,7 +176,7 @@ def closure_edges(
     labels, sigma, clusters = scale_model(recorded or closures, config)
     L = sqrt_informations(covariances)
     wide = sqrt_informations(covariances + sigma[:, None, None] ** 2 * metric.d[:, :, None] * metric.d[:, None, :])
-    return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels), clusters
+    return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels, metric.divides), clusters
 
 
 def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, config: BackendConfig) -> Float:

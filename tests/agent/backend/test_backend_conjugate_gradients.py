@@ -107,7 +107,7 @@ def test_segments_end_where_a_chain_ends_and_the_fixed_pose_stands_alone() -> No
 def _edges(i: np.ndarray, j: np.ndarray) -> Edges:
     n = len(i)
     L = np.zeros((n, 6, 6))
-    return Edges(i, j, np.zeros((n, 4)), np.zeros((n, 6)), L, L, np.zeros(n), np.full(n, -1))
+    return Edges(i, j, np.zeros((n, 4)), np.zeros((n, 6)), L, L, np.zeros(n), np.full(n, -1), np.zeros(n, dtype=bool))
 
 
 @pytest.mark.parametrize("formulation", [Formulation.INDEPENDENT, Formulation.SMOOTHED])

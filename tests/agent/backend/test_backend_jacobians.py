@@ -1,5 +1,7 @@
 """Claim: every Jacobian is the numerical derivative, at random states, near pi and near zero translation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -31,7 +33,7 @@ def edge(rng: np.random.Generator, case: str, sigma: float, cluster: int, scale:
     wide = np.linalg.inv(np.linalg.cholesky(covariance + sigma**2 * np.outer(d, d)))
     edges = Edges(
         np.array([0]), np.array([1]), quaternions(R_hat[None]), d[None], L[None], wide[None],
-        np.array([sigma]), np.array([cluster]),
+        np.array([sigma]), np.array([cluster]), np.array([False]),
     )  # fmt: skip
     state = state_of(np.array([T_i, T_i @ T_ij]))
     return edges, State(state.q, state.t, np.array([scale]))
@@ -55,6 +57,16 @@ def test_jacobians_are_the_numerical_derivatives(case: str, sigma: float, cluste
     edges, state = edge(np.random.default_rng(seed), case, sigma, cluster)
     at = residuals(edges, state)
     jac = jacobians(edges, at)
+    analytic = np.hstack([jac.A_i[0], jac.A_j[0], jac.a_scale[0][:, None]])
+    measured = np.stack([numerical(edges, state, n)[:6] for n in range(13)], axis=1)
+    np.testing.assert_allclose(analytic, measured, atol=2e-7 * max(1.0, float(np.abs(measured).max())))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_of_a_scale_that_divides_the_poses_are_the_numerical_derivatives(seed: int) -> None:
+    edges, state = edge(np.random.default_rng(seed), "random", 0.0, 0, scale=1.2)
+    edges = replace(edges, divides=np.array([True]))
+    jac = jacobians(edges, residuals(edges, state))
     analytic = np.hstack([jac.A_i[0], jac.A_j[0], jac.a_scale[0][:, None]])
     measured = np.stack([numerical(edges, state, n)[:6] for n in range(13)], axis=1)
     np.testing.assert_allclose(analytic, measured, atol=2e-7 * max(1.0, float(np.abs(measured).max())))

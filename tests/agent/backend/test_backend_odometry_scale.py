@@ -8,11 +8,12 @@ import pytest
 
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation
-from flocc_agent.core.pose_graph import Component, GraphSolution, PoseGraph, stretched
+from flocc_agent.core.pose_graph import Component, GraphSolution, OptimisationFailed, PoseGraph, stretched
 from flocc_lab.graph_family.family_spec import Lengths, drawn
 from flocc_lab.graph_family.graphs import Member, made
 from flocc_lab.graph_family.judge import judged
 from flocc_lab.graph_family.methods import answer_of, settings
+from flocc_lab.graph_family.team_walks import TeamSpec, team_graph
 from flocc_protocol.ids import LogId
 
 FIRST, SECOND = LogId("r00"), LogId("r01")
@@ -127,3 +128,14 @@ def test_a_warm_round_begins_with_the_scales_that_were_found() -> None:
     assert again.iterations < first.iterations / 3
     moved_m = component(again).T_map_keyframe[SECOND] - component(first).T_map_keyframe[SECOND]
     assert np.abs(moved_m).max() < 0.02
+
+
+def test_odometry_that_is_true_does_not_seem_too_long_where_its_steps_are_noisy() -> None:
+    """A factor of what is noisy is found too small: that is 2 % here, and 0.4 % where the scale divides the poses."""
+    ratios = []
+    for seed in (1, 1001):
+        found = optimise(team_graph(TeamSpec(seed=seed, robots=3, poses=100)).graph, settings())
+        assert not isinstance(found, OptimisationFailed)
+        ratios += [scale.ratio for component in found.components for scale in component.odometry_scales.values()]
+    assert len(ratios) == 6
+    assert abs(float(np.mean(ratios)) - 1.0) < 0.01
