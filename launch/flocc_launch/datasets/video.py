@@ -161,13 +161,13 @@ def video_faults(path: Path, file: Path, trajectory: Trajectory, lens: Lens | No
             f"{lens.camera.width}x{lens.camera.height}"
         )
     covered = posed_frames(trajectory, head)
-    if covered == 0:
+    if covered is not None and covered < min(2, head.frames):
         first_s, last_s = float(trajectory.stamps_s[0]), float(trajectory.stamps_s[-1])
         steps = f" in steps of {(last_s - first_s) / (len(trajectory) - 1):.3f} s" if len(trajectory) > 1 else ""
         duration_s = head.frames / head.rate_hz
         faults.append(
             f"{file}: the trajectory is from {first_s:.3f} s to {last_s:.3f} s{steps}, but {path.name} is from 0 s to "
-            f"{duration_s:.3f} s, so that no frame has a pose; "
+            f"{duration_s:.3f} s, so that {covered or 'no'} frame has a pose; "
             "stamps are seconds and count from the video's first frame"
         )
     return faults
