@@ -23,6 +23,7 @@ from flocc_protocol.codec import (
     Codec,
     Pose7,
     Reader,
+    blob,
     from_bytes,
     listed,
     optional,
@@ -36,6 +37,7 @@ from flocc_protocol.ids import KeyframeId, checked_name
 
 RECORD_BYTES_MAX = 8 * 1024
 SIGNATURE_BYTES = 64
+SHA256_BYTES = 32
 SEALED_RECORD_BYTES_MAX = RECORD_BYTES_MAX + SIGNATURE_BYTES
 DESCRIPTOR_DIMENSION_MAX = 2048
 REASON_LENGTH_MAX = 80
@@ -233,6 +235,22 @@ class OdometryCovarianceRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class LatentRecord:
+    """What a keyframe's latent is, in swarms with keys: SHA-256 (32 bytes) of it as it is sent, in one or two forms."""
+
+    index: int
+    sha256: bytes
+
+    def __post_init__(self) -> None:
+        if len(self.sha256) not in (SHA256_BYTES, 2 * SHA256_BYTES):
+            raise ValueError(f"a latent has one or two hashes of {SHA256_BYTES} bytes, not {len(self.sha256)} bytes")
+
+    def names(self, sha256: bytes) -> bool:
+        """Whether bytes of this hash are the latent."""
+        return sha256 in (self.sha256[:SHA256_BYTES], self.sha256[SHA256_BYTES:])
+
+
+@dataclass(frozen=True, slots=True)
 class UnknownRecord:
     """A record of a later version: its code and all its bytes, the code among them.
 
@@ -255,7 +273,7 @@ MeasurementRecord = (
     | MetricClosureRecord
     | OdometryCovarianceRecord
 )
-Record = KeyframeRecord | ClosureRecord | RejectionRecord | MeasurementRecord | UnknownRecord
+Record = KeyframeRecord | ClosureRecord | RejectionRecord | MeasurementRecord | LatentRecord | UnknownRecord
 KEYFRAME_CODE = 1
 CODE_MAX = 127
 """A code is one byte of msgpack, the second one of a record."""
@@ -302,6 +320,7 @@ _BY_CODE: dict[int, Codec[Any]] = {
     9: struct(RobotBearingRecord, index=COUNT, robot=text(NAME_LENGTH_MAX), position_m=ARRAY, covariance_m2=ARRAY),
     10: struct(MetricClosureRecord, query=KEYFRAME_ID, match=KEYFRAME_ID, T_query_match=POSE, covariance=ARRAY),
     11: struct(OdometryCovarianceRecord, index=COUNT, covariance=ARRAY),
+    12: struct(LatentRecord, index=COUNT, sha256=blob(2 * SHA256_BYTES)),
 }
 _CODES: dict[type[Record], int] = {
     KeyframeRecord: 1,
@@ -315,6 +334,7 @@ _CODES: dict[type[Record], int] = {
     RobotBearingRecord: 9,
     MetricClosureRecord: 10,
     OdometryCovarianceRecord: 11,
+    LatentRecord: 12,
 }
 _FIELDS = {_CODES[kind]: len(fields(kind)) for kind in _CODES}
 

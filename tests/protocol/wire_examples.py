@@ -58,6 +58,7 @@ from flocc_protocol.records import (
     FixRecord,
     GeodeticFixRecord,
     KeyframeRecord,
+    LatentRecord,
     MetricClosureRecord,
     OdometryCovarianceRecord,
     PoseFixRecord,
@@ -119,6 +120,7 @@ RECORDS: tuple[Record, ...] = (
     RobotBearingRecord(7, "bob-2", Array.of(np.array([1.0, 2.0, 3.0]), "f8"), Array.of(np.eye(3).ravel(), "f8")),
     MetricClosureRecord(KeyframeId(ALICE, 4), KeyframeId(BOB, 1), IDENTITY, Array.of(np.arange(21.0), "f8")),
     OdometryCovarianceRecord(7, Array.of(np.arange(21.0), "f8")),
+    LatentRecord(7, bytes(range(32))),
 )
 ENCODED = tuple(encode_record(record) for record in RECORDS)
 
@@ -156,7 +158,7 @@ MESSAGES: tuple[Message, ...] = (
     Answer(8),
     Coordinator(ADVERT),
     Handover(TERM),
-    Records((RecordBatch(ALICE, 12, 0x1234, ENCODED), RecordBatch(BOB, 0, 0, ENCODED[:1]))),
+    Records((RecordBatch(ALICE, 12, 0x1234, ENCODED[:-1]), RecordBatch(BOB, 0, 0, ENCODED[:1]))),
     RecordRequest((LogPosition(ALICE, 12), LogPosition(BOB, 41))),
     CorrectionBatch(CORRECTIONS),
     CorrectionRequest((ALICE, BOB)),
@@ -334,6 +336,7 @@ records: st.SearchStrategy[Record] = st.one_of(
         lambda pair: st.builds(MetricClosureRecord, st.just(pair.low), st.just(pair.high), poses(), arrays((21,)))
     ),
     st.builds(OdometryCovarianceRecord, _counts, arrays((21,))),
+    st.builds(LatentRecord, _counts, st.sampled_from([32, 64]).flatmap(lambda n: st.binary(min_size=n, max_size=n))),
 )
 
 

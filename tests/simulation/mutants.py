@@ -5,24 +5,29 @@ that a table of them reads as what the checkers are good for.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 
-from flocc_agent.core import assembly, election, judgement, loop_closing, robot
-from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core import assembly, election, judgement, log_copy, loop_closing, plausibility, robot
+from flocc_agent.core.assembly import GraphAssembly, _Odometry
+from flocc_agent.core.cold_storage import ColdPieces
+from flocc_agent.core.correction_evidence import CorrectionEvidence
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, PersistCorrection, PersistTerm, Report
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.latents import Latents, Reach
+from flocc_agent.core.log_copy import EncodedRecords, _Block
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.offers import Offers
 from flocc_agent.core.place_recognition import PlaceRecognition
+from flocc_agent.core.plausibility import Doubts
+from flocc_agent.core.prospects import Prospect, Prospects
 from flocc_agent.core.pulls import Pulls
 from flocc_agent.core.reports import LogForked
 from flocc_agent.core.robot import Robot
@@ -45,18 +50,36 @@ class Mutant:
         owner: Class or module of the function.
         function: Its name.
         wrap: Makes the broken one.
+        in_pieces: It shows in what left memory.
     """
 
     name: str
     owner: Any
     function: str
     wrap: Wrap
+    in_pieces: bool = False
 
     @contextmanager
     def alive(self) -> Iterator[None]:
         """Put the broken function in its place for a while."""
-        with patch.object(self.owner, self.function, self.wrap(getattr(self.owner, self.function))):
+        broken = patch.object(self.owner, self.function, self.wrap(getattr(self.owner, self.function)))
+        with broken, small_pieces() if self.in_pieces else nullcontext():
             yield
+
+
+@contextmanager
+def small_pieces() -> Iterator[None]:
+    """Logs and odometry in pieces of four, of which one stays in memory: what drawn swarms record fills some."""
+    with ExitStack() as stack:
+        for owner, name in (
+            (log_copy, "BLOCK_RECORDS"),
+            (robot, "BLOCK_RECORDS"),
+            (assembly, "POSES_OF_A_PIECE"),
+            (robot, "POSES_OF_A_PIECE"),
+        ):
+            stack.enter_context(patch.object(owner, name, 4))
+        stack.enter_context(patch.object(robot, "ColdPieces", lambda storage, _held: ColdPieces(storage, 1)))
+        yield
 
 
 def first_caught(mutant: Mutant, seeds: range) -> tuple[int, str] | None:
@@ -280,6 +303,30 @@ def _follows_whoever_came_first(original: Callable[..., Any]) -> Callable[..., A
     return broken
 
 
+def _moves_cold_odometry(original: Callable[..., Any]) -> Callable[..., Any]:
+    def broken(self: _Odometry, number: int) -> Any:
+        rows = original(self, number)
+        return rows + 0.5 if isinstance(self._pieces[number], int) else rows
+
+    return broken
+
+
+def _gives_the_first_piece(original: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, place, size_bytes: original(self, 0, size_bytes)
+
+
+def _gives_the_next_record(original: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, k: original(self, (k + 1) % len(self.ends))
+
+
+def _takes_all_for_refused(original: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, pair, **_: original(self, pair, is_closure=False)
+
+
+def _lets_nothing_go(_: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, owner, number: self._warm.append((owner, number))
+
+
 MUTANTS = (
     # corrections
     Mutant("T_map_odom is 50 m off", Corrections, "_made", afterwards(_off_by_50_m)),
@@ -340,4 +387,23 @@ MUTANTS = (
     Mutant("pairs of robots that are gone stay open", Offers, "_takeover_at_s", always(float("inf"))),
     Mutant("latents out of reach are not asked for", Latents, "wants", always(())),
     Mutant("a resolved pair is registered again", LoopClosing, "on_resolved", lambda _: lambda *_a: None),
+    # what may be believed
+    Mutant("every correction is believed", plausibility, "contradiction", always(None)),
+    Mutant("every correction is doubted", plausibility, "contradiction", always("so")),
+    Mutant("all odometry counts as broken", CorrectionEvidence, "explains", always(False)),
+    Mutant("closures always count as torn", CorrectionEvidence, "is_torn", always(True)),
+    Mutant("what is held back is never looked at again", Doubts, "to_look_at", always(None)),
+    Mutant("nothing ties a robot to its map", GraphAssembly, "joined", always(False)),
+    # prospects
+    Mutant("all pairs are unlikely", Prospects, "_is_unlikely", always(True)),
+    Mutant("unlikely pairs wait for ever", Prospects, "of", always(Prospect.HELD)),
+    Mutant("what was judged is taken for refused", Prospects, "on_judged", _takes_all_for_refused),
+    # logs in pieces
+    Mutant("a block gives its next record", _Block, "record", _gives_the_next_record, in_pieces=True),
+    Mutant(
+        "a block's checksum is another", EncodedRecords, "block_checksum", afterwards(lambda c: c ^ 1), in_pieces=True
+    ),
+    Mutant("what left memory comes back as something else", ColdPieces, "get", _gives_the_first_piece, in_pieces=True),
+    Mutant("odometry comes back moved", _Odometry, "_piece", _moves_cold_odometry, in_pieces=True),
+    Mutant("nothing leaves memory", ColdPieces, "add", _lets_nothing_go, in_pieces=True),
 )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.agent.core.virtual_time import EveryoneSigns
 
 from flocc_agent.core.effects import Deliver, Effect
 from flocc_agent.core.events import Event
@@ -33,22 +34,6 @@ JUMP_M = 5.0
 """No honest round moves a robot of these swarms by so much, once all are in one map."""
 
 
-class _EveryoneSigns:
-    """A sealer whose signatures are always good: the liar is a member."""
-
-    def seal(self, log: LogId, number: int, record: bytes) -> bytes:
-        return record
-
-    def opened(self, log: LogId, number: int, sealed: bytes) -> bytes:
-        return sealed
-
-    def sign_correction(self, correction: bytes) -> bytes:
-        return bytes(64)
-
-    def check_correction(self, leader: LogId, correction: bytes, signature: bytes) -> None:
-        """Nothing to say."""
-
-
 def scenario() -> Scenario:
     fields: dict[str, Any] = {
         "name": "liar",
@@ -63,7 +48,7 @@ def scenario() -> Scenario:
 
 def swarm(monkeypatch: pytest.MonkeyPatch, keys: bool) -> Swarm:
     if keys:
-        monkeypatch.setattr(virtual_robot, "Robot", partial(Robot, sealer=_EveryoneSigns()))
+        monkeypatch.setattr(virtual_robot, "Robot", partial(Robot, sealer=EveryoneSigns()))
     made = prepared(scenario())
     made.run_until(0.0)
     return made

@@ -19,6 +19,8 @@ QUICK = {
     "the worst-ranked leads",
     "heartbeats ten times as often",
     "pairs are not handed to stronger robots",
+    "every correction is believed",
+    "what left memory comes back as something else",
 }
 CHOSEN = [mutant for mutant in MUTANTS if os.environ.get("FLOCC_MUTANTS") == "all" or mutant.name in QUICK]
 

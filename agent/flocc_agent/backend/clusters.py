@@ -12,9 +12,6 @@ from flocc_agent.core.pose_graph import LoopClosure
 from flocc_protocol.ids import LogId
 
 Int = NDArray[np.int64]
-Float = NDArray[np.float64]
-
-VOTES_POWER = 1.0 / 3.0
 
 
 def cluster_labels(closures: Sequence[LoopClosure], keyframes_max: int) -> Int:
@@ -32,18 +29,6 @@ def cluster_labels(closures: Sequence[LoopClosure], keyframes_max: int) -> Int:
     _, first, labels = np.unique(connected_components(joined)[1], return_index=True, return_inverse=True)
     order = np.argsort(np.argsort(first))
     return np.asarray(order[labels], dtype=np.int64)
-
-
-def votes(closures: Sequence[LoopClosure], keyframes_max: int) -> Float:
-    """How much each closure (L,) says on its own: closures of one place are wrong together.
-
-    A repeated facade gives ten closures in a row that agree with each other. Those of a cluster count as the square
-    root of their number.
-    """
-    if not closures:
-        return np.zeros(0)
-    labels = cluster_labels(closures, keyframes_max)
-    return np.asarray(np.bincount(labels)[labels] ** (VOTES_POWER - 1.0))
 
 
 def _by_pair(closures: Sequence[LoopClosure]) -> list[tuple[Int, Int]]:

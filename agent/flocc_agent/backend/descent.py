@@ -15,6 +15,7 @@ from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.config import BackendConfig
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 DAMPING_MIN, DAMPING_MAX = 1.0, 1e12
 DAMPING_FACTOR = 10.0
@@ -44,12 +45,16 @@ class Solved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Objective:
-    """What is minimised: edges, which of them are closures, and how its linear systems are solved."""
+    """What is minimised: edges, which of them are closures, and how its linear systems are solved.
+
+    Closures (L,) that are `held` take no part until the poses that others give agree with them.
+    """
 
     edges: Edges
     closures: slice
     linear: LinearSolver
     config: BackendConfig
+    held: Bool | None = None
 
     def cost(self, state: State, weights: Float, hold: bool) -> float:
         """Sum of half squared residuals, weighted, with the priors of cluster scales."""
@@ -71,6 +76,14 @@ class Objective:
     def closure_residuals(self, state: State) -> Float:
         """Squared residuals (L,) of the closures."""
         return residuals(taken(self.edges, self.closures), state, hold=False).squared()
+
+    def agreeing(self, state: State) -> Bool:
+        """Whether each closure (L,) is within its bound; a held one also where no scale may pass zero."""
+        edges, bounds = taken(self.edges, self.closures), self.bounds()
+        agree = residuals(edges, state, hold=False).squared() <= bounds
+        if self.held is not None and np.any(self.held & agree):
+            agree &= ~self.held | (residuals(edges, state, hold=True).squared() <= bounds)
+        return np.asarray(agree)
 
     def weights(self, of_closures: Float | float = 1.0) -> Float:
         """Weights (E,) of all edges, given those of the closures."""

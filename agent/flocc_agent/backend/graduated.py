@@ -62,7 +62,7 @@ class Graduated:
 def graduated(objective: Objective, state: State, start_ratio: float) -> Graduated:
     """Run the stages from a state; the control parameter starts at `start_ratio` at the latest."""
     config, bound = objective.config, objective.bounds()
-    squared = objective.closure_residuals(state)
+    squared = _squared(objective, state)
     control, stages = initial_control(config.solver, squared, bound, start_ratio), []
     iterations = 0
     while iterations < config.iterations_max:
@@ -70,11 +70,17 @@ def graduated(objective: Objective, state: State, start_ratio: float) -> Graduat
         state, stage = _staged(objective, state, np.where(of_closures < WEIGHT_MIN, 0.0, of_closures), control)
         stages.append(stage)
         iterations += stage.iterations
-        squared = objective.closure_residuals(state)
+        squared = _squared(objective, state)
         if gnc_finished(config.solver, of_closures, control):
             break
         control = next_control(config, squared, bound, control, start_ratio)
     return Graduated(state, squared <= bound, iterations, tuple(stages))
+
+
+def _squared(objective: Objective, state: State) -> Float:
+    """Squared residuals (L,) of the closures; of those that are held infinite, so that they weigh nothing."""
+    squared = objective.closure_residuals(state)
+    return squared if objective.held is None else np.where(objective.held, np.inf, squared)
 
 
 def _staged(objective: Objective, state: State, of_closures: Float, control: float) -> tuple[State, Stage]:
@@ -91,7 +97,7 @@ def _staged(objective: Objective, state: State, of_closures: Float, control: flo
 
 def initial_control(solver: Solver, squared: Float, bound: Float, start_ratio: float) -> float:
     """First value of the control parameter, at which the cost is convex, or as far on as `start_ratio` says."""
-    worst = float(np.max(squared / bound))
+    worst = float(np.max(squared / bound, where=np.isfinite(squared), initial=0.0))
     if solver is Solver.GNC_TLS:
         return max(1.0 / max(2.0 * worst - 1.0, 1e-3), start_ratio)
     return max(min(2.0 * worst, 1.0 / start_ratio), 1.0)

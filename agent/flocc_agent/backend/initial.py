@@ -102,7 +102,11 @@ def extended(T_map_keyframe: Float, trajectory: Trajectory) -> Float:
     return np.concatenate([T_map_keyframe[:known], T_map_odom @ T_odom[known:]])
 
 
-def trusted_closures(closures: Sequence[LoopClosure], earlier: GraphSolution) -> NDArray[np.bool_]:
-    """Which closures (L,) the earlier solution did not reject: those that it used, and those that it has not seen."""
-    rejected = {(c.query, c.match) for c in earlier.closures if c.state is ClosureState.REJECTED}
-    return np.array([(c.query, c.match) not in rejected for c in closures], dtype=bool)
+def trusted_closures(
+    closures: Sequence[LoopClosure], is_held: NDArray[np.bool_], earlier: GraphSolution
+) -> NDArray[np.bool_]:
+    """Which closures (L,) the earlier solution used, or has not seen; of those that are held only used ones."""
+    states = {(c.query, c.match): c.state for c in earlier.closures}
+    before = [states.get((c.query, c.match)) for c in closures]
+    used, rejected = (np.array([s is state for s in before]) for state in (ClosureState.USED, ClosureState.REJECTED))
+    return np.asarray(np.where(is_held, used, ~rejected), dtype=bool)

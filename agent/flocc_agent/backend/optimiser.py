@@ -7,7 +7,7 @@ exclusions with a reason; what cannot be solved keeps its odometry. Deterministi
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,8 +25,10 @@ from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded,
 from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.settled import settled_round
 from flocc_agent.backend.solvers import continued
-from flocc_agent.config import BackendConfig
+from flocc_agent.backend.understated import widened
+from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import (
+    ClosureResult,
     ClosureState,
     GraphSolution,
     LoopClosure,
@@ -40,6 +42,9 @@ from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.ids import KeyframeId, LogId
 
 logger = logging.getLogger(__name__)
+
+AWAY_MIN = 10
+"""Fewer closures that are turned away are named one by one, and say nothing of all."""
 
 
 def optimise(
@@ -92,33 +97,57 @@ def _optimise(
         return replace(settled, solve_s=solve_s, timings_s={"settled": solve_s})
     screened = screen(graph)
     left = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    if config.formulation is not Formulation.BASE and config.solver in (Solver.GNC_TLS, Solver.GNC_GM):
+        larger = widened(screened.trajectories, left, config)
+        left, warnings = larger.closures, (*screened.warnings, *larger.warnings)
+        screened = replace(screened, trajectories=larger.trajectories, warnings=warnings)
     held = held_closures(screened.trajectories, left, config)
     screened = replace(screened, excluded={**screened.excluded, **held})
     if not screened.trajectories:
         return OptimisationFailed("; ".join(screened.warnings) or "the pose graph has no odometry")
-    usable = {k: c for k, c in enumerate(graph.closures) if k not in screened.excluded}
+    usable = {k: c for k, c in left.items() if k not in held}
     after_screening = time.perf_counter()
+    of_held = {k: left[k] for k in held}
     outcomes = [
-        _solve_group(logs, usable, screened, config, initial, covariance_of)
+        _solve_group(logs, usable, of_held, screened, config, initial, covariance_of)
         for logs in components_of(list(screened.trajectories), list(usable.values()))
     ]
-    results = {k: excluded(graph.closures[k], reason) for k, reason in screened.excluded.items()}
+    results: dict[int, ClosureResult] = {}
     for outcome in outcomes:
         results.update(outcome.closures)
+    left_out = {k: reason for k, reason in screened.excluded.items() if k not in results}
+    results.update({k: excluded(graph.closures[k], reason) for k, reason in left_out.items()})
     timings_s = {"screening": after_screening - began, **summed_timings(outcomes)}
     return GraphSolution(
         components=tuple(sorted((c for outcome in outcomes for c in outcome.components), key=lambda c: c.anchor)),
         closures=tuple(results[k] for k in range(len(graph.closures))),
-        warnings=(*screened.warnings, *screened.excluded.values(), *(w for o in outcomes for w in o.warnings)),
+        warnings=(
+            *screened.warnings,
+            *turned_away(results, left),
+            *left_out.values(),
+            *(w for o in outcomes for w in o.warnings),
+        ),
         iterations=sum(outcome.iterations for outcome in outcomes),
         solve_s=time.perf_counter() - began,
         timings_s=timings_s,
     )
 
 
+def turned_away(results: Mapping[int, ClosureResult], closures: Collection[int]) -> tuple[str, ...]:
+    """A sentence where a solution rests on less than half of the closures that could be used."""
+    away = sum(results[k].state is not ClosureState.USED for k in closures)
+    if away < AWAY_MIN or 2 * away <= len(closures):
+        return ()
+    return (
+        f"{away} of {len(closures)} closures contradict others or odometry and were turned away: most are wrong, "
+        "or covariances are stated too small; robots may be in wrong places",
+    )
+
+
 def _solve_group(
     logs: Sequence[LogId],
     usable: Mapping[int, LoopClosure],
+    held: Mapping[int, LoopClosure],
     screened: Screened,
     config: BackendConfig,
     initial: GraphSolution | None,
@@ -126,12 +155,15 @@ def _solve_group(
 ) -> SolvedLogs:
     """Solve logs that closures connect; where that fails, every log keeps its odometry."""
     trajectories = {log: screened.trajectories[log] for log in logs}
-    closures = {k: c for k, c in usable.items() if c.query.log in trajectories and c.match.log in trajectories}
+    closures, of_held = (
+        {k: c for k, c in all_.items() if c.query.log in trajectories and c.match.log in trajectories}
+        for all_ in (usable, held)
+    )
     if not closures:
         return SolvedLogs(tuple(odometry_component(log, trajectories[log]) for log in logs), {})
     wanted = [keyframe for keyframe in covariance_of if keyframe.log in trajectories]
     try:
-        return _solve_and_split(trajectories, closures, config, initial, wanted)
+        return _solve_and_split(trajectories, closures, of_held, config, initial, wanted)
     except (SingularSystem, np.linalg.LinAlgError, FloatingPointError) as error:
         reason = f"the component of robot {logs[0]} could not be solved and keeps its odometry: {error}"
         logger.error("%s", reason)
@@ -142,18 +174,21 @@ def _solve_group(
 def _solve_and_split(
     trajectories: Mapping[LogId, Trajectory],
     closures: Mapping[int, LoopClosure],
+    held: Mapping[int, LoopClosure],
     config: BackendConfig,
     initial: GraphSolution | None,
     wanted: Sequence[KeyframeId],
 ) -> SolvedLogs:
     """Filter and solve; what the closures left do not hold together is solved apart, with the closures that it has."""
     began = time.perf_counter()
-    kept = filtered(trajectories, closures, config)
+    kept = filtered(trajectories, closures, held, config)
     filtering_s = time.perf_counter() - began
     outcome = SolvedLogs((), {}, timings_s={"consistency": filtering_s})
     if kept.is_connected:
         outcome = _solve_connected(kept, config, initial, wanted)
         outcome = replace(outcome, timings_s={"consistency": filtering_s, **outcome.timings_s})
+        kept = kept.released(outcome.closures)
+        outcome = replace(outcome, closures={k: r for k, r in outcome.closures.items() if k in kept.closures})
         kept = kept.without({k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED})
     if kept.is_connected:
         return replace(outcome, closures={**outcome.closures, **kept.turned_away})
@@ -171,7 +206,7 @@ def _split(
     screened = Screened(dict(kept.trajectories), {}, ())
     plain = config.model_copy(update={"pairwise_consistency": False})
     left = kept.left
-    parts = [_solve_group(logs, left, screened, plain, initial, wanted) for logs in kept.groups]
+    parts = [_solve_group(logs, left, kept.held, screened, plain, initial, wanted) for logs in kept.groups]
     closures = dict(kept.turned_away)
     for part in parts:
         closures.update(part.closures)
@@ -197,7 +232,7 @@ def _solve_connected(
     times = [time.perf_counter()]
     aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
     times.append(time.perf_counter())
-    chains = chains_of(kept.trajectories, kept.left, wanted, config)
+    chains = chains_of(kept.trajectories, kept.taking_part, wanted, config)
     found = _solve_aligned(kept, chains, aligned, config, initial)
     if chains is not None and not _is_explained(chains, found):
         found = _solve_all(kept, chains, found, config)
@@ -230,19 +265,19 @@ def _solve_aligned(
 ) -> SolvedWithScales:
     """Solve an aligned component, with all its keyframes or by its chains."""
     if chains is None:
-        begun = posed(kept.trajectories, kept.left, aligned, config, initial)
+        begun = posed(kept.trajectories, kept.taking_part, aligned, config, initial, None, kept.held)
     else:
         shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
-        begun = posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded)
+        begun = posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, kept.held)
 
     def anew(scales: Mapping[LogId, float]) -> Posed:
         """The component, begun with the ways of logs made longer or shorter."""
         longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
         again = initial_poses(longer, kept.left, config.steepness, None)
         if chains is None:
-            return posed(kept.trajectories, kept.left, again, config, None)
+            return posed(kept.trajectories, kept.taking_part, again, config, None, None, kept.held)
         shorter = Aligned(chains.shortened(again.T_map_keyframe), again.is_warm)
-        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded)
+        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded, kept.held)
 
     return solve_with_scales(begun, initial, anew)
 
@@ -259,7 +294,8 @@ def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: 
     problem, state = found.posed.problem, found.solved.state
     scales = problem.scales_applied(state)
     T = chains.lengthened(problem.by_log(state.poses()), scales)
-    whole = posed(kept.trajectories, kept.left, Aligned(T, False), config, None).with_scaled(scales)
+    whole = posed(kept.trajectories, kept.taking_part, Aligned(T, False), config, None, None, kept.held)
+    whole = whole.with_scaled(scales)
     start = replace(whole.start, scale=state.scale)
     whole = replace(whole, start=start, trusted=found.posed.trusted)
     solved = continued(whole.objective, start)

@@ -30,6 +30,7 @@ class Way:
         levered: (N, 3) the same of each edge times where it lies, summed up.
         squared: (N,) the same times the square of where it lies.
         translation: (N,) variance of translation, m^2.
+        length_sigma: What lengths may be off by, beside noise.
     """
 
     T: Float
@@ -37,9 +38,10 @@ class Way:
     levered: Float
     squared: Float
     translation: Float
+    length_sigma: float = ODOMETRY_LENGTH_SIGMA
 
     @classmethod
-    def of(cls, trajectory: Trajectory, config: BackendConfig) -> "Way":
+    def of(cls, trajectory: Trajectory, config: BackendConfig, length_sigma: float = ODOMETRY_LENGTH_SIGMA) -> "Way":
         """Sum up a trajectory's covariances, each taken as isotropic: the largest of its three variances."""
         T = np.asarray(trajectory.T_odom_keyframe, dtype=float)
         S = trajectory.edge_covariances
@@ -50,7 +52,7 @@ class Way:
         turning, moving = variances[:, :3].max(axis=1), variances[:, 3:].max(axis=1)
         at = T[1:, :3, 3]
         levered, squared = turning[:, None] * at, turning * np.einsum("ni,ni->n", at, at)
-        return cls(T, _summed(turning), _summed(levered), _summed(squared), _summed(moving))
+        return cls(T, _summed(turning), _summed(levered), _summed(squared), _summed(moving), length_sigma)
 
     def variances(self, i: Int, j: Int, x: Float) -> tuple[Float, Float]:
         """Variances (K,) between keyframes i and j (K,): of rotation, and of a point x (K, 3) that is held by j."""
@@ -59,7 +61,7 @@ class Way:
         lever = self.levered[high] - self.levered[low]
         squared = self.squared[high] - self.squared[low]
         swung = squared - 2.0 * np.einsum("ki,ki->k", x, lever) + rotation * np.einsum("ki,ki->k", x, x)
-        stretch = ODOMETRY_LENGTH_SIGMA**2 * np.sum((self.T[i, :3, 3] - self.T[j, :3, 3]) ** 2, axis=1)
+        stretch = self.length_sigma**2 * np.sum((self.T[i, :3, 3] - self.T[j, :3, 3]) ** 2, axis=1)
         return rotation, np.maximum(swung, 0.0) + self.translation[high] - self.translation[low] + stretch
 
 

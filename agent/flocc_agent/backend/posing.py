@@ -1,12 +1,11 @@
 """A component as the solver takes it: arrays, what is minimised, where it starts."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.clusters import votes
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, off_half_turns, state_of
 from flocc_agent.backend.initial import Aligned, trusted_closures
@@ -14,6 +13,7 @@ from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.problem import Problem, build
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN
+from flocc_agent.backend.votes import votes
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, Trajectory
 from flocc_protocol.ids import LogId
@@ -69,20 +69,23 @@ def posed(
     config: BackendConfig,
     initial: GraphSolution | None,
     recorded: Mapping[int, LoopClosure] | None = None,
+    held: Collection[int] = (),
 ) -> Posed:
     """The problem of aligned logs and the closures that are left, with all odometry taken as true.
 
     Where the closures' keyframes are named by their places in chains, `recorded` has them under their own numbers.
+    Closures that are `held` count once the poses that others give agree with them.
     """
     problem = build(trajectories, closures, config, recorded)
     in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
-    says = votes(in_order, config.cluster_keyframes_max)
+    says = votes(trajectories, closures, recorded or closures, config)
+    is_held = np.array([k in held for k in problem.closure_ids], dtype=bool)
     aligned_state = state_of(np.concatenate([aligned.T_map_keyframe[log] for log in problem.logs]), problem.clusters)
     return Posed(
         problem,
-        Objective(problem.edges, problem.closure_rows, linear, config),
+        Objective(problem.edges, problem.closure_rows, linear, config, is_held),
         off_half_turns(problem.edges, aligned_state),
-        trusted_closures(in_order, initial) if aligned.is_warm and initial is not None else None,
+        trusted_closures(in_order, is_held, initial) if aligned.is_warm and initial is not None else None,
         Places(problem, trajectories, closures, says, config.steepness),
     )

@@ -245,7 +245,7 @@ def _opened(component: Component, graph: PoseGraph, fresh: set[int], seen: Mappi
     closures = {
         k: c
         for k, c in enumerate(graph.closures)
-        if c.query.log in bases
+        if c.query.log in bases and c.match.log in bases
         and c.match.log in bases
         and (
             k in fresh

@@ -153,21 +153,19 @@ def confirmed(objective: Objective, state: State, trusted: Bool) -> Solved | Non
     """
     weights = objective.weights(trusted.astype(float))
     solved = descend(objective, state, weights)
-    agree = objective.closure_residuals(solved.state) <= objective.bounds()
-    if not np.array_equal(agree, trusted):
+    if not np.array_equal(objective.agreeing(solved.state), trusted):
         return None
     return Solved(solved.state, weights, solved.cost, solved.iterations, solved.converged)
 
 
 def selected(objective: Objective, state: State, iterations: int) -> Solved:
     """Keep the closures within their bounds, solve with them alone, and repeat until the choice stands."""
-    bound = objective.bounds()
-    chosen = objective.closure_residuals(state) <= bound
+    chosen = objective.agreeing(state)
     for _ in range(SELECTIONS_MAX):
         weights = objective.weights(chosen.astype(float))
         solved = descend(objective, state, weights)
         state, iterations = solved.state, iterations + solved.iterations
-        again = objective.closure_residuals(state) <= bound
+        again = objective.agreeing(state)
         if np.array_equal(again, chosen) or iterations >= objective.config.iterations_max:
             break
         chosen = again

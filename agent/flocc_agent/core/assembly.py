@@ -25,6 +25,7 @@ from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
+    LatentRecord,
     Record,
     RejectionRecord,
     UnknownRecord,
@@ -180,6 +181,10 @@ class GraphAssembly:
         """Number of closures, each pair once."""
         return len(self._closures)
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        return {} if self._cold is None else {"warm_odometry_pieces": self._cold.size()}
+
     def add(self, new: NewRecord) -> None:
         """Take in one record; records of a log come in their order, those of different logs in any."""
         record = new.record
@@ -188,7 +193,7 @@ class GraphAssembly:
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
                 self._add_closure(new, record)
-            case RejectionRecord():
+            case RejectionRecord() | LatentRecord():
                 pass
             case UnknownRecord():
                 self._reads_all = False

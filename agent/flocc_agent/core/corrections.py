@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.announcing import Announcer
 from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
-from flocc_agent.core.gossip import LIVES_MAX, Sealer, lives
+from flocc_agent.core.gossip import Sealer, may_hold
 from flocc_agent.core.knot_requests import GRACE_S, KnotRequests
 from flocc_agent.core.knots import Track, corrected, knots_of, strays
 from flocc_agent.core.parameters import GossipParameters
@@ -246,7 +246,7 @@ class Corrections:
         return []
 
     def _is_room(self, log: LogId) -> bool:
-        return len(self._newest) < self._gossip.logs_max and lives(self._newest, log.robot) < LIVES_MAX
+        return may_hold(self._newest, log, self._gossip.logs_max)
 
     def take(self, message: LogCorrection, now: float = 0.0) -> list[Effect]:
         """Keep a newer correction that was not refused; apply it when it is this robot's, whole, and can be true."""

@@ -9,6 +9,7 @@ from flocc_agent.core.reports import Fact
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import CandidatePair, LogCorrection, Message
+from flocc_protocol.records import LatentRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +44,19 @@ class Unicast:
 
 @dataclass(frozen=True, slots=True)
 class FetchLatent:
-    """Get a latent from a robot in range into the store; answer LatentFetched or LatentFetchFailed."""
+    """Get a latent from a robot in range into the store; answer LatentFetched or LatentFetchFailed.
+
+    Attributes:
+        keyframe: Whose.
+        holder: The robot.
+        deadline_s: Time for it, seconds.
+        named: What its owner's log says that it is, where it does.
+    """
 
     keyframe: KeyframeId
     holder: str
     deadline_s: float
+    named: LatentRecord | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,6 +46,8 @@ FIRST_COUNTER_MAX = 2**16
 RISE_MAX, RISE_PER_S = FIRST_COUNTER_MAX + COUNTER_JUMP_MAX, 200.0
 """By how much all proofs together raise it at once, and over time, beyond one step each: so a flood of claims, each of
 them signed, leaves counters that a robot which was away learns in as long as the flood lasted."""
+FORGOTTEN_S = 3600.0
+"""So long after the last claim only counters count that were followed, claimed here, or corrected by."""
 LOST_MAX = 64
 PEERS_MAX = 512
 
@@ -141,6 +143,8 @@ class LeaderElection:
         self._rank = rank(compute_class, own)
         self._parameters = parameters
         self._counter_max = counter_max
+        self._followed_max = counter_max
+        self._claimed_s = now
         self._rise = float(RISE_MAX)
         self._rise_s = now
         self._peers: dict[str, _Peer] = {}
@@ -182,6 +186,7 @@ class LeaderElection:
 
     def on_heartbeat(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Learn of a robot in range and of the leader it follows."""
+        self._forget_claims(now)
         self._meet(sender, heartbeat.compute_class)
         advert = heartbeat.leader
         if advert is None:
@@ -242,6 +247,8 @@ class LeaderElection:
         does where somebody else spoke in its term.
         """
         refused = self._learn_counter(sender, term.counter, now)
+        if not refused:
+            self._followed_max = max(self._followed_max, term.counter)
         if not refused and self._leader is not None and self.leading and term >= self._leader.term:
             self._due_s = float("-inf")
         return refused
@@ -322,6 +329,7 @@ class LeaderElection:
 
     def _follow(self, heard: LeaderAdvert, now: float) -> list[Effect]:
         self._leader = heard
+        self._followed_max = max(self._followed_max, min(heard.term.counter, self._counter_max))
         self._turn(Turn.HEARS, now + self._parameters.leader_timeout_s)
         return [_leader_report(heard.term)]
 
@@ -349,6 +357,7 @@ class LeaderElection:
 
     def _claim(self) -> list[Effect]:
         self._counter_max = min(self._counter_max + 1, TERM_COUNTER_MAX)
+        self._followed_max = self._counter_max
         term = Term(self._counter_max, self._own)
         self._leader = LeaderAdvert(term, self._compute_class, beat=0, hops=0)
         self._turn(Turn.CLAIMS, float("inf"))
@@ -377,7 +386,13 @@ class LeaderElection:
         raised = max(0, min(counter, reach) - self._counter_max)
         self._rise -= raised if self._counter_max else 0
         self._counter_max += raised
+        self._claimed_s = now if raised else self._claimed_s
         return [_refused(sender, "a term counter far above all others")] if counter > reach else []
+
+    def _forget_claims(self, now: float) -> None:
+        """What was claimed, and never followed nor corrected by, is not kept out of reach of others for ever."""
+        if self._claimed_s + FORGOTTEN_S <= now:
+            self._counter_max = self._followed_max
 
 
 def _is_first_hand(sender: LogId, advert: LeaderAdvert) -> bool:

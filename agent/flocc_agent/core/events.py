@@ -39,11 +39,13 @@ class KeyframeEncoded:
         keyframe: Which.
         descriptor: For place recognition.
         doubts: What its image says against the camera, told for the first time.
+        sha256: Of the latent as it is sent, 32 bytes for each form; empty where nobody asks for it.
     """
 
     keyframe: KeyframeId
     descriptor: Array
     doubts: tuple[CameraDoubted, ...] = ()
+    sha256: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ What is said of this robot's own log is only a reason to ask for the records; a 
 is what shows that somebody else writes its log.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple, Protocol
 
 from flocc_agent.core.announcing import Announcer
@@ -37,6 +37,8 @@ RECORDS_MAX = 200_000
 """Records that are kept of one log: a keyframe and a closure each second for a day. Further ones are refused."""
 LIVES_MAX = 16
 """Logs that are kept of one robot name: as often may it lose its disk while the swarm remembers it."""
+FIRST_LIVES_RATIO = 0.25
+"""Share of all places that only names have which hold none yet: some that fill theirs keep no further robot out."""
 
 
 class Sealer(Protocol):
@@ -203,9 +205,9 @@ class Gossip:
         """Why a log cannot be taken in; None when it can, or is here. No robot takes the room of all others."""
         if log in self.logs:
             return None
-        if len(self.logs) >= self._parameters.logs_max:
-            return "too many logs"
-        return "too many logs of one robot" if lives(self.logs, log.robot) >= LIVES_MAX else None
+        if may_hold(self.logs, log, self._parameters.logs_max):
+            return None
+        return "too many logs of one robot" if lives(self.logs, log.robot) else "too many logs"
 
     def on_request(self, sender: LogId, request: RecordRequest) -> list[Effect]:
         """Send what follows, as much of all logs as fits a message."""
@@ -333,6 +335,14 @@ class Gossip:
 def lives(logs: Iterable[LogId], robot: str) -> int:
     """How many of these logs are of one robot name."""
     return sum(log.robot == robot for log in logs)
+
+
+def may_hold(logs: Collection[LogId], log: LogId, logs_max: int) -> bool:
+    """Whether there is room for one more log: the last places are for names that hold none."""
+    held = lives(logs, log.robot)
+    if not held:
+        return len(logs) < logs_max
+    return held < LIVES_MAX and len(logs) < (1.0 - FIRST_LIVES_RATIO) * logs_max
 
 
 def _is_full(message: Records) -> bool:

@@ -2,10 +2,12 @@
 
 A latent out of reach is asked of relays: heartbeats carry what a robot wants, and neighbours that can reach the
 owner fetch and hold it, or pass on that the owner has it no more. Failed fetches are tried again after growing pauses.
+In a swarm with keys the owner's log says what a latent is, so that a relay cannot serve another one.
 """
 
+from array import array
 from bisect import insort
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 
@@ -13,6 +15,7 @@ from flocc_agent.core.effects import Effect, FetchLatent
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.pulls import remember
 from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.records import LatentRecord, Record
 
 PAUSED_MAX = 1024
 LOST_S = 30.0
@@ -124,10 +127,34 @@ class _Fetch:
         return self.not_before_s if self.in_flight_until_s is None else self.in_flight_until_s
 
 
+class LatentNames:
+    """Where the logs say what a keyframe's latent is, as numbers of records; 0 where they do not."""
+
+    def __init__(self) -> None:
+        self.record_at: Callable[[LogId, int], Record] | None = None
+        self._numbers: dict[LogId, array[int]] = {}
+
+    def add(self, keyframe: KeyframeId, number: int) -> None:
+        """A record says it; the first one of a keyframe counts, which comes after its keyframe's record."""
+        numbers = self._numbers.setdefault(keyframe.log, array("I"))
+        if keyframe.index > number:
+            return
+        numbers.extend([0] * (keyframe.index + 1 - len(numbers)))
+        numbers[keyframe.index] = numbers[keyframe.index] or number
+
+    def of(self, keyframe: KeyframeId) -> LatentRecord | None:
+        """What a latent is."""
+        numbers = self._numbers.get(keyframe.log, ())
+        number = numbers[keyframe.index] if keyframe.index < len(numbers) else 0
+        record = self.record_at(keyframe.log, number) if number and self.record_at is not None else None
+        return record if isinstance(record, LatentRecord) else None
+
+
 class Latents:
     """The latents of one robot's store, fetches under way, and wishes of others."""
 
     def __init__(self, own: LogId, parameters: LoopClosingParameters) -> None:
+        self.names = LatentNames()
         self._own = own
         self._parameters = parameters
         self._held: set[KeyframeId] = set()
@@ -236,7 +263,7 @@ class Latents:
             if holder is not None:
                 fetch = self._fetches.setdefault(keyframe, _Fetch())
                 fetch.holder, fetch.in_flight_until_s = holder, now + self._parameters.fetch_timeout_s
-                effects.append(FetchLatent(keyframe, holder, self._parameters.fetch_timeout_s))
+                effects.append(FetchLatent(keyframe, holder, self._parameters.fetch_timeout_s, self.names.of(keyframe)))
         self._forget_oldest()
         return effects
 

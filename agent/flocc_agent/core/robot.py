@@ -94,6 +94,7 @@ from flocc_protocol.messages import (
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
+    LatentRecord,
     Record,
     RejectionRecord,
 )
@@ -147,6 +148,7 @@ class _Pending:
     T_odom_camera: Pose7
     encoded: bool = False
     descriptor: Array | None = None
+    sha256: bytes = b""
 
 
 class Robot:
@@ -202,6 +204,7 @@ class Robot:
             listens_until_s,
             self.recognition.agreement,
         )
+        self.closing.latents.names.record_at = self._record_at
         self.in_map = None if restored.saved is None else InMap(restored.saved, now)
         self.corrections = Corrections(
             log,
@@ -270,6 +273,7 @@ class Robot:
             **self.election.sizes(),
             **self._answers.sizes(),
             **self._muted.sizes("muted"),
+            **self.assembly.sizes(),
             **self._distrusted.sizes("distrusted"),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
@@ -282,9 +286,9 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor, doubts):
+            case KeyframeEncoded(keyframe, descriptor, doubts, sha256):
                 self.closing.on_held(keyframe)
-                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now)]
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256)]
             case KeyframeEncodingFailed(keyframe, reason, doubts):
                 reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
                 return [*reports, *self._on_encoded(keyframe, None, now)]
@@ -477,20 +481,24 @@ class Robot:
         self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
         return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
-    def _on_encoded(self, keyframe: KeyframeId, descriptor: Array | None, now: float) -> list[Effect]:
+    def _on_encoded(
+        self, keyframe: KeyframeId, descriptor: Array | None, now: float, sha256: bytes = b""
+    ) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
 
         A keyframe that failed to encode has a record all the same, with its odometry: measurements need no more.
         """
         for pending in self._pending:
             if pending.index == keyframe.index:
-                pending.encoded, pending.descriptor = True, descriptor
+                pending.encoded, pending.descriptor, pending.sha256 = True, descriptor, sha256
         effects: list[Effect] = []
         while self._pending and self._pending[0].encoded:
             ready = self._pending.pop(0)
             record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
             effects += self._append(record, now)
             effects.append(_keyframe_report(self.log, record))
+            if self._has_keys and ready.sha256:
+                effects += self._append(LatentRecord(ready.index, ready.sha256), now)
             for measurement in self._waiting.pop(ready.index, ()):
                 effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
         return effects
@@ -556,6 +564,8 @@ class Robot:
                     keyframe = KeyframeId(new.log, index)
                     if descriptor is not None and self._may_match(keyframe):
                         described.append((keyframe, descriptor))
+                case LatentRecord(index):
+                    self.closing.latents.names.add(KeyframeId(new.log, index), new.number)
                 case ClosureRecord(query, match):
                     self.closing.on_closure(CandidatePair.of(query, match), now)
                 case RejectionRecord(query, match, reason, _, odometry_correspondences):

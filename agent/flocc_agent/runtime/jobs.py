@@ -5,6 +5,7 @@ inbox; whatever fails becomes the event that says so.
 """
 
 import asyncio
+import hashlib
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -32,7 +33,7 @@ from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseG
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.store import Store
-from flocc_agent.runtime.transport import Fetched, Transport
+from flocc_agent.runtime.transport import Fetched, FetchProblem, Transport
 from flocc_agent.runtime.workers import Workers, WorkFailed
 
 IMAGES_MAX = 8
@@ -83,6 +84,7 @@ class Tools:
         transport: Fetches latents.
         clock_s: Seconds since the start of the run.
         images: Those that wait for the encoder.
+        names_latents: The robot's log says what its latents are: the swarm has keys.
     """
 
     perception: Perception
@@ -94,6 +96,7 @@ class Tools:
     transport: Transport
     clock_s: Callable[[], float]
     images: ImageSlots = field(default_factory=ImageSlots)
+    names_latents: bool = False
 
 
 def job_of(effect: Job, tools: Tools) -> Coroutine[Any, Any, Event]:
@@ -122,7 +125,14 @@ async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEnco
     if looked.descriptor is None or looked.latent is None:
         return KeyframeEncodingFailed(effect.keyframe, looked.fault, looked.doubts)
     await asyncio.to_thread(tools.store.put_latent, effect.keyframe, looked.latent)
-    return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts)
+    sha256 = await asyncio.to_thread(_sent_forms, looked.latent, tools.perception) if tools.names_latents else b""
+    return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts, sha256)
+
+
+def _sent_forms(latent: bytes, perception: Perception) -> bytes:
+    """Hashes of what is sent of a latent: itself, and where there is one the picture in its place."""
+    forms = dict.fromkeys(perception.part(latent, encode_bytes) for encode_bytes in (None, 0))
+    return b"".join(hashlib.sha256(form).digest() for form in forms)
 
 
 async def fetch(effect: FetchLatent, tools: Tools) -> LatentFetched | LatentFetchFailed:
@@ -132,6 +142,8 @@ async def fetch(effect: FetchLatent, tools: Tools) -> LatentFetched | LatentFetc
     answer = await tools.transport.fetch_latent(holder, str(keyframe), effect.deadline_s, encode_s=encode_s)
     if not isinstance(answer, Fetched):
         return LatentFetchFailed(keyframe, holder, answer.problem.value)
+    if effect.named is not None and not effect.named.names(hashlib.sha256(answer.latent).digest()):
+        return LatentFetchFailed(keyframe, holder, FetchProblem.WRONG_HASH.value)
     tools.workers.stages.observe("fetch", tools.clock_s() - began_s)
     await asyncio.to_thread(tools.store.put_latent, keyframe, answer.latent)
     return LatentFetched(keyframe, holder)

@@ -10,7 +10,6 @@ import json
 import shutil
 import sys
 from argparse import ArgumentParser
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -53,13 +52,12 @@ def size_of(robot: Path) -> tuple[int, int]:
 
 
 def judged(run: Path) -> str:
-    """One line on a run: closures that were accepted, wrong, and wrong in the solution; error; what robots doubted."""
+    """One line on a run: closures that were accepted, wrong, and wrong in the solution; maps; error."""
     loaded = load(RunFolder(run))
     found = verdicts(loaded)
     used = {(pair.query, pair.match): pair.used for pair in loaded.pairs}
     wrong = [ends for ends, right in found.items() if not right]
     report = json.loads((run / "report.json").read_text())
-    doubts = Counter((one["doubt"], one["robot"]) for one in report["doubted_cameras"])
     cells = (
         run.name,
         len(found),
@@ -67,7 +65,6 @@ def judged(run: Path) -> str:
         sum(used[ends] is not False for ends in wrong),
         len(report["map_frames"]),
         report["ate_joint_m"],
-        ", ".join(sorted({f"{doubt} {robot}" for doubt, robot in doubts})),
     )
     return "| " + " | ".join(str(cell) for cell in cells) + " |"
 
@@ -85,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--judge", type=Path, nargs="+", help="instead: run folders, a line each")
     given = parser.parse_args(arguments)
     if given.judge:
-        heads = ("run", "closures", "wrong", "wrong ones used", "maps", "joint ATE, m", "told")
+        heads = ("run", "closures", "wrong", "wrong ones used", "maps", "joint ATE, m")
         sys.stdout.write(f"| {' | '.join(heads)} |\n{'| --- ' * len(heads)}|\n")
         sys.stdout.writelines(f"{judged(run)}\n" for run in given.judge)
         return

@@ -19,6 +19,7 @@ from flocc_protocol.messages import Heartbeat, LogCorrection
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
+    LatentRecord,
     MeasurementRecord,
     Record,
     RejectionRecord,
@@ -43,7 +44,7 @@ class Heard:
 
     def record(self, log: LogId, record: Record, t: float) -> Reported[Fact] | None:
         """What a log's next record tells of; None where people need not know."""
-        if isinstance(record, MeasurementRecord | UnknownRecord):
+        if isinstance(record, MeasurementRecord | LatentRecord | UnknownRecord):
             return None
         match record:
             case KeyframeRecord(index, stamp_s, T_odom_camera):

@@ -146,7 +146,8 @@ def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> lis
     doubles = {hardship.robot for hardship in hardships if hardship.kind is HardshipKind.TWIN}
     classes = {name: -1 if name in doubles else scenario.robot(name).compute_class for name in scenario.names()}
     told_twice = any(hardship.kind is HardshipKind.OLDER for hardship in hardships)
-    return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes)
+    honest = all(hardship.kind is not HardshipKind.LIAR for hardship in hardships)
+    return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes, honest)
 
 
 def is_noiseless(scenario: Scenario) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.effects import PersistRecord
 from flocc_agent.core.events import KeyframeCaptured
 from flocc_agent.core.log_copy import LogCopy, decoded
+from flocc_agent.core.prospects import REFUSED_MIN, UNLIKELY
 from flocc_launch.simulation.invariants import Step, core, groups
 from flocc_launch.simulation.rightness import component_of
 from flocc_launch.simulation.swarm import Swarm
@@ -25,14 +26,17 @@ MARGIN = 1e-4
 
 @dataclass(slots=True)
 class Complete:
-    """Every keyframe is recorded and solved; of each two logs, keyframes that look most alike are registered."""
+    """Every keyframe is recorded and solved; of each two logs, keyframes that look most alike are registered.
+
+    A pair is refused unseen only by a robot that holds refusals of pairs that were seen.
+    """
 
     _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
     _captured: Counter[tuple[str, int]] = field(default_factory=Counter)
     _recorded: Counter[tuple[str, int]] = field(default_factory=Counter)
 
     def step(self, step: Step) -> Iterator[str]:
-        """Note keyframes that were taken and recorded; nothing is wrong yet."""
+        """Note keyframes that were taken and recorded; pairs that are refused unseen for no reason."""
         life = step.station.name, step.station.life
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
         for effect in step.effects:
@@ -41,7 +45,10 @@ class Complete:
                 if isinstance(record, KeyframeRecord):
                     self._recorded[life] += 1
                     self._describe(effect.data, record)
-        yield from ()
+                elif isinstance(record, RejectionRecord) and record.reason == UNLIKELY:
+                    seen = _refused_and_seen(step.station)
+                    if seen < REFUSED_MIN:
+                        yield f"{step.station.name} refuses {record.query} {record.match} unseen, {seen} were seen"
 
     def _describe(self, data: bytes, record: KeyframeRecord) -> None:
         if record.descriptor is not None:
@@ -111,6 +118,11 @@ def resolved_pairs(logs: dict[LogId, LogCopy]) -> set[CandidatePair]:
 def _second(values: NDArray[np.float32], but: int) -> float:
     """The highest value at another place."""
     return float(np.delete(values, but).max(initial=-1.0))
+
+
+def _refused_and_seen(station: Station) -> int:
+    records = (record for copy in core(station).gossip.logs.values() for record in copy.other_records())
+    return sum(isinstance(record, RejectionRecord) and record.reason != UNLIKELY for record in records)
 
 
 def _unsolved(leader: Station) -> Iterator[str]:

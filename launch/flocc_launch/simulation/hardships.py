@@ -16,7 +16,7 @@ from flocc_launch.simulation.swarm import Swarm
 HARDSHIPS_MAX = 2
 RATIO = 0.5
 """Share of the seeds that have some."""
-TWIN_RATIO = 0.15
+TWIN_RATIO, LIAR_RATIO = 0.15, 0.1
 
 
 class HardshipKind(StrEnum):
@@ -28,6 +28,7 @@ class HardshipKind(StrEnum):
     SLOW = "slow disk"
     TORN = "power cut"
     TWIN = "second robot of its name"
+    LIAR = "a leader that lies"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +58,15 @@ def drawn_hardships(seed: int, names: Sequence[str], end_s: float) -> tuple[Hard
     if rng.uniform() < TWIN_RATIO:
         from_s, to_s = _times(rng, end_s)
         drawn.append(Hardship(HardshipKind.TWIN, str(rng.choice(names)), from_s, to_s))
+    rng = np.random.default_rng([seed, 4])
+    if rng.uniform() < LIAR_RATIO:
+        from_s, to_s = _times(rng, end_s)
+        drawn.append(Hardship(HardshipKind.LIAR, str(rng.choice(names)), from_s, to_s))
     return tuple(sorted(drawn, key=lambda hardship: hardship.from_s))
 
 
 def _drawn(rng: np.random.Generator, names: Sequence[str], end_s: float) -> Hardship:
-    kinds = [kind for kind in HardshipKind if kind is not HardshipKind.TWIN]
+    kinds = [kind for kind in HardshipKind if kind not in (HardshipKind.TWIN, HardshipKind.LIAR)]
     kind = kinds[int(rng.integers(len(kinds)))]
     from_s, to_s = _times(rng, end_s)
     return Hardship(kind, str(rng.choice(names)), from_s, to_s, int(rng.integers(20, 600)))
@@ -100,5 +105,8 @@ def _enter(swarm: Swarm, hardship: Hardship) -> None:
         case HardshipKind.TWIN:
             at(hardship.from_s, "add_twin")
             swarm.agenda.at(hardship.to_s, lambda: swarm.kill(f"{hardship.robot}-twin"))
+        case HardshipKind.LIAR:
+            swarm.agenda.at(hardship.from_s, lambda: setattr(station, "lies", True))
+            at(hardship.to_s, "mend")
         case _:
             assert_never(hardship.kind)

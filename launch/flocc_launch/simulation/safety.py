@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+from flocc_agent.core.corrections import UNTRUE
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
@@ -24,9 +25,10 @@ from flocc_agent.core.events import (
 )
 from flocc_agent.core.log_copy import decoded
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
+from flocc_agent.core.plausibility import UNTIED
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.prospects import UNLIKELY
-from flocc_agent.core.reports import NeighbourDown, NeighbourUp
+from flocc_agent.core.reports import NeighbourDown, NeighbourUp, PeerRefused
 from flocc_launch.simulation import liveness
 from flocc_launch.simulation.completeness import Complete
 from flocc_launch.simulation.costs import Balanced, Cheap
@@ -46,13 +48,14 @@ APART_S = FAR_TAKEOVERS * TAKEOVER_S + 10.0
 """So long after two robots lost or found each other a pair may be taken over, and its latents be fetched."""
 
 
-def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int]) -> list[Invariant]:
+def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], honest: bool = True) -> list[Invariant]:
     """DESIGN.md, section 5, that memory is bounded, and that what comes out is right, complete and cheap.
 
     Args:
         separated: At times robots cannot hear each other; then, and only then, may two of them take one pair.
         noiseless: Odometry and registrations are without noise, so that the truth can be asked for.
         classes: Compute class by robot name.
+        honest: Nobody lies on purpose.
     """
     complete = Complete()
     sent = frozenset({Broadcast, Unicast})
@@ -71,6 +74,7 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int]) ->
         ),
         Invariant("one frame", lacking=liveness.in_other_frames),
         Invariant("nothing lost", step=Published().step, lacking=liveness.not_everywhere),
+        Invariant("believed", step=doubted_in_error if honest else None, wants=frozenset({Report})),
         Invariant("bounded", step=Bounded().step),
         Invariant("reported", step=Doubles().step, wants=sent | told),
         Invariant("cheap", step=Cheap().step, wants=sent | told | {LatentFetched, LatentFetchFailed}),
@@ -88,6 +92,15 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int]) ->
             wants=frozenset({GraphOptimised, PairRegistered, Register, Deliver}),
         ),
     ]
+
+
+def doubted_in_error(step: Step) -> Iterator[str]:
+    """An honest leader whose correction is called a lie; one that is waited for is none."""
+    for effect in step.effects:
+        if isinstance(effect, Report) and isinstance(effect.fact, PeerRefused):
+            reason = effect.fact.reason
+            if reason.startswith(UNTRUE) and not reason.endswith(UNTIED):
+                yield f"{step.station.name} calls it a lie what {effect.fact.peer} says: {reason}"
 
 
 @dataclass(slots=True)

@@ -153,6 +153,13 @@ class Swarm:
 
         self.agenda.at(until_s, go_back)
 
+    def mend(self, name: str) -> None:
+        """A robot that lied is switched off, and comes back as it should be."""
+        self.stations[name].lies = False
+        if self.stations[name].running:
+            self.kill(name)
+            self.start(name)
+
     def flip_bit(self, name: str, number: int) -> None:
         """Damage a robot's disk while it is switched off for a moment."""
         self.kill(name)

@@ -5,7 +5,7 @@ memory is gone: answers of workers and links that belong to an earlier life are 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import assert_never
 
 from flocc_agent.core.effects import (
@@ -37,7 +37,10 @@ from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture, Playback
 from flocc_launch.simulation.virtual_workers import VirtualWorkers
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import Envelope, Message
+from flocc_protocol.messages import CorrectionBatch, Envelope, LogCorrection, Message
+
+LIE_M = 1e6
+"""How far from where they are a robot that lies puts others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +87,7 @@ class Station:
         core: The robot's behaviour, None while it is switched off.
         life: Counts starts.
         solution: The last solution it made as a leader.
+        lies: As a leader it tells others that they are far away.
         dies_after: The power is cut when so many effects of a step with more are carried out; None: it is not.
     """
 
@@ -108,6 +112,7 @@ class Station:
         self.core: Robot | None = None
         self.life = 0
         self.solution: GraphSolution | None = None
+        self.lies = False
         self.dies_after: int | None = None
         self.compute_class = compute_class
         self._agenda = agenda
@@ -292,9 +297,9 @@ class Station:
             case PersistRecord(log, number, data):
                 self.disk.put_record(log, number, data, now_s)
             case Broadcast(message):
-                self._around.broadcast(self, message)
+                self._around.broadcast(self, self._told(message))
             case Unicast(to, message):
-                self._around.unicast(self, to, message)
+                self._around.unicast(self, to, self._told(message))
             case Encode(keyframe, image, T_odom_camera):
                 capture = self._images.pop(image)
                 done_s = self.workers.encoded_at_s(now_s)
@@ -315,3 +320,15 @@ class Station:
                 pass
             case _:
                 assert_never(effect)
+
+    def _told(self, message: Message) -> Message:
+        """What it says instead, where it lies."""
+        if not self.lies or not isinstance(message, CorrectionBatch):
+            return message
+        return CorrectionBatch(tuple(_far_away(c) if c.term.leader == self.log else c for c in message.corrections))
+
+
+def _far_away(correction: LogCorrection) -> LogCorrection:
+    x_m, *rest = correction.T_map_odom
+    y_m, z_m, *q = rest
+    return replace(correction, T_map_odom=(x_m + LIE_M, y_m, z_m, q[0], q[1], q[2], q[3]))

@@ -82,3 +82,21 @@ def test_closures_of_several_pairs_join_groups_together() -> None:
     assert too_few([R1, R2, R3], ids, 2) == []
     assert too_few([R1, R2, R3], {k: c for k, c in ids.items() if k != len(ids) - 1}, 2) == [len(JOIN_2_3)]
     assert too_few([R1, R2, R3], ids, 7) == sorted(ids)
+
+
+def test_a_ring_of_robots_with_one_closure_each_is_joined_and_a_chain_of_them_is_not() -> None:
+    ring = [closure(R1, 4, R2, 5), closure(R2, 9, R3, 8), closure(R3, 14, R1, 13)]
+    assert too_few([R1, R2, R3], dict(enumerate(ring)), 2) == []
+    assert too_few([R1, R2, R3], dict(enumerate(ring)), 3) == [0, 1, 2]
+    assert too_few([R1, R2, R3], dict(enumerate(ring[:2])), 2) == [0, 1]
+
+
+def test_two_rings_that_one_closure_connects_stay_apart() -> None:
+    a, b = [[LogId(f"{side}{k}") for k in range(3)] for side in "ab"]
+    rings = [closure_of(x, y) for logs in (a, b) for x, y in zip(logs, logs[1:] + logs[:1], strict=True)]
+    closures = dict(enumerate([*rings, closure_of(a[0], b[0])]))
+    assert too_few([*a, *b], closures, 2) == [len(rings)]
+
+
+def closure_of(a: LogId, b: LogId) -> LoopClosure:
+    return LoopClosure(KeyframeId(a, 0), KeyframeId(b, 0), np.eye(4))

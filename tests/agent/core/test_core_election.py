@@ -10,6 +10,7 @@ from flocc_agent.core.effects import Broadcast, Effect, PersistTerm, Report, Uni
 from flocc_agent.core.election import (
     ANSWER_TIMEOUT_S,
     COUNTER_JUMP_MAX,
+    FORGOTTEN_S,
     RISE_MAX,
     RISE_PER_S,
     TRANSITIONS,
@@ -302,6 +303,19 @@ def test_heartbeats_with_huge_counters_shut_nobody_out() -> None:
     robots.add("r3")
     robots.run(6.0)
     assert robots.leaders() == dict.fromkeys(("r1", "r2", "r3"), "1:r1")
+
+
+def test_what_was_claimed_and_never_followed_is_forgotten_after_an_hour() -> None:
+    """The rogue is outranked, so that its terms are no one's; those of the leader stay known."""
+    machine, rogue = election(R2, counter=5), LogId("r9")
+    for step in range(1, 4):
+        machine.on_coordinator(rogue, Coordinator(LeaderAdvert(Term(50_000, rogue), 0, step, 0)), float(step))
+    machine.on_heartbeat(R1, heartbeat(LeaderAdvert(Term(7, R1), 0, 1, 0), 7), 4.0)
+    assert machine.counter_max > 3000
+    machine.on_heartbeat(R1, heartbeat(LeaderAdvert(Term(7, R1), 0, 2, 0), 7), 3.0 + FORGOTTEN_S - 1.0)
+    assert machine.counter_max > 3000
+    machine.on_heartbeat(R1, heartbeat(LeaderAdvert(Term(7, R1), 0, 3, 0), 7), 3.0 + FORGOTTEN_S)
+    assert machine.counter_max == 7
 
 
 def test_no_leader_is_followed_beyond_the_greatest_number_of_hops() -> None:

@@ -193,6 +193,21 @@ def test_many_logs_of_one_robot_leave_room_for_others() -> None:
     assert len(reader.logs[R2]) == 3
 
 
+def test_names_that_fill_their_places_leave_room_for_first_logs_of_others() -> None:
+    parameters = GossipParameters(logs_max=64)
+    reader, told = Gossip(R1, parameters), list[type[Fact]]()
+    for name in range(6):
+        for life in range(LIVES_MAX):
+            log = LogId(f"rogue{name}", life)
+            told += facts(reader.on_records(LogId(f"rogue{name}"), batch(writer(log, 1), log, 0), 0.0)[1])
+    assert told
+    for name in range(10):
+        log = LogId(f"late{name}")
+        reader.on_records(log, batch(writer(log, 2), log, 0), 1.0)
+        assert len(reader.logs[log]) == 2
+    assert len(reader.logs) <= parameters.logs_max
+
+
 def test_claims_of_what_nobody_has_do_not_fill_the_memory() -> None:
     reader = Gossip(R1, PARAMETERS)
     for t in range(3000):
