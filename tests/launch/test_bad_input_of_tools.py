@@ -41,11 +41,14 @@ HOSTILE_FILES = [
     ("x.toml", ["launch"], ".".join(["a"] * DEEP) + " = 1\n", "has a key of more than 64 parts"),
     ("x.jrl", ["optimise", "--out", "o"], '{"a":' + "[" * DEEP + "]" * DEEP + "}", "is nested too deeply"),
     ("x.g2o", ["optimise", "--out", "o"], EDGE, "line 1: -1 is no key of a vertex"),
+    ("x.jpg", ["launch"], "\xff\xd8\xff\xe0", "x.jpg: is no text, so no TOML file (byte 1)"),
 ]
 
 
-@pytest.mark.parametrize(("name", "command", "text", "said"), HOSTILE_FILES, ids=["deep", "long", "json", "negative"])
-def test_a_file_that_would_exhaust_its_reader_is_refused(
+@pytest.mark.parametrize(
+    ("name", "command", "text", "said"), HOSTILE_FILES, ids=["deep", "long", "json", "negative", "picture"]
+)
+def test_a_file_that_its_reader_cannot_take_is_refused(
     name: str,
     command: list[str],
     text: str,
@@ -55,7 +58,7 @@ def test_a_file_that_would_exhaust_its_reader_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / name).write_text(text)
+    (tmp_path / name).write_text(text, encoding="latin-1")
     assert run(monkeypatch, command[0], name, *command[1:]) == 2
     assert said in sentence(capsys)
 

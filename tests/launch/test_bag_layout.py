@@ -227,3 +227,33 @@ def test_a_broken_ros_2_folder_is_one_sentence(tmp_path: Path, spoil: str) -> No
     with pytest.raises(DatasetError, match=r"run: (cannot be opened|is damaged or cut off): ") as caught:
         convert(bag, tmp_path / "out")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_mounting_that_is_repeated_on_tf_is_taken_unless_it_moves(tmp_path: Path, turns: bool) -> None:
+    script = walking(True)
+    for k in range(5):
+        script.transform("/tf", ZERO_NS + k * S, ("/body", "housing"), (0.2, 0.0, 0.1 * k if turns else 0.3))
+        script.transform("/tf", ZERO_NS + k * S, ("housing", "camera"), q_xyzw=FORWARD)
+    script.messages.sort(key=lambda message: message[2])
+    bag = script.write(tmp_path / "run.bag")
+    if turns:
+        with pytest.raises(DatasetError, match=r"the camera \(camera\) moves on the body \(body\), as /tf says"):
+            convert(bag, tmp_path / "out")
+        return
+    T = Recording.open(convert(bag, tmp_path / "out")).T_body_camera
+    expected = np.array([[0, 0, 1, 0.2], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+    np.testing.assert_allclose(T, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("image", "focal_px"),
+    [("/cam/image_rect/compressed", 28.0), ("/cam/rect/image", 28.0), ("/cam/direct/image_raw", 30.0)],
+)
+def test_of_rectified_images_the_projection_counts(tmp_path: Path, image: str, focal_px: float) -> None:
+    script = walking(False, image=image)
+    for topic, _, _, message in script.messages:
+        if topic == "/cam/camera_info":
+            message.p[[0, 5, 2, 6]] = 28.0, 28.0, 16.0, 12.0
+    camera = Recording.open(convert(script.write(tmp_path / "run", "db3"), tmp_path / "out")).camera
+    assert camera.fx == pytest.approx(focal_px)

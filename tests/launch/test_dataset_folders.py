@@ -101,7 +101,7 @@ def test_sevenscenes_is_stamped_by_its_frame_numbers(tmp_path: Path) -> None:
     assert source.truth is not None
     np.testing.assert_allclose(source.truth.T_fixed_body, moving(6), atol=1e-9)
     assert source.lens is not None
-    assert source.lens.camera == CameraModel(32, 24, 585.0, 585.0, 16.0, 12.0)
+    assert source.lens.camera == CameraModel(32, 24, 29.25, 29.25, 16.0, 12.0)
 
 
 def test_kitti_takes_calibration_times_and_poses(tmp_path: Path) -> None:
@@ -587,3 +587,49 @@ def test_a_folder_that_is_refused_by_name_is_no_team(tmp_path: Path) -> None:
     (tmp_path / "mesh_info.json").write_text("{}")
     with pytest.raises(DatasetError, match="is Polycam's raw export, which flocc does not read"):
         list(infos(tmp_path))
+
+
+def test_published_intrinsics_are_not_those_of_images_of_another_shape(tmp_path: Path) -> None:
+    path = write_sevenscenes(tmp_path / "s")
+    for file in path.glob("*.jpg"):
+        cv2.imwrite(str(file), np.zeros((18, 32), np.uint8))
+    assert read_source(path).lens is None
+
+
+def test_ground_truth_of_a_sensor_is_brought_to_the_body(tmp_path: Path) -> None:
+    path = write_euroc(tmp_path / "e")
+    before = read_source(path).truth
+    sensor = "T_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+    (path / "mav0" / "state_groundtruth_estimate0" / "sensor.yaml").write_text(
+        "sensor_type: visual-inertial\n" + sensor
+    )
+    after = read_source(path).truth
+    assert before is not None
+    assert after is not None
+    np.testing.assert_allclose(before.T_fixed_body[:, :3, 3] - after.T_fixed_body[:, :3, 3], [[0.5, 0, 0]] * 3)
+
+
+@pytest.mark.parametrize(("unit", "read"), [(1.0, True), (1000.0, False)])
+def test_stamps_of_frames_are_taken(tmp_path: Path, unit: float, read: bool) -> None:
+    for k in range(4):
+        write_image(tmp_path / f"{k}.png")
+    frames = [
+        {"file_path": f"{k}.png", "timestamp": unit * (5 + k / 10), "transform_matrix": moving(4)[k].tolist()}
+        for k in range(4)
+    ]
+    table = {"w": 32, "h": 24, "fl_x": 7, "fl_y": 8, "cx": 16, "cy": 12, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    if not read:
+        with pytest.raises(DatasetError, match="timestamp must be seconds in every frame"):
+            read_source(tmp_path)
+        return
+    assert [stamp_s for stamp_s, _ in read_source(tmp_path).images] == pytest.approx([5.0, 5.1, 5.2, 5.3])
+
+
+def test_a_matrix_that_is_not_finite_is_not_taken_for_two(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png")
+    frames = [{"file_path": "a.png", "transform_matrix": np.full((4, 4), np.nan).tolist()}]
+    table = {"w": 32, "h": 24, "fl_x": 7, "fl_y": 8, "cx": 16, "cy": 12, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    with pytest.raises(FloccError, match=r"a\.png: the pose has a number that is not finite"):
+        read_source(tmp_path)

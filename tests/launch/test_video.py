@@ -74,3 +74,32 @@ def test_a_video_is_launched_and_one_that_is_none_is_refused(
     (tmp_path / "team" / "broken.mp4").write_bytes(b"no video")
     assert list(infos(tmp_path / "team")) == []
     assert "broken.mp4: cannot be read as a video; write it as MP4" in caplog.text
+
+
+def test_frames_that_no_pose_covers_are_told_or_refused(
+    video: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    beside(video, 1.5)
+    assert info(video).posed == 15
+    convert(video, tmp_path / "out")
+    assert "walk.mp4: 15 of 30 frames lie outside of the trajectory's time, or in a gap of it" in caplog.text
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    write_tum(video.with_suffix(".tum"), Trajectory(100 * np.arange(30.0), poses))
+    with pytest.raises(DatasetError, match=r"walk.tum: .* in steps of 100.000 s, .* so that 1 frame has a pose"):
+        convert(video, tmp_path / "other")
+    assert "1 frame has a pose" in info(video).faults[0]
+
+
+def test_what_stands_beside_videos_is_not_called_not_taken(video: Path, caplog: pytest.LogCaptureFixture) -> None:
+    beside(video)
+    (video.parent / "README").write_text("mine")
+    list(infos(video.parent))
+    assert caplog.text.rstrip().endswith("bag or video: README")
+
+
+def test_a_folder_that_is_converted_names_what_it_holds(video: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"inside of it, walk\.mp4 would be"):
+        convert(video.parent, tmp_path / "out")
+    (tmp_path / "set" / "sequences" / "00" / "image_0").mkdir(parents=True)
+    with pytest.raises(DatasetError, match=r"inside of it, sequences.00 would be"):
+        convert(tmp_path / "set", tmp_path / "out")

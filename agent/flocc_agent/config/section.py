@@ -126,8 +126,10 @@ def read_toml(path: Path) -> dict[str, object]:
         return tomllib.loads(text)
     except RecursionError as error:
         raise ConfigError(f"{path}: is nested too deeply") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is no text, so no TOML file (byte {error.start + 1})") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import align
-from flocc_agent.backend.consensus import ConsensusPart, SharedPoses, part_of, solved_alone
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import PoseGraph, Trajectory
+from flocc_lab.consensus import ConsensusPart, SharedPoses, part_of, solved_alone
 from flocc_lab.experiments.distributed import OPTIMA
 from flocc_lab.experiments.rbcd_run import cut_by_time, graph_cost
 from flocc_launch.graph_files import read_g2o

@@ -210,7 +210,7 @@ def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens
         raise DatasetError(f"{bag.path}: topic {robot.info.name} has no message that can be read")
     T_body_camera, note = (None, None) if options.odometry else layout.mounting(robot)
     try:
-        lens = lens_of(first[1], robot.info)
+        lens = lens_of(first[1], robot.info, robot.image)
     except DatasetError as error:
         raise DatasetError(f"{bag.path}: {error}; name a camera file with --camera") from error
     lens = lens if T_body_camera is None else replace(lens, T_body_camera=T_body_camera)
@@ -359,7 +359,7 @@ class _Conversion:
         if body == self._first_info or self.robot.info is None:
             return
         try:
-            found = lens_of(self.bag.decoded(raw, self.robot.info), self.robot.info).camera
+            found = lens_of(self.bag.decoded(raw, self.robot.info), self.robot.info, self.robot.image).camera
         except DatasetError:
             return
         self._infos_differ += found != self.lens.camera

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.ros2.static_frames import StaticFrames
+from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, StaticFrames, pose_of_transform
 from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES, stamp_ns
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
@@ -22,6 +22,8 @@ from flocc_launch.datasets.source import DatasetError
 Float = NDArray[np.float64]
 
 TRANSFORMS_READ_MAX = 2000
+STILL_MAX = 1e-4
+"""By how much a transform that stays as it is may differ from its first one: metres, and parts of a rotation."""
 FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
 TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk")
 
@@ -275,6 +277,8 @@ class Layout:
         if camera == body and camera:
             return np.eye(4), None
         T_body_camera = self.static.between(body, camera) if body and camera else None
+        if T_body_camera is None and body and camera and self.edges:
+            T_body_camera = self._between_on_tf(body, camera)
         if T_body_camera is not None:
             return T_body_camera, None
         if body and camera and self.has_static:
@@ -286,6 +290,36 @@ class Layout:
             f"{self.bag.path}: nothing says where the camera ({camera or 'no frame'}) sits on the body "
             f"({body or 'no frame'}); they are taken as one: name a camera file with T_body_camera (--camera) if not"
         )
+
+    def _between_on_tf(self, body: str, camera: str) -> Float | None:
+        """`T_body_camera` where transforms that stay as they are stand on /tf, as ROS 1 repeats them; None without any.
+
+        Raises:
+            DatasetError: The camera moves on the body.
+        """
+        topics = list(dict.fromkeys(self.edges.values()))
+        first: dict[tuple[str, str], tuple[Any, Float]] = {}
+        moving: set[tuple[str, str]] = set()
+        for topic, _, raw in self.bag.raw(topics):
+            try:
+                for each in self.bag.decoded(raw, topic).transforms:
+                    edge = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
+                    if edge not in moving and (edge in first or len(first) < FRAMES_MAX):
+                        T = pose_of_transform(each.transform, topic.name)
+                        if np.abs(T - first.setdefault(edge, (each, T))[1]).max() > STILL_MAX:
+                            moving.add(edge)
+            except (DatasetError, BadMessage):
+                continue
+        still = [each for edge, (each, _) in first.items() if edge not in moving]
+        T_body_camera = self.static.with_others(still).between(body, camera)
+        every = [each for each, _ in first.values()]
+        if T_body_camera is None and self.static.with_others(every).between(body, camera) is not None:
+            raise DatasetError(
+                f"{self.bag.path}: the camera ({camera}) moves on the body ({body}), as {', '.join(topics)} says; "
+                "flocc takes a fixed one: name the frame that carries it as odometry, or a camera file with "
+                "T_body_camera (--camera)"
+            )
+        return T_body_camera
 
     def _body(self, poses: PoseSource | None) -> str:
         if poses is None:

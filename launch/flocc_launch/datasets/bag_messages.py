@@ -1,6 +1,7 @@
 """ROS messages as what a recording holds: encoded images, poses, intrinsics."""
 
 import math
+import re
 from collections.abc import Iterator
 from itertools import islice
 from typing import Any
@@ -9,7 +10,13 @@ import numpy as np
 
 from flocc_agent.runtime.picture_heads import SUFFIXES, PictureError, head_of
 from flocc_agent.runtime.pictures import FULL, SAMPLE_MAX, Levels, levels_of
-from flocc_agent.runtime.ros2.raw_images import camera_of, compressed_pixels, raw_pixels, refuse_depth
+from flocc_agent.runtime.ros2.raw_images import (
+    camera_of,
+    compressed_pixels,
+    raw_pixels,
+    rectified_camera_of,
+    refuse_depth,
+)
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.pixels import encoded_image, pnm
@@ -142,13 +149,19 @@ def checked_numbers(numbers: tuple[float, ...], topic: BagTopic) -> tuple[float,
     return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm
 
 
-def lens_of(message: Any, topic: BagTopic) -> Lens:
+RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
+"""In the names of topics of images that were undistorted, as image_proc and camera drivers publish them."""
+
+
+def lens_of(message: Any, topic: BagTopic, images: BagTopic) -> Lens:
     """Intrinsics of a CameraInfo message; the camera is taken as the body.
+
+    Of images that are rectified, by their topic's name, the projection matrix counts and there is no distortion.
 
     Raises:
         DatasetError: The camera is not calibrated, or of a model that flocc does not read.
     """
     try:
-        return Lens(camera_of(message))
+        return Lens((rectified_camera_of if RECTIFIED.search(images.name) else camera_of)(message))
     except ValueError as error:
         raise DatasetError(f"topic {topic.name}: {error}") from error

@@ -28,10 +28,13 @@ from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
     convert_video,
+    files_beside,
     is_video,
     lens_beside,
     odometry_beside,
+    posed_frames,
     read_head,
+    video_faults,
 )
 from flocc_launch.datasets.writer import Progress, write_source
 from flocc_protocol.errors import FloccError
@@ -240,12 +243,13 @@ def _video_info(path: Path) -> Info:
     lacks = [
         *([f"{path}: {WHAT_ODOMETRY}"] if odometry is None else []),
         *([f"{path}: intrinsics are missing; name a camera file with --camera"] if lens is None else []),
+        *([] if odometry is None or trajectory is None else video_faults(path, odometry, trajectory, lens, head)),
     ]
     return Info(
         path=path,
         format="video",
         images=head.frames,
-        posed=None,
+        posed=None if trajectory is None else posed_frames(trajectory, head),
         from_s=0.0,
         to_s=head.frames / head.rate_hz if head.rate_hz > 0 else 0.0,
         camera=lens.camera if lens else None,
@@ -271,7 +275,8 @@ def infos(path: Path, format_name: str | None = None, form: str | None = None) -
             yield info(entry, None, form)
         except FloccError as error:
             logger.warning("%s", error)
-    others = [entry.name for entry in sorted(path.iterdir()) if entry not in team.values() and entry.name[0] != "."]
+    taken = set(team.values()) | {file for entry in team.values() if is_video(entry) for file in files_beside(entry)}
+    others = [entry.name for entry in sorted(path.iterdir()) if entry not in taken and entry.name[0] != "."]
     if others:
         logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,8 @@ from flocc_launch.datasets.video import is_video
 CLOCKS_DIFFER = (
     "both must be of one clock: flocc dataset clock measures how far they are apart, and --time-offset mends it"
 )
+INSIDE_MAX = 200
+"""Entries of a folder that is none of the known data sets that are looked at for what its owner may have meant."""
 READERS: dict[str, Callable[[Path], Source]] = {
     "euroc": read_euroc,
     "kitti": read_kitti,
@@ -65,14 +68,22 @@ def detect_format(path: Path) -> str:
     other = kind_of_folder(path) if path.is_dir() else kind_of_file(path)
     if other is not None:
         raise DatasetError(f"{path}: {other}")
-    inside = (
-        [entry.name for entry in sorted(path.iterdir()) if is_dataset(entry) or is_bag(entry)] if path.is_dir() else []
-    )
+    inside = _taken_inside(path)
     raise DatasetError(
         f"{path}: is none of the known data sets ({', '.join(READERS)}); a plain one has images/, a trajectory "
         f"(odometry.tum or groundtruth.tum) and camera.yaml; {_what_is_there(path)}"
         + (f"; inside of it, {', '.join(inside[:8])} would be" if inside else "")
     )
+
+
+def _taken_inside(path: Path) -> list[str]:
+    """What of a folder would be taken by itself, else of its folders (KITTI's `sequences/00`)."""
+    for pattern in ("*", "*/*"):
+        entries = sorted(islice(path.glob(pattern), INSIDE_MAX)) if path.is_dir() else []
+        found = [entry for entry in entries if is_dataset(entry) or is_bag(entry) or is_video(entry)]
+        if found:
+            return [str(entry.relative_to(path)) for entry in found]
+    return []
 
 
 def _what_is_there(path: Path) -> str:

@@ -146,12 +146,17 @@ def _what_is_there(where: Path) -> str:
     return f"; there is {', '.join(told) or 'nothing'}, but images are {read}: convert them to JPEG or PNG"
 
 
+def camera_files(path: Path) -> list[Path]:
+    """Files of a folder that describe a camera, by their names; the first is taken."""
+    files = [path / name for name in CAMERA_FILES if os.path.lexists(path / name)]
+    return files + (sorted(path.glob("*-camchain.yaml")) if path.is_dir() else [])
+
+
 def camera_file(
     path: Path, images: Sequence[tuple[float, Path]] = (), size: tuple[int, int] | None = None
 ) -> Lens | None:
     """The camera that a file in a folder describes, or None; a file without a size takes that of the images."""
-    files = [path / name for name in CAMERA_FILES if os.path.lexists(path / name)]
-    files += sorted(path.glob("*-camchain.yaml")) if path.is_dir() else []
+    files = camera_files(path)
     if not files:
         return None
     lens = read_lens(files[0], size_of(images) if images else size)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.geometry import inverse
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.pose_limits import spikes
 from flocc_agent.runtime.text_tables import RecordingError, number_lines
@@ -24,7 +25,7 @@ from flocc_launch.datasets.files import (
     some,
     unequal,
 )
-from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.intrinsics import mounting_of, read_lens
 from flocc_launch.datasets.kitti_raw import rectified_lens
 from flocc_launch.datasets.pixels import Stamped, image_size
 from flocc_launch.datasets.plain import trajectories_beside
@@ -33,6 +34,7 @@ from flocc_launch.datasets.source import DatasetError, Lens, Source
 Float = NDArray[np.float64]
 
 SEVENSCENES_RATE_HZ = 30.0
+SEVENSCENES_FOCAL, SEVENSCENES_SIZE = 585.0, (640, 480)
 KITTI_RATE_HZ = 10.0
 EUROC_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt0")
 UP_CAMERA = np.array([0.0, -1.0, 0.0])
@@ -69,9 +71,22 @@ def read_euroc(path: Path) -> Source:
     file = next((mav / name / "data.csv" for name in EUROC_TRUTHS if (mav / name / "data.csv").exists()), None)
     if file is not None:
         truth, truth_notes = read_trajectory(file, otherwise="euroc")
+        truth = _of_body(truth, file.with_name("sensor.yaml"))
         notes = (*notes, *truth_notes)
     notes = (*image_notes, *notes)
     return Source(path, "euroc", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+
+
+def _of_body(truth: Trajectory, sensor: Path) -> Trajectory:
+    """Poses of the body, of those of a sensor that its file places on the body.
+
+    Raises:
+        DatasetError: The file's `T_BS` is no pose.
+    """
+    T_body_sensor = mounting_of(sensor) if sensor.exists() else None
+    if T_body_sensor is None:
+        return truth
+    return Trajectory(truth.stamps_s, truth.T_fixed_body @ inverse(T_body_sensor))
 
 
 def _euroc_images(cam: Path) -> tuple[Stamped, tuple[str, ...], tuple[str, ...]]:
@@ -186,9 +201,13 @@ SEVENSCENES_LENSES = ("camera-intrinsics.txt", "_info.txt")
 """Where 7-Scenes and BundleFusion, which names its files alike, say the intrinsics."""
 
 
-def _sevenscenes_lens(path: Path, image: Path) -> Lens:
+def _sevenscenes_lens(path: Path, image: Path) -> Lens | None:
+    """Intrinsics of a file, else the published ones for images of their shape, scaled to their size."""
     width, height = image_size(image)
     file = next((path / name for name in SEVENSCENES_LENSES if (path / name).exists()), None)
     if file is None:
-        return Lens(CameraModel(width, height, 585.0, 585.0, width / 2, height / 2))
+        if width * SEVENSCENES_SIZE[1] != height * SEVENSCENES_SIZE[0]:
+            return None
+        focal = SEVENSCENES_FOCAL * width / SEVENSCENES_SIZE[0]
+        return Lens(CameraModel(width, height, focal, focal, width / 2, height / 2))
     return read_lens(file, (width, height))

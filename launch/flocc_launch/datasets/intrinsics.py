@@ -14,7 +14,7 @@ from flocc_launch.datasets.calibrations.fields import lens_of_keys
 from flocc_launch.datasets.calibrations.maps import FORMS, REFUSED_MAPS, Cameras, form_of
 from flocc_launch.datasets.calibrations.taken_keys import Keys, plain
 from flocc_launch.datasets.calibrations.texts import REFUSED_TEXTS, TEXT_FORMS, text_form
-from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_launch.datasets.source import DatasetError, Float, Lens
 
 Size = tuple[int, int]
 FOLLOWED = (("cam0_calib", "body_T_cam0"), ("relative_config_imucam", None))
@@ -136,11 +136,26 @@ def _followed(path: Path, document: dict[str, Any], size: Size | None) -> Lens |
             note = f"{path}: the camera is of {document[key]}; of the rest, only {mounting or 'that name'} is used"
             if given is None:
                 return replace(lens, notes=(*lens.notes, note))
-            of_body = lens_of_keys(
-                Keys({"T_body_camera": given, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "w": 2, "h": 2}), size
-            )
-            return replace(lens, T_body_camera=of_body.T_body_camera, notes=(*lens.notes, note))
+            return replace(lens, T_body_camera=_mounting(given), notes=(*lens.notes, note))
     return None
+
+
+def _mounting(given: Any) -> Float:
+    numbers = {"T_body_camera": given, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "w": 2, "h": 2}
+    return lens_of_keys(Keys(numbers), None).T_body_camera
+
+
+def mounting_of(path: Path) -> Float | None:
+    """Where the `sensor.yaml` of any sensor (EuRoC) places it on the body, or None where it does not say.
+
+    Raises:
+        DatasetError: Its `T_BS` is no pose.
+    """
+    try:
+        given = _document(read_text(path)).get("T_BS")
+        return None if given is None else _mounting(given)
+    except FORM_ERRORS as error:
+        raise DatasetError(f"{path}: T_BS cannot be read: {error}") from error
 
 
 def _choice(cameras: Cameras, chosen: str | None, size: Size | None) -> tuple[str, tuple[str, ...]]:

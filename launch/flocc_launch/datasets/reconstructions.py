@@ -28,6 +28,8 @@ from flocc_launch.datasets.stamped_names import stamps_of_names
 Float = NDArray[np.float64]
 
 STEP_S = 1.0
+STEP_MIN_S, STEP_MAX_S = 1e-3, 10.0
+"""Between two images of one path; what is further apart or closer is of another unit than seconds."""
 REPLICA_RATE_HZ = 30.0
 CAMERA_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera looks along -z with y up; ours along z with y down."""
@@ -168,7 +170,13 @@ def read_transforms(path: Path) -> Source:
         if without is not None:
             raise DatasetError(f"{file}: the transform_matrix of {without} is no matrix")
         twice = next(
-            (f["file_path"] for f in frames if not np.array_equal(poses[str(f["file_path"])], f["transform_matrix"])),
+            (
+                f["file_path"]
+                for f in frames
+                if not np.array_equal(
+                    poses[str(f["file_path"])], np.array(f["transform_matrix"], float), equal_nan=True
+                )
+            ),
             None,
         )
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -181,7 +189,9 @@ def read_transforms(path: Path) -> Source:
     if wrong is not None:
         raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
     world = {name: checked_pose(T @ CAMERA_OF_OPENGL, f"{file}: {name}") for name, T in poses.items()}
-    return _source(path, "transforms", path, world, None, file)
+    return _source(
+        path, "transforms", path, world, None, file, {str(f["file_path"]): f.get("timestamp") for f in frames}
+    )
 
 
 def _image_folder(path: Path) -> Path:
@@ -189,7 +199,13 @@ def _image_folder(path: Path) -> Path:
 
 
 def _source(
-    path: Path, name: str, folder: Path, poses: dict[str, Float], lens: Lens | None, calibration: Path | None = None
+    path: Path,
+    name: str,
+    folder: Path,
+    poses: dict[str, Float],
+    lens: Lens | None,
+    calibration: Path | None = None,
+    stamps: dict[str, Any] | None = None,
 ) -> Source:
     """Images with their poses in the order of their names, and a lens, or one of a file that may not say their size."""
     found = {
@@ -200,13 +216,15 @@ def _source(
     if not found:
         raise DatasetError(f"{folder}: has none of the {len(poses)} images, of which the first is {next(iter(poses))}")
     stamps_s, _ = stamps_of_names([Path(key).stem for key in found], folder)
+    if stamps_s is None:
+        stamps_s = _seconds([(stamps or {}).get(key) for key in found], path)
     invented = stamps_s is None
     stamps_s = [STEP_S * k for k in range(len(found))] if stamps_s is None else stamps_s
     order = np.argsort(stamps_s)
-    stamps, keys = np.array(stamps_s)[order], [list(found)[k] for k in order]
-    if np.any(np.diff(stamps) <= 0):
-        raise DatasetError(f"{folder}: two images have one stamp in their names")
-    truth = Trajectory(stamps, np.array([poses[key] for key in keys]))
+    stamped_s, keys = np.array(stamps_s)[order], [list(found)[k] for k in order]
+    if np.any(np.diff(stamped_s) <= 0):
+        raise DatasetError(f"{folder}: two images have one stamp")
+    truth = Trajectory(stamped_s, np.array([poses[key] for key in keys]))
     missing = len(poses) - len(found)
     notes = [f"{path}: a reconstruction has no metric scale unless it was set; its distances are taken as metres"]
     if invented:
@@ -216,10 +234,28 @@ def _source(
         notes.append(f"{folder}: {others} more images have no pose in the model and were left out")
     if missing:
         notes.append(f"{folder}: {missing} of {len(poses)} images do not exist and were left out")
-    images = tuple(zip(stamps.tolist(), (found[key] for key in keys), strict=True))
+    images = tuple(zip(stamped_s.tolist(), (found[key] for key in keys), strict=True))
     if calibration is not None:
         lens = read_lens(calibration, size_of(images))
     return Source(path, name, images, lens, truth=truth, notes=tuple(notes))
+
+
+def _seconds(given: list[Any], path: Path) -> list[float] | None:
+    """Stamps that frames give in seconds, or None where they give none.
+
+    Raises:
+        DatasetError: Some frames have none, or they cannot be seconds.
+    """
+    numbers = [float(stamp) for stamp in given if isinstance(stamp, int | float) and not isinstance(stamp, bool)]
+    if not any(stamp is not None for stamp in given):
+        return None
+    step_s = float(np.median(np.diff(np.sort(numbers)))) if len(numbers) > 1 else 0.0
+    if len(numbers) < len(given) or not STEP_MIN_S <= step_s <= STEP_MAX_S:
+        raise DatasetError(
+            f"{path / 'transforms.json'}: timestamp must be seconds in every frame; {len(numbers)} of {len(given)} "
+            f"have a number, {step_s:g} apart: mend them, or leave timestamp out and name the images by their stamps"
+        )
+    return numbers
 
 
 def _without_pose(folder: Path, found: list[Path]) -> int:

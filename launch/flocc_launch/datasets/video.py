@@ -12,7 +12,7 @@ from typing import Any
 
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_launch.datasets.files import camera_file
+from flocc_launch.datasets.files import camera_file, camera_files
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import JPEG_QUALITY, ImageWriter
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRAJECTORY_SUFFIXES
@@ -81,9 +81,20 @@ def odometry_beside(path: Path) -> Path | None:
     return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
 
 
+def files_beside(path: Path) -> list[Path]:
+    """What is read with a video, of what stands beside it."""
+    odometry = odometry_beside(path)
+    own = _own_lens(path)
+    return [*([odometry] if odometry else []), *([own] if own else camera_files(path.parent)[:1])]
+
+
+def _own_lens(path: Path) -> Path | None:
+    return next((path.with_suffix(s) for s in (".toml", ".yaml", ".yml") if path.with_suffix(s).is_file()), None)
+
+
 def lens_beside(path: Path, size: tuple[int, int] | None = None) -> Lens | None:
     """The camera of a video: of its own name, or the folder's; `size` is that of the video."""
-    own = next((path.with_suffix(s) for s in (".toml", ".yaml", ".yml") if path.with_suffix(s).is_file()), None)
+    own = _own_lens(path)
     return camera_file(path.parent, size=size) if own is None else read_lens(own, size)
 
 
@@ -122,12 +133,9 @@ def convert_video(
     if lens is None:
         raise DatasetError(f"{path}: intrinsics are missing; name a camera file with --camera")
     trajectory, notes = read_trajectory(file, form)
-    if (head.width, head.height) != (lens.camera.width, lens.camera.height):
-        raise DatasetError(
-            f"{path}: frames are {head.width}x{head.height}, but the intrinsics are for "
-            f"{lens.camera.width}x{lens.camera.height}"
-        )
-    _check_clock(path, file, trajectory, head)
+    faults = video_faults(path, file, trajectory, lens, head)
+    if faults:
+        raise DatasetError(faults[0])
     with RecordingWriter(out, f"video {path.resolve()} every={every} odometry={file}") as writer:
         images = ImageWriter(lens)
         writer.write_lens(images.lens)
@@ -140,18 +148,44 @@ def convert_video(
         if writer.count == 0:
             raise DatasetError(f"{path}: no frame of it can be read")
         lost = head.frames // every - writer.count
-    notes = (*notes, *lens.notes)
+    notes = (*notes, *lens.notes, *_uncovered(path, trajectory, head))
     return (*notes, *([f"{path}: {lost} of {head.frames // every} frames could not be read"] if lost > 1 else []))
 
 
-def _check_clock(path: Path, file: Path, trajectory: Trajectory, head: Video) -> None:
-    first_s, last_s = float(trajectory.stamps_s[0]), float(trajectory.stamps_s[-1])
-    duration_s = head.frames / head.rate_hz if head.rate_hz > 0 else float("inf")
-    if first_s > duration_s or last_s < 0:
-        raise DatasetError(
-            f"{file}: the trajectory is from {first_s:.3f} s to {last_s:.3f} s, but {path.name} is from 0 s to "
-            f"{duration_s:.3f} s; stamps count from the video's first frame"
+def video_faults(path: Path, file: Path, trajectory: Trajectory, lens: Lens | None, head: Video) -> list[str]:
+    """Why a video, its trajectory and its lens do not belong together, one sentence each."""
+    faults = []
+    if lens is not None and (head.width, head.height) != (lens.camera.width, lens.camera.height):
+        faults.append(
+            f"{path}: frames are {head.width}x{head.height}, but the intrinsics are for "
+            f"{lens.camera.width}x{lens.camera.height}"
         )
+    covered = posed_frames(trajectory, head)
+    if covered is not None and covered < min(2, head.frames):
+        first_s, last_s = float(trajectory.stamps_s[0]), float(trajectory.stamps_s[-1])
+        steps = f" in steps of {(last_s - first_s) / (len(trajectory) - 1):.3f} s" if len(trajectory) > 1 else ""
+        duration_s = head.frames / head.rate_hz
+        faults.append(
+            f"{file}: the trajectory is from {first_s:.3f} s to {last_s:.3f} s{steps}, but {path.name} is from 0 s to "
+            f"{duration_s:.3f} s, so that {covered or 'no'} frame has a pose; "
+            "stamps are seconds and count from the video's first frame"
+        )
+    return faults
+
+
+def posed_frames(trajectory: Trajectory, head: Video) -> int | None:
+    """How many frames lie within a trajectory's time, and not in a gap of it; None where the head says no rate."""
+    if head.rate_hz <= 0 or head.frames == 0:
+        return None
+    return sum(trajectory.at(k / head.rate_hz) is not None for k in range(head.frames))
+
+
+def _uncovered(path: Path, trajectory: Trajectory, head: Video) -> list[str]:
+    covered = posed_frames(trajectory, head)
+    if covered is None or head.frames - covered <= 1:  # the head's rate is a mean, and the last frame may be late
+        return []
+    where = "outside of the trajectory's time, or in a gap of it"
+    return [f"{path}: {head.frames - covered} of {head.frames} frames lie {where}: no robot uses them"]
 
 
 def _frames(path: Path, every: int) -> Iterator[tuple[float, bytes]]:

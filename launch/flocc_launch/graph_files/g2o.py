@@ -73,6 +73,7 @@ def read_g2o(path: Path, isotropic: bool = False) -> GraphFile:
         left_out=left_out,
         fixed=fixed,
         notes=(*notes, *fix_notes, *_weight_notes(measurements, planar)),
+        vertices={log: tuple(of_log) for log, of_log in _by_log(keys).items()},
     )
 
 
@@ -213,11 +214,17 @@ def _fixed(
 
 def _initial(vertices: Mapping[int, Float], graph: PoseGraph) -> dict[LogId, Float]:
     """Poses of each log whose vertices are all there, in the order of their keys."""
-    by_log: dict[LogId, list[int]] = {}
-    for key in sorted(vertices):
-        by_log.setdefault(log_of(key), []).append(key)
+    by_log = _by_log(vertices)
     whole = {log: keys for log, keys in by_log.items() if len(keys) == len(graph.trajectories.get(log, ()))}
     return {log: np.array([vertices[key] for key in keys]) for log, keys in whole.items()}
+
+
+def _by_log(keys: Iterable[int]) -> dict[LogId, list[int]]:
+    """Keys of each log, in their order."""
+    by_log: dict[LogId, list[int]] = {}
+    for key in sorted(keys):
+        by_log.setdefault(log_of(key), []).append(key)
+    return by_log
 
 
 def _numbers(words: list[str], count: int) -> tuple[int, int, Float]:
@@ -293,19 +300,30 @@ def _truth(folder: Path, graph: PoseGraph) -> dict[LogId, Float]:
     return truth
 
 
-def write_g2o(path: Path, T_keyframe: Mapping[LogId, Float], closures: Iterable[LoopClosure] = ()) -> None:
+def write_g2o(
+    path: Path,
+    T_keyframe: Mapping[LogId, Float],
+    closures: Iterable[LoopClosure] = (),
+    vertices: Mapping[LogId, Sequence[int]] | None = None,
+) -> None:
     """Write poses (N, 4, 4) of every log and the metric closures between them.
 
-    Keys carry the robot's number (from `a` on, in the order of the logs) in their top byte; odometry edges join
-    consecutive poses as they are. A covariance that is not given is written as unit information.
+    Odometry edges join consecutive poses as they are. A covariance that is not given is written as unit information.
+
+    Args:
+        path: The file.
+        T_keyframe: Poses.
+        closures: Between them.
+        vertices: The number of every keyframe; without them keys carry the robot's number (from `a` on, in the order
+            of the logs) in their top byte.
 
     Raises:
         GraphFileError: The file cannot be written.
     """
-    numbers = {log: ord("a") + n for n, log in enumerate(sorted(T_keyframe))}
+    firsts = {log: (ord("a") + n) << INDEX_BITS for n, log in enumerate(sorted(T_keyframe))}
 
     def key(keyframe: KeyframeId) -> int:
-        return (numbers[keyframe.log] << INDEX_BITS) | keyframe.index
+        return vertices[keyframe.log][keyframe.index] if vertices else firsts[keyframe.log] | keyframe.index
 
     posed = [(KeyframeId(log, k), T) for log in sorted(T_keyframe) for k, T in enumerate(T_keyframe[log])]
     lines = [vertex_line(key(keyframe), T) for keyframe, T in posed]

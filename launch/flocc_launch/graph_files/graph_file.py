@@ -53,6 +53,7 @@ class GraphFile:
         fixed: Keyframes that the file holds where they are.
         notes: What else of the file was not taken as it stands, in one sentence each.
         stamps_s: (N,) time of every keyframe of each log, counted from the file's first, where it has times.
+        vertices: The file's own number of every keyframe of each log, where it numbers them.
     """
 
     graph: PoseGraph
@@ -65,6 +66,7 @@ class GraphFile:
     left_out: Mapping[str, int] = field(default_factory=dict)
     fixed: tuple[KeyframeId, ...] = ()
     notes: tuple[str, ...] = ()
+    vertices: Mapping[LogId, tuple[int, ...]] = field(default_factory=dict)
 
     def without_outliers(self) -> "GraphFile":
         """The same file without the closures that it labels as wrong."""

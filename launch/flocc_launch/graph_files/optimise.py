@@ -101,7 +101,7 @@ def optimise_file(
         "drop_labelled_outliers": drop_labelled_outliers,
         **report(file, config, solution),
     }
-    _write(out, result, in_frame_of(file, solution), file.graph.closures)
+    _write(out, result, in_frame_of(file, solution), file)
     return result
 
 
@@ -242,7 +242,7 @@ def _name(closure: ClosureResult) -> dict[str, str]:
     return {"query": str(closure.query), "match": str(closure.match), "reason": closure.reason}
 
 
-def _write(out: Path, result: Mapping[str, Any], solution: GraphSolution, closures: Any) -> None:
+def _write(out: Path, result: Mapping[str, Any], solution: GraphSolution, file: GraphFile) -> None:
     poses = {log: T for c in solution.components for log, T in c.T_map_keyframe.items()}
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -250,9 +250,11 @@ def _write(out: Path, result: Mapping[str, Any], solution: GraphSolution, closur
     except OSError as error:
         raise OptimiseError(f"{out}: cannot be written: {error.strerror or error}") from error
     used = [
-        _scaled(c, r.scale) for c, r in zip(closures, solution.closures, strict=True) if r.state is ClosureState.USED
+        _scaled(c, r.scale)
+        for c, r in zip(file.graph.closures, solution.closures, strict=True)
+        if r.state is ClosureState.USED
     ]
-    write_g2o(out / "optimised.g2o", poses, used)
+    write_g2o(out / "optimised.g2o", poses, used, file.vertices)
 
 
 def _scaled(closure: LoopClosure, scale: float | None) -> LoopClosure:

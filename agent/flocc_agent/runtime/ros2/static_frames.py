@@ -1,6 +1,7 @@
 """Where the camera sits on the body, from /tf_static: a bounded tree of frames that do not move."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,10 +33,25 @@ class StaticFrames:
             BadMessage: A transform is not rigid, or there are too many frames.
         """
         for stamped in message.transforms:
-            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
-            if child not in self._parents and len(self._parents) >= FRAMES_MAX:
-                raise BadMessage(f"/tf_static has more than {FRAMES_MAX} frames")
-            self._parents[child] = (parent, _pose(stamped.transform, f"/tf_static: {parent} to {child}"))
+            self._add(stamped)
+
+    def _add(self, stamped: Any) -> None:
+        child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+        if child not in self._parents and len(self._parents) >= FRAMES_MAX:
+            raise BadMessage(f"/tf_static has more than {FRAMES_MAX} frames")
+        self._parents[child] = (parent, pose_of_transform(stamped.transform, f"/tf_static: {parent} to {child}"))
+
+    def with_others(self, transforms: Sequence[Any]) -> "StaticFrames":
+        """These frames and those of other TransformStamped messages, which do not move either; its own count first.
+
+        Raises:
+            BadMessage: A transform is not rigid, or there are too many frames.
+        """
+        both = StaticFrames()
+        for stamped in transforms:
+            both._add(stamped)
+        both._parents.update(self._parents)
+        return both
 
     def between(self, a: str, b: str) -> Float | None:
         """`T_a_b`, or None where no chain of static transforms connects the two."""
@@ -58,7 +74,12 @@ class StaticFrames:
         return found
 
 
-def _pose(transform: Any, where: str) -> Float:
+def pose_of_transform(transform: Any, where: str) -> Float:
+    """Pose of a Transform message.
+
+    Raises:
+        BadMessage: It is no pose.
+    """
     t, q = transform.translation, transform.rotation
     return pose_of_numbers((t.x, t.y, t.z, q.x, q.y, q.z, q.w), where)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.backend.consensus import ConsensusPart, SharedPoses, part_of, shared_poses, solved_alone
 from flocc_agent.backend.edges import residuals, state_of
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import build
@@ -14,6 +13,7 @@ from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
 from flocc_lab.bench.consensus_sweeps import Sweeps
 from flocc_lab.bench.generated_graph import GeneratedGraph, Noise, generate
+from flocc_lab.consensus import ConsensusPart, SharedPoses, part_of, shared_poses, solved_alone
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_protocol.ids import LogId
 
