@@ -229,6 +229,15 @@ def prior_sigmas(closures: Sequence[LoopClosure], config: BackendConfig) -> Floa
     return np.where(known, config.scale_prior_sigma_ratio, config.scale_prior_unknown_sigma_ratio)
 
 
+def without_unit(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:
+    """Whether nothing is known of each closure's unit (L,), in which its covariance is told."""
+    own = config.formulation in (Formulation.INDEPENDENT, Formulation.SMOOTHED)
+    free = own and config.scale_initial is not ScaleInitial.RAW
+    return np.array(
+        [free and not c.metric and c.scale_initial is None and c.covariance is not None for c in closures], dtype=bool
+    )
+
+
 def comparable(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:
     """Whether each closure's network unit compares with others': by Eq. (6), or because units are taken as metres."""
     raw = config.scale_initial is ScaleInitial.RAW

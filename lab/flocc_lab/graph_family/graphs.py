@@ -135,6 +135,7 @@ def _measured(rng: np.random.Generator, pair: Pair, T_query_match: Float, spec: 
         return LoopClosure(query, match, T, covariance=np.diag(sigma**2), metric=True)
     if spec.lengths is Lengths.UNIT:
         T[:3, 3] /= length_m
+        sigma[3:] /= length_m
         return LoopClosure(query, match, T, covariance=np.diag(sigma**2))
     metres_per_unit = float(np.exp(rng.normal(0.0, UNITS_SIGMA_RATIO)))
     T[:3, 3] /= metres_per_unit
