@@ -35,7 +35,7 @@ from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.runtime.ros2 import types
 from flocc_agent.runtime.ros2.diagnostics import diagnostics
 from flocc_agent.runtime.ros2.markers import KnownClosure, Markers
-from flocc_agent.runtime.ros2.node import RosNode, open_node
+from flocc_agent.runtime.ros2.node import RosNode, ignore, open_node
 from flocc_agent.runtime.ros2.outgoing import Outgoing
 from flocc_agent.runtime.ros2.topics import Offer, Qos
 from flocc_agent.runtime.ros2.types import MessageTypes, Ros2Error
@@ -218,11 +218,17 @@ def test_keys_are_parameters_and_namespaces_are_taken() -> None:
         (["-p", "map_frame:=odom"], "map_frame and odom_frame must differ"),
         (["-p", "map_frame"], "ROS 2 does not start: .*parse parameter override rule"),
         (["-r", "__ns:=r 1"], "ROS 2 does not start"),
+        (["--bogus"], r"ROS 2 does not start: it does not know the arguments \['--bogus'\]"),
+        (["-p", "autostart:=maybe"], "ROS 2 does not start: .* expecting type 'BOOL'"),
+        (["-p", "qos_overrides./r1/odom.subscription.reliability:=bogus"], "ROS 2 does not start: .*`bogus`"),
+        (["-p", "qos_overrides./r1/odom.subscription.depth:=-1"], "ROS 2 does not start: .*history depth"),
+        (["-p", "qos_overrides./r1/path.publisher.depth:=many"], "ROS 2 does not start: .*depth' to 'many'"),
     ],
 )
 def test_arguments_that_cannot_be_are_one_sentence(words: Sequence[str], said: str) -> None:
-    with pytest.raises((Ros2Error, ConfigError), match=said):
-        open_node(Ros2Config(), "flocc_r1", words, TYPES)
+    with pytest.raises((Ros2Error, ConfigError), match=said), opened(*words) as node:
+        node.publisher("path", types.PATH, Qos(1))
+        node.subscribe("odom", types.ODOMETRY, Qos(1), ignore)
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,7 @@ ODOMETRY_GAP_MAX_S = 0.5
 BACK_IN_TIME = (
     "time goes backwards; such messages are left out. After a reset of odometry or clock, call ~/reset_odometry"
 )
+WITHOUT_STAMP = "the stamps are 0, so nothing can be dated by them; the driver must fill in header.stamp"
 CLOCKS_APART_MAX_S = 10.0
 
 SENSOR = Qos(5, best_effort=True)
@@ -85,6 +86,7 @@ class Hearing:
         self.subscribed: dict[str, Topic] = {}
         self.eye: Eye | None = None
         self.T_body_camera: Float | None = None
+        self._camera_frame = config.camera_frame
         if config.camera_mounting is not None:
             self.mount(pose_of_numbers(config.camera_mounting, "camera_mounting"))
 
@@ -140,7 +142,7 @@ class Hearing:
         sample = odometry_of(message, config.odom_frame, config.base_frame)
         self._check_step(*sample)
         if not self.synchroniser.add_odometry(*sample):
-            self.complain("odometry", BACK_IN_TIME)
+            self.complain("odometry", BACK_IN_TIME if sample[0] else WITHOUT_STAMP)
             return False
         self.covariances.add(sample[0], np.reshape(message.pose.covariance, (6, 6)))
         return True
@@ -159,11 +161,11 @@ class Hearing:
 
     def _take_image(self, payload: bytes) -> bool:
         stamp_ns, frame = header_of(payload)
-        wanted = self._config.camera_frame
-        if wanted and frame.lstrip("/") != wanted:
-            raise BadMessage(f"images are in frame {frame!r}, but the configuration says {wanted!r}")
+        if self._is_of_another_camera(frame):
+            told = "the configuration says" if self._config.camera_frame else "the mounting that was read is of"
+            raise BadMessage(f"images are in frame {frame!r}, but {told} {self._camera_frame!r}")
         if not self.synchroniser.add_image(stamp_ns, payload):
-            self.complain("image", BACK_IN_TIME)
+            self.complain("image", BACK_IN_TIME if stamp_ns else WITHOUT_STAMP)
             return False
         return True
 
@@ -184,7 +186,14 @@ class Hearing:
             while self._wanted.is_full():
                 lacking = self._lacking(self._wanted.take())
                 self.synchroniser.dropped[f"image without {lacking}" if lacking else "image not taken in time"] += 1
+        while self._wanted and self._is_of_another_camera(header_of(self._wanted.oldest.payload)[1]):
+            self._wanted.take()
+            self.synchroniser.dropped["image of another camera"] += 1
         return self._wanted.take() if self._wanted and self._lacking(self._wanted.oldest) is None else None
+
+    def _is_of_another_camera(self, frame: str) -> bool:
+        """Whether an image's frame is not the one that is configured, or whose mounting was read."""
+        return bool(self._camera_frame) and frame.lstrip("/") != self._camera_frame
 
     def _lacking(self, posed: PosedImage) -> str | None:
         """What is not known yet of an image's camera."""
@@ -198,6 +207,7 @@ class Hearing:
         if self.T_body_camera is None:
             T_body_camera = self._static.between(self._config.base_frame, camera_frame)
             if T_body_camera is not None:
+                self._camera_frame = camera_frame
                 self.mount(T_body_camera)
         return self.T_body_camera
 

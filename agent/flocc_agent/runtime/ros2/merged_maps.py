@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import Ros2Config
+from flocc_agent.config.ros2 import TOPIC_PATTERN
 from flocc_agent.core.corrected import CorrectedLog
 from flocc_agent.runtime.ros2.merged_grid import CELLS_MAX, Grid, TooLarge, merged
 from flocc_agent.runtime.ros2.node import RosNode
@@ -63,6 +64,10 @@ class MergedMaps:
                 continue
             topic = self._config.grid_topic
             named = topic if robot == self._robot else f"/{robot.replace('-', '_')}/{topic}"
+            if TOPIC_PATTERN.fullmatch(named) is None:  # a robot may be called 2nd, a namespace may not
+                self._topics[robot] = named
+                self._complaints.append((named, f"robot {robot!r} has no ROS namespace of its name; no grid of it"))
+                continue
             self._topics[robot] = self._node.subscribe(named, GRID, LATCHED, self._keep(robot)).name
 
     def is_due(self, logs: Mapping[str, CorrectedLog]) -> bool:

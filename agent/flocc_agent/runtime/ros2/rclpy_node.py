@@ -7,7 +7,8 @@ thread of its own; callbacks only enqueue. The node is a lifecycle node that act
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from typing import Any, cast
@@ -93,17 +94,19 @@ class RclpyNode:
         self._seen: set[tuple[str, ...]] = set()
         self.notes: list[str] = []
         try:
-            rclpy.init(
-                args=["--ros-args", *ros_args] if ros_args else None,
-                context=self._context,
-                domain_id=config.domain_id,
-                signal_handler_options=SignalHandlerOptions.NO,
-            )
-            self._node = ManagedNode(name, context=self._context, namespace=config.namespace or None)
-            self.config = self._with_parameters(config)
-        except (RuntimeError, ParameterException, ValueError) as error:
+            with _in_words():
+                rclpy.init(
+                    args=["--ros-args", *ros_args] if ros_args else None,
+                    context=self._context,
+                    domain_id=config.domain_id,
+                    signal_handler_options=SignalHandlerOptions.NO,
+                )
+                self._node = ManagedNode(name, context=self._context, namespace=config.namespace or None)
+                self.config = self._with_parameters(config)
+                activates_itself = self._node.declare_parameter("autostart", True).value
+        except Ros2Error:
             self._context.try_shutdown()
-            raise Ros2Error(f"ROS 2 does not start: {str(error).split(', at /')[0]}") from error
+            raise
         middleware = rclpy.get_rmw_implementation_identifier()
         self.where = (
             f"{middleware}, domain {self._context.get_domain_id()}, node {self._node.get_fully_qualified_name()}"
@@ -113,7 +116,7 @@ class RclpyNode:
         self._executor.add_node(self._node)
         self._node.create_timer(LOOK_S, self._look, clock=rclpy.clock.Clock())
         self._thread = threading.Thread(target=self._spin, name="rclpy", daemon=True)
-        if self._node.declare_parameter("autostart", True).value:
+        if activates_itself:
             self._node.trigger_configure()
             self._node.trigger_activate()
         self._thread.start()
@@ -139,7 +142,8 @@ class RclpyNode:
         """Declare a publisher; of a type that this ROS does not have, a silent one."""
         kind = self._kind(type_name, f"{topic} is not published")
         overrides = QoSOverridingOptions.with_default_policies()
-        made = kind and self._node.create_publisher(kind, topic, profile(qos), qos_overriding_options=overrides)
+        with _in_words():
+            made = kind and self._node.create_publisher(kind, topic, profile(qos), qos_overriding_options=overrides)
         return RclpyPublisher(self._node, made, self._types)
 
     def subscribe(
@@ -173,11 +177,12 @@ class RclpyNode:
             )
 
         if kind is not None:
-            try:
-                told = SubscriptionEventCallbacks(message_lost=lambda said: count(missed.lost(said.total_count)))
-                made = made_with(told)
-            except UnsupportedEventTypeError:
-                made = made_with(None)
+            with _in_words():
+                try:
+                    told = SubscriptionEventCallbacks(message_lost=lambda said: count(missed.lost(said.total_count)))
+                    made = made_with(told)
+                except UnsupportedEventTypeError:
+                    made = made_with(None)
             self._subscribed.append((named, made))
         return named
 
@@ -231,6 +236,21 @@ class RclpyNode:
                 node = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
                 known = hashed if hashed.startswith("RIHS01_") else topic.hash
                 self._on_offer(Offer(node, topic.name, end.topic_type, known, misfit))
+
+
+@contextmanager
+def _in_words() -> Iterator[None]:
+    """What ROS does not take of its arguments and parameters, in one sentence.
+
+    Raises:
+        Ros2Error: It did not take something.
+    """
+    try:
+        yield
+    except (RuntimeError, ParameterException, ValueError) as error:
+        told = str(error).split(", at /")[0]
+        told = f"it does not know the arguments {told}" if told.startswith("[") else told  # rclpy only lists them
+        raise Ros2Error(f"ROS 2 does not start: {told}") from error
 
 
 def _sender_of(info: Any) -> tuple[bytes | None, int | None]:

@@ -27,13 +27,19 @@ class StaticFrames:
         self._parents: dict[str, tuple[str, Float]] = {}
 
     def add(self, message: Any) -> None:
-        """Take in a TFMessage of /tf_static.
+        """Take in a TFMessage of /tf_static; one that is bad does not take the others with it.
 
         Raises:
             BadMessage: A transform is not rigid, or there are too many frames.
         """
+        fault: BadMessage | None = None
         for stamped in message.transforms:
-            self._add(stamped)
+            try:
+                self._add(stamped)
+            except BadMessage as error:
+                fault = fault or error
+        if fault is not None:
+            raise fault
 
     def _add(self, stamped: Any) -> None:
         child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")

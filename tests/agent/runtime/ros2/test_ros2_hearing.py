@@ -4,8 +4,9 @@ import pytest
 from tests.agent.runtime.ros2 import cdr_by_hand
 from tests.agent.runtime.ros2.cdr_by_hand import Stamped
 
-from flocc_agent.config import Ros2Config
+from flocc_agent.config import KeyframeConfig, Ros2Config
 from flocc_agent.runtime.facts import RosProblem
+from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.ros2.hearing import Hearing
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes
@@ -14,6 +15,7 @@ from flocc_agent.runtime.ros2.types import ODOMETRY, MessageTypes
 
 TYPES = MessageTypes()
 HASH = TYPES.hash(ODOMETRY)
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class Heard:
@@ -28,9 +30,17 @@ class Heard:
     def _report(self, fact: RosProblem) -> None:
         self.said.append(fact.sentence)
 
-    def odometry(self, stamp_s: int) -> None:
-        sample = Stamped((stamp_s, 0), "odom", "base_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    def odometry(self, stamp_s: int, x_m: float = 0.0) -> None:
+        sample = Stamped((stamp_s, 0), "odom", "base_link", (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         assert self.hearing.take("odometry", cdr_by_hand.odometry(sample))
+
+    def image(self, stamp_s: int, frame: str) -> None:
+        self.hearing.take("image", cdr_by_hand.image((stamp_s, 0), frame, (2, 4), "mono8", bytes(8), 4))
+
+    def static(self, *frames: tuple[str, tuple[float, ...]]) -> None:
+        """Children of base_link with their quaternions, in one message."""
+        samples = [Stamped((0, 0), "base_link", child, (1.0, 0.0, 0.0), q) for child, q in frames]
+        self.hearing.take("tf_static", cdr_by_hand.transforms(samples))
 
 
 @pytest.mark.parametrize(
@@ -66,6 +76,41 @@ def test_a_clock_that_begins_anew_is_apart_for_a_moment() -> None:
         heard.odometry(stamp_s)
         heard.hearing.compare_clocks(now_s * 10**9)
     assert heard.said == []
+
+
+def test_a_bad_static_transform_does_not_take_the_others_with_it() -> None:
+    heard = Heard()
+    heard.static(("wheel", (0.0,) * 4), ("cam", UPRIGHT))
+    assert heard.hearing.mounting("cam") is not None
+    assert heard.said == [
+        "ROS 2: /tf_static: base_link to wheel: position (1, 0, 0) with a quaternion of length 0 is no pose"
+    ]
+
+
+def test_images_of_another_camera_do_not_get_the_mounting_of_the_first() -> None:
+    heard = Heard()
+    heard.static(("left", UPRIGHT), ("right", UPRIGHT))
+    K = (4.0, 0.0, 2.0, 0.0, 4.0, 1.0, 0.0, 0.0, 1.0)
+    heard.hearing.take("camera_info", cdr_by_hand.camera_info((1, 0), "left", (2, 4), K, [], [0.0] * 12))
+    for k, frame in enumerate(("left", "right", "/left")):
+        heard.image(1 + k, frame)
+    for stamp_s in (0, 1, 2, 3, 4):
+        heard.odometry(stamp_s, float(stamp_s))
+    selector = KeyframeSelector(KeyframeConfig(distance_m=0.5))
+    taken = iter(lambda: heard.hearing.next_wanted(selector), None)
+    assert [posed.stamp_ns // 10**9 for posed in taken] == [1, 3]
+    assert heard.hearing.synchroniser.dropped == {"image of another camera": 1}
+    heard.image(5, "right")
+    assert heard.said == ["ROS 2: images are in frame 'right', but the mounting that was read is of 'left'"]
+
+
+def test_stamps_that_nobody_filled_in_are_not_called_backwards() -> None:
+    heard = Heard()
+    for _ in range(2):
+        heard.image(0, "left")
+    assert heard.said == [
+        "ROS 2: the stamps are 0, so nothing can be dated by them; the driver must fill in header.stamp"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -172,6 +172,18 @@ def test_grids_of_all_robots_of_the_map_are_heard_and_drawn_where_corrections_sa
     assert len(node.put) == 2
 
 
+def test_a_robot_whose_name_is_no_namespace_is_said_and_not_heard() -> None:
+    node, facts = Node(), list[Any]()
+    maps = MergedMaps(Ros2Config(grid_topic="local_map"), "r1", TYPES, node, Problems(facts.append))  # type: ignore[arg-type]
+    for _ in range(2):
+        maps.follow({"2nd": None, "r-2": None})
+        maps.complain()
+    assert list(node.subscribed) == ["local_map", "/r_2/local_map"]
+    assert [fact.sentence for fact in facts] == [
+        "/2nd/local_map: robot '2nd' has no ROS namespace of its name; no grid of it"
+    ]
+
+
 def test_without_a_grid_topic_nothing_is_heard() -> None:
     node = Node()
     maps = MergedMaps(Ros2Config(), "r1", TYPES, node, Problems(lambda _: None))  # type: ignore[arg-type]
