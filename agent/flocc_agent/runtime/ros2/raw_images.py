@@ -113,9 +113,19 @@ def compressed_pixels(message: Any, size: Size | None = None) -> Pixels:
     """
     refuse_depth(message)
     try:
-        return decoded(bytes(message.data), size)
+        pixels = decoded(bytes(message.data), size)
     except ValueError as error:
         raise ValueError(f"an image compressed as {message.format!r} cannot be read: {error}") from error
+    return _demosaiced(pixels, str(message.format))
+
+
+def _demosaiced(pixels: Pixels, form: str) -> Pixels:
+    """Colours of a mosaic that was compressed as it is; image_transport then names the mosaic and no target format."""
+    taken_as, _, compressed_as = form.partition(";")
+    layout = _ENCODINGS.get(taken_as.strip())
+    is_mosaic = layout is not None and layout.order.startswith("Bayer") and compressed_as.strip().endswith("compressed")
+    is_grey = bool((pixels == pixels[..., :1]).all())
+    return _in_order(np.ascontiguousarray(pixels[..., 0]), layout) if layout and is_mosaic and is_grey else pixels
 
 
 def refuse_depth(message: Any) -> None:

@@ -241,3 +241,18 @@ def test_a_live_wide_lens_is_remapped_to_a_pinhole() -> None:
 def test_eight_coefficients_of_a_rational_model_are_all_used() -> None:
     D = (0.55, -2.6, 0.0007, -0.0003, 1.5, 0.43, -2.5, 1.46)
     assert lens(D, model="rational_polynomial").distortion == D
+
+
+@pytest.mark.parametrize(
+    ("form", "expected"),
+    [
+        ("bayer_rggb8; png compressed ", (200, 60, 20)),
+        ("bayer_rggb8; png compressed bgr8", (60, 60, 60)),
+        ("mono8; png compressed ", (60, 60, 60)),
+    ],
+)
+def test_a_mosaic_that_was_compressed_as_it_is_gets_its_colours(form: str, expected: tuple[int, ...]) -> None:
+    mosaic = np.tile(np.array([[200, 60], [60, 20]], dtype=np.uint8), (HEIGHT // 2, WIDTH // 2))
+    encoded = cv2.imencode(".png", mosaic)[1].tobytes()
+    image = Eye(MODEL).image(TYPES.read(cdr_by_hand.compressed_image(STAMP, "cam", form, encoded), COMPRESSED_IMAGE))
+    assert tuple(image.pixels[2, 3]) == expected
