@@ -199,7 +199,7 @@ class GraphAssembly:
                 self._reads_all = False
             case _:
                 self.revision += 1
-                self._await(self._measured.add(new))
+                self._await(self._measured.add(new, record))
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.

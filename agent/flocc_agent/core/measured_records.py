@@ -11,6 +11,7 @@ from flocc_agent.core.pose_graph import MeasuredFactor, is_landmark
 from flocc_agent.geometry import symmetric
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import (
+    MeasurementRecord,
     MetricClosureRecord,
     OdometryCovarianceRecord,
 )
@@ -27,9 +28,8 @@ class MeasuredRecords:
         self._waiting: dict[str, list[float]] = {}
         self._edges: dict[LogId, dict[int, Float]] = {}
 
-    def add(self, new: NewRecord) -> tuple[KeyframeId, ...]:
-        """Take in a record, and give the keyframes that it speaks of."""
-        record = new.record
+    def add(self, new: NewRecord, record: MeasurementRecord) -> tuple[KeyframeId, ...]:
+        """Take in a record, which is the new one's, and give the keyframes that it speaks of."""
         if isinstance(record, OdometryCovarianceRecord):
             self._edges.setdefault(new.log, {})[record.index] = symmetric(record.covariance.numpy())
             return ()
