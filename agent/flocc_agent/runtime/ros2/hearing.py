@@ -87,6 +87,7 @@ class Hearing:
         self.eye: Eye | None = None
         self.T_body_camera: Float | None = None
         self._camera_frame = config.camera_frame
+        self._eye_frame = ""
         if config.camera_mounting is not None:
             self.mount(pose_of_numbers(config.camera_mounting, "camera_mounting"))
 
@@ -131,8 +132,12 @@ class Hearing:
         return False
 
     def _take_camera_info(self, payload: bytes) -> None:
-        model = model_of(self._types.read(payload, CAMERA_INFO), self._config.rectified)
+        message = self._types.read(payload, CAMERA_INFO)
+        model, frame = model_of(message, self._config.rectified), message.header.frame_id
         if self.eye is None or self.eye.model != model:
+            if self.eye is not None and frame != self._eye_frame:
+                raise BadMessage(f"intrinsics are of frame {frame!r}, but those before were of {self._eye_frame!r}")
+            self._eye_frame = frame
             view_deg = self._config.field_of_view_deg
             self.eye = Eye(model, None if view_deg is None else math.radians(view_deg))
 

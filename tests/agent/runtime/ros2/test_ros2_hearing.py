@@ -104,6 +104,16 @@ def test_images_of_another_camera_do_not_get_the_mounting_of_the_first() -> None
     assert heard.said == ["ROS 2: images are in frame 'right', but the mounting that was read is of 'left'"]
 
 
+def test_intrinsics_of_another_camera_on_the_topic_do_not_replace_the_first() -> None:
+    heard = Heard()
+    for frame, focal in (("left", 4.0), ("right", 5.0), ("left", 4.0)):
+        K = (focal, 0.0, 2.0, 0.0, focal, 1.0, 0.0, 0.0, 1.0)
+        heard.hearing.take("camera_info", cdr_by_hand.camera_info((1, 0), frame, (2, 4), K, [], [0.0] * 12))
+        assert heard.hearing.eye is not None
+        assert heard.hearing.eye.model.fx == 4.0
+    assert heard.said == ["ROS 2: intrinsics are of frame 'right', but those before were of 'left'"]
+
+
 def test_stamps_that_nobody_filled_in_are_not_called_backwards() -> None:
     heard = Heard()
     for _ in range(2):
