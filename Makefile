@@ -48,8 +48,8 @@ contracts:
 LIVE := swarm and not scenarios
 tests:
 	@mkdir -p build; set -o pipefail; status=0; live=0; export OMP_NUM_THREADS=1; \
-	nice -n 19 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -o cache_dir=.pytest_cache/unit -m "not swarm" > build/pytest.txt 2>&1 & unit=$$!; \
-	trap 'kill $$unit 2>/dev/null' EXIT; \
+	set -m; nice -n 19 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -o cache_dir=.pytest_cache/unit -m "not swarm" > build/pytest.txt 2>&1 & unit=$$!; set +m; \
+	trap 'kill -- -$$unit 2>/dev/null' EXIT; \
 	rm -f build/pytest-swarm-again.txt; \
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "$(LIVE) and beside" | tee build/pytest-beside.txt || live=1; \
 	wait $$unit || status=1; trap - EXIT; cat build/pytest.txt; unset OMP_NUM_THREADS; \

@@ -218,8 +218,8 @@ def test_malformed_safetensors_tables_are_refused(tmp_path: Path, entry: Any) ->
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "nothing.pth", tmp_path):
-        with pytest.raises(BadCheckpoint, match="cannot be read"):
+    for path, said in ((tmp_path / "nothing.pth", "cannot be read"), (tmp_path, "is not a file")):
+        with pytest.raises(BadCheckpoint, match=said):
             read_checkpoint(path)
 
 
