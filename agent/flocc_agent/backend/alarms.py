@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from flocc_agent.backend.pair_closures import PairClosures, Way, measured
+from flocc_agent.backend.pair_closures import PairClosures, Way, by_logs, measured
 from flocc_agent.backend.relayed import relayed
 from flocc_agent.backend.together import (
     AGREEING_MIN,
@@ -130,12 +130,7 @@ def held_closures(
     if config.formulation is Formulation.BASE or config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
         return {}
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
-    pairs: dict[tuple[LogId, LogId], list[int]] = {}
-    for k, closure in sorted(closures.items()):
-        if closure.support != 1:
-            continue
-        low, high = sorted((closure.query, closure.match))
-        pairs.setdefault((low.log, high.log), []).append(k)
+    pairs = by_logs({k: closure for k, closure in closures.items() if closure.support == 1})
     of_pairs = {pair: measured(ids, closures, config) for pair, ids in pairs.items()}
     bound, bound_of_one = (float(chdtri(freedom, 1.0 - config.inlier_probability)) for freedom in (6.0, 1.0))
     judges = [judges_of(pair, ways, of_pairs, bound) for pair in of_pairs]

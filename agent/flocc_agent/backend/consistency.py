@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from flocc_agent.backend.alignment import Rays, rays_of, travelled_m
+from flocc_agent.backend.pair_closures import by_logs
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_protocol.ids import LogId
@@ -35,10 +36,7 @@ def inconsistent(
     trajectories: Mapping[LogId, Trajectory], closures: Mapping[int, LoopClosure], config: BackendConfig
 ) -> dict[int, str]:
     """Closures to turn away, by index, with the reason; pairs with more than `CLOSURES_MAX` are left alone."""
-    pairs: dict[tuple[LogId, LogId], list[int]] = {}
-    for k in sorted(closures):
-        a, b = sorted((closures[k].query.log, closures[k].match.log))
-        pairs.setdefault((a, b), []).append(k)
+    pairs = by_logs(closures)
     path_m = {log: travelled_m(trajectory) for log, trajectory in trajectories.items()}
     dropped: dict[int, str] = {}
     for ids in (ids for ids in pairs.values() if 2 < len(ids) <= CLOSURES_MAX):

@@ -10,6 +10,7 @@ from flocc_agent.backend.problem import closure_covariances, diagonal_covariance
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import inverse
+from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -96,6 +97,15 @@ class PairClosures:
     shorter_max_m: Float
     rotation: Float
     translation: Float
+
+
+def by_logs(closures: Mapping[int, LoopClosure]) -> dict[tuple[LogId, LogId], list[int]]:
+    """Numbers of closures, rising, of each two logs, the lower log first."""
+    found: dict[tuple[LogId, LogId], list[int]] = {}
+    for k in sorted(closures):
+        low, high = sorted((closures[k].query.log, closures[k].match.log))
+        found.setdefault((low, high), []).append(k)
+    return found
 
 
 def measured(ids: list[int], closures: Mapping[int, LoopClosure], config: BackendConfig) -> PairClosures:

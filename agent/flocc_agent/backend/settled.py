@@ -32,6 +32,7 @@ from flocc_agent.backend.mapped import (
     stiff_trajectory,
 )
 from flocc_agent.backend.measured import CERTAIN_RATIO, JOINS
+from flocc_agent.backend.pair_closures import by_logs
 from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.problem import diagonal_covariance
 from flocc_agent.backend.results import Solution, closure_results, excluded, odometry_component
@@ -178,12 +179,8 @@ def _news(
 
 def _near(graph: PoseGraph, came: Sequence[int]) -> dict[int, LoopClosure] | None:
     """New closures and, of the same two logs, those nearest to them; None where there are too few of these."""
-    pairs: dict[tuple[LogId, LogId], list[int]] = {}
-    for k, closure in enumerate(graph.closures):
-        low, high = sorted((closure.query, closure.match))
-        pairs.setdefault((low.log, high.log), []).append(k)
     chosen = set(came)
-    for ids in pairs.values():
+    for ids in by_logs(dict(enumerate(graph.closures))).values():
         new = np.flatnonzero(np.isin(ids, came))
         if len(new) == 0:
             continue

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from flocc_agent.backend.alarms import EXCESS_MAX, PARTNERS, PLANAR_RAD, compared, said_by
-from flocc_agent.backend.pair_closures import PairClosures, Way, measured
+from flocc_agent.backend.pair_closures import PairClosures, Way, by_logs, measured
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_protocol.ids import LogId
@@ -88,12 +88,8 @@ class Difference:
 def _differences(told: Widened, config: BackendConfig) -> tuple[Difference, Difference]:
     """Differences in rotation and in translation."""
     ways = {log: Way.of(trajectory, config, length_sigma=0.0) for log, trajectory in told.trajectories.items()}
-    pairs: dict[tuple[LogId, LogId], list[int]] = {}
-    for k, closure in sorted(told.closures.items()):
-        low, high = sorted((closure.query, closure.match))
-        pairs.setdefault((low.log, high.log), []).append(k)
     turns, moves, tilt = [], [], 0.0
-    for (a, b), ids in pairs.items():
+    for (a, b), ids in by_logs(told.closures).items():
         if len(ids) > PARTNERS:
             c = measured(ids, told.closures, config)
             turn, move = _from_best(ways[a], ways[b], c)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from flocc_agent.backend.alarms import EXCESS_MAX, compared, said_by
-from flocc_agent.backend.pair_closures import Way, measured
+from flocc_agent.backend.pair_closures import Way, by_logs, measured
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_protocol.ids import LogId
@@ -47,13 +47,9 @@ def votes(
     place = {k: n for n, k in enumerate(sorted(closures))}
     if not place:
         return np.zeros(0)
-    pairs: dict[tuple[LogId, LogId], list[int]] = {}
-    for k in place:
-        low, high = sorted((closures[k].query.log, closures[k].match.log))
-        pairs.setdefault((low, high), []).append(k)
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
     joined = [np.zeros((0, 2), dtype=np.int64)]
-    for (a, b), ids in pairs.items():
+    for (a, b), ids in by_logs(closures).items():
         near = _near(ids, recorded, config.cluster_keyframes_max)
         if len(near):
             c = measured(ids, closures, config)

@@ -209,9 +209,7 @@ def evidence_of(
 ) -> CorrectionEvidence:
     """What closures of a correction's log and its measurements say of it, as far as the other ends are known."""
     own, near_m = placed.own.log, view_m(odometry)
-    ties, fixes = by_far_log(own, closures, len(odometry)), dict[LogId, dict[int, Float]]()
-    for factor in graph.measured(own):
-        _sort_in(factor, own, len(odometry), ties, fixes)
+    ties, fixes = _ties_and_fixes(own, closures, len(odometry), graph)
     ends = [_End(0, np.zeros(3), 0.0, 0.0, None)] if placed.own.anchor == own else []
     within = list[_End]()
     for far, of_log in ties.items():
@@ -294,6 +292,16 @@ def _slack_m(one: _End, other: _End, graph: HeldGraph) -> float:
     return min(slack_m, DRIFT_RATIO * float(np.linalg.norm(way[-1, :3, 3] - way[0, :3, 3])) + WOUND_RATIO * way_m(way))
 
 
+def _ties_and_fixes(
+    log: LogId, closures: Sequence[ClosureRecord], keyframes: int, graph: HeldGraph
+) -> tuple[dict[LogId, list[Tie]], dict[LogId, dict[int, Float]]]:
+    """Of a log's known keyframes: ties to keyframes by their log, and places by the frame that they are in."""
+    ties, fixes = by_far_log(log, closures, keyframes), dict[LogId, dict[int, Float]]()
+    for factor in graph.measured(log):
+        _sort_in(factor, log, keyframes, ties, fixes)
+    return ties, fixes
+
+
 def _sort_in(
     factor: MeasuredFactor,
     own: LogId,
@@ -355,9 +363,7 @@ def _seen(
 def missed_m(log: LogId, closures: Sequence[ClosureRecord], graph: HeldGraph) -> float:
     """How much of a log's way its odometry missed, by closures that contradict it, whatever solution is believed."""
     odometry, missed = graph.odometry(log), 0.0
-    ties, fixes = by_far_log(log, closures, len(odometry)), dict[LogId, dict[int, Float]]()
-    for factor in graph.measured(log):
-        _sort_in(factor, log, len(odometry), ties, fixes)
+    ties, fixes = _ties_and_fixes(log, closures, len(odometry), graph)
     for places in fixes.values():
         near = sorted(places)
         moved_m = np.linalg.norm(np.diff(np.array([places[k] for k in near]), axis=0), axis=1)
