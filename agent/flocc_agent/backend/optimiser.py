@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flocc_agent.backend.alarms import held_closures
+from flocc_agent.backend.alarms import fitted_lengths, held_closures
 from flocc_agent.backend.chains import STRAIN_RATIO_MAX, Chains, chains_of
 from flocc_agent.backend.filtering import Filtered, filtered
 from flocc_agent.backend.initial import Aligned, component_with, initial_poses
@@ -231,11 +231,12 @@ def _solve_connected(
     """Align the odom frames, pose the problem, solve it, collect what consumers get (Sec. III-C)."""
     times = [time.perf_counter()]
     aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
+    lengths_m = fitted_lengths(kept.trajectories, {**kept.left, **kept.taking_part}, config)
     times.append(time.perf_counter())
     chains = chains_of(kept.trajectories, kept.taking_part, wanted, config)
-    found = _solve_aligned(kept, chains, aligned, config, initial)
+    found = _solve_aligned(kept, chains, aligned, config, initial, lengths_m)
     if chains is not None and not _is_explained(chains, found):
-        found = _solve_all(kept, chains, found, config)
+        found = _solve_all(kept, chains, found, config, lengths_m)
         chains = None
     solved, at = found.solved, found.posed
     if not (np.all(np.isfinite(solved.state.t)) and np.all(np.isfinite(solved.state.q))):
@@ -261,23 +262,30 @@ def _solve_connected(
 
 
 def _solve_aligned(
-    kept: Filtered, chains: Chains | None, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None
+    kept: Filtered,
+    chains: Chains | None,
+    aligned: Aligned,
+    config: BackendConfig,
+    initial: GraphSolution | None,
+    lengths_m: Mapping[int, float],
 ) -> SolvedWithScales:
     """Solve an aligned component, with all its keyframes or by its chains."""
     if chains is None:
-        begun = posed(kept.trajectories, kept.taking_part, aligned, config, initial, None, kept.held)
+        begun = posed(kept.trajectories, kept.taking_part, aligned, config, initial, None, kept.held, lengths_m)
     else:
         shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
-        begun = posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, kept.held)
+        begun = posed(
+            chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, kept.held, lengths_m
+        )
 
     def anew(scales: Mapping[LogId, float]) -> Posed:
         """The component, begun with the ways of logs made longer or shorter."""
         longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
         again = initial_poses(longer, kept.left, config.steepness, None)
         if chains is None:
-            return posed(kept.trajectories, kept.taking_part, again, config, None, None, kept.held)
+            return posed(kept.trajectories, kept.taking_part, again, config, None, None, kept.held, lengths_m)
         shorter = Aligned(chains.shortened(again.T_map_keyframe), again.is_warm)
-        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded, kept.held)
+        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded, kept.held, lengths_m)
 
     return solve_with_scales(begun, initial, anew)
 
@@ -289,12 +297,14 @@ def _is_explained(chains: Chains, found: SolvedWithScales) -> bool:
     return bool(np.isfinite(strain)) and abs(strain) <= STRAIN_RATIO_MAX * max(solved.cost, 1.0)
 
 
-def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: BackendConfig) -> SolvedWithScales:
+def _solve_all(
+    kept: Filtered, chains: Chains, found: SolvedWithScales, config: BackendConfig, lengths_m: Mapping[int, float]
+) -> SolvedWithScales:
     """Go on from where the chains' solution has all keyframes, with all of odometry and the same closures."""
     problem, state = found.posed.problem, found.solved.state
     scales = problem.scales_applied(state)
     T = chains.lengthened(problem.by_log(state.poses()), scales)
-    whole = posed(kept.trajectories, kept.taking_part, Aligned(T, False), config, None, None, kept.held)
+    whole = posed(kept.trajectories, kept.taking_part, Aligned(T, False), config, None, None, kept.held, lengths_m)
     whole = whole.with_scaled(scales)
     start = replace(whole.start, scale=state.scale)
     whole = replace(whole, start=start, trusted=found.posed.trusted)

@@ -70,13 +70,14 @@ def posed(
     initial: GraphSolution | None,
     recorded: Mapping[int, LoopClosure] | None = None,
     held: Collection[int] = (),
+    lengths_m: Mapping[int, float] | None = None,
 ) -> Posed:
     """The problem of aligned logs and the closures that are left, with all odometry taken as true.
 
     Where the closures' keyframes are named by their places in chains, `recorded` has them under their own numbers.
     Closures that are `held` count once the poses that others give agree with them.
     """
-    problem = build(trajectories, closures, config, recorded)
+    problem = build(trajectories, closures, config, recorded).with_lengths(lengths_m or {})
     in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     says = votes(trajectories, closures, recorded or closures, config)

@@ -280,7 +280,12 @@ def _posed(opened: Open, T_tails: Mapping[LogId, Float], config: BackendConfig) 
         renamed[n - len(tied)] = LoopClosure(
             at, KeyframeId(log, 0), np.eye(4), CERTAIN_RATIO, covariance=S, metric=True, support=JOINS
         )
-    return posed(trajectories, renamed, Aligned(T, True), config, None)
+    lengths_m = {
+        k: float(np.linalg.norm(T[c.query.log][c.query.index][:3, 3] - T[c.match.log][c.match.index][:3, 3]))
+        for k, c in renamed.items()
+        if not c.metric and c.scale_initial is None and c.covariance is not None
+    }
+    return posed(trajectories, renamed, Aligned(T, True), config, None, None, (), lengths_m)
 
 
 def _stiff_poses(opened: Open) -> Float:
