@@ -377,7 +377,9 @@ def alarms(judges: Judges, bound: float, bounds_of_all: tuple[float, float], exc
         reasons[n] = _reason(by.at((n, p)), bool(by.falls[n, p]), excess, "closures around it")
     all_ = judges.with_all
     disagrees = (all_.squared > bounds_of_all[0]) | (judges.collapse > bounds_of_all[1])
-    for n in np.flatnonzero(judges.counts & disagrees).tolist():
+    supported = np.sum(certainty * agree, axis=1) > np.sum(certainty * (others & ~agree), axis=1)
+    supported &= agreeing >= AGREEING_MIN
+    for n in np.flatnonzero(judges.counts & disagrees & ~supported).tolist():
         reasons.setdefault(n, _reason(all_.at(n), bool(all_.falls[n]), excess, "the closures around it"))
     if judges.with_odometry is not None:
         own, alone = judges.with_odometry, ~np.any(agree, axis=1)
