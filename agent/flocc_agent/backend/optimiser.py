@@ -20,6 +20,7 @@ from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scales, with_mean_of_one
+from flocc_agent.backend.parted import less_exact, sentence
 from flocc_agent.backend.posing import Posed, posed
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
@@ -185,14 +186,28 @@ def _solve_and_split(
     filtering_s = time.perf_counter() - began
     outcome = SolvedLogs((), {}, timings_s={"consistency": filtering_s})
     if kept.is_connected:
-        outcome = _solve_connected(kept, config, initial, wanted)
+        whole = kept
+        outcome, kept = _solve_and_choose(whole, config, initial, wanted)
+        if not kept.is_connected and (wider := less_exact(whole, kept, config)):
+            again = replace(whole, closures={**whole.closures, **wider})
+            outcome_again, kept_again = _solve_and_choose(again, config, initial, wanted)
+            if wider.keys() <= kept_again.left.keys():
+                warnings = (*outcome_again.warnings, sentence(wider))
+                outcome, kept = replace(outcome_again, warnings=warnings), kept_again
         outcome = replace(outcome, timings_s={"consistency": filtering_s, **outcome.timings_s})
-        kept = kept.released(outcome.closures)
-        outcome = replace(outcome, closures={k: r for k, r in outcome.closures.items() if k in kept.closures})
-        kept = kept.without({k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED})
     if kept.is_connected:
         return replace(outcome, closures={**outcome.closures, **kept.turned_away})
     return _split(kept, outcome, config, initial, wanted)
+
+
+def _solve_and_choose(
+    whole: Filtered, config: BackendConfig, initial: GraphSolution | None, wanted: Sequence[KeyframeId]
+) -> tuple[SolvedLogs, Filtered]:
+    """Solve a component; what it makes of it, and what is left once closures that disagree are turned away."""
+    outcome = _solve_connected(whole, config, initial, wanted)
+    kept = whole.released(outcome.closures)
+    outcome = replace(outcome, closures={k: r for k, r in outcome.closures.items() if k in kept.closures})
+    return outcome, kept.without({k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED})
 
 
 def _split(
