@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from flocc_agent.backend.alarms import held_closures
-from flocc_agent.backend.chains import STRAIN_RATIO_MAX, Chains, chains_of
+from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.filtering import Filtered, filtered
 from flocc_agent.backend.initial import Aligned, component_with, initial_poses
 from flocc_agent.backend.linear import SingularSystem
@@ -21,7 +21,7 @@ from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scales, with_mean_of_one
 from flocc_agent.backend.parted import less_exact, sentence
-from flocc_agent.backend.posing import Posed, posed
+from flocc_agent.backend.posing import Posed, posed, posed_by_chains
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.settled import settled_round
@@ -249,7 +249,7 @@ def _solve_connected(
     times.append(time.perf_counter())
     chains = chains_of(kept.trajectories, kept.taking_part, wanted, config)
     found = _solve_aligned(kept, chains, aligned, config, initial)
-    if chains is not None and not _is_explained(chains, found):
+    if chains is not None and not is_explained(chains, found.posed.problem, found.solved):
         found = _solve_all(kept, chains, found, config)
         chains = None
     solved, at = found.solved, found.posed
@@ -279,29 +279,15 @@ def _solve_aligned(
     kept: Filtered, chains: Chains | None, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None
 ) -> SolvedWithScales:
     """Solve an aligned component, with all its keyframes or by its chains."""
-    if chains is None:
-        begun = posed(kept.trajectories, kept.taking_part, aligned, config, initial, None, kept.held)
-    else:
-        shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
-        begun = posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, kept.held)
+    begun = posed_by_chains(kept.trajectories, kept.taking_part, chains, aligned, config, initial, kept.held)
 
     def anew(scales: Mapping[LogId, float]) -> Posed:
         """The component, begun with the ways of logs made longer or shorter."""
         longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
         again = initial_poses(longer, kept.left, config.steepness, None)
-        if chains is None:
-            return posed(kept.trajectories, kept.taking_part, again, config, None, None, kept.held)
-        shorter = Aligned(chains.shortened(again.T_map_keyframe), again.is_warm)
-        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded, kept.held)
+        return posed_by_chains(kept.trajectories, kept.taking_part, chains, again, config, None, kept.held)
 
     return solve_with_scales(begun, initial, anew)
-
-
-def _is_explained(chains: Chains, found: SolvedWithScales) -> bool:
-    """Whether chains say what odometry of all their keyframes would say."""
-    problem, solved = found.posed.problem, found.solved
-    strain = chains.strain(problem.by_log(solved.state.poses()), problem.scales_applied(solved.state))
-    return bool(np.isfinite(strain)) and abs(strain) <= STRAIN_RATIO_MAX * max(solved.cost, 1.0)
 
 
 def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: BackendConfig) -> SolvedWithScales:
