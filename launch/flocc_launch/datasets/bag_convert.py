@@ -30,6 +30,7 @@ from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.pixels import ImageWriter, levels_note
 from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_launch.datasets.stamp_gaps import StampGaps
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
 logger = logging.getLogger(__name__)
@@ -288,6 +289,7 @@ class _Conversion:
     _done_s: float | None = field(init=False, default=None)
     _pictures: ImageWriter = field(init=False)
     _last_pose: tuple[float, ...] = ()
+    _stamps: StampGaps = field(default_factory=StampGaps)
     _first_info: bytes | None = None
     _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
@@ -343,7 +345,7 @@ class _Conversion:
         """Finish the recording of the journey that runs."""
         writer, log = self._writer, self._log
         try:
-            writer.flush()
+            writer.sort()
             log.finish(self.zero_ns)
             self._write_beside(writer)
         finally:
@@ -412,9 +414,8 @@ class _Conversion:
             stamp_s = (taken_ns - self.zero_ns) * 1e-9
             if self._done_s is not None and stamp_s <= self._done_s + 1e-9:
                 return
-            last_s = self._writer.last_stamp_s
-            if last_s is not None and stamp_s <= last_s:
-                tally.step_back(last_s, stamp_s)
+            if not self._stamps.fits(taken_ns):
+                tally.step_back(self._writer.last_stamp_s or 0.0, stamp_s)
                 return
             self._writer.add(stamp_s, *self._encoded(message))
             self._image_span_s = _wider(self._image_span_s, stamp_s)
