@@ -25,7 +25,7 @@ from flocc_launch.datasets.bag_messages import (
 )
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
-from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.intrinsics import believable, read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.pixels import ImageWriter, levels_note
@@ -211,7 +211,7 @@ def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens
         raise DatasetError(f"{bag.path}: topic {robot.info.name} has no message that can be read")
     T_body_camera, note = (None, None) if options.odometry else layout.mounting(robot)
     try:
-        lens = lens_of(first[1], robot.info, robot.image)
+        lens = believable(lens_of(first[1], robot.info, robot.image), f"topic {robot.info.name}")
     except DatasetError as error:
         raise DatasetError(f"{bag.path}: {error}; name a camera file with --camera") from error
     lens = lens if T_body_camera is None else replace(lens, T_body_camera=T_body_camera)

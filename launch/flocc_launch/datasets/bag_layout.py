@@ -6,10 +6,10 @@ images, as a live agent takes it. Odometry may be a topic of poses, or an edge o
 with what there is.
 """
 
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -149,7 +149,9 @@ class Layout:
             return [self._robot(name, parts[name], poses) for name, poses in own.items()]
         return [self._robot("", images, None)]
 
-    def _told_apart_by_odometry(self, images: list[BagTopic]) -> tuple[dict[str, list[BagTopic]], dict[str, PoseSource]]:
+    def _told_apart_by_odometry(
+        self, images: list[BagTopic]
+    ) -> tuple[dict[str, list[BagTopic]], dict[str, PoseSource]]:
         """Images and odometry by what tells topics of odometry apart, as `cam_r1` and `odom_r1` of `odom_r2`."""
         for word in (PARTS_OF_NAMES, LETTERS_OR_DIGITS):
             poses = _of_distinct_words(self._own_poses(), word)
@@ -256,14 +258,15 @@ class Layout:
         return [t for t in candidates if not any(word in t.name.lower() for word in TRUTH_WORDS)] or candidates
 
     def _is_another_robot(self, image: BagTopic, poses: BagTopic) -> bool:
-        """Whether poses are another robot's than images: namespaces of both that are alike, or of frames that differ."""
+        """Whether poses are another robot's than images, by namespaces of one kind or those of frames."""
         here, there = _root(image.name), _root(poses.name)
         if here and there and here != there and self._are_siblings(here, there):
             return True
-        head = self.head(poses)
-        frames = {_root(frame) for frame in (head.frame, head.child)} - {""} if head is not None else set()
-        camera = _root(self._frame(image))
-        return bool(camera and frames) and camera not in frames
+        head, camera = self.head(poses), self._frame(image)
+        if head is None or self.static.between(head.child, camera) is not None:
+            return False
+        roots = {_root(frame) for frame in (head.frame, head.child)} - {""}
+        return bool(_root(camera) and roots) and _root(camera) not in roots
 
     def _are_siblings(self, one: str, other: str) -> bool:
         """Whether two namespaces are of one kind: named alike but for a number, or with topics of the same names."""
@@ -406,11 +409,16 @@ def _words(name: str, word: str) -> str:
     return "-".join(re.findall(word, name.lower()))
 
 
+def _alike(lists: list[list[str]]) -> int:
+    """In how many of their first words lists are the same."""
+    return sum(1 for _ in takewhile(lambda words: len(set(words)) == 1, zip(*lists, strict=False)))
+
+
 def _of_distinct_words(topics: list[BagTopic], word: str) -> dict[str, BagTopic]:
     """Topics by what is between the words that all their names begin and end with; empty where one has nothing."""
     words = {topic.name: _words(topic.name, word).split("-") for topic in topics}
-    front = len(os.path.commonprefix(list(words.values())))
-    back = len(os.path.commonprefix([each[front:][::-1] for each in words.values()]))
+    front = _alike(list(words.values()))
+    back = _alike([each[front:][::-1] for each in words.values()])
     between = {"-".join(words[topic.name][front : len(words[topic.name]) - back]): topic for topic in topics}
     return between if len(between) == len(topics) and all(between) else {}
 

@@ -24,7 +24,6 @@ from flocc_launch.datasets.pixels import size_of, usable_images
 from flocc_launch.datasets.plain import is_plain, read_plain
 from flocc_launch.datasets.reconstructions import (
     colmap_folder,
-    has_binary_model,
     read_colmap,
     read_replica,
     read_transforms,
@@ -154,7 +153,7 @@ def _known_format(path: Path) -> str | None:
         return "7scenes"
     if image_folder(path) is not None:
         return "kitti-raw"
-    if colmap_folder(path) is not None or has_binary_model(path):
+    if colmap_folder(path) is not None:
         return "colmap"
     if (path / "transforms.json").exists():
         return "transforms"

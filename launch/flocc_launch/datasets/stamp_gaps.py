@@ -1,10 +1,11 @@
 """Messages that come late, as threads and networks swap them, told from a clock that was set back.
 
-A late one fills a gap that those before it left. After a clock was set back all fall among stamps that are there already.
+A late one fills a gap that those before it left. After a clock was set back all fall among stamps that are there.
 """
 
 from bisect import bisect, insort
 from collections import deque
+from itertools import pairwise
 from statistics import quantiles
 
 KEPT = 64
@@ -32,8 +33,7 @@ class StampGaps:
         after = bisect(self._taken, stamp_ns)
         if after == 0 or len(self._came) < 3:
             return False
-        came = list(self._came)
-        step_ns = quantiles((abs(b - a) for a, b in zip(came, came[1:], strict=False)), n=4)[0]
+        step_ns = quantiles((abs(b - a) for a, b in pairwise(self._came)), n=4)[0]
         before_ns, after_ns = self._taken[after - 1], self._taken[after]
         near_ns = min(stamp_ns - before_ns, after_ns - stamp_ns)
         return after_ns - before_ns >= GAP_STEPS_MIN * step_ns and near_ns >= max(NEAR_STEPS_MIN * step_ns, 1)
