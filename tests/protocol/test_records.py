@@ -198,7 +198,9 @@ def test_a_descriptor_of_int8_is_found_in_its_record(index: int, dimension: int)
     array = Array.int8(np.random.default_rng(dimension).standard_normal(dimension))
     for seal in (b"", bytes(64)):
         data = encode_record(replace(KEYFRAME, index=index, descriptor=array)) + seal
-        assert data[int8_descriptor(data)] == array.data
+        place = int8_descriptor(data)
+        assert place is not None
+        assert data[place] == array.data
 
 
 def test_other_records_have_no_descriptor_of_int8() -> None:
