@@ -4,7 +4,8 @@
 
 A drawn mission is solved from nothing when it has so many keyframes. From then on each round has ten closures more, and
 the keyframes that came meanwhile; all rounds are done twice, whole ones from the round before, and such as rest on the
-choice of closures of the last whole one where they can. Prints one JSON object: CPU seconds, ratios to the first solve, joint ATE against the truth.
+choice of closures of the last whole one where they can. Prints one JSON object: CPU seconds, ratios to the first solve,
+joint ATE against the truth.
 """
 
 import argparse
