@@ -194,6 +194,69 @@ def test_a_body_that_odometry_does_not_name_is_found_on_tf_or_refused(tmp_path: 
     assert Recording.open(convert(bag, tmp_path / "found")).T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
 
 
+def test_a_mounting_that_static_transforms_give_twice_is_refused(tmp_path: Path) -> None:
+    script = mounted(walking(False))
+    script.transform("/tf_static", ZERO_NS + 9 * S, ("housing", "camera"), (0.0, 0.1, 0.0), FORWARD)
+    with pytest.raises(DatasetError, match="place camera, between body and camera, in more than one way"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("images", "info"), [("cam0", "cam1"), ("stereo/left", "stereo/right")])
+@pytest.mark.parametrize("frame", ["", "camera"])
+def test_intrinsics_of_the_other_camera_are_not_taken(tmp_path: Path, images: str, info: str, frame: str) -> None:
+    script = robot_of(BagScript(False), f"/{images}/image_raw", "/odom", 0.0, (frame, "body"))
+    script.messages = [
+        (name.replace(images, info) if "info" in name else name, *rest) for name, *rest in script.messages
+    ]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("stamped", ["now", "never", "each"])
+def test_a_path_gives_where_its_end_is(tmp_path: Path, stamped: str) -> None:
+    script = walking(False, odometry=None)
+    for k in range(1, 6):
+        now_ns = ZERO_NS + k * S
+        each = {"now": [now_ns] * (k + 1), "never": [0] * (k + 1), "each": [ZERO_NS + j * S for j in range(k + 1)]}
+        script.path("/path", each[stamped], now_ns)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    first = 0 if stamped == "each" else 1
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(first, 5)])
+
+
+@pytest.mark.parametrize(("topic", "fixed"), [("/goal_pose", "map"), ("/plan", "map"), ("/marker/pose", "camera")])
+def test_poses_of_goals_and_of_what_is_seen_are_no_odometry(tmp_path: Path, topic: str, fixed: str) -> None:
+    script = walking(False, odometry=None)
+    script.fixed = fixed
+    for k in range(11):
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+        script.pose_stamped(topic, ZERO_NS + k * S // 2, 50.0)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])
+
+
+@pytest.mark.parametrize(
+    ("ways", "said"),
+    [((0.0, 0.0), "nothing moves"), ((1.0, 3.0), "rotations never change though the path turns"), ((1.0, 1.0), "")],
+)
+def test_odometry_that_says_nothing_of_rotations_or_motion_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, ways: tuple[float, float], said: str
+) -> None:
+    script = walking(False, odometry=None)
+    for k in range(11):
+        along, across = (min(k, 5) * ways[0], max(k - 5, 0) * (ways[1] - ways[0]))
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "camera"), (along + max(k - 5, 0) * ways[0], across, 0))
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    told = [word for word in ("nothing moves", "rotations never change though the path turns") if word in caplog.text]
+    assert told == ([said] if said else [])
+
+
+def test_odometry_that_is_ground_truth_by_its_name_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = walking(False, odometry="/vicon/odom").write(tmp_path / "run", "mcap")
+    convert(bag, tmp_path / "out")
+    assert "odometry is /vicon/odom, ground truth by its name, which does not drift" in caplog.text
+
+
 @pytest.mark.parametrize("storage", ["bag", "db3"])
 def test_images_that_come_late_go_where_they_belong(tmp_path: Path, storage: str) -> None:
     script = walking(storage == "bag", count=12)

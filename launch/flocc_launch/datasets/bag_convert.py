@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.runtime.pictures import FULL, PictureError
+from flocc_agent.runtime.pose_limits import oddity
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_clock import ClockChoice, choose_clock
-from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, listed, only
+from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, is_truth, listed, only
 from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
     IMAGE_TYPES,
@@ -37,6 +38,7 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT_MESSAGES = 1000
 STRAY = "the stamp is zero, or more than a minute off that of the others"
+UNTURNED_MAX = 1000
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
 HEADER_BYTES = 12
@@ -190,6 +192,8 @@ def _conversion(layout: Layout, robot: RobotTopics, out: Path, options: BagOptio
     others = layout.other_poses(robot)
     if others:
         notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
+    if robot.poses is not None and is_truth(robot.poses.topic):
+        notes.append(f"{layout.bag.path}: odometry is {robot.poses}, ground truth by its name, which does not drift")
     notes += [clock.note] if clock.note else []
     return _Conversion(layout.bag, robot, lens, options, clock, out, identity, notes=notes)
 
@@ -290,6 +294,7 @@ class _Conversion:
     _pictures: ImageWriter = field(init=False)
     _last_pose: tuple[float, ...] = ()
     _stamps: StampGaps = field(default_factory=StampGaps)
+    _unturned: list[tuple[float, ...]] | None = field(default_factory=list)
     _first_info: bytes | None = None
     _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
@@ -382,11 +387,22 @@ class _Conversion:
                 if is_new:
                     self._begin_journey(good_ns, bag_ns)
                 self._pose_span_s = _wider(self._pose_span_s, (good_ns - self.zero_ns) * 1e-9)
+                if good_ns > self._log.last_ns:
+                    self._see_motion(good)
                 if len(posed) == 1 and good_ns == self._log.last_ns and good != self._last_pose:
                     self.poses.damage("the stamp is that of the pose before")
                 elif not self._log.add(good_ns, good) and len(posed) == 1:
                     self.poses.step_back(self._log.last_ns * 1e-9, good_ns * 1e-9)
                 self._last_pose = good
+
+    def _see_motion(self, numbers: tuple[float, ...]) -> None:
+        """Keep positions as long as all rotations are the first one, thinned where there are many."""
+        if self._unturned is None or (self._unturned and numbers[3:] != self._unturned[0][3:]):
+            self._unturned = None
+            return
+        self._unturned.append(numbers)
+        if len(self._unturned) > UNTURNED_MAX:
+            del self._unturned[1::2]
 
     def _begin_journey(self, stamp_ns: int, bag_ns: int) -> None:
         """Go on in another recording, since odometry is of another frame from here."""
@@ -470,6 +486,9 @@ class _Conversion:
         if self.watch.outliers:
             jumps = f"{self.watch.outliers} single poses jump, and were left out"
             self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {jumps}")
+        unturned = np.array(self._unturned or np.empty((0, 7)))
+        if (odd := oddity(unturned[:, :3], unturned[:, 3:])) is not None:
+            self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {odd}")
         tallies = [(self.images, self.robot.image)]
         if self.robot.poses is not None:
             tallies.append((self.poses, self.robot.poses.topic))

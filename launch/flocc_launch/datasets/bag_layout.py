@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, StaticFrames, pose_of_transform
+from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, STILL_MAX, StaticFrames, pose_of_transform
 from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
@@ -24,10 +24,12 @@ from flocc_launch.datasets.source import DatasetError
 Float = NDArray[np.float64]
 
 TRANSFORMS_READ_MAX = 2000
-STILL_MAX = 1e-4
-"""By how much a transform that stays as it is may differ from its first one: metres, and parts of a rotation."""
 FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
 PARTS_OF_NAMES, LETTERS_OR_DIGITS = r"[a-z0-9]+", r"[a-z]+|\d+"
+WANTED_POSES = re.compile(
+    r"plan|goal|setpoint|target|waypoint|initial_?pose|desired|reference|command|cmd", re.IGNORECASE
+)
+"""Leaves of topics that say where a robot is to be, not where it is."""
 TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk")
 
 
@@ -208,7 +210,7 @@ class Layout:
         Raises:
             DatasetError: The one beside the images is of another frame.
         """
-        infos = self._of_types((CAMERA_TYPE,))
+        infos = [t for t in self._of_types((CAMERA_TYPE,)) if not _are_of_two_cameras(t.name, image.name)]
         base = image.name.removesuffix("/compressed")
         near = [t for t in infos if t.name in (f"{base}/camera_info", f"{_parent(base)}/camera_info")]
         near = near or [t for t in infos if _parent(t.name) == _parent(base)]
@@ -254,8 +256,18 @@ class Layout:
 
     def _own_poses(self) -> list[BagTopic]:
         """Topics of poses, without those that are ground truth by their names where there are others."""
-        candidates = self._of_types(POSE_TYPES)
-        return [t for t in candidates if not any(word in t.name.lower() for word in TRUTH_WORDS)] or candidates
+        candidates = [
+            t
+            for t in self._of_types(POSE_TYPES)
+            if not WANTED_POSES.search(t.name.rsplit("/", 1)[-1]) and not self._is_of_something_seen(t)
+        ]
+        return [t for t in candidates if not is_truth(t)] or candidates
+
+    def _is_of_something_seen(self, poses: BagTopic) -> bool:
+        """Whether poses that name no child are in the frame of a camera, as those of markers and objects are."""
+        head = self.head(poses)
+        cameras = {self._frame(topic) for topic in self._of_types(IMAGE_TYPES)} - {""}
+        return head is not None and not head.child and poses.type != "nav_msgs/msg/Odometry" and head.frame in cameras
 
     def _is_another_robot(self, image: BagTopic, poses: BagTopic) -> bool:
         """Whether poses are another robot's than images, by namespaces of one kind or those of frames."""
@@ -317,6 +329,11 @@ class Layout:
         body = self._body(robot.poses)
         if camera == body and camera:
             return np.eye(4), None
+        if (moved := self.static.moved_between(body, camera)) is not None:
+            raise DatasetError(
+                f"{self.bag.path}: static transforms place {moved}, between {body} and {camera}, in more than one way; "
+                "name a camera file with T_body_camera (--camera)"
+            )
         T_body_camera = self.static.between(body, camera) if body and camera else None
         if T_body_camera is None and body and camera and self.edges:
             T_body_camera = self._between_on_tf(body, camera)
@@ -435,6 +452,13 @@ def _by_namespace(names: Sequence[str]) -> dict[str, list[str]]:
     return groups
 
 
+def _are_of_two_cameras(one: str, other: str) -> bool:
+    """Whether topics lie in namespaces that differ in nothing but a number, or left and right."""
+    places = [_parent(name.removesuffix("/compressed")).lower() for name in (one, other)]
+    kinds = [re.sub(r"\d+|left|right|front|rear|back", "#", place) for place in places]
+    return places[0] != places[1] and kinds[0] == kinds[1]
+
+
 def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
     """The left one of two cameras whose names differ in nothing else."""
     lefts = [name for name in topics if "left" in name.lower()]
@@ -443,6 +467,11 @@ def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
         if lefts[0].lower().replace("left", "right") == other.lower():
             return topics[lefts[0]]
     return None
+
+
+def is_truth(topic: BagTopic) -> bool:
+    """Whether a topic of poses is ground truth, by its name."""
+    return any(word in topic.name.lower() for word in TRUTH_WORDS)
 
 
 def named(bag: Bag, types: Sequence[str], name: str) -> BagTopic:
