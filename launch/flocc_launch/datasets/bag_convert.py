@@ -145,9 +145,14 @@ def _convert_robots(
     Raises:
         DatasetError: Something is wrong with the recording of a robot; of several such, the first is raised.
     """
-    runs = [_conversion(layout, robot, out, options) for out, robot in robots.items()]
-    _pass_over(layout.bag, runs, progress)
-    faults = []
+    runs, faults = [], []
+    for out, robot in robots.items():
+        try:
+            runs.append(_conversion(layout, robot, out, options))
+        except DatasetError as error:
+            faults.append(error)
+    if runs:
+        _pass_over(layout.bag, runs, progress)
     for run in runs:
         try:
             run.judge()
@@ -229,6 +234,7 @@ class Tally:
     Attributes:
         seen: Messages.
         damaged: Of them, those that cannot be used.
+        repeated: Of them, those with the stamp of the one before.
         backwards: Of them, those that go back in time.
         reason: Of the first damaged one.
         step: Of the first that goes back.
@@ -236,6 +242,7 @@ class Tally:
 
     seen: int = 0
     damaged: int = 0
+    repeated: int = 0
     backwards: int = 0
     reason: str = ""
     step: str = ""
@@ -253,8 +260,10 @@ class Tally:
     def sentences(self, topic: BagTopic) -> list[str]:
         """What was left out."""
         damaged = f"topic {topic.name}: {self.damaged} of {self.seen} messages were left out: {self.reason}"
+        twice = f"topic {topic.name}: {self.repeated} of {self.seen} messages repeat a stamp, and were left out"
         back = f"topic {topic.name}: {self.step}; {self.backwards} of {self.seen} messages were left out"
-        return [*([damaged] if self.damaged else []), *([back] if self.backwards else [])]
+        told = ((damaged, self.damaged), (twice, self.repeated), (back, self.backwards))
+        return [sentence for sentence, count in told if count]
 
     def is_too_much(self) -> bool:
         """Whether the topic cannot be trusted."""
@@ -294,6 +303,7 @@ class _Conversion:
     _pictures: ImageWriter = field(init=False)
     _last_pose: tuple[float, ...] = ()
     _stamps: StampGaps = field(default_factory=StampGaps)
+    _frame: str | None = None
     _unturned: list[tuple[float, ...]] | None = field(default_factory=list)
     _first_info: bytes | None = None
     _infos_differ: int = 0
@@ -422,6 +432,7 @@ class _Conversion:
             return
         try:
             message = self.bag.decoded(raw, topic)
+            self._see_frame(message.header.frame_id)
             taken_ns = bag_ns if self.clock.is_bag else stamp_ns(message.header)
             if taken_ns == 0 or (not self.clock.is_bag and self.clock.is_off(taken_ns, bag_ns)):
                 raise DatasetError(STRAY)
@@ -430,6 +441,9 @@ class _Conversion:
             stamp_s = (taken_ns - self.zero_ns) * 1e-9
             if self._done_s is not None and stamp_s <= self._done_s + 1e-9:
                 return
+            if stamp_s == self._writer.last_stamp_s:
+                tally.repeated += 1
+                return
             if not self._stamps.fits(taken_ns):
                 tally.step_back(self._writer.last_stamp_s or 0.0, stamp_s)
                 return
@@ -437,6 +451,16 @@ class _Conversion:
             self._image_span_s = _wider(self._image_span_s, stamp_s)
         except DatasetError as error:
             tally.damage(_bare(error, topic))
+
+    def _see_frame(self, frame: str) -> None:
+        """See that images are of the frame of the first one.
+
+        Raises:
+            DatasetError: They are of another, as of another camera on the same topic.
+        """
+        self._frame = frame if self._frame is None else self._frame
+        if frame != self._frame:
+            raise DatasetError(f"an image is of the frame {frame or 'no name'}, the first one of {self._frame}")
 
     def _encoded(self, message: Any) -> tuple[bytes, str]:
         encoded, suffix = image_file(message, self.robot.image, self.options.jpeg)

@@ -90,8 +90,8 @@ def believable(lens: Lens, path: Path | str) -> Lens:
     is_square = abs(camera.fx - camera.fy) < SQUARE_RATIO * camera.fx
     if not is_square and abs(camera.fx - camera.cx) < EQUAL_RATIO * camera.fx:
         raise DatasetError(
-            f"{path}: {camera.fx:g} {camera.fy:g} {camera.cx:g} {camera.cy:g} would be fx cx fy cy, by their sizes, where "
-            "fx fy cx cy is read; write each under its name"
+            f"{path}: {camera.fx:g} {camera.fy:g} {camera.cx:g} {camera.cy:g} would be fx cx fy cy, by their sizes, "
+            "where fx fy cx cy is read; write each under its name"
         )
     if t_m > MOUNTING_MAX_M:
         raise DatasetError(f"{path}: the camera is {t_m:g} m from its body; write the mounting in metres")
