@@ -25,6 +25,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 Floats = NDArray[np.float32]
+Places = NDArray[np.int32]
 
 NOTHING = -2.0
 """Similarity with a log of which no row is here: below every threshold."""
@@ -65,6 +66,9 @@ class Descriptor(NamedTuple):
 class _Rows:
     """Descriptors of one length of one or more logs, as the rows of one growing matrix.
 
+    A row that goes is replaced by the last one, so a log's rows lie anywhere; their places are listed in the order of
+    its keyframes.
+
     Attributes:
         dimension: D.
         logs: Number (N,) of each row's log.
@@ -78,9 +82,11 @@ class _Rows:
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
-        self._by_log: dict[int, array[int]] = {}
-        self._thinned = 0
-        self._unthinned: dict[int, int] = {}
+        self._nearest = np.empty(CAPACITY_FIRST, dtype=np.float32)
+        """Of rows that stand for older ones: no earlier one that stands is more similar."""
+        self._places: dict[int, array[int]] = {}
+        self._standing: dict[int, int] = {}
+        """How many of a log's rows, its first ones, stand for older ones."""
         self._same_place: dict[int, float] = {}
 
     def __len__(self) -> int:
@@ -89,7 +95,7 @@ class _Rows:
     @property
     def numbers(self) -> list[int]:
         """Of each log that has rows."""
-        return list(self._unthinned)
+        return list(self._places)
 
     @property
     def logs(self) -> NDArray[np.int32]:
@@ -107,16 +113,15 @@ class _Rows:
             self._inverse_norms = np.resize(self._inverse_norms, self._count + more)
             self._logs = np.resize(self._logs, self._count + more)
             self._indices = np.resize(self._indices, self._count + more)
+            self._nearest = np.resize(self._nearest, self._count + more)
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
         self._rows[self._count] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
-        if log in self._by_log:
-            self._by_log[log].append(self._count)
+        self._places.setdefault(log, array("i")).append(self._count)
         self._count += 1
-        self._unthinned[log] = self._unthinned.get(log, 0) + 1
 
     def thin(self, log: int, held: int) -> None:
         """Keep a log's newest so many rows whole, and at most so many that stand for its older ones.
@@ -124,51 +129,65 @@ class _Rows:
         A log is looked through in blocks of its own rows, and no other one's decide, so that robots which hold it find
         the same ones to stay: they ask for the same pairs then, instead of each for its own.
         """
-        while self._unthinned[log] >= held + THINNED_AT_ONCE:
-            oldest = self._thinned + np.flatnonzero(self._logs[self._thinned : self._count] == log)[:THINNED_AT_ONCE]
-            stay = oldest[self._stays(log, oldest, self._standing(log))]
-            others = np.setdiff1d(np.arange(self._thinned, self._count), oldest, assume_unique=True)
-            self._order(self._thinned, np.concatenate([stay, others]))
-            self._thinned += len(stay)
-            self._unthinned[log] -= len(oldest)
-            while len(self._standing(log)) > held and self._same_place.get(log, 0.0) > -1.0:
-                self._thin_again(log)
+        while len(self._places[log]) - self._standing.get(log, 0) >= held + THINNED_AT_ONCE:
+            first = self._standing.setdefault(log, 0)
+            bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
+            places = self.places(log)
+            self._standing[log] += THINNED_AT_ONCE
+            self._leave_out(log, self._represented(places[first : first + THINNED_AT_ONCE], places[:first], bound))
+            while self._standing[log] > held and self._same_place[log] > -1.0:
+                self._thin_again(log, held)
 
-    def _thin_again(self, log: int) -> None:
-        """Look through a log's rows that stand for others with a lower bound."""
+    def _thin_again(self, log: int, held: int) -> None:
+        """Look through a log's rows that stand for others with a lower bound, where that may make few enough."""
         self._same_place[log] -= SAME_PLACE_STEP
-        standing, stay = self._standing(log), np.empty(0, dtype=np.intp)
-        for first in range(0, len(standing), THINNED_AT_ONCE):
-            block = standing[first : first + THINNED_AT_ONCE]
-            stay = np.concatenate([stay, block[self._stays(log, block, stay)]])
-        gone = np.setdiff1d(standing, stay, assume_unique=True)
-        self._order(0, np.setdiff1d(np.arange(self._count), gone, assume_unique=True))
-        self._thinned -= len(gone)
+        bound, standing = self._same_place[log], self.places(log)[: self._standing[log]]
+        is_alone = self._nearest[standing] < bound
+        if np.count_nonzero(is_alone) > held:
+            return
+        stay, near, gone = standing[is_alone], standing[~is_alone], []
+        for first in range(0, len(near), THINNED_AT_ONCE):
+            block = near[first : first + THINNED_AT_ONCE]
+            gone.append(self._represented(block, stay, bound))
+            stay = np.concatenate([stay, np.setdiff1d(block, gone[-1], assume_unique=True)])
+        self._leave_out(log, np.concatenate(gone))
 
-    def _standing(self, log: int) -> NDArray[np.intp]:
-        """Places of a log's rows that stand for older ones."""
-        return np.flatnonzero(self._logs[: self._thinned] == log)
+    def places(self, log: int) -> Places:
+        """Places of a log's rows, in the order of its keyframes."""
+        return np.array(self._places[log], dtype=np.int32)
 
-    def _stays(self, log: int, block: NDArray[np.intp], before: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which rows (K,) of a log neither one of those before them nor one before it in the block stands for."""
-        bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
-        rows = self._units(block)
-        stays = np.ones(len(block), dtype=bool)
-        for first in range(0, len(before), ROWS_AT_ONCE):
-            stays &= ~np.any(rows @ self._units(before[first : first + ROWS_AT_ONCE]).T >= bound, axis=1)
-        among = rows @ rows.T >= bound
+    def _represented(self, block: Places, others: Places, bound: float) -> Places:
+        """Which rows of a block others of their log stand for, or one before them in the block that stays."""
+        rows, nearest = self._units(block), np.full(len(block), NOTHING, dtype=np.float32)
+        for first in range(0, len(others), ROWS_AT_ONCE):
+            similarities = rows @ self._units(others[first : first + ROWS_AT_ONCE]).T
+            np.maximum(nearest, similarities.max(axis=1), out=nearest)
+        among, stays = rows @ rows.T, nearest < bound
         for k in np.flatnonzero(stays).tolist():
-            stays[k] = not np.any(among[k, :k] & stays[:k])
-        return stays
+            before = among[k, :k][stays[:k]]
+            nearest[k] = max(nearest[k], before.max(initial=NOTHING))
+            stays[k] = nearest[k] < bound
+        self._nearest[block] = nearest
+        return block[~stays]
 
-    def _order(self, first: int, order: NDArray[np.intp]) -> None:
-        """Put these rows after the first so many, and leave out what is not among them."""
-        self._by_log.clear()
-        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
-            values[first : first + len(order)] = values[order]
-        self._count = first + len(order)
+    def _leave_out(self, log: int, gone: Places) -> None:
+        """Take away rows of a log that others stand for."""
+        places = self.places(log)
+        self._places[log] = array("i", places[~np.isin(places, gone)].tolist())
+        self._standing[log] -= len(gone)
+        for place in np.sort(gone)[::-1].tolist():
+            self._count -= 1
+            if place != self._count:
+                self._move(self._count, place)
 
-    def _units(self, places: NDArray[np.intp]) -> Floats:
+    def _move(self, place: int, to: int) -> None:
+        """Put a row where one is no longer needed."""
+        for values in (self._rows, self._inverse_norms, self._logs, self._indices, self._nearest):
+            values[to] = values[place]
+        of_log = self._places[int(self._logs[to])]
+        of_log[bisect_left(of_log, int(self._indices[to]), key=self._indices.item)] = to
+
+    def _units(self, places: Places) -> Floats:
         """Rows (K, D) of unit length."""
         return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
 
@@ -185,7 +204,7 @@ class _Rows:
 
     def around(self, log: int, index: int, reach: int) -> tuple[Floats, int] | None:
         """Unit descriptors (K, D) of a log's keyframes up to `reach` from one, and which is its; None without it."""
-        rows = self._rows_of(log)
+        rows = self._places.get(log, array("i"))
         first = bisect_left(rows, index - reach, key=self._indices.item)
         near = rows[first : first + 2 * reach + 1]
         indices = self._indices[near].tolist()
@@ -193,13 +212,6 @@ class _Rows:
             return None
         near = near[: bisect_right(indices, index + reach)]
         return self._rows[near] * self._inverse_norms[near, None], indices.index(index)
-
-    def _rows_of(self, log: int) -> "array[int]":
-        """Rows of a log, in the order of its keyframes."""
-        rows = self._by_log.get(log)
-        if rows is None:
-            rows = self._by_log[log] = array("i", np.flatnonzero(self.logs == log).tolist())
-        return rows
 
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
@@ -271,10 +283,11 @@ class PlaceRecognition:
                 best[name] = similarity
         return best
 
-    def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
+    def on_keyframes(self, keyframes: Sequence[tuple[KeyframeId, Array]]) -> list[Found]:
         """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
         found: list[Found] = []
         others: list[tuple[KeyframeId, Descriptor]] = []
+        self._meet(keyframes)
         for keyframe, place in keyframes:
             descriptor = comparable(place)
             if descriptor is None or not self._add(keyframe, descriptor):
@@ -304,14 +317,8 @@ class PlaceRecognition:
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
         log, dimension = keyframe.log, len(descriptor.row)
-        number = self._numbers.get(log)
-        if number is None:
-            number = self._numbers[log] = len(self._logs)
-            self._logs.append(log)
-            self._dimensions.append(dimension)
-            self._best.append(-1.0)
-            self._thin_all()
-        elif self._dimensions[number] != dimension:
+        number = self._numbers[log]
+        if self._dimensions[number] != dimension:
             return False
         if log == self._own:
             if self._own_rows is None:
@@ -326,8 +333,17 @@ class PlaceRecognition:
             rows.thin(number, self._share)
         return True
 
-    def _thin_all(self) -> None:
-        """With another log each has a smaller share, also one that gets no more keyframes."""
+    def _meet(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> None:
+        """Number logs that are new: each has a smaller share then, also one that gets no more keyframes."""
+        known = len(self._logs)
+        for keyframe, place in keyframes:
+            if keyframe.log not in self._numbers and (descriptor := comparable(place)) is not None:
+                self._numbers[keyframe.log] = len(self._logs)
+                self._logs.append(keyframe.log)
+                self._dimensions.append(len(descriptor.row))
+                self._best.append(-1.0)
+        if len(self._logs) == known:
+            return
         for rows in (*self._others.values(), *([] if self._own_rows is None else [self._own_rows])):
             for number in rows.numbers:
                 rows.thin(number, self._share)
@@ -348,8 +364,7 @@ class PlaceRecognition:
         np.maximum.at(best, others.logs, similarities)
         self._best = np.maximum(best, self._best).tolist()
         for number in np.flatnonzero(best >= self._parameters.similarity_threshold).tolist():
-            rows = np.flatnonzero(others.logs == number)
-            found += self._candidates(keyframe, self._logs[number], others.indices[rows], similarities[rows])
+            found += self._candidates(keyframe, number, others, similarities)
         return _sorted(found)
 
     def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
@@ -366,7 +381,7 @@ class PlaceRecognition:
             if highest > self._best[number]:
                 self._best[number] = highest
             if highest >= self._parameters.similarity_threshold:
-                found += _sorted(self._candidates(keyframe, self._own, own.indices, similarities[k]))
+                found += _sorted(self._candidates(keyframe, self._numbers[self._own], own, similarities[k]))
         return found
 
     def _is_compared(self, log: LogId) -> bool:
@@ -380,19 +395,27 @@ class PlaceRecognition:
         apart = keyframe.index - own.indices
         similarities = own.similarities([descriptor])[0]
         far = np.where(apart >= self._parameters.own_gap_keyframes, similarities, np.float32(-2.0))
-        return self._candidates(keyframe, self._own, own.indices, far)
+        return self._candidates(keyframe, self._numbers[self._own], own, far)
 
-    def _candidates(
-        self, keyframe: KeyframeId, log: LogId, indices: NDArray[np.int32], similarities: Floats
-    ) -> list[Found]:
-        """The most similar keyframes of one log, those above the threshold."""
-        best = [int(similarities.argmax())]
+    def _candidates(self, keyframe: KeyframeId, number: int, rows: _Rows, similarities: Floats) -> list[Found]:
+        """The most similar keyframes of one log, those above the threshold.
+
+        Args:
+            keyframe: That it is compared with.
+            number: The log's.
+            rows: Where the log is.
+            similarities: (N,) of all rows.
+        """
+        log, places = self._logs[number], rows.places(number)
+        of_log = similarities[places]
+        best = [int(of_log.argmax())]
         if self._parameters.best_matches > 1:
-            best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
+            best = np.argsort(-of_log, kind="stable")[: self._parameters.best_matches].tolist()
+        indices = rows.indices[places[best]].tolist()
         return [
-            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, int(indices[k]))), float(similarities[k])))
-            for k in best
-            if similarities[k] >= self._parameters.similarity_threshold
+            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, index)), similarity))
+            for index, similarity in zip(indices, of_log[best].tolist(), strict=True)
+            if similarity >= self._parameters.similarity_threshold
         ]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flocc_agent.core.parameters import PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import Found, PlaceRecognition, direction
+from flocc_agent.core.place_recognition import THINNED_AT_ONCE, Found, PlaceRecognition, direction
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -80,3 +80,31 @@ def test_every_keyframe_has_a_partner_in_each_other_log_where_anything_is_alike_
     first, second = (next(each for each in keyframes if each[0].log == log) for log in (OTHERS[0], OWN))
     assert recognition.on_keyframes([first]) == []
     assert [candidate.pair.other(OWN_FIRST) for _, candidate in recognition.on_keyframes([second])] == [first[0]]
+
+
+def test_rows_that_stand_for_others_are_few_unlike_and_found_by_their_keyframes() -> None:
+    """Many logs of which none is like itself: bounds fall until few enough stay, and what stays is where it belongs."""
+    rng = np.random.default_rng(5)
+    logs, held, count = [LogId(f"r{k}") for k in range(2, 8)], 1200, 900
+    keyframes = [(KeyframeId(log, k), Array.int8(rng.standard_normal(64))) for log in logs for k in range(count)]
+    units = {keyframe: direction(array) for keyframe, array in keyframes}
+    whole, parts = (
+        PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.99), keyframes_held=held)
+        for _ in range(2)
+    )
+    whole.on_keyframes(keyframes)
+    for first in range(0, len(keyframes), 500):
+        parts.on_keyframes(keyframes[first : first + 500])
+    share = held // (len(logs) - 1)
+    for recognition in (whole, parts):
+        assert recognition.rows <= len(logs) * (2 * share + THINNED_AT_ONCE)
+        for log in logs:
+            kept = [k for k in range(count) if (found := recognition._around(KeyframeId(log, k), 0)) and len(found[0])]
+            assert set(range(count - share, count)) <= set(kept)
+            assert len(kept) <= 2 * share + THINNED_AT_ONCE
+            for k in kept:
+                around = recognition._around(KeyframeId(log, k), 0)
+                assert around is not None
+                np.testing.assert_allclose(around[0][around[1]], units[KeyframeId(log, k)], atol=1e-6)
+            asked = KeyframeId(OWN, 0), dict(keyframes)[KeyframeId(log, kept[0])]
+            assert recognition.on_keyframes([asked])[0][1].pair.other(asked[0]) == KeyframeId(log, kept[0])
