@@ -11,9 +11,10 @@ that was a moment before or on an earlier visit. What a log has of one place doe
 import math
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate, chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 Floats = NDArray[np.float32]
-Places = NDArray[np.int32]
+Places = NDArray[np.intp]
 
 NOTHING = -2.0
 """Similarity with a log of which no row is here: below every threshold."""
@@ -63,11 +64,18 @@ class Descriptor(NamedTuple):
     inverse_norm: float
 
 
-class _Rows:
-    """Descriptors of one length of one or more logs, as the rows of one growing matrix.
+@dataclass(frozen=True, slots=True)
+class _Lent:
+    """Descriptors of one log that somebody else holds, as rows (K, D) of int8."""
 
-    A row that goes is replaced by the last one, so a log's rows lie anywhere; their places are listed in the order of
-    its keyframes.
+    log: int
+    rows: NDArray[np.int8]
+
+
+class _Rows:
+    """Descriptors of one length of one or more logs: the rows of one growing matrix, and before them lent ones.
+
+    A row that goes is replaced by the last one, so a log's rows lie anywhere.
 
     Attributes:
         dimension: D.
@@ -78,15 +86,18 @@ class _Rows:
     def __init__(self, dimension: int, dtype: type[np.int8 | np.float32]) -> None:
         self.dimension = dimension
         self._count = 0
+        self._lent: list[_Lent] = []
+        self._lent_ends = [0]
         self._rows: NDArray[Any] = np.empty((CAPACITY_FIRST, dimension), dtype=dtype)
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._nearest = np.empty(CAPACITY_FIRST, dtype=np.float32)
         """Of rows that stand for older ones: no earlier one that stands is more similar."""
-        self._places: dict[int, array[int]] = {}
+        self._by_log: dict[int, array[int]] = {}
         self._standing: dict[int, int] = {}
         """How many of a log's rows, its first ones, stand for older ones."""
+        self._unthinned: dict[int, int] = {}
         self._same_place: dict[int, float] = {}
 
     def __len__(self) -> int:
@@ -95,7 +106,7 @@ class _Rows:
     @property
     def numbers(self) -> list[int]:
         """Of each log that has rows."""
-        return list(self._places)
+        return list(self._unthinned)
 
     @property
     def logs(self) -> NDArray[np.int32]:
@@ -105,23 +116,77 @@ class _Rows:
     def indices(self) -> NDArray[np.int32]:
         return self._indices[: self._count]
 
+    @property
+    def _first(self) -> int:
+        """Which is the first row of the matrix."""
+        return self._lent_ends[-1]
+
     def append(self, log: int, index: int, descriptor: Descriptor) -> None:
         """Add a row; the first one that is no int8 makes all of them float32."""
-        if self._count == len(self._rows):
-            more = max(CAPACITY_FIRST, self._count // 4)
-            self._rows = np.concatenate([self._rows, np.empty((more, self.dimension), dtype=self._rows.dtype)])
-            self._inverse_norms = np.resize(self._inverse_norms, self._count + more)
-            self._logs = np.resize(self._logs, self._count + more)
-            self._indices = np.resize(self._indices, self._count + more)
-            self._nearest = np.resize(self._nearest, self._count + more)
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
-        self._rows[self._count] = descriptor.row
+        self._make_room(1)
+        self._rows[self._count - self._first] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
-        self._places.setdefault(log, array("i")).append(self._count)
+        if log in self._by_log:
+            self._by_log[log].append(self._count)
         self._count += 1
+        self._unthinned[log] = self._unthinned.get(log, 0) + 1
+
+    def _make_room(self, more: int) -> None:
+        """Let so many rows follow in the matrix."""
+        held = self._count - self._first
+        if held + more > len(self._rows):
+            size = max(held + more, len(self._rows) + max(CAPACITY_FIRST, held // 4))
+            rows = np.empty((size, self.dimension), dtype=self._rows.dtype)
+            rows[:held] = self._rows[:held]
+            self._rows = rows
+        if self._count + more > len(self._logs):
+            size = self._count + max(CAPACITY_FIRST, self._count // 4, more)
+            self._inverse_norms = np.resize(self._inverse_norms, size)
+            self._logs = np.resize(self._logs, size)
+            self._indices = np.resize(self._indices, size)
+            self._nearest = np.resize(self._nearest, size)
+
+    # Rows that somebody else holds
+
+    def lend(self, log: int, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
+        """Read newer descriptors of a log where somebody else holds them, if these are the same, and hold none."""
+        held = self._rows_of(log)
+        at = bisect_left(held, indices[0], key=self._indices.item)
+        own = np.array(held[at : at + len(indices)], dtype=np.intp)
+        if self._rows.dtype != np.int8 or len(own) != len(indices):
+            return
+        if at < self._standing.get(log, 0) or own.min() < self._first:
+            return
+        if self._indices[own].tolist() != list(indices) or not np.array_equal(self._rows[own - self._first], rows):
+            return
+        left = self._count - len(own)
+        order, holes = np.arange(self._first, left), np.sort(own[own < left])
+        order[holes - self._first] = np.setdiff1d(np.arange(left, self._count), own, assume_unique=True)
+        self._rows[holes - self._first] = self._rows[order[holes - self._first] - self._first]
+        size = len(order) + max(CAPACITY_FIRST, len(order) // 4)
+        if len(self._rows) > size:
+            self._rows = self._rows[:size].copy()
+        self._order_columns(self._first, np.concatenate([own, order]))
+        self._lent.append(_Lent(log, rows))
+        self._lent_ends.append(self._first + len(rows))
+
+    def _take_back(self, log: int) -> None:
+        """Hold the oldest rows of a log here again, as many as are looked through at one time."""
+        standing = self._standing.get(log, 0)
+        while (lowest := self.places(log)[standing : standing + THINNED_AT_ONCE].min()) < self._first:
+            number = bisect_right(self._lent_ends, lowest) - 1
+            first, end = self._lent_ends[number], self._lent_ends[number + 1]
+            self._make_room(end - first)
+            held = self._count - self._first
+            self._rows[held : held + end - first] = self._lent.pop(number).rows
+            self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
+            self._order_columns(first, np.concatenate([np.arange(end, self._count), np.arange(first, end)]))
+
+    # Old rows
 
     def thin(self, log: int, held: int) -> None:
         """Keep a log's newest so many rows whole, and at most so many that stand for its older ones.
@@ -129,11 +194,13 @@ class _Rows:
         A log is looked through in blocks of its own rows, and no other one's decide, so that robots which hold it find
         the same ones to stay: they ask for the same pairs then, instead of each for its own.
         """
-        while len(self._places[log]) - self._standing.get(log, 0) >= held + THINNED_AT_ONCE:
+        while self._unthinned[log] >= held + THINNED_AT_ONCE:
+            self._take_back(log)
             first = self._standing.setdefault(log, 0)
             bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
             places = self.places(log)
             self._standing[log] += THINNED_AT_ONCE
+            self._unthinned[log] -= THINNED_AT_ONCE
             self._leave_out(log, self._represented(places[first : first + THINNED_AT_ONCE], places[:first], bound))
             while self._standing[log] > held and self._same_place[log] > -1.0:
                 self._thin_again(log, held)
@@ -154,7 +221,7 @@ class _Rows:
 
     def places(self, log: int) -> Places:
         """Places of a log's rows, in the order of its keyframes."""
-        return np.array(self._places[log], dtype=np.int32)
+        return np.array(self._rows_of(log), dtype=np.intp)
 
     def _represented(self, block: Places, others: Places, bound: float) -> Places:
         """Which rows of a block others of their log stand for, or one before them in the block that stays."""
@@ -173,7 +240,7 @@ class _Rows:
     def _leave_out(self, log: int, gone: Places) -> None:
         """Take away rows of a log that others stand for."""
         places = self.places(log)
-        self._places[log] = array("i", places[~np.isin(places, gone)].tolist())
+        self._by_log[log] = array("i", places[~np.isin(places, gone)].tolist())
         self._standing[log] -= len(gone)
         for place in np.sort(gone)[::-1].tolist():
             self._count -= 1
@@ -182,14 +249,35 @@ class _Rows:
 
     def _move(self, place: int, to: int) -> None:
         """Put a row where one is no longer needed."""
-        for values in (self._rows, self._inverse_norms, self._logs, self._indices, self._nearest):
+        self._rows[to - self._first] = self._rows[place - self._first]
+        for values in (self._inverse_norms, self._logs, self._indices, self._nearest):
             values[to] = values[place]
-        of_log = self._places[int(self._logs[to])]
-        of_log[bisect_left(of_log, int(self._indices[to]), key=self._indices.item)] = to
+        of_log = self._by_log.get(int(self._logs[to]))
+        if of_log is not None:
+            of_log[bisect_left(of_log, int(self._indices[to]), key=self._indices.item)] = to
+
+    def _order_columns(self, first: int, order: Places) -> None:
+        """Put what is known of these rows after that of the first so many."""
+        self._by_log.clear()
+        for values in (self._inverse_norms, self._logs, self._indices, self._nearest):
+            values[first : first + len(order)] = values[order]
+        self._count = first + len(order)
 
     def _units(self, places: Places) -> Floats:
         """Rows (K, D) of unit length."""
-        return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
+        if places.min(initial=self._first) >= self._first:
+            rows = self._rows[places - self._first].astype(np.float32)
+        else:
+            rows = np.array([self._row(place) for place in places.tolist()], dtype=np.float32)
+        return np.asarray(rows * self._inverse_norms[places, None])
+
+    def _row(self, place: int) -> NDArray[Any]:
+        if place >= self._first:
+            return np.asarray(self._rows[place - self._first])
+        number = bisect_right(self._lent_ends, place) - 1
+        return np.asarray(self._lent[number].rows[place - self._lent_ends[number]])
+
+    # Comparing
 
     def similarities(self, descriptors: Sequence[Descriptor]) -> Floats:
         """Cosine similarities (B, N) of B descriptors with all rows."""
@@ -204,26 +292,52 @@ class _Rows:
 
     def around(self, log: int, index: int, reach: int) -> tuple[Floats, int] | None:
         """Unit descriptors (K, D) of a log's keyframes up to `reach` from one, and which is its; None without it."""
-        rows = self._places.get(log, array("i"))
+        rows = self._rows_of(log)
         first = bisect_left(rows, index - reach, key=self._indices.item)
         near = rows[first : first + 2 * reach + 1]
         indices = self._indices[near].tolist()
         if index not in indices:
             return None
         near = near[: bisect_right(indices, index + reach)]
-        return self._rows[near] * self._inverse_norms[near, None], indices.index(index)
+        return self._units(np.array(near, dtype=np.intp)), indices.index(index)
+
+    def _rows_of(self, log: int) -> "array[int]":
+        """Rows of a log, in the order of its keyframes."""
+        rows = self._by_log.get(log)
+        if rows is None:
+            places = np.flatnonzero(self.logs == log)
+            in_order = places[np.argsort(self._indices[places], kind="stable")]
+            rows = self._by_log[log] = array("i", in_order.tolist())
+        return rows
 
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
-        if self._rows.dtype == np.float32:
+        if not self._lent and self._rows.dtype == np.float32:
             return np.asarray(queries @ self._rows[: self._count].T)
         products = np.empty((len(queries), self._count), dtype=np.float32)
         floats = np.empty((ROWS_AT_ONCE, self.dimension), dtype=np.float32)
-        for first in range(0, self._count, ROWS_AT_ONCE):
-            rows = self._rows[first : min(first + ROWS_AT_ONCE, self._count)]
-            np.copyto(floats[: len(rows)], rows)
-            products[:, first : first + len(rows)] = queries @ floats[: len(rows)].T
+        at = 0
+        for rows in self._pieces():
+            part = floats[: sum(map(len, rows))]
+            np.concatenate(rows, out=part, casting="same_kind")
+            products[:, at : at + len(part)] = queries @ part.T
+            at += len(part)
         return products
+
+    def _pieces(self) -> Iterator[list[NDArray[Any]]]:
+        """All rows in their order, at most so many at one time as are compared together."""
+        together: list[NDArray[Any]] = []
+        room = ROWS_AT_ONCE
+        held = self._rows[: self._count - self._first]
+        own = (held[k : k + ROWS_AT_ONCE] for k in range(0, len(held), ROWS_AT_ONCE))
+        for rows in chain((lent.rows for lent in self._lent), own):
+            if len(rows) > room:
+                yield together
+                together, room = [], ROWS_AT_ONCE
+            together.append(rows)
+            room -= len(rows)
+        if together:
+            yield together
 
 
 class PlaceRecognition:
@@ -299,6 +413,13 @@ class PlaceRecognition:
                 found += self._among_all(keyframe, descriptor)
                 others = []
         return found + self._among_own(others)
+
+    def lend(self, log: LogId, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
+        """Somebody holds descriptors of a log's keyframes as rows (K, D) that never change: compare them there."""
+        number = self._numbers.get(log)
+        others = self._others.get(rows.shape[1])
+        if indices and number is not None and others is not None and self._dimensions[number] == others.dimension:
+            others.lend(number, indices, rows)
 
     def agreement(self, pair: CandidatePair) -> float | None:
         """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""
