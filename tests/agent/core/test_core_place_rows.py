@@ -89,7 +89,7 @@ def test_rows_that_stand_for_others_are_few_unlike_and_found_by_their_keyframes(
     rng = np.random.default_rng(5)
     logs, held, count = [LogId(f"r{k}") for k in range(2, 8)], 1200, 900
     keyframes = [(KeyframeId(log, k), Array.int8(rng.standard_normal(64))) for log in logs for k in range(count)]
-    units = {keyframe: direction(array) for keyframe, array in keyframes}
+    arrays = dict(keyframes)
     whole, parts = (
         PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.99), keyframes_held=held)
         for _ in range(2)
@@ -101,15 +101,16 @@ def test_rows_that_stand_for_others_are_few_unlike_and_found_by_their_keyframes(
     for recognition in (whole, parts):
         assert recognition.rows <= len(logs) * (2 * share + THINNED_AT_ONCE)
         for log in logs:
-            kept = [k for k in range(count) if (found := recognition._around(KeyframeId(log, k), 0)) and len(found[0])]
+            kept = {k: around for k in range(count) if (around := recognition._around(KeyframeId(log, k), 0))}
             assert set(range(count - share, count)) <= set(kept)
             assert len(kept) <= 2 * share + THINNED_AT_ONCE
-            for k in kept:
-                around = recognition._around(KeyframeId(log, k), 0)
-                assert around is not None
-                np.testing.assert_allclose(around[0][around[1]], units[KeyframeId(log, k)], atol=1e-6)
-            asked = KeyframeId(OWN, 0), dict(keyframes)[KeyframeId(log, kept[0])]
-            assert recognition.on_keyframes([asked])[0][1].pair.other(asked[0]) == KeyframeId(log, kept[0])
+            for k, (units, number) in kept.items():
+                unit = direction(arrays[KeyframeId(log, k)])
+                assert unit is not None
+                np.testing.assert_allclose(units[number], unit, atol=1e-6)
+            oldest = KeyframeId(log, min(kept))
+            found = recognition.on_keyframes([(OWN_FIRST, arrays[oldest])])
+            assert found[0][1].pair.other(OWN_FIRST) == oldest
 
 
 class Logs:
