@@ -360,7 +360,8 @@ def alarms(judges: Judges, bound: float, bounds_of_all: tuple[float, float], exc
 
     Partners vote with their certainty; against a closure only those with more agreement of their own. Where half as
     many agree it is no single mistake: the solver decides, and says so. The bounds of what all say together are those
-    of the whole difference, and of a length that would have to collapse.
+    of the whole difference, and of a length that would have to collapse; that begins with the surest, which may be
+    wrong, so that it holds none with which several agree that together are surer than those that do not.
     """
     count, by = judges.size, judges.with_partners
     others = judges.partners != np.arange(count)[:, None]

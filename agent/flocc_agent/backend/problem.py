@@ -73,11 +73,8 @@ class Problem:
         ids = [self.closure_ids[row - self.closure_rows.start] for row in rows.tolist()]
         ratio = np.array([max(lengths_m.get(k, NEAR_M), NEAR_M) for k in ids])
         part, scale_initial = taken(self.edges, rows), self.scale_initial.copy()
-        d, L, sigma = (
-            part.d * ratio[:, None],
-            part.sqrt_information.copy(),
-            np.maximum(part.sigma / ratio, FITTED_SIGMA_RATIO),
-        )
+        d, L = part.d * ratio[:, None], part.sqrt_information.copy()
+        sigma = np.maximum(part.sigma / ratio, FITTED_SIGMA_RATIO)
         L[:, :, 3:] /= ratio[:, None, None]
         covariances = np.linalg.inv(np.swapaxes(L, 1, 2) @ L)
         longer = {

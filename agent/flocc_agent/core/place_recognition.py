@@ -11,9 +11,10 @@ that was a moment before or on an earlier visit. What a log has of one place doe
 import math
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate, chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 Floats = NDArray[np.float32]
+Places = NDArray[np.intp]
 
 NOTHING = -2.0
 """Similarity with a log of which no row is here: below every threshold."""
@@ -62,8 +64,18 @@ class Descriptor(NamedTuple):
     inverse_norm: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Lent:
+    """Descriptors of one log that somebody else holds, as rows (K, D) of int8."""
+
+    log: int
+    rows: NDArray[np.int8]
+
+
 class _Rows:
-    """Descriptors of one length of one or more logs, as the rows of one growing matrix.
+    """Descriptors of one length of one or more logs: the rows of one growing matrix, and before them lent ones.
+
+    A row that goes is replaced by the last one, so a log's rows lie anywhere.
 
     Attributes:
         dimension: D.
@@ -74,12 +86,17 @@ class _Rows:
     def __init__(self, dimension: int, dtype: type[np.int8 | np.float32]) -> None:
         self.dimension = dimension
         self._count = 0
+        self._lent: list[_Lent] = []
+        self._lent_ends = [0]
         self._rows: NDArray[Any] = np.empty((CAPACITY_FIRST, dimension), dtype=dtype)
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
+        self._nearest = np.empty(CAPACITY_FIRST, dtype=np.float32)
+        """Of rows that stand for older ones: no earlier one that stands is more similar."""
         self._by_log: dict[int, array[int]] = {}
-        self._thinned = 0
+        self._standing: dict[int, int] = {}
+        """How many of a log's rows, its first ones, stand for older ones."""
         self._unthinned: dict[int, int] = {}
         self._same_place: dict[int, float] = {}
 
@@ -99,17 +116,17 @@ class _Rows:
     def indices(self) -> NDArray[np.int32]:
         return self._indices[: self._count]
 
+    @property
+    def _first(self) -> int:
+        """Which is the first row of the matrix."""
+        return self._lent_ends[-1]
+
     def append(self, log: int, index: int, descriptor: Descriptor) -> None:
         """Add a row; the first one that is no int8 makes all of them float32."""
-        if self._count == len(self._rows):
-            more = max(CAPACITY_FIRST, self._count // 4)
-            self._rows = np.concatenate([self._rows, np.empty((more, self.dimension), dtype=self._rows.dtype)])
-            self._inverse_norms = np.resize(self._inverse_norms, self._count + more)
-            self._logs = np.resize(self._logs, self._count + more)
-            self._indices = np.resize(self._indices, self._count + more)
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
-        self._rows[self._count] = descriptor.row
+        self._make_room(1)
+        self._rows[self._count - self._first] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
@@ -118,6 +135,59 @@ class _Rows:
         self._count += 1
         self._unthinned[log] = self._unthinned.get(log, 0) + 1
 
+    def _make_room(self, more: int) -> None:
+        """Let so many rows follow in the matrix."""
+        held = self._count - self._first
+        if held + more > len(self._rows):
+            size = max(held + more, len(self._rows) + max(CAPACITY_FIRST, held // 4))
+            rows = np.empty((size, self.dimension), dtype=self._rows.dtype)
+            rows[:held] = self._rows[:held]
+            self._rows = rows
+        if self._count + more > len(self._logs):
+            size = self._count + max(CAPACITY_FIRST, self._count // 4, more)
+            self._inverse_norms = np.resize(self._inverse_norms, size)
+            self._logs = np.resize(self._logs, size)
+            self._indices = np.resize(self._indices, size)
+            self._nearest = np.resize(self._nearest, size)
+
+    # Rows that somebody else holds
+
+    def lend(self, log: int, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
+        """Read newer descriptors of a log where somebody else holds them, if these are the same, and hold none."""
+        held = self._rows_of(log)
+        at = bisect_left(held, indices[0], key=self._indices.item)
+        own = np.array(held[at : at + len(indices)], dtype=np.intp)
+        if self._rows.dtype != np.int8 or len(own) != len(indices):
+            return
+        if at < self._standing.get(log, 0) or own.min() < self._first:
+            return
+        if self._indices[own].tolist() != list(indices) or not np.array_equal(self._rows[own - self._first], rows):
+            return
+        left = self._count - len(own)
+        order, holes = np.arange(self._first, left), np.sort(own[own < left])
+        order[holes - self._first] = np.setdiff1d(np.arange(left, self._count), own, assume_unique=True)
+        self._rows[holes - self._first] = self._rows[order[holes - self._first] - self._first]
+        size = len(order) + max(CAPACITY_FIRST, len(order) // 4)
+        if len(self._rows) > size:
+            self._rows = self._rows[:size].copy()
+        self._order_columns(self._first, np.concatenate([own, order]))
+        self._lent.append(_Lent(log, rows))
+        self._lent_ends.append(self._first + len(rows))
+
+    def _take_back(self, log: int) -> None:
+        """Hold the oldest rows of a log here again, as many as are looked through at one time."""
+        standing = self._standing.get(log, 0)
+        while (lowest := self.places(log)[standing : standing + THINNED_AT_ONCE].min()) < self._first:
+            number = bisect_right(self._lent_ends, lowest) - 1
+            first, end = self._lent_ends[number], self._lent_ends[number + 1]
+            self._make_room(end - first)
+            held = self._count - self._first
+            self._rows[held : held + end - first] = self._lent.pop(number).rows
+            self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
+            self._order_columns(first, np.concatenate([np.arange(end, self._count), np.arange(first, end)]))
+
+    # Old rows
+
     def thin(self, log: int, held: int) -> None:
         """Keep a log's newest so many rows whole, and at most so many that stand for its older ones.
 
@@ -125,52 +195,89 @@ class _Rows:
         the same ones to stay: they ask for the same pairs then, instead of each for its own.
         """
         while self._unthinned[log] >= held + THINNED_AT_ONCE:
-            oldest = self._thinned + np.flatnonzero(self._logs[self._thinned : self._count] == log)[:THINNED_AT_ONCE]
-            stay = oldest[self._stays(log, oldest, self._standing(log))]
-            others = np.setdiff1d(np.arange(self._thinned, self._count), oldest, assume_unique=True)
-            self._order(self._thinned, np.concatenate([stay, others]))
-            self._thinned += len(stay)
-            self._unthinned[log] -= len(oldest)
-            while len(self._standing(log)) > held and self._same_place.get(log, 0.0) > -1.0:
-                self._thin_again(log)
+            self._take_back(log)
+            first = self._standing.setdefault(log, 0)
+            bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
+            places = self.places(log)
+            self._standing[log] += THINNED_AT_ONCE
+            self._unthinned[log] -= THINNED_AT_ONCE
+            self._leave_out(log, self._represented(places[first : first + THINNED_AT_ONCE], places[:first], bound))
+            while self._standing[log] > held and self._same_place[log] > -1.0:
+                self._thin_again(log, held)
 
-    def _thin_again(self, log: int) -> None:
-        """Look through a log's rows that stand for others with a lower bound."""
+    def _thin_again(self, log: int, held: int) -> None:
+        """Look through a log's rows that stand for others with a lower bound, where that may make few enough."""
         self._same_place[log] -= SAME_PLACE_STEP
-        standing, stay = self._standing(log), np.empty(0, dtype=np.intp)
-        for first in range(0, len(standing), THINNED_AT_ONCE):
-            block = standing[first : first + THINNED_AT_ONCE]
-            stay = np.concatenate([stay, block[self._stays(log, block, stay)]])
-        gone = np.setdiff1d(standing, stay, assume_unique=True)
-        self._order(0, np.setdiff1d(np.arange(self._count), gone, assume_unique=True))
-        self._thinned -= len(gone)
+        bound, standing = self._same_place[log], self.places(log)[: self._standing[log]]
+        is_alone = self._nearest[standing] < bound
+        if np.count_nonzero(is_alone) > held:
+            return
+        stay, near, gone = standing[is_alone], standing[~is_alone], []
+        for first in range(0, len(near), THINNED_AT_ONCE):
+            block = near[first : first + THINNED_AT_ONCE]
+            gone.append(self._represented(block, stay, bound))
+            stay = np.concatenate([stay, np.setdiff1d(block, gone[-1], assume_unique=True)])
+        self._leave_out(log, np.concatenate(gone))
 
-    def _standing(self, log: int) -> NDArray[np.intp]:
-        """Places of a log's rows that stand for older ones."""
-        return np.flatnonzero(self._logs[: self._thinned] == log)
+    def places(self, log: int) -> Places:
+        """Places of a log's rows, in the order of its keyframes."""
+        return np.array(self._rows_of(log), dtype=np.intp)
 
-    def _stays(self, log: int, block: NDArray[np.intp], before: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which rows (K,) of a log neither one of those before them nor one before it in the block stands for."""
-        bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
-        rows = self._units(block)
-        stays = np.ones(len(block), dtype=bool)
-        for first in range(0, len(before), ROWS_AT_ONCE):
-            stays &= ~np.any(rows @ self._units(before[first : first + ROWS_AT_ONCE]).T >= bound, axis=1)
-        among = rows @ rows.T >= bound
+    def _represented(self, block: Places, others: Places, bound: float) -> Places:
+        """Which rows of a block others of their log stand for, or one before them in the block that stays."""
+        rows, nearest = self._units(block), np.full(len(block), NOTHING, dtype=np.float32)
+        for first in range(0, len(others), ROWS_AT_ONCE):
+            similarities = rows @ self._units(others[first : first + ROWS_AT_ONCE]).T
+            np.maximum(nearest, similarities.max(axis=1), out=nearest)
+        among, stays = rows @ rows.T, nearest < bound
         for k in np.flatnonzero(stays).tolist():
-            stays[k] = not np.any(among[k, :k] & stays[:k])
-        return stays
+            before = among[k, :k][stays[:k]]
+            nearest[k] = max(nearest[k], before.max(initial=NOTHING))
+            stays[k] = nearest[k] < bound
+        self._nearest[block] = nearest
+        return block[~stays]
 
-    def _order(self, first: int, order: NDArray[np.intp]) -> None:
-        """Put these rows after the first so many, and leave out what is not among them."""
+    def _leave_out(self, log: int, gone: Places) -> None:
+        """Take away rows of a log that others stand for."""
+        places = self.places(log)
+        self._by_log[log] = array("i", places[~np.isin(places, gone)].tolist())
+        self._standing[log] -= len(gone)
+        for place in np.sort(gone)[::-1].tolist():
+            self._count -= 1
+            if place != self._count:
+                self._move(self._count, place)
+
+    def _move(self, place: int, to: int) -> None:
+        """Put a row where one is no longer needed."""
+        self._rows[to - self._first] = self._rows[place - self._first]
+        for values in (self._inverse_norms, self._logs, self._indices, self._nearest):
+            values[to] = values[place]
+        of_log = self._by_log.get(int(self._logs[to]))
+        if of_log is not None:
+            of_log[bisect_left(of_log, int(self._indices[to]), key=self._indices.item)] = to
+
+    def _order_columns(self, first: int, order: Places) -> None:
+        """Put what is known of these rows after that of the first so many."""
         self._by_log.clear()
-        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
+        for values in (self._inverse_norms, self._logs, self._indices, self._nearest):
             values[first : first + len(order)] = values[order]
         self._count = first + len(order)
 
-    def _units(self, places: NDArray[np.intp]) -> Floats:
+    def _units(self, places: Places) -> Floats:
         """Rows (K, D) of unit length."""
-        return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
+        if places.min(initial=self._first) >= self._first:
+            rows = self._rows[places - self._first].astype(np.float32)
+        else:
+            rows = np.array([self._row(place) for place in places.tolist()], dtype=np.float32)
+        return np.asarray(rows * self._inverse_norms[places, None])
+
+    def _row(self, place: int) -> NDArray[Any]:
+        if place >= self._first:
+            return np.asarray(self._rows[place - self._first])
+        number = bisect_right(self._lent_ends, place) - 1
+        return np.asarray(self._lent[number].rows[place - self._lent_ends[number]])
+
+    # Comparing
 
     def similarities(self, descriptors: Sequence[Descriptor]) -> Floats:
         """Cosine similarities (B, N) of B descriptors with all rows."""
@@ -192,26 +299,45 @@ class _Rows:
         if index not in indices:
             return None
         near = near[: bisect_right(indices, index + reach)]
-        return self._rows[near] * self._inverse_norms[near, None], indices.index(index)
+        return self._units(np.array(near, dtype=np.intp)), indices.index(index)
 
     def _rows_of(self, log: int) -> "array[int]":
         """Rows of a log, in the order of its keyframes."""
         rows = self._by_log.get(log)
         if rows is None:
-            rows = self._by_log[log] = array("i", np.flatnonzero(self.logs == log).tolist())
+            places = np.flatnonzero(self.logs == log)
+            in_order = places[np.argsort(self._indices[places], kind="stable")]
+            rows = self._by_log[log] = array("i", in_order.tolist())
         return rows
 
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
-        if self._rows.dtype == np.float32:
+        if not self._lent and self._rows.dtype == np.float32:
             return np.asarray(queries @ self._rows[: self._count].T)
         products = np.empty((len(queries), self._count), dtype=np.float32)
         floats = np.empty((ROWS_AT_ONCE, self.dimension), dtype=np.float32)
-        for first in range(0, self._count, ROWS_AT_ONCE):
-            rows = self._rows[first : min(first + ROWS_AT_ONCE, self._count)]
-            np.copyto(floats[: len(rows)], rows)
-            products[:, first : first + len(rows)] = queries @ floats[: len(rows)].T
+        at = 0
+        for rows in self._pieces():
+            part = floats[: sum(map(len, rows))]
+            np.concatenate(rows, out=part, casting="same_kind")
+            products[:, at : at + len(part)] = queries @ part.T
+            at += len(part)
         return products
+
+    def _pieces(self) -> Iterator[list[NDArray[Any]]]:
+        """All rows in their order, at most so many at one time as are compared together."""
+        together: list[NDArray[Any]] = []
+        room = ROWS_AT_ONCE
+        held = self._rows[: self._count - self._first]
+        own = (held[k : k + ROWS_AT_ONCE] for k in range(0, len(held), ROWS_AT_ONCE))
+        for rows in chain((lent.rows for lent in self._lent), own):
+            if len(rows) > room:
+                yield together
+                together, room = [], ROWS_AT_ONCE
+            together.append(rows)
+            room -= len(rows)
+        if together:
+            yield together
 
 
 class PlaceRecognition:
@@ -271,10 +397,11 @@ class PlaceRecognition:
                 best[name] = similarity
         return best
 
-    def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
+    def on_keyframes(self, keyframes: Sequence[tuple[KeyframeId, Array]]) -> list[Found]:
         """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
         found: list[Found] = []
         others: list[tuple[KeyframeId, Descriptor]] = []
+        self._meet(keyframes)
         for keyframe, place in keyframes:
             descriptor = comparable(place)
             if descriptor is None or not self._add(keyframe, descriptor):
@@ -286,6 +413,13 @@ class PlaceRecognition:
                 found += self._among_all(keyframe, descriptor)
                 others = []
         return found + self._among_own(others)
+
+    def lend(self, log: LogId, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
+        """Somebody holds descriptors of a log's keyframes as rows (K, D) that never change: compare them there."""
+        number = self._numbers.get(log)
+        others = self._others.get(rows.shape[1])
+        if indices and number is not None and others is not None and self._dimensions[number] == others.dimension:
+            others.lend(number, indices, rows)
 
     def agreement(self, pair: CandidatePair) -> float | None:
         """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""
@@ -304,14 +438,8 @@ class PlaceRecognition:
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
         log, dimension = keyframe.log, len(descriptor.row)
-        number = self._numbers.get(log)
-        if number is None:
-            number = self._numbers[log] = len(self._logs)
-            self._logs.append(log)
-            self._dimensions.append(dimension)
-            self._best.append(-1.0)
-            self._thin_all()
-        elif self._dimensions[number] != dimension:
+        number = self._numbers[log]
+        if self._dimensions[number] != dimension:
             return False
         if log == self._own:
             if self._own_rows is None:
@@ -326,8 +454,17 @@ class PlaceRecognition:
             rows.thin(number, self._share)
         return True
 
-    def _thin_all(self) -> None:
-        """With another log each has a smaller share, also one that gets no more keyframes."""
+    def _meet(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> None:
+        """Number logs that are new: each has a smaller share then, also one that gets no more keyframes."""
+        known = len(self._logs)
+        for keyframe, place in keyframes:
+            if keyframe.log not in self._numbers and (descriptor := comparable(place)) is not None:
+                self._numbers[keyframe.log] = len(self._logs)
+                self._logs.append(keyframe.log)
+                self._dimensions.append(len(descriptor.row))
+                self._best.append(-1.0)
+        if len(self._logs) == known:
+            return
         for rows in (*self._others.values(), *([] if self._own_rows is None else [self._own_rows])):
             for number in rows.numbers:
                 rows.thin(number, self._share)
@@ -348,8 +485,7 @@ class PlaceRecognition:
         np.maximum.at(best, others.logs, similarities)
         self._best = np.maximum(best, self._best).tolist()
         for number in np.flatnonzero(best >= self._parameters.similarity_threshold).tolist():
-            rows = np.flatnonzero(others.logs == number)
-            found += self._candidates(keyframe, self._logs[number], others.indices[rows], similarities[rows])
+            found += self._candidates(keyframe, number, others, similarities)
         return _sorted(found)
 
     def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
@@ -366,7 +502,7 @@ class PlaceRecognition:
             if highest > self._best[number]:
                 self._best[number] = highest
             if highest >= self._parameters.similarity_threshold:
-                found += _sorted(self._candidates(keyframe, self._own, own.indices, similarities[k]))
+                found += _sorted(self._candidates(keyframe, self._numbers[self._own], own, similarities[k]))
         return found
 
     def _is_compared(self, log: LogId) -> bool:
@@ -380,19 +516,27 @@ class PlaceRecognition:
         apart = keyframe.index - own.indices
         similarities = own.similarities([descriptor])[0]
         far = np.where(apart >= self._parameters.own_gap_keyframes, similarities, np.float32(-2.0))
-        return self._candidates(keyframe, self._own, own.indices, far)
+        return self._candidates(keyframe, self._numbers[self._own], own, far)
 
-    def _candidates(
-        self, keyframe: KeyframeId, log: LogId, indices: NDArray[np.int32], similarities: Floats
-    ) -> list[Found]:
-        """The most similar keyframes of one log, those above the threshold."""
-        best = [int(similarities.argmax())]
+    def _candidates(self, keyframe: KeyframeId, number: int, rows: _Rows, similarities: Floats) -> list[Found]:
+        """The most similar keyframes of one log, those above the threshold.
+
+        Args:
+            keyframe: That it is compared with.
+            number: The log's.
+            rows: Where the log is.
+            similarities: (N,) of all rows.
+        """
+        log, places = self._logs[number], rows.places(number)
+        of_log = similarities[places]
+        best = [int(of_log.argmax())]
         if self._parameters.best_matches > 1:
-            best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
+            best = np.argsort(-of_log, kind="stable")[: self._parameters.best_matches].tolist()
+        indices = rows.indices[places[best]].tolist()
         return [
-            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, int(indices[k]))), float(similarities[k])))
-            for k in best
-            if similarities[k] >= self._parameters.similarity_threshold
+            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, index)), similarity))
+            for index, similarity in zip(indices, of_log[best].tolist(), strict=True)
+            if similarity >= self._parameters.similarity_threshold
         ]
 
 
