@@ -76,7 +76,7 @@ class Problem:
         d, L = part.d * ratio[:, None], part.sqrt_information.copy()
         sigma = np.maximum(part.sigma / ratio, FITTED_SIGMA_RATIO)
         L[:, :, 3:] /= ratio[:, None, None]
-        covariances = np.linalg.inv(np.swapaxes(L, 1, 2) @ L)
+        covariances = np.asarray(np.linalg.inv(np.swapaxes(L, 1, 2) @ L), dtype=np.float64)
         longer = {
             "d": d,
             "sqrt_information": L,
