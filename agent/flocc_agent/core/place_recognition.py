@@ -37,6 +37,8 @@ SAME_PLACE_SIMILARITY = 0.9
 """An old keyframe with a more similar one in its log is represented by that one."""
 SAME_PLACE_STEP = 0.05
 """Where the representatives are too many, less similar ones stand for each other."""
+LENT_AT_ONCE = 256
+"""Rows that others hold as well are let go together: what stays is copied."""
 ROWS_AT_ONCE = 256
 """int8 rows that are compared at one time: as floats they stay in a processor's cache."""
 RUN_REACH = 2
@@ -85,6 +87,7 @@ class _Rows:
         self._count = 0
         self._lent: list[_Lent] = []
         self._lent_ends = [0]
+        self._offered: list[tuple[Sequence[int], _Lent]] = []
         self._rows: NDArray[Any] = np.empty((CAPACITY_FIRST, dimension), dtype=dtype)
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
@@ -119,8 +122,10 @@ class _Rows:
         """Add a row; the first one that is no int8 makes all of them float32."""
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
-        self._make_room(1)
-        self._rows[self._count - self._first] = descriptor.row
+        place = self._count - self._first
+        if place == len(self._rows) or self._count == len(self._logs):
+            self._make_room(1)
+        self._rows[place] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
@@ -147,18 +152,37 @@ class _Rows:
 
     def lend(self, log: int, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
         """Read newer descriptors of a log where somebody else holds them, if these are the same, and hold none."""
-        held = self._rows_of(log)
-        at = bisect_left(held, indices[0], key=self._indices.item)
-        own = np.array(held[at : at + len(indices)], dtype=np.intp)
-        if self._rows.dtype != np.int8 or len(own) != len(indices) or own.min() < self._first + self._thinned:
+        self._offered.append((indices, _Lent(log, rows)))
+        if sum(len(lent.rows) for _, lent in self._offered) >= LENT_AT_ONCE:
+            self._take_offered()
+
+    def _take_offered(self) -> None:
+        """Let rows of the matrix go that others hold, some blocks at a time: the rest moves up."""
+        offered, self._offered = self._offered, []
+        is_here, lent_places = np.ones(self._count - self._first, dtype=bool), list[NDArray[np.intp]]()
+        for indices, lent in offered:
+            places = self._same(lent, indices)
+            if places is not None and is_here[places - self._first].all():
+                is_here[places - self._first] = False
+                lent_places.append(places)
+                self._lent.append(lent)
+        if not lent_places:
             return
-        if self._indices[own].tolist() != list(indices) or not np.array_equal(self._rows[own - self._first], rows):
-            return
-        rest = np.setdiff1d(np.arange(self._first, self._count), own, assume_unique=True)
-        self._rows = np.concatenate([self._rows[rest - self._first], self._rows[:CAPACITY_FIRST]])
-        self._order_columns(self._first, np.concatenate([own, rest]))
-        self._lent.append(_Lent(log, rows))
-        self._lent_ends.append(self._first + len(rows))
+        rest = np.flatnonzero(is_here)
+        self._rows = np.concatenate([self._rows[rest], self._rows[:CAPACITY_FIRST]])
+        self._order_columns(self._first, np.concatenate([*lent_places, self._first + rest]))
+        self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
+
+    def _same(self, lent: _Lent, indices: Sequence[int]) -> NDArray[np.intp] | None:
+        """Where rows of a log's newer keyframes stand in the matrix; None where they are not all here, and these."""
+        held = self._rows_of(lent.log)
+        first = bisect_left(held, indices[0], key=self._indices.item)
+        places = np.array(held[first : first + len(indices)], dtype=np.intp)
+        if self._rows.dtype != np.int8 or self._indices[places].tolist() != list(indices):
+            return None
+        if places.min() < self._first + self._thinned:
+            return None
+        return places if np.array_equal(self._rows[places - self._first], lent.rows) else None
 
     def _take_back(self, log: int) -> None:
         """Hold the oldest rows of a log here again, as many as are looked through at one time."""

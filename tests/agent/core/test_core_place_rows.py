@@ -5,7 +5,7 @@ import pytest
 
 from flocc_agent.core.log_copy import BLOCK_RECORDS, LogCopy
 from flocc_agent.core.parameters import PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import Found, PlaceRecognition, direction
+from flocc_agent.core.place_recognition import LENT_AT_ONCE, Found, PlaceRecognition, direction
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import KeyframeRecord, encode_record
@@ -124,7 +124,7 @@ def test_rows_that_a_log_holds_are_not_held_twice() -> None:
         logs.add(recognition, keyframe, array)
     (rows,) = recognition._others.values()
     assert len(rows) == len(OTHERS) * KEYFRAMES
-    assert len(rows._rows) <= len(OTHERS) * (KEYFRAMES % BLOCK_RECORDS) + BLOCK_RECORDS
+    assert len(rows._rows) <= len(OTHERS) * (KEYFRAMES % BLOCK_RECORDS) + LENT_AT_ONCE + BLOCK_RECORDS
 
 
 def test_rows_that_are_others_than_those_held_here_are_not_taken() -> None:
@@ -135,6 +135,8 @@ def test_rows_that_are_others_than_those_held_here_are_not_taken() -> None:
     for indices, lent in ((range(64), rows[1:65]), (range(90, 110), rows[90:110]), (range(64), rows[:64, :32])):
         recognition.lend(OTHERS[0], list(indices), lent)
     recognition.lend(OTHERS[1], list(range(64)), rows[:64])
+    for _ in range(2):
+        recognition.lend(OTHERS[0], list(range(100, 228)), rows[100:228])
     recognition.lend(OTHERS[0], [], rows[:0])
     (held,) = recognition._others.values()
     assert held._lent == []
