@@ -2,14 +2,17 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 from tests.launch.bag_fixtures import ZERO_NS, BagScript, walking
 
 from flocc_agent.runtime.recording import Recording
 from flocc_launch.datasets.commands import convert, info, infos
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.source import DatasetError
+from flocc_launch.datasets.stamp_gaps import StampGaps
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_scenario
 
@@ -97,6 +100,254 @@ def test_a_bag_of_two_robots_is_launched_as_two(tmp_path: Path, monkeypatch: pyt
     assert "Alpha: images /Alpha/cam/image/compressed, " in told[0]
     paths = recordings(scenario)
     assert [Recording.open(path).frames[0].T_odom_body[0, 3] for path in paths.values()] == [0.0, 10.0]
+
+
+def robot_of(
+    script: BagScript,
+    images: str | None,
+    odometry: str | None,
+    x_m: float,
+    frames: tuple[str, str] = ("camera", "body"),
+) -> BagScript:
+    """A robot's part of a bag, or half of one; its intrinsics lie beside its images."""
+    script.frame, script.child = frames
+    if images is not None:
+        script.camera_info(images.replace("image_raw", "camera_info").replace("image_", "info_"), ZERO_NS, 30.0 + x_m)
+    for k in range(4):
+        if odometry is not None:
+            script.odometry(odometry, ZERO_NS + k * S, x_m + k)
+        if images is not None:
+            script.compressed(f"{images}/compressed", ZERO_NS + k * S, 50)
+    script.messages.sort(key=lambda message: message[2])
+    return script
+
+
+@pytest.mark.parametrize(
+    ("images", "odometry", "names"),
+    [
+        ("/cam_{}/image_raw", "/odom_{}", ("r1", "r2")),
+        ("/image_{}", "/odom_{}", ("r1", "r2")),
+        ("/{}_camera/image_raw", "/{}_odom", ("r1", "r2")),
+        ("/camera{}/image_raw", "/odom{}", ("1", "2")),
+    ],
+)
+def test_robots_are_told_apart_by_a_part_of_a_name(
+    tmp_path: Path, images: str, odometry: str, names: tuple[str, str]
+) -> None:
+    script = BagScript(False)
+    for number, name in enumerate(names):
+        robot_of(script, images.format(name), odometry.format(name), float(number), (f"{name}_c", f"{name}_b"))
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    found = {name: Recording.open(tmp_path / "out" / name) for name in names}
+    assert [recording.frames[0].T_odom_body[0, 3] for recording in found.values()] == [0.0, 1.0]
+    assert [recording.camera.fx for recording in found.values()] == [30.0, 31.0]
+
+
+def test_two_cameras_of_one_odometry_are_not_two_robots(tmp_path: Path) -> None:
+    script = robot_of(robot_of(BagScript(False), "/camera1/image_raw", "/odom", 0.0), "/camera2/image_raw", None, 1.0)
+    with pytest.raises(DatasetError, match="has 2 image topics, name one with --image-topic"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("first", "second"), [("r1", "r2"), ("r2", "r1")])
+@pytest.mark.parametrize("half", ["images", "odometry"])
+def test_a_whole_robot_is_taken_beside_half_of_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, first: str, second: str, half: str
+) -> None:
+    script = robot_of(BagScript(False), f"/{first}/cam/image_raw", f"/{first}/odom", 1.0)
+    parts = (f"/{second}/cam/image_raw", None) if half == "images" else (None, f"/{second}/odom")
+    bag = robot_of(script, parts[0], parts[1], 7.0).write(tmp_path / "team", "mcap")
+    recording = Recording.open(convert(bag, tmp_path / "out"))
+    assert recording.frames[0].T_odom_body[0, 3] == 1.0
+    assert recording.camera.fx == 31.0
+    told = f"{second} has images but no odometry" if half == "images" else f"not taken: /{second}/odom"
+    assert told in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("images", "odometry", "frames"),
+    [
+        ("/r1/cam/image_raw", "/r2/odom", ("", "")),
+        ("/alpha/cam/image_raw", "/bob/odom", ("", "")),
+        ("/image_raw", "/odom", ("r1/cam", "r2/base")),
+    ],
+)
+def test_images_of_one_robot_do_not_get_the_odometry_of_another(
+    tmp_path: Path, images: str, odometry: str, frames: tuple[str, str]
+) -> None:
+    script = robot_of(BagScript(False), images, None, 0.0, (frames[0] or "camera", ""))
+    if "bob" in odometry:
+        script.camera_info("/bob/cam/camera_info", ZERO_NS)
+    robot_of(script, None, odometry, 5.0, (frames[1] or "odom", frames[1] or "body"))
+    with pytest.raises(DatasetError, match=r"is another robot's odometry than that of .*image"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+
+
+def test_a_body_that_odometry_does_not_name_is_found_on_tf_or_refused(tmp_path: Path) -> None:
+    script = mounted(robot_of(BagScript(False), "/cam/image_raw", "/odom", 0.0, ("camera", "")))
+    with pytest.raises(
+        DatasetError, match=r"the camera \(camera\) sits on housing, but /odom does not say which frame"
+    ):
+        convert(script.write(tmp_path / "unnamed", "mcap"), tmp_path / "out")
+    for frame in ("odom", "body"):
+        script.transform("/tf", ZERO_NS, ("camera" if frame == "odom" else "odom", frame))
+    bag = script.write(tmp_path / "run", "mcap")
+    assert Recording.open(convert(bag, tmp_path / "found")).T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
+
+
+def test_a_mounting_that_static_transforms_give_twice_is_refused(tmp_path: Path) -> None:
+    script = mounted(walking(False))
+    script.transform("/tf_static", ZERO_NS + 9 * S, ("housing", "camera"), (0.0, 0.1, 0.0), FORWARD)
+    with pytest.raises(DatasetError, match="place camera, between body and camera, in more than one way"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("images", "info"), [("cam0", "cam1"), ("stereo/left", "stereo/right")])
+@pytest.mark.parametrize("frame", ["", "camera"])
+def test_intrinsics_of_the_other_camera_are_not_taken(tmp_path: Path, images: str, info: str, frame: str) -> None:
+    script = robot_of(BagScript(False), f"/{images}/image_raw", "/odom", 0.0, (frame, "body"))
+    script.messages = [
+        (name.replace(images, info) if "info" in name else name, *rest) for name, *rest in script.messages
+    ]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("stamped", ["now", "never", "each"])
+def test_a_path_gives_where_its_end_is(tmp_path: Path, stamped: str) -> None:
+    script = walking(False, odometry=None)
+    for k in range(1, 6):
+        now_ns = ZERO_NS + k * S
+        each = {"now": [now_ns] * (k + 1), "never": [0] * (k + 1), "each": [ZERO_NS + j * S for j in range(k + 1)]}
+        script.path("/path", each[stamped], now_ns)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    first = 0 if stamped == "each" else 1
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(first, 5)])
+
+
+@pytest.mark.parametrize(("topic", "fixed"), [("/goal_pose", "map"), ("/plan", "map"), ("/marker/pose", "camera")])
+def test_poses_of_goals_and_of_what_is_seen_are_no_odometry(tmp_path: Path, topic: str, fixed: str) -> None:
+    script = walking(False, odometry=None)
+    script.fixed = fixed
+    for k in range(11):
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+        script.pose_stamped(topic, ZERO_NS + k * S // 2, 50.0)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])
+
+
+@pytest.mark.parametrize(
+    ("ways", "said"),
+    [((0.0, 0.0), "nothing moves"), ((1.0, 3.0), "rotations never change though the path turns"), ((1.0, 1.0), "")],
+)
+def test_odometry_that_says_nothing_of_rotations_or_motion_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, ways: tuple[float, float], said: str
+) -> None:
+    script = walking(False, odometry=None)
+    for k in range(11):
+        along, across = (min(k, 5) * ways[0], max(k - 5, 0) * (ways[1] - ways[0]))
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "camera"), (along + max(k - 5, 0) * ways[0], across, 0))
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    told = [word for word in ("nothing moves", "rotations never change though the path turns") if word in caplog.text]
+    assert told == ([said] if said else [])
+
+
+def test_odometry_that_is_ground_truth_by_its_name_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = walking(False, odometry="/vicon/odom").write(tmp_path / "run", "mcap")
+    convert(bag, tmp_path / "out")
+    assert "odometry is /vicon/odom, ground truth by its name, which does not drift" in caplog.text
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_robots_with_transforms_of_their_own_may_have_the_same_frames(tmp_path: Path, moves: bool) -> None:
+    script = BagScript(False)
+    for number, name in enumerate(("r1", "r2")):
+        odometry = None if moves else f"/{name}/odom"
+        robot_of(script, f"/{name}/cam/image_raw", odometry, float(number), ("camera", "body"))
+        script.transform(f"/{name}/tf_static", ZERO_NS, ("body", "camera"), (0.1 + number, 0.0, 0.0))
+        for k in range(9 if moves else 0):
+            script.transform(f"/{name}/tf", ZERO_NS + k * S // 2, ("odom", "body"), (number + 0.5 * k, 0.0, 0.0))
+    script.messages.sort(key=lambda message: message[2])
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    found = [Recording.open(tmp_path / "out" / name) for name in ("r1", "r2")]
+    assert [recording.T_body_camera[0, 3] for recording in found] == pytest.approx([0.1, 1.1])
+    assert [recording.frames[0].T_odom_body[0, 3] for recording in found] == [0.0, 1.0]
+
+
+def test_one_robot_without_intrinsics_costs_no_other(tmp_path: Path) -> None:
+    script = team()
+    script.messages = [message for message in script.messages if message[0] != "/bob_2/cam/camera_info"]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out" / "alpha").frames) == 4
+
+
+def test_images_of_another_frame_and_repeated_ones_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = walking(False, count=12)
+    script.frame = "other"
+    script.compressed("/cam/image/compressed", ZERO_NS + S // 2)
+    script.frame = "camera"
+    repeated = [(name, kind, ns + 1000, message) for name, kind, ns, message in script.messages if "image" in name]
+    script.messages = sorted([*script.messages, *repeated[:-1]], key=lambda message: message[2])
+    bag = script.write(tmp_path / "run", "mcap")
+    assert len(Recording.open(convert(bag, tmp_path / "out")).frames) == 12
+    assert "12 of 25 messages repeat a stamp" in caplog.text
+    assert "1 of 25 messages were left out: an image is of the frame other, the first one of camera" in caplog.text
+
+
+def test_topics_without_messages_are_not_chosen_from(tmp_path: Path) -> None:
+    script = walking(False)
+    path = tmp_path / "run"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection("/rear/image_raw", "sensor_msgs/msg/Image", typestore=script.store)
+        writer.add_connection("/wheels/odom", "nav_msgs/msg/Odometry", typestore=script.store)
+        connections = {
+            (name, kind): writer.add_connection(name, kind, typestore=script.store)
+            for name, kind in dict.fromkeys(message[:2] for message in script.messages)
+        }
+        for name, kind, stamp_ns, message in script.messages:
+            raw = bytes(script.store.serialize_cdr(message, kind))
+            writer.write(connections[name, kind], stamp_ns, raw)
+    assert len(Recording.open(convert(path, tmp_path / "out")).frames) == 5
+
+
+@pytest.mark.parametrize("storage", ["bag", "db3"])
+def test_images_that_come_late_go_where_they_belong(tmp_path: Path, storage: str) -> None:
+    script = walking(storage == "bag", count=12)
+    at = [k for k, message in enumerate(script.messages) if "image" in message[0]]
+    for one, other in ((3, 4), (7, 9)):
+        (*_, first), (*_, second) = script.messages[at[one]], script.messages[at[other]]
+        script.messages[at[one]] = (*script.messages[at[one]][:3], second)
+        script.messages[at[other]] = (*script.messages[at[other]][:3], first)
+    bag = script.write(tmp_path / ("run.bag" if storage == "bag" else "run"), storage)
+    recording = Recording.open(convert(bag, tmp_path / "out"))
+    assert [frame.T_odom_body[0, 3] for frame in recording.frames] == pytest.approx([k + 0.2 for k in range(12)])
+    pictures = [cv2.imread(str(frame.image_path), cv2.IMREAD_GRAYSCALE) for frame in recording.frames]
+    greys = [picture[0, 0] for picture in pictures if picture is not None]
+    assert greys == pytest.approx([10 * k for k in range(12)], abs=2)
+
+
+def test_a_clock_that_was_set_back_fills_no_gaps() -> None:
+    gaps = StampGaps()
+    forward = [gaps.fits(k * 100) for k in range(50)]
+    back = [gaps.fits(4000 + phase + k * 100) for phase in (30, 50) for k in range(9)]
+    assert all(forward)
+    assert not any(back)
+    assert gaps.fits(5000)
+
+
+def test_a_message_that_was_kept_back_does_not_choose_the_clock(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = walking(False)
+    first = next(k for k, message in enumerate(script.messages) if message[0] == "/odom")
+    stale = BagScript(False)
+    stale.odometry("/odom", ZERO_NS - 20 * S, -1.0)
+    script.messages[first] = (*script.messages[first][:3], stale.messages[0][3])
+    assert len(Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames) == 4
+    assert "stamped by clocks" not in caplog.text
 
 
 def test_the_left_camera_of_two_is_taken(tmp_path: Path) -> None:

@@ -15,7 +15,9 @@ from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.source import DatasetError
+from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_scenario
 
 COUNT = IMAGES * PASSES
@@ -51,6 +53,13 @@ def test_one_data_set_is_cut_into_robots(own: Path) -> None:
     assert [len(Recording.open(path).frames) for path in paths.values()] == [COUNT // 2, COUNT // 2]
 
 
+def test_an_error_can_be_expected_of_a_data_set_with_ground_truth(own: Path) -> None:
+    """Whatever its file is called: what counts is the recording that is made of it."""
+    asked = {"robots": {"red": {"recording": str(own)}}, "expectations": {"ate_max_m": 1.0}}
+    scenario = Scenario.model_validate(asked)
+    check_measurable(scenario, recordings(scenario))
+
+
 def test_keyframes_are_closer_where_robots_move_little(own: Path) -> None:
     told: list[str] = []
     keyframes = read_scenario(str(own), {}, tell=told.append).keyframes
@@ -79,6 +88,20 @@ def test_a_folder_around_one_data_set_is_that_data_set(own: Path, tmp_path: Path
     scenario = read_scenario(str(around), {}, agents=2, tell=told.append)
     assert scenario.names() == ["r1", "r2"]
     assert told[0].startswith(f"data: {around / 'drive'}, cut by time into 2 robots")
+
+
+def test_a_robots_folder_may_hold_its_data_set_and_what_is_left_is_said(own: Path, tmp_path: Path) -> None:
+    for place in ("a", "b/monday", "c/monday", "c/tuesday"):
+        shutil.copytree(own, tmp_path / "team" / place)
+    (tmp_path / "team" / "d").mkdir()
+    (tmp_path / "team" / "d" / "walk.mp4").write_bytes(b"")
+    (tmp_path / "team" / "notes").mkdir()
+    told: list[str] = []
+    scenario = read_scenario(str(tmp_path / "team"), {}, tell=told.append)
+    assert scenario.names() == ["a", "b", "d"]
+    assert "; not taken: c, notes" in told[0]
+    assert str(scenario.robots["b"].recording).endswith("b/monday")
+    assert str(scenario.robots["d"].recording).endswith("d/walk.mp4")
 
 
 def test_robots_that_recorded_together_keep_their_distance_in_time(own: Path, tmp_path: Path) -> None:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.runtime.pictures import FULL, PictureError
+from flocc_agent.runtime.pose_limits import oddity
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_clock import ClockChoice, choose_clock
-from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, listed, only
+from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, is_truth, listed, only
 from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
     IMAGE_TYPES,
@@ -25,17 +26,19 @@ from flocc_launch.datasets.bag_messages import (
 )
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
-from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.intrinsics import believable, read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.pixels import ImageWriter, levels_note
 from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_launch.datasets.stamp_gaps import StampGaps
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
 logger = logging.getLogger(__name__)
 
 CHECKPOINT_MESSAGES = 1000
 STRAY = "the stamp is zero, or more than a minute off that of the others"
+UNTURNED_MAX = 1000
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
 HEADER_BYTES = 12
@@ -142,9 +145,14 @@ def _convert_robots(
     Raises:
         DatasetError: Something is wrong with the recording of a robot; of several such, the first is raised.
     """
-    runs = [_conversion(layout, robot, out, options) for out, robot in robots.items()]
-    _pass_over(layout.bag, runs, progress)
-    faults = []
+    runs, faults = [], []
+    for out, robot in robots.items():
+        try:
+            runs.append(_conversion(layout, robot, out, options))
+        except DatasetError as error:
+            faults.append(error)
+    if runs:
+        _pass_over(layout.bag, runs, progress)
     for run in runs:
         try:
             run.judge()
@@ -189,6 +197,8 @@ def _conversion(layout: Layout, robot: RobotTopics, out: Path, options: BagOptio
     others = layout.other_poses(robot)
     if others:
         notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
+    if robot.poses is not None and is_truth(robot.poses.topic):
+        notes.append(f"{layout.bag.path}: odometry is {robot.poses}, ground truth by its name, which does not drift")
     notes += [clock.note] if clock.note else []
     return _Conversion(layout.bag, robot, lens, options, clock, out, identity, notes=notes)
 
@@ -210,7 +220,7 @@ def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens
         raise DatasetError(f"{bag.path}: topic {robot.info.name} has no message that can be read")
     T_body_camera, note = (None, None) if options.odometry else layout.mounting(robot)
     try:
-        lens = lens_of(first[1], robot.info, robot.image)
+        lens = believable(lens_of(first[1], robot.info, robot.image), f"topic {robot.info.name}")
     except DatasetError as error:
         raise DatasetError(f"{bag.path}: {error}; name a camera file with --camera") from error
     lens = lens if T_body_camera is None else replace(lens, T_body_camera=T_body_camera)
@@ -224,6 +234,7 @@ class Tally:
     Attributes:
         seen: Messages.
         damaged: Of them, those that cannot be used.
+        repeated: Of them, those with the stamp of the one before.
         backwards: Of them, those that go back in time.
         reason: Of the first damaged one.
         step: Of the first that goes back.
@@ -231,6 +242,7 @@ class Tally:
 
     seen: int = 0
     damaged: int = 0
+    repeated: int = 0
     backwards: int = 0
     reason: str = ""
     step: str = ""
@@ -248,8 +260,10 @@ class Tally:
     def sentences(self, topic: BagTopic) -> list[str]:
         """What was left out."""
         damaged = f"topic {topic.name}: {self.damaged} of {self.seen} messages were left out: {self.reason}"
+        twice = f"topic {topic.name}: {self.repeated} of {self.seen} messages repeat a stamp, and were left out"
         back = f"topic {topic.name}: {self.step}; {self.backwards} of {self.seen} messages were left out"
-        return [*([damaged] if self.damaged else []), *([back] if self.backwards else [])]
+        told = ((damaged, self.damaged), (twice, self.repeated), (back, self.backwards))
+        return [sentence for sentence, count in told if count]
 
     def is_too_much(self) -> bool:
         """Whether the topic cannot be trusted."""
@@ -288,6 +302,9 @@ class _Conversion:
     _done_s: float | None = field(init=False, default=None)
     _pictures: ImageWriter = field(init=False)
     _last_pose: tuple[float, ...] = ()
+    _stamps: StampGaps = field(default_factory=StampGaps)
+    _frame: str | None = None
+    _unturned: list[tuple[float, ...]] | None = field(default_factory=list)
     _first_info: bytes | None = None
     _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
@@ -343,7 +360,7 @@ class _Conversion:
         """Finish the recording of the journey that runs."""
         writer, log = self._writer, self._log
         try:
-            writer.flush()
+            writer.sort()
             log.finish(self.zero_ns)
             self._write_beside(writer)
         finally:
@@ -380,11 +397,22 @@ class _Conversion:
                 if is_new:
                     self._begin_journey(good_ns, bag_ns)
                 self._pose_span_s = _wider(self._pose_span_s, (good_ns - self.zero_ns) * 1e-9)
+                if good_ns > self._log.last_ns:
+                    self._see_motion(good)
                 if len(posed) == 1 and good_ns == self._log.last_ns and good != self._last_pose:
                     self.poses.damage("the stamp is that of the pose before")
                 elif not self._log.add(good_ns, good) and len(posed) == 1:
                     self.poses.step_back(self._log.last_ns * 1e-9, good_ns * 1e-9)
                 self._last_pose = good
+
+    def _see_motion(self, numbers: tuple[float, ...]) -> None:
+        """Keep positions as long as all rotations are the first one, thinned where there are many."""
+        if self._unturned is None or (self._unturned and numbers[3:] != self._unturned[0][3:]):
+            self._unturned = None
+            return
+        self._unturned.append(numbers)
+        if len(self._unturned) > UNTURNED_MAX:
+            del self._unturned[1::2]
 
     def _begin_journey(self, stamp_ns: int, bag_ns: int) -> None:
         """Go on in another recording, since odometry is of another frame from here."""
@@ -404,6 +432,7 @@ class _Conversion:
             return
         try:
             message = self.bag.decoded(raw, topic)
+            self._see_frame(message.header.frame_id)
             taken_ns = bag_ns if self.clock.is_bag else stamp_ns(message.header)
             if taken_ns == 0 or (not self.clock.is_bag and self.clock.is_off(taken_ns, bag_ns)):
                 raise DatasetError(STRAY)
@@ -412,14 +441,26 @@ class _Conversion:
             stamp_s = (taken_ns - self.zero_ns) * 1e-9
             if self._done_s is not None and stamp_s <= self._done_s + 1e-9:
                 return
-            last_s = self._writer.last_stamp_s
-            if last_s is not None and stamp_s <= last_s:
-                tally.step_back(last_s, stamp_s)
+            if stamp_s == self._writer.last_stamp_s:
+                tally.repeated += 1
+                return
+            if not self._stamps.fits(taken_ns):
+                tally.step_back(self._writer.last_stamp_s or 0.0, stamp_s)
                 return
             self._writer.add(stamp_s, *self._encoded(message))
             self._image_span_s = _wider(self._image_span_s, stamp_s)
         except DatasetError as error:
             tally.damage(_bare(error, topic))
+
+    def _see_frame(self, frame: str) -> None:
+        """See that images are of the frame of the first one.
+
+        Raises:
+            DatasetError: They are of another, as of another camera on the same topic.
+        """
+        self._frame = frame if self._frame is None else self._frame
+        if frame != self._frame:
+            raise DatasetError(f"an image is of the frame {frame or 'no name'}, the first one of {self._frame}")
 
     def _encoded(self, message: Any) -> tuple[bytes, str]:
         encoded, suffix = image_file(message, self.robot.image, self.options.jpeg)
@@ -469,6 +510,9 @@ class _Conversion:
         if self.watch.outliers:
             jumps = f"{self.watch.outliers} single poses jump, and were left out"
             self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {jumps}")
+        unturned = np.array(self._unturned or np.empty((0, 7)))
+        if (odd := oddity(unturned[:, :3], unturned[:, 3:])) is not None:
+            self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {odd}")
         tallies = [(self.images, self.robot.image)]
         if self.robot.poses is not None:
             tallies.append((self.poses, self.robot.poses.topic))
