@@ -13,10 +13,8 @@ from flocc_agent.perception.mast3r.reciprocal_matching import (  # noqa: E402
     MatchParameters,
     match_confidences,
     match_views,
-    matches_near_starts,
     reciprocal_matches,
     reciprocal_matches_both_ways,
-    symmetric_matches,
 )
 from flocc_agent.perception.mast3r.search import BlockIndex, nearest  # noqa: E402
 
@@ -42,16 +40,6 @@ def test_matches_equal_the_references_for_every_size_and_subsampling() -> None:
 
 
 @pytest.mark.golden
-def test_given_starts_within_a_tolerance_equal_the_references() -> None:
-    fields, cases = records()
-    for case in (case for case in cases if case["tag"] == "pixel_tol5"):
-        starts = torch.stack(case["init"], dim=1).numpy()
-        found = matches_near_starts(fields[case["name"]]["A"], fields[case["name"]]["B"], starts, 5.0)
-        assert np.array_equal(found.xy1, case["xy1"])
-        assert np.array_equal(found.xy2, case["xy2"])
-
-
-@pytest.mark.golden
 def test_union_of_both_directions_and_its_confidences_equal_the_references() -> None:
     fields, cases = records()
     for case in (case for case in cases if case["tag"] == "nonsym"):
@@ -60,17 +48,6 @@ def test_union_of_both_directions_and_its_confidences_equal_the_references() -> 
         assert np.array_equal(found.xy1, case["xy1"])
         assert np.array_equal(found.xy2, case["xy2"])
         assert np.array_equal(match_confidences(found, field["qa"], field["qb"]), case["conf"].numpy())
-
-
-@pytest.mark.golden
-def test_union_of_two_decodes_and_its_confidences_equal_the_references() -> None:
-    fields, cases = records()
-    for case in (case for case in cases if case["tag"] == "sym"):
-        field = fields[case["name"]]
-        found, confidences = symmetric_matches((field["A"], field["B"]), (case["f12"], case["f22"]), tuple(case["q"]))
-        assert np.array_equal(found.xy1, case["xy1"])
-        assert np.array_equal(found.xy2, case["xy2"])
-        assert np.allclose(confidences, case["conf"].numpy(), rtol=1e-6)
 
 
 DECODED = [("tiny_sq", 4), ("tiny_min", 4), ("tiny_portrait", 4), ("small_land", 8)]
