@@ -1,5 +1,6 @@
 """Reciprocal matching: the reference's matches, exactly."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,12 +28,14 @@ def records() -> tuple[dict[str, Any], list[Any]]:
 
 @pytest.mark.golden
 def test_matches_equal_the_references_for_every_size_and_subsampling() -> None:
+    """The reference searched each in up to three ways; ours is one for all of them."""
     fields, cases = records()
+    ours = cache(lambda name, S: reciprocal_matches(fields[name]["A"], fields[name]["B"], S))
     checked = 0
     for case in cases:
         if "S" not in case:
             continue
-        found = reciprocal_matches(fields[case["name"]]["A"], fields[case["name"]]["B"], case["S"])
+        found = ours(case["name"], case["S"])
         assert np.array_equal(found.xy1, case["xy1"])
         assert np.array_equal(found.xy2, case["xy2"])
         checked += 1
