@@ -8,7 +8,7 @@ In a swarm with keys the owner's log says what a latent is, so that a relay cann
 from array import array
 from bisect import insort
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 from flocc_agent.core.effects import Effect, FetchLatent
@@ -25,6 +25,8 @@ WANTS_MAX = 8
 """Latents out of reach that are asked of relays at one time; a message carries 16."""
 RELAYS_MAX = 16
 """Latents kept for others at one time: the wants of two robots."""
+FALSE_MAX = 64
+"""Of so many latents it is remembered that one robot in range served something else in their place."""
 RETRY_S = 1.0
 """First pause after a failed fetch; it doubles up to `RETRY_MAX_S`."""
 RETRY_MAX_S = 16.0
@@ -54,6 +56,7 @@ class Reach:
     def __init__(self) -> None:
         self._peers: dict[str, Peer] = {}
         self._holders: dict[KeyframeId, list[str]] = {}
+        self._false: dict[str, dict[KeyframeId, None]] = {}
 
     def __contains__(self, name: object) -> bool:
         return name in self._peers
@@ -63,7 +66,8 @@ class Reach:
 
     def update(self, name: str, peer: Peer) -> bool:
         """Note a robot in range; whether that changes what can be had."""
-        known = self._peers.get(name)
+        known, false = self._peers.get(name), self._false.get(name)
+        peer = peer if false is None else replace(peer, holds=tuple(k for k in peer.holds if k not in false))
         self._peers[name] = peer
         if known is None or known.holds != peer.holds:
             self._note_holds(name, known.holds if known else (), peer.holds)
@@ -78,8 +82,15 @@ class Reach:
         peer = self._peers.get(log.robot)
         return peer is not None and peer.log in (None, log)
 
+    def on_false(self, name: str, keyframe: KeyframeId) -> None:
+        """What a robot holds for others is not what the owner made; others are asked until it is out of range."""
+        if name in self._peers and name != keyframe.log.robot:
+            remember(self._false.setdefault(name, {}), keyframe, None, FALSE_MAX)
+            self.update(name, self._peers[name])
+
     def remove(self, name: str) -> None:
         """A robot is out of range."""
+        self._false.pop(name, None)
         peer = self._peers.pop(name, None)
         if peer is not None:
             self._note_holds(name, peer.holds, ())

@@ -227,6 +227,11 @@ class LoopClosing:
         self.latents.on_failed(keyframe, now)
         self._changed = True
 
+    def on_false_latent(self, keyframe: KeyframeId, holder: str) -> None:
+        """What a robot served is not what the keyframe's owner made."""
+        self._reach.on_false(holder, keyframe)
+        self._chosen = None
+
     def on_wants(self, wants: Iterable[KeyframeId], now: float) -> None:
         """Latents that a neighbour cannot reach."""
         self._changed |= self.latents.on_wants(wants, now)

@@ -16,6 +16,7 @@ from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, 
 from flocc_agent.core.effects import Broadcast, Effect, Encode, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
+    LATENT_FALSE,
     LATENT_UNKNOWN,
     BlockIterated,
     BlockIterationFailed,
@@ -457,8 +458,10 @@ class Robot:
         return [Unicast(sender.robot, Digests(self._boot, *digests, *versions))]
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
-        """Try again later, unless the owner itself no longer has the latent."""
+        """Try again later, with another holder if this one served a false one, unless its owner lost the latent."""
         self.closing.on_fetch_failed(keyframe, now)
+        if reason == LATENT_FALSE:
+            self.closing.on_false_latent(keyframe, holder)
         report = Report(LatentFailed(keyframe=keyframe, holder=holder, reason=reason))
         lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
         return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now)]

@@ -6,6 +6,7 @@ from tests.agent.core.virtual_time import Robots, answer, keyframe
 
 from flocc_agent.core.effects import Effect, Encode, FetchLatent, Register, Unicast
 from flocc_agent.core.events import (
+    LATENT_FALSE,
     LATENT_UNKNOWN,
     Event,
     KeyframeEncodingFailed,
@@ -17,7 +18,7 @@ from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, r
 from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
-from flocc_agent.core.reports import ClosureRejected
+from flocc_agent.core.reports import ClosureRejected, LatentFailed
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
 from flocc_protocol.records import RejectionRecord
@@ -307,6 +308,25 @@ def test_wishes_that_nobody_can_grant_do_not_keep_others_waiting() -> None:
     assert turns == set(needed)
 
 
+def test_a_holder_that_served_a_false_latent_is_asked_again_only_when_it_comes_back() -> None:
+    wanted, holds = keyframe("r3/1"), Peer(0, holds=(keyframe("r3/1"), keyframe("r3/2")))
+    around = reach(r2=holds.holds, r4=holds.holds)
+    around.on_false("r2", wanted)
+    around.update("r2", holds)
+    assert (around.holder(wanted), around.holder(keyframe("r3/2"))) == ("r4", "r2")
+    around.on_false("r4", wanted)
+    assert Latents(R1, PARAMETERS).wants([wanted], around, 0.0) == (wanted,)
+    around.remove("r2")
+    around.update("r2", holds)
+    assert around.holder(wanted) == "r2"
+
+
+def test_a_latent_is_asked_of_its_owner_whatever_it_served() -> None:
+    around = reach(r2=())
+    around.on_false("r2", keyframe("r2/1"))
+    assert around.holder(keyframe("r2/1")) == "r2"
+
+
 def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     latents = Latents(R1, PARAMETERS)
     for k in range(50):
@@ -408,6 +428,23 @@ def test_a_lost_latent_is_known_to_robots_that_only_hear_the_owner_through_other
     assert {fact.reason for fact in robots.facts("r4", ClosureRejected)} == {"a latent was lost"}
     robots.run(60.0)
     assert all(core.closing.lost(robots.now_s) == () for core in robots.cores.values())
+
+
+def test_a_relay_that_serves_false_latents_keeps_no_closure_back() -> None:
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, FetchLatent) and effect.holder == "r2" and effect.keyframe.log.robot != "r2":
+            return LatentFetchFailed(effect.keyframe, effect.holder, LATENT_FALSE)
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2", "r3", "r4"):
+        robots.add(name)
+    robots.separate("r1", "r4")
+    meet(robots, "r1", "r4")
+    robots.run(60.0)
+    assert robots.cores["r3"].assembly.closures == 4
+    false = [fact.keyframe for fact in robots.facts("r4", LatentFailed) if fact.holder == "r2"]
+    assert len(false) == len(set(false)) > 0
 
 
 def test_an_own_latent_that_the_store_evicted_rejects_its_pair() -> None:
