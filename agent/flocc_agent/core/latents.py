@@ -27,6 +27,8 @@ RELAYS_MAX = 16
 """Latents kept for others at one time: the wants of two robots."""
 FALSE_MAX = 64
 """Of so many latents it is remembered that one robot in range served something else in their place."""
+BACKLOG_MAX = 64
+"""A stronger robot with which so many pairs wait is handed no more: who found them begins with them."""
 RETRY_S = 1.0
 """First pause after a failed fetch; it doubles up to `RETRY_MAX_S`."""
 RETRY_MAX_S = 16.0
@@ -57,6 +59,7 @@ class Reach:
         self._peers: dict[str, Peer] = {}
         self._holders: dict[KeyframeId, list[str]] = {}
         self._false: dict[str, dict[KeyframeId, None]] = {}
+        self._handed: dict[str, int] = {}
 
     def __contains__(self, name: object) -> bool:
         return name in self._peers
@@ -69,6 +72,7 @@ class Reach:
         known, false = self._peers.get(name), self._false.get(name)
         peer = peer if false is None else replace(peer, holds=tuple(k for k in peer.holds if k not in false))
         self._peers[name] = peer
+        self._handed.pop(name, None)
         if known is None or known.holds != peer.holds:
             self._note_holds(name, known.holds if known else (), peer.holds)
         return known is None or (known.compute_class, known.holds, known.log) != (
@@ -91,6 +95,7 @@ class Reach:
     def remove(self, name: str) -> None:
         """A robot is out of range."""
         self._false.pop(name, None)
+        self._handed.pop(name, None)
         peer = self._peers.pop(name, None)
         if peer is not None:
             self._note_holds(name, peer.holds, ())
@@ -115,6 +120,20 @@ class Reach:
             if peer.compute_class > compute_class
         ]
         return min(better)[2] if better else None
+
+    def is_full(self, name: str) -> bool:
+        """Whether a robot in range has more than enough pairs to register."""
+        peer = self._peers.get(name)
+        return peer is not None and peer.load >= BACKLOG_MAX
+
+    def room(self, name: str) -> int:
+        """How many more pairs may be handed to a robot until it says again how many wait there: all here may do so."""
+        peer = self._peers[name]
+        return max(0, -(-(BACKLOG_MAX - peer.load) // len(self._peers)) - self._handed.get(name, 0))
+
+    def on_handed(self, name: str, pairs: int) -> None:
+        """So many pairs were handed to a robot."""
+        self._handed[name] = self._handed.get(name, 0) + pairs
 
     def holder(self, keyframe: KeyframeId) -> str | None:
         """Who in range can give a latent: its owner, or a robot that holds it."""

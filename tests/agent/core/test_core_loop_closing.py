@@ -1,9 +1,12 @@
 """Candidates to registrations: each pair by one robot, taken over, rejected when its latents are lost."""
 
+from collections import Counter
 from typing import Any
 
+import pytest
 from tests.agent.core.virtual_time import Robots, answer, keyframe
 
+from flocc_agent.core import latents
 from flocc_agent.core.effects import Effect, Encode, FetchLatent, Register, Unicast
 from flocc_agent.core.events import (
     LATENT_FALSE,
@@ -13,7 +16,7 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
 )
-from flocc_agent.core.latents import RELAYS_MAX, RETRY_S, Latents, Peer, Reach
+from flocc_agent.core.latents import BACKLOG_MAX, RELAYS_MAX, RETRY_S, Latents, Peer, Reach
 from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, registrar_of
 from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -335,7 +338,89 @@ def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - RELAYS_MAX, 50))
 
 
+def handed(machine: LoopClosing, now: float) -> list[CandidatePair]:
+    told = [effect.message for effect in machine.tick(now) if isinstance(effect, Unicast) and effect.to == "server"]
+    return [pair for message in told if isinstance(message, CandidateOffer) for pair in message.pairs]
+
+
+def test_a_stronger_robot_is_handed_its_share_of_what_it_has_room_for_the_most_similar_first() -> None:
+    machine, pairs = closing(), pairs_of(R1, 5)
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX - 4))
+    machine.on_peer("r2", Peer(0))
+    for k, pair in enumerate(pairs):
+        found(machine, pair, 0.5 + 0.1 * k)
+    assert handed(machine, 0.0) == [pairs[4], pairs[3]]
+    assert handed(machine, 0.3) == []
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX - 4))
+    assert handed(machine, 0.6) == [pairs[2], pairs[1]]
+    assert handed(machine, OFFER_PERIOD_S) == sorted([pairs[4], pairs[3]])
+
+
+def test_while_a_stronger_robot_has_more_than_enough_to_do_others_help() -> None:
+    machine, pairs = closing(), pairs_of(R1, 5)
+    for k in range(100):
+        machine.on_held(KeyframeId(R1, k))
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    machine.on_peer("r2", Peer(0))
+    for k, pair in enumerate(pairs):
+        found(machine, pair, 0.5 + 0.1 * k)
+    helped = PARAMETERS.registrations_max + PARAMETERS.fetches_max
+    effects = machine.tick(0.0)
+    assert offers(effects) == []
+    assert [effect.keyframe for effect in effects if isinstance(effect, FetchLatent)] == [keyframe("r2/1")]
+    assert machine.load == helped
+    machine.on_peer("server", Peer(9, load=0))
+    assert handed(machine, 0.5) == [pairs[1], pairs[0]]
+
+
+def test_what_nobody_in_range_can_give_is_left_to_the_stronger_robot() -> None:
+    machine = closing()
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    found(machine, pair_of(R1))
+    assert machine.tick(0.0) == []
+    assert machine.load == 0
+    assert len(machine.open_pairs()) == 1
+
+
+def test_a_robot_that_begins_hands_on_what_it_may_have_handed_on_before() -> None:
+    machine = closing(listens_until_s=1.0)
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    machine.on_peer("r2", Peer(0))
+    found(machine, pair_of(R1))
+    assert handed(machine, 1.0) == [pair_of(R1)]
+
+
+def test_pairs_that_a_stronger_robot_was_not_told_of_do_not_wait_for_it_when_it_is_gone() -> None:
+    machine = closing()
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    found(machine, pair_of(R1))
+    machine.tick(0.0)
+    machine.on_lost("server", 1.0)
+    machine.on_peer("r2", Peer(0))
+    assert [effect.keyframe for effect in machine.tick(1.0) if isinstance(effect, FetchLatent)] == [keyframe("r2/1")]
+
+
 # Whole robots
+
+
+def test_a_server_that_answers_nothing_does_not_keep_the_others_from_closing_loops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(latents, "BACKLOG_MAX", 2)
+    robots = Robots()
+    for name in ("r1", "r2"):
+        robots.add(name)
+    robots.add("server", compute_class=9)
+    robots.run(30.0)
+    robots.work = lambda robots, name, effect: (
+        None if name == "server" and isinstance(effect, Register) else answer(effect)
+    )
+    meet(robots, "r1", "r2", keyframes=16)
+    robots.run(30.0)
+    by = Counter(name for _, name, effect in robots.done if isinstance(effect, Register))
+    assert by["server"] == 1
+    assert by["r1"] + by["r2"] >= 8
+    assert len(registrations(robots)) == len(set(registrations(robots)))
 
 
 def test_every_pair_is_registered_once() -> None:
