@@ -16,6 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.closure_ends import Tie, tie_of
 from flocc_agent.core.correction_evidence import TIES_MIN, Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import contradiction
@@ -84,9 +85,9 @@ class CorrectedRobot:
         """T_odom_camera (N, 4, 4)."""
         return self.odometries.get(log, np.empty((0, 4, 4)))
 
-    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
+    def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
         """The newest ones."""
-        return [c for c in reversed(self.closures) if log in (c.query.log, c.match.log)][:ties_max]
+        return [tie_of(log, c) for c in reversed(self.closures) if log in (c.query.log, c.match.log)][:ties_max]
 
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """Fixes."""

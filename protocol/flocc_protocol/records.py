@@ -281,6 +281,10 @@ PAIR_HEADER = 0x92
 """First byte of every record: a msgpack array of two, its code and its fields."""
 _SHORT_LIST = 0x90
 _LIST_SIZE_BYTES = {0xDC: 2, 0xDD: 4}
+_INT8_VECTOR = b"\x94\xa2i1\x91"
+"""How an array of int8 in one dimension begins: a list of four, the code, a list of one."""
+_UINT_BYTES = {0xCC: 1, 0xCD: 2, 0xCE: 4}
+_BIN_BYTES = {0xC4: 1, 0xC5: 2, 0xC6: 4}
 
 
 _STAMP = real(-1e12, 1e12)
@@ -410,6 +414,23 @@ def code_of(data: bytes) -> int:
     if len(data) < 3 or data[0] != PAIR_HEADER or not 1 <= data[1] <= CODE_MAX:
         raise DecodeError("a record is a code and its fields")
     return data[1]
+
+
+def int8_descriptor(data: bytes) -> slice | None:
+    """Where an encoded keyframe record has its descriptor of int8, whatever follows the record; None without one."""
+    at = data.find(_INT8_VECTOR) if data[1] == KEYFRAME_CODE else -1
+    if at < 0:
+        return None
+    size, at = _unsigned(data, at + len(_INT8_VECTOR), _UINT_BYTES)
+    length, first = _unsigned(data, at, _BIN_BYTES)
+    return slice(first, first + length) if 0 < size == length and first + length <= len(data) else None
+
+
+def _unsigned(data: bytes, at: int, sizes_bytes: dict[int, int]) -> tuple[int, int]:
+    """A number of MessagePack's and where it ends: one of so many bytes after its first, or its first alone."""
+    head = data[at] if at < len(data) else 0
+    end = at + 1 + sizes_bytes.get(head, 0)
+    return (head if end == at + 1 else int.from_bytes(data[at + 1 : end], "big")), end
 
 
 def chain(before: int, record_bytes: bytes) -> int:

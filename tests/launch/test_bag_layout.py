@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from tests.launch.bag_fixtures import ZERO_NS, BagScript, walking
@@ -10,6 +11,7 @@ from flocc_agent.runtime.recording import Recording
 from flocc_launch.datasets.commands import convert, info, infos
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.source import DatasetError
+from flocc_launch.datasets.stamp_gaps import StampGaps
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_scenario
 
@@ -97,6 +99,136 @@ def test_a_bag_of_two_robots_is_launched_as_two(tmp_path: Path, monkeypatch: pyt
     assert "Alpha: images /Alpha/cam/image/compressed, " in told[0]
     paths = recordings(scenario)
     assert [Recording.open(path).frames[0].T_odom_body[0, 3] for path in paths.values()] == [0.0, 10.0]
+
+
+def robot_of(
+    script: BagScript,
+    images: str | None,
+    odometry: str | None,
+    x_m: float,
+    frames: tuple[str, str] = ("camera", "body"),
+) -> BagScript:
+    """A robot's part of a bag, or half of one; its intrinsics lie beside its images."""
+    script.frame, script.child = frames
+    if images is not None:
+        script.camera_info(images.replace("image_raw", "camera_info").replace("image_", "info_"), ZERO_NS, 30.0 + x_m)
+    for k in range(4):
+        if odometry is not None:
+            script.odometry(odometry, ZERO_NS + k * S, x_m + k)
+        if images is not None:
+            script.compressed(f"{images}/compressed", ZERO_NS + k * S, 50)
+    script.messages.sort(key=lambda message: message[2])
+    return script
+
+
+@pytest.mark.parametrize(
+    ("images", "odometry", "names"),
+    [
+        ("/cam_{}/image_raw", "/odom_{}", ("r1", "r2")),
+        ("/image_{}", "/odom_{}", ("r1", "r2")),
+        ("/{}_camera/image_raw", "/{}_odom", ("r1", "r2")),
+        ("/camera{}/image_raw", "/odom{}", ("1", "2")),
+    ],
+)
+def test_robots_are_told_apart_by_a_part_of_a_name(
+    tmp_path: Path, images: str, odometry: str, names: tuple[str, str]
+) -> None:
+    script = BagScript(False)
+    for number, name in enumerate(names):
+        robot_of(script, images.format(name), odometry.format(name), float(number), (f"{name}_c", f"{name}_b"))
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    found = {name: Recording.open(tmp_path / "out" / name) for name in names}
+    assert [recording.frames[0].T_odom_body[0, 3] for recording in found.values()] == [0.0, 1.0]
+    assert [recording.camera.fx for recording in found.values()] == [30.0, 31.0]
+
+
+def test_two_cameras_of_one_odometry_are_not_two_robots(tmp_path: Path) -> None:
+    script = robot_of(robot_of(BagScript(False), "/camera1/image_raw", "/odom", 0.0), "/camera2/image_raw", None, 1.0)
+    with pytest.raises(DatasetError, match="has 2 image topics, name one with --image-topic"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("first", "second"), [("r1", "r2"), ("r2", "r1")])
+@pytest.mark.parametrize("half", ["images", "odometry"])
+def test_a_whole_robot_is_taken_beside_half_of_another(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, first: str, second: str, half: str
+) -> None:
+    script = robot_of(BagScript(False), f"/{first}/cam/image_raw", f"/{first}/odom", 1.0)
+    parts = (f"/{second}/cam/image_raw", None) if half == "images" else (None, f"/{second}/odom")
+    bag = robot_of(script, parts[0], parts[1], 7.0).write(tmp_path / "team", "mcap")
+    recording = Recording.open(convert(bag, tmp_path / "out"))
+    assert recording.frames[0].T_odom_body[0, 3] == 1.0
+    assert recording.camera.fx == 31.0
+    told = f"{second} has images but no odometry" if half == "images" else f"not taken: /{second}/odom"
+    assert told in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("images", "odometry", "frames"),
+    [
+        ("/r1/cam/image_raw", "/r2/odom", ("", "")),
+        ("/alpha/cam/image_raw", "/bob/odom", ("", "")),
+        ("/image_raw", "/odom", ("r1/cam", "r2/base")),
+    ],
+)
+def test_images_of_one_robot_do_not_get_the_odometry_of_another(
+    tmp_path: Path, images: str, odometry: str, frames: tuple[str, str]
+) -> None:
+    script = robot_of(BagScript(False), images, None, 0.0, (frames[0] or "camera", ""))
+    if "bob" in odometry:
+        script.camera_info("/bob/cam/camera_info", ZERO_NS)
+    robot_of(script, None, odometry, 5.0, (frames[1] or "odom", frames[1] or "body"))
+    with pytest.raises(DatasetError, match=r"is another robot's odometry than that of .*image"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+
+
+def test_a_body_that_odometry_does_not_name_is_found_on_tf_or_refused(tmp_path: Path) -> None:
+    script = mounted(robot_of(BagScript(False), "/cam/image_raw", "/odom", 0.0, ("camera", "")))
+    with pytest.raises(
+        DatasetError, match=r"the camera \(camera\) sits on housing, but /odom does not say which frame"
+    ):
+        convert(script.write(tmp_path / "unnamed", "mcap"), tmp_path / "out")
+    for frame in ("odom", "body"):
+        script.transform("/tf", ZERO_NS, ("camera" if frame == "odom" else "odom", frame))
+    bag = script.write(tmp_path / "run", "mcap")
+    assert Recording.open(convert(bag, tmp_path / "found")).T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
+
+
+@pytest.mark.parametrize("storage", ["bag", "db3"])
+def test_images_that_come_late_go_where_they_belong(tmp_path: Path, storage: str) -> None:
+    script = walking(storage == "bag", count=12)
+    at = [k for k, message in enumerate(script.messages) if "image" in message[0]]
+    for one, other in ((3, 4), (7, 9)):
+        (*_, first), (*_, second) = script.messages[at[one]], script.messages[at[other]]
+        script.messages[at[one]] = (*script.messages[at[one]][:3], second)
+        script.messages[at[other]] = (*script.messages[at[other]][:3], first)
+    bag = script.write(tmp_path / ("run.bag" if storage == "bag" else "run"), storage)
+    recording = Recording.open(convert(bag, tmp_path / "out"))
+    assert [frame.T_odom_body[0, 3] for frame in recording.frames] == pytest.approx([k + 0.2 for k in range(12)])
+    pictures = [cv2.imread(str(frame.image_path), cv2.IMREAD_GRAYSCALE) for frame in recording.frames]
+    greys = [picture[0, 0] for picture in pictures if picture is not None]
+    assert greys == pytest.approx([10 * k for k in range(12)], abs=2)
+
+
+def test_a_clock_that_was_set_back_fills_no_gaps() -> None:
+    gaps = StampGaps()
+    forward = [gaps.fits(k * 100) for k in range(50)]
+    back = [gaps.fits(4000 + phase + k * 100) for phase in (30, 50) for k in range(9)]
+    assert all(forward)
+    assert not any(back)
+    assert gaps.fits(5000)
+
+
+def test_a_message_that_was_kept_back_does_not_choose_the_clock(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = walking(False)
+    first = next(k for k, message in enumerate(script.messages) if message[0] == "/odom")
+    stale = BagScript(False)
+    stale.odometry("/odom", ZERO_NS - 20 * S, -1.0)
+    script.messages[first] = (*script.messages[first][:3], stale.messages[0][3])
+    assert len(Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames) == 4
+    assert "stamped by clocks" not in caplog.text
 
 
 def test_the_left_camera_of_two_is_taken(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -460,6 +461,20 @@ def test_a_row_of_colmap_that_was_cut_is_said(tmp_path: Path, last: str, said: s
     assert not [note for note in read_source(write_colmap(tmp_path)).notes if "images.txt" in note]
 
 
+def test_of_several_models_of_colmap_the_largest_is_taken_and_said(tmp_path: Path) -> None:
+    rows = [f"{k + 1} 1 0 0 0 0 0 {k} 1 {k}.png\n1.5 2.5 -1\n" for k in range(4)]
+    for number, kept in enumerate((rows[:1], rows[1:])):
+        place = tmp_path / "sparse" / str(number)
+        place.mkdir(parents=True)
+        (place / "cameras.txt").write_text("1 PINHOLE 32 24 7 8 16 12\n")
+        (place / "images.txt").write_text("".join(kept))
+    for k in range(4):
+        write_image(tmp_path / "images" / f"{k}.png")
+    source = read_source(tmp_path)
+    assert len(source.images) == 3
+    assert f"{tmp_path}: the model sparse/1 was taken; not those of other frames: sparse/0" in source.notes
+
+
 def test_a_camera_of_colmap_that_is_no_number_is_refused_with_its_line(tmp_path: Path) -> None:
     path = write_colmap(tmp_path, "4 1 0 0 0 0 0 3 1.5 3.png\n")
     with pytest.raises(DatasetError, match=r"images\.txt:8: CAMERA_ID must be a whole number, not '1\.5'"):
@@ -624,6 +639,31 @@ def test_stamps_of_frames_are_taken(tmp_path: Path, unit: float, read: bool) -> 
             read_source(tmp_path)
         return
     assert [stamp_s for stamp_s, _ in read_source(tmp_path).images] == pytest.approx([5.0, 5.1, 5.2, 5.3])
+
+
+@pytest.mark.parametrize(
+    ("applied", "said"),
+    [
+        ({"applied_scale": 0.1}, ""),
+        ({"applied_scale": 0.0}, "applied_scale must be a number above 0"),
+        ({"applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "applied_transform is not rigid"),
+    ],
+)
+def test_a_scale_that_nerfstudio_applied_is_undone(tmp_path: Path, applied: dict[str, Any], said: str) -> None:
+    frames = []
+    for k in range(4):
+        write_image(tmp_path / f"{k}.png")
+        frames.append({"file_path": f"{k}.png", "time": k / 4, "transform_matrix": moving(4)[k].tolist()})
+    table = {"w": 32, "h": 24, "fl_x": 7, "fl_y": 8, "cx": 16, "cy": 12, "frames": frames, **applied}
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    if said:
+        with pytest.raises(DatasetError, match=said):
+            read_source(tmp_path)
+        return
+    source = read_source(tmp_path)
+    assert source.truth is not None
+    np.testing.assert_allclose(source.truth.T_fixed_body[:, :3, 3], 10 * moving(4)[:, :3, 3])
+    assert f"{tmp_path / 'transforms.json'}: not used of its frames: time" in source.notes
 
 
 def test_a_matrix_that_is_not_finite_is_not_taken_for_two(tmp_path: Path) -> None:

@@ -81,6 +81,20 @@ def test_a_folder_around_one_data_set_is_that_data_set(own: Path, tmp_path: Path
     assert told[0].startswith(f"data: {around / 'drive'}, cut by time into 2 robots")
 
 
+def test_a_robots_folder_may_hold_its_data_set_and_what_is_left_is_said(own: Path, tmp_path: Path) -> None:
+    for place in ("a", "b/monday", "c/monday", "c/tuesday"):
+        shutil.copytree(own, tmp_path / "team" / place)
+    (tmp_path / "team" / "d").mkdir()
+    (tmp_path / "team" / "d" / "walk.mp4").write_bytes(b"")
+    (tmp_path / "team" / "notes").mkdir()
+    told: list[str] = []
+    scenario = read_scenario(str(tmp_path / "team"), {}, tell=told.append)
+    assert scenario.names() == ["a", "b", "d"]
+    assert "; not taken: c, notes" in told[0]
+    assert str(scenario.robots["b"].recording).endswith("b/monday")
+    assert str(scenario.robots["d"].recording).endswith("d/walk.mp4")
+
+
 def test_robots_that_recorded_together_keep_their_distance_in_time(own: Path, tmp_path: Path) -> None:
     team = tmp_path / "team"
     for name in ("early", "late"):

@@ -1,5 +1,6 @@
 """A video file is cut into its frames; where odometry or intrinsics are missing, one sentence says so."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_launch.datasets.commands import convert, info, infos, split
 from flocc_launch.datasets.source import DatasetError
+from flocc_launch.datasets.video import odometry_beside
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.shipped import read_scenario
 
@@ -103,3 +105,11 @@ def test_a_folder_that_is_converted_names_what_it_holds(video: Path, tmp_path: P
     (tmp_path / "set" / "sequences" / "00" / "image_0").mkdir(parents=True)
     with pytest.raises(DatasetError, match=r"inside of it, sequences.00 would be"):
         convert(tmp_path / "set", tmp_path / "out")
+
+
+def test_one_trajectory_is_not_that_of_two_videos(video: Path) -> None:
+    beside(video)
+    (video.parent / f"{video.stem}.tum").rename(video.parent / "odometry.tum")
+    assert odometry_beside(video) is not None
+    shutil.copyfile(video, video.with_name("other.mp4"))
+    assert odometry_beside(video) is None

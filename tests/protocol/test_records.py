@@ -28,6 +28,7 @@ from flocc_protocol.records import (
     chain,
     decode_record,
     encode_record,
+    int8_descriptor,
 )
 
 KEYFRAME = KeyframeRecord(0, 0.0, IDENTITY, None)
@@ -189,3 +190,28 @@ def test_a_record_with_fewer_fields_than_known_is_a_decode_error() -> None:
     code, fields = from_bytes(ENCODED[0], RECORD_BYTES_MAX)
     with pytest.raises(DecodeError, match="of length 4, got 3"):
         decode_record(to_bytes([code, fields[:-1]]))
+
+
+@pytest.mark.parametrize("index", [0, 127, 128, 70_000])
+@pytest.mark.parametrize("dimension", [1, 127, 128, 255, 256, DESCRIPTOR_DIMENSION_MAX])
+def test_a_descriptor_of_int8_is_found_in_its_record(index: int, dimension: int) -> None:
+    array = Array.int8(np.random.default_rng(dimension).standard_normal(dimension))
+    for seal in (b"", bytes(64)):
+        data = encode_record(replace(KEYFRAME, index=index, descriptor=array)) + seal
+        place = int8_descriptor(data)
+        assert place is not None
+        assert data[place] == array.data
+
+
+def test_other_records_have_no_descriptor_of_int8() -> None:
+    floats = replace(KEYFRAME, descriptor=Array.of(np.ones(8)))
+    for record in (
+        replace(KEYFRAME, descriptor=None),
+        floats,
+        *(each for each in RECORDS if not isinstance(each, KeyframeRecord)),
+    ):
+        assert int8_descriptor(encode_record(record)) is None
+    data = encode_record(replace(KEYFRAME, descriptor=Array.int8(np.ones(8))))
+    for end in range(3, len(data)):
+        place = int8_descriptor(data[:end])
+        assert place is None or place.stop <= end

@@ -7,11 +7,12 @@ closures it is kept where their records stand, and both become matrices when som
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from itertools import chain, islice
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.closure_ends import Tie, TieColumns
 from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
@@ -168,6 +169,7 @@ class GraphAssembly:
         self._records: dict[tuple[LogId, int], Record] | None = {} if record_at is None else None
         self._record_at = record_at or self._kept_record
         self._closures: dict[CandidatePair, tuple[LogId, int]] = {}
+        self._ties = TieColumns()
         self._unbuilt: set[CandidatePair] = set()
         self._reads_all = True
         self._built: list[CandidatePair] = []
@@ -223,16 +225,13 @@ class GraphAssembly:
         odometry = self._odometry.get(log)
         return np.empty((0, 4, 4)) if odometry is None else odometry.matrices()
 
-    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
-        """The newest closures of a log."""
-        pairs = (pair for pair in reversed(self._closures) if log in (pair.low.log, pair.high.log))
-        records = (self._record_at(*self._closures[pair]) for pair in islice(pairs, ties_max))
-        return [record for record in records if isinstance(record, ClosureRecord)]
+    def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
+        """The newest closures of a log; their records are not read."""
+        return self._ties.of(log, ties_max)
 
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """What else was measured at a log's keyframes, or of them."""
-        factors = self._measured.factors(self._odometry, self._known)
-        return [factor for factor in factors if log in (factor.query.log, factor.match.log)]
+        return self._measured.of(log, self._odometry, self._known)
 
     def joined(self, log: LogId, other: LogId) -> bool:
         """Whether closures, other measurements or the opened map lead from one log to the other.
@@ -241,7 +240,7 @@ class GraphAssembly:
         """
         if not self._reads_all and log in self._odometry and other in self._odometry:
             return True
-        links = list(dict.fromkeys((pair.low.log, pair.high.log) for pair in self._closures))
+        links = self._ties.links()
         measured = self._measured.factors(self._odometry, self._known)
         links += [(factor.query.log, factor.match.log) for factor in measured]
         if self._saved is not None:
@@ -302,6 +301,9 @@ class GraphAssembly:
         pair = CandidatePair.of(record.query, record.match)
         held = self._closures.get(pair)
         if held is None or (new.log, new.number) < held:
+            if held is not None:
+                self._ties.remove(pair.low, pair.high)
+            self._ties.put(record)
             self._closures[pair] = (new.log, new.number)
             if self._records is not None:
                 self._records[new.log, new.number] = record

@@ -7,13 +7,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.closure_ends import Tie
 from flocc_agent.core.geodesy import T_earth_enu
 from flocc_agent.core.knots import corrected
 from flocc_agent.core.pose_graph import MeasuredFactor, is_landmark
 from flocc_agent.geometry import between, inverse, umeyama
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import LogCorrection
-from flocc_protocol.records import ClosureRecord
 
 Float = NDArray[np.float64]
 Int = NDArray[np.intp]
@@ -47,7 +47,7 @@ class HeldGraph(Protocol):
         """T_odom_camera (N, 4, 4) of the known keyframes of a log."""
         ...
 
-    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
+    def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
         """The newest closures of a log."""
         ...
 
@@ -66,15 +66,6 @@ class Placed:
 
     own: LogCorrection
     others: Mapping[LogId, LogCorrection]
-
-
-@dataclass(frozen=True, slots=True)
-class Tie:
-    """One closure: a log's own keyframe, the other one, and how long its translation is, metres or 0."""
-
-    near: int
-    far: int
-    length_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +196,7 @@ def _apart_m(one: Float, other: Float, first: Int, last: Int) -> Float:
 
 
 def evidence_of(
-    placed: Placed, closures: Sequence[ClosureRecord], camera: Float, odometry: Float, graph: HeldGraph
+    placed: Placed, closures: Sequence[Tie], camera: Float, odometry: Float, graph: HeldGraph
 ) -> CorrectionEvidence:
     """What closures of a correction's log and its measurements say of it, as far as the other ends are known."""
     own, near_m = placed.own.log, view_m(odometry)
@@ -215,7 +206,7 @@ def evidence_of(
     for far, of_log in ties.items():
         found = _seen(placed, far, of_log, camera, graph)
         made = [
-            _End(tie.near, off, sigma_m, near_m + VIEW_LENGTHS * tie.length_m + sigma_m, KeyframeId(far, tie.far))
+            _End(tie.near, off, sigma_m, near_m + VIEW_LENGTHS * tie.length_m + sigma_m, tie.far)
             for tie, off, sigma_m in found
         ]
         (within if far == own else ends).extend(made)
@@ -293,10 +284,10 @@ def _slack_m(one: _End, other: _End, graph: HeldGraph) -> float:
 
 
 def _ties_and_fixes(
-    log: LogId, closures: Sequence[ClosureRecord], keyframes: int, graph: HeldGraph
+    log: LogId, closures: Sequence[Tie], keyframes: int, graph: HeldGraph
 ) -> tuple[dict[LogId, list[Tie]], dict[LogId, dict[int, Float]]]:
     """Of a log's known keyframes: ties to keyframes by their log, and places by the frame that they are in."""
-    ties, fixes = by_far_log(log, closures, keyframes), dict[LogId, dict[int, Float]]()
+    ties, fixes = by_far_log(closures, keyframes), dict[LogId, dict[int, Float]]()
     for factor in graph.measured(log):
         _sort_in(factor, log, keyframes, ties, fixes)
     return ties, fixes
@@ -314,9 +305,7 @@ def _sort_in(
     if near.log != own or near.index >= keyframes:
         return
     if not is_landmark(far.log):
-        ties.setdefault(far.log, []).append(
-            Tie(near.index, far.index, float(np.linalg.norm(factor.T_query_match[:3, 3])))
-        )
+        ties.setdefault(far.log, []).append(Tie(near.index, far, float(np.linalg.norm(factor.T_query_match[:3, 3]))))
         return
     T = T_earth_enu(factor.place) if factor.place is not None else factor.T_query_match
     fixes.setdefault(far.log, {})[near.index] = (T if far == factor.query else inverse(T))[:3, 3]
@@ -331,14 +320,12 @@ def _fitted(fixes: Mapping[int, Float], camera: Float, may_m: float) -> list[_En
     return [_End(k, off, 0.0, may_m, None) for k, off in zip(near, off_m, strict=True)]
 
 
-def by_far_log(own: LogId, closures: Sequence[ClosureRecord], keyframes: int) -> dict[LogId, list[Tie]]:
+def by_far_log(closures: Sequence[Tie], keyframes: int) -> dict[LogId, list[Tie]]:
     """Closures of a log by the log of their other end."""
     ties: dict[LogId, list[Tie]] = {}
-    for closure in closures:
-        near, far = (closure.query, closure.match) if closure.query.log == own else (closure.match, closure.query)
-        if near.index < keyframes:
-            length_m = (closure.scale_initial or 0.0) * float(np.linalg.norm(closure.T_query_match_unscaled[:3]))
-            ties.setdefault(far.log, []).append(Tie(near.index, far.index, length_m))
+    for tie in closures:
+        if tie.near < keyframes:
+            ties.setdefault(tie.far.log, []).append(tie)
     return ties
 
 
@@ -348,10 +335,10 @@ def _seen(
     """Closures with one log, how far off (3,) they put this robot's cameras, and by how much that may be wrong."""
     own = log == placed.own.log
     correction, odometry = placed.own if own else placed.others.get(log), graph.odometry(log)
-    ties = [tie for tie in ties if tie.far < len(odometry)]
+    ties = [tie for tie in ties if tie.far.index < len(odometry)]
     if correction is None or correction.anchor != placed.own.anchor or not ties:
         return []
-    near, far = np.array([tie.near for tie in ties]), np.array([tie.far for tie in ties])
+    near, far = np.array([tie.near for tie in ties]), np.array([tie.far.index for tie in ties])
     ends = camera[far] if own else corrected(correction, odometry[far], far)
     sigma_m = np.zeros(len(ties))
     if correction.knots is None:
@@ -360,7 +347,7 @@ def _seen(
     return list(zip(ties, camera[near, :3, 3] - ends[:, :3, 3], sigma_m.tolist(), strict=True))
 
 
-def missed_m(log: LogId, closures: Sequence[ClosureRecord], graph: HeldGraph) -> float:
+def missed_m(log: LogId, closures: Sequence[Tie], graph: HeldGraph) -> float:
     """How much of a log's way its odometry missed, by closures that contradict it, whatever solution is believed."""
     odometry, missed = graph.odometry(log), 0.0
     ties, fixes = _ties_and_fixes(log, closures, len(odometry), graph)
@@ -371,10 +358,10 @@ def missed_m(log: LogId, closures: Sequence[ClosureRecord], graph: HeldGraph) ->
         missed += float(np.maximum(moved_m - told_m, 0.0).sum())
     for far, of_log in ties.items():
         there = graph.odometry(far)
-        known = sorted((tie for tie in of_log if tie.far < len(there)), key=lambda tie: tie.near)
+        known = sorted((tie for tie in of_log if tie.far.index < len(there)), key=lambda tie: tie.near)
         if not known:
             continue
-        here_m, there_m = odometry[[tie.near for tie in known], :3, 3], there[[tie.far for tie in known], :3, 3]
+        here_m, there_m = odometry[[tie.near for tie in known], :3, 3], there[[tie.far.index for tie in known], :3, 3]
         may_m = view_m(odometry) + VIEW_LENGTHS * np.array([tie.length_m for tie in known])
         if far == log:
             missed += float(np.maximum(np.linalg.norm(here_m - there_m, axis=1) - may_m, 0.0).sum())

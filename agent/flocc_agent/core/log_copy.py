@@ -2,7 +2,8 @@
 
 Rules: what a record says is not kept as objects; whoever derives something from records does so as they come. Full
 blocks of records never change, so copies of one log in one process share them, and old ones leave memory where there
-is a cold storage; the last few records are kept singly.
+is a cold storage; the last few records are kept singly. Descriptors of a block stand in it as rows, which place
+recognition reads where they are.
 The chained checksum is one of all bytes so far: it is known after each block, and found again from there.
 """
 
@@ -11,11 +12,25 @@ from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import accumulate
 from typing import overload
 from weakref import WeakValueDictionary
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flocc_agent.core.cold_storage import ColdPieces
-from flocc_protocol.records import KEYFRAME_CODE, KeyframeRecord, Record, UnknownRecord, chain, decode_record
+from flocc_protocol.records import (
+    KEYFRAME_CODE,
+    KeyframeRecord,
+    Record,
+    UnknownRecord,
+    chain,
+    decode_record,
+    int8_descriptor,
+)
+
+Rows = NDArray[np.int8]
 
 BLOCK_RECORDS = 64
 """Records of a block: some 15 kB, so that a checksum within it takes microseconds."""
@@ -26,13 +41,59 @@ CODE_AT = 1
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class _Block:
-    """`BLOCK_RECORDS` records in one piece, and where each ends."""
+    """`BLOCK_RECORDS` records in one piece, and their descriptors apart, as rows that others may read.
+
+    Attributes:
+        data: The records without what stands in the rows.
+        ends: Where each ends in that.
+        cuts: Where in a record its row belongs; 0 where it has none.
+        rows: Descriptors (K, D) int8, of the records that have one, in their order; of one length.
+    """
 
     data: bytes
     ends: "array[int]"
+    cuts: "array[int]"
+    rows: Rows
+
+    @classmethod
+    def of(cls, records: Sequence[bytes]) -> "_Block":
+        """These records."""
+        places = list(map(int8_descriptor, records))
+        dimension = next((place.stop - place.start for place in places if place is not None), 0)
+        data, rows = list[bytes](), list[bytes]()
+        ends, cuts, end = array("I"), array("H"), 0
+        for record, place in zip(records, places, strict=True):
+            if place is None or place.stop - place.start != dimension:
+                data.append(record)
+                cuts.append(0)
+            else:
+                data.append(record[: place.start] + record[place.stop :])
+                cuts.append(place.start)
+                rows.append(record[place])
+            end += len(data[-1])
+            ends.append(end)
+        return cls(b"".join(data), ends, cuts, np.frombuffer(b"".join(rows), np.int8).reshape(len(rows), dimension))
+
+    @classmethod
+    def whole(cls, data: bytes, ends: "array[int]") -> "_Block":
+        """Records in one piece, with their descriptors."""
+        return cls(data, ends, array("H", bytes(2 * len(ends))), np.empty((0, 0), np.int8))
 
     def record(self, k: int) -> bytes:
-        return self.data[self.ends[k - 1] if k else 0 : self.ends[k]]
+        data, cut = self.data[self.ends[k - 1] if k else 0 : self.ends[k]], self.cuts[k]
+        return data if not cut else b"".join((data[:cut], self.rows[self._row(k)].tobytes(), data[cut:]))
+
+    def _row(self, k: int) -> int:
+        return k - self.cuts[:k].count(0)
+
+    def is_keyframe(self, k: int) -> bool:
+        return self.data[(self.ends[k - 1] if k else 0) + CODE_AT] == KEYFRAME_CODE
+
+    def is_of(self, other: "_Block") -> bool:
+        """Whether both have the same records."""
+        return (self.data, self.ends, self.cuts) == (other.data, other.ends, other.cuts) and np.array_equal(
+            self.rows, other.rows
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,19 +104,18 @@ class _ColdBlock:
     size_bytes: int
 
 
-_blocks: "WeakValueDictionary[tuple[bytes, bytes], _Block]" = WeakValueDictionary()
+_blocks: "WeakValueDictionary[int, _Block]" = WeakValueDictionary()
+"""By a checksum of their bytes."""
 
 
 def _block_of(records: Sequence[bytes]) -> _Block:
     """A block of these records; one that somebody in this process holds already."""
-    data, ends, end = b"".join(records), array("I"), 0
-    for record in records:
-        end += len(record)
-        ends.append(end)
-    key = (data, ends.tobytes())
-    block = _blocks.get(key)
-    if block is None:
-        block = _blocks[key] = _Block(data, ends)
+    block = _Block.of(records)
+    key = zlib.crc32(block.rows.tobytes(), zlib.crc32(block.data))
+    held = _blocks.get(key)
+    if held is not None and held.is_of(block):
+        return held
+    _blocks[key] = block
     return block
 
 
@@ -112,13 +172,14 @@ class EncodedRecords(Sequence[bytes]):
         assert self._cold is not None
         piece, ends = self._cold.get(block.place, block.size_bytes), array("I")
         ends.frombytes(piece[: BLOCK_RECORDS * ends.itemsize])
-        return _Block(piece[BLOCK_RECORDS * ends.itemsize :], ends)
+        return _Block.whole(piece[BLOCK_RECORDS * ends.itemsize :], ends)
 
     def cool(self, number: int) -> None:
         """Move a full block out of memory, where there is room for it elsewhere."""
         block = self._full[number]
         if isinstance(block, _Block) and self._cold is not None:
-            piece = block.ends.tobytes() + block.data
+            records = [block.record(k) for k in range(BLOCK_RECORDS)]
+            piece = array("I", accumulate(map(len, records))).tobytes() + b"".join(records)
             place = self._cold.put(piece)
             if place is not None:
                 self._full[number] = _ColdBlock(place, len(piece))
@@ -141,10 +202,18 @@ class EncodedRecords(Sequence[bytes]):
 
     def block_checksum(self, number: int, k: int, before: int) -> int:
         """Checksum after the first `k` records of a full block, of that before it."""
-        if not k:
-            return before
         block = self._block(number)
-        return zlib.crc32(memoryview(block.data)[: block.ends[k - 1]], before)
+        for record in map(block.record, range(k)):
+            before = chain(before, record)
+        return before
+
+    def block_descriptors(self, number: int, first: int) -> tuple[list[int], Rows]:
+        """Keyframes of a full block that is in memory, of which the first has this index, and their rows (K, D)."""
+        block = self._full[number]
+        if not isinstance(block, _Block):
+            return [], np.empty((0, 0), np.int8)
+        keyframes = accumulate((block.is_keyframe(k) for k in range(BLOCK_RECORDS)), initial=first)
+        return [index for index, cut in zip(keyframes, block.cuts, strict=False) if cut], block.rows
 
 
 class _DecodedRecords(Sequence[Record]):
@@ -188,13 +257,14 @@ class LogCopy:
         keyframes: How many of them are keyframes.
     """
 
-    __slots__ = ("_block_checksums", "_seal_bytes", "_tail_checksums", "encoded", "keyframes")
+    __slots__ = ("_block_checksums", "_block_keyframes", "_seal_bytes", "_tail_checksums", "encoded", "keyframes")
 
     def __init__(self, cold: ColdPieces | None = None) -> None:
         self.encoded = EncodedRecords(cold=cold)
         self.keyframes = 0
         self._seal_bytes = 0
         self._block_checksums = array("I")
+        self._block_keyframes = array("I", [0])
         self._tail_checksums = [0]
 
     def __len__(self) -> int:
@@ -232,6 +302,12 @@ class LogCopy:
             self._block_checksums.append(self._tail_checksums[0])
             del self._tail_checksums[:-1]
         self.keyframes += data[CODE_AT] == KEYFRAME_CODE
+        if len(self._tail_checksums) == 1:
+            self._block_keyframes.append(self.keyframes)
+
+    def descriptors(self, block: int) -> tuple[list[int], Rows]:
+        """Keyframes of a full block and their descriptors, as they are held here: rows (K, D) of int8."""
+        return self.encoded.block_descriptors(block, self._block_keyframes[block])
 
     def agrees(self, first: int, checksum_before: int, records: Sequence[bytes]) -> bool:
         """Whether records from a number on, which this copy holds or could go on with, are what it has there."""

@@ -1,4 +1,8 @@
-"""Measurements' records of all logs, and the factors made of them as soon as what they need is here."""
+"""Measurements' records of all logs, and the factors made of them as soon as what they need is here.
+
+Rules: a factor is made once, when somebody asks for it; who asks for those of one log pays for records that name its
+robot only.
+"""
 
 from collections.abc import Callable, Mapping
 
@@ -14,18 +18,23 @@ from flocc_protocol.records import (
     MeasurementRecord,
     MetricClosureRecord,
     OdometryCovarianceRecord,
+    Record,
+    RobotBearingRecord,
+    RobotSightingRecord,
 )
 
 Float = NDArray[np.float64]
+Place = tuple[LogId, int]
+"""A log and the number of a record in it."""
 
 
 class MeasuredRecords:
     """What was measured besides odometry and images, of every known log."""
 
     def __init__(self) -> None:
-        self._unmade: list[NewRecord] = []
-        self._made: dict[tuple[LogId, int], MeasuredFactor] = {}
-        self._waiting: dict[str, list[float]] = {}
+        self._unmade: dict[str, dict[Place, NewRecord]] = {}
+        self._made: dict[LogId, dict[Place, MeasuredFactor]] = {}
+        self._waiting: dict[str, dict[Place, float]] = {}
         self._edges: dict[LogId, dict[int, Float]] = {}
 
     def add(self, new: NewRecord, record: MeasurementRecord) -> tuple[KeyframeId, ...]:
@@ -33,37 +42,54 @@ class MeasuredRecords:
         if isinstance(record, OdometryCovarianceRecord):
             self._edges.setdefault(new.log, {})[record.index] = symmetric(record.covariance.numpy())
             return ()
-        self._unmade.append(new)
+        for robot in _robots_of(new.log, record):
+            self._unmade.setdefault(robot, {})[new.log, new.number] = new
         return (record.query, record.match) if isinstance(record, MetricClosureRecord) else ()
 
     def awaited(self, robot: str, stamp_s: float) -> bool:
         """Whether a sighting of a robot waited for its odometry to reach this stamp; it is told once."""
         stamps_s = self._waiting.get(robot)
-        if not stamps_s or min(stamps_s) > stamp_s:
+        if not stamps_s or min(stamps_s.values()) > stamp_s:
             return False
-        self._waiting[robot] = [other for other in stamps_s if other > stamp_s]
+        self._waiting[robot] = {place: other for place, other in stamps_s.items() if other > stamp_s}
         return True
 
     def factors(self, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> tuple[MeasuredFactor, ...]:
         """All factors whose keyframes are here, by log and number."""
-        self._waiting.clear()
-        self._unmade = [new for new in self._unmade if not self._make(new, tracks, known)]
-        return tuple(self._made[key] for key in sorted(self._made))
+        for robot in list(self._unmade):
+            self._make_all(robot, tracks, known)
+        made = {place: factor for of_log in self._made.values() for place, factor in of_log.items()}
+        return tuple(made[place] for place in sorted(made))
+
+    def of(self, log: LogId, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> tuple[MeasuredFactor, ...]:
+        """Those factors at a log's keyframes, or of them."""
+        self._make_all(log.robot, tracks, known)
+        made = self._made.get(log, {})
+        return tuple(made[place] for place in sorted(made))
+
+    def _make_all(self, robot: str, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> None:
+        """Make what can be made of the records that name a robot."""
+        for new in list(self._unmade.get(robot, {}).values()):
+            if self._make(new, tracks, known):
+                for name in _robots_of(new.log, new.record):
+                    del self._unmade[name][new.log, new.number]
 
     def _make(self, new: NewRecord, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> bool:
         """Make a factor; whether the record need not be looked at again."""
+        place = new.log, new.number
         keyframe = made_at(new.log, new.record)
         if keyframe is not None and not known(keyframe):
             return False
         made = factor_of(new.log, new.record, tracks)
         if isinstance(made, Waiting):
-            self._waiting.setdefault(made.robot, []).append(made.stamp_s)
+            self._waiting.setdefault(made.robot, {})[place] = made.stamp_s
             return False
         if made is None:
             return True
         if not all(is_landmark(end.log) or known(end) for end in (made.query, made.match)):
             return False
-        self._made[new.log, new.number] = made
+        for log in {made.query.log, made.match.log}:
+            self._made.setdefault(log, {})[place] = made
         return True
 
     def edge_covariances(self, log: LogId, keyframes: int) -> Float | None:
@@ -76,3 +102,14 @@ class MeasuredRecords:
             if 1 <= index < keyframes:
                 covariances[index - 1] = covariance
         return covariances
+
+
+def _robots_of(log: LogId, record: Record) -> set[str]:
+    """Robots whose logs a record of a log may speak of."""
+    match record:
+        case RobotSightingRecord() | RobotBearingRecord():
+            return {log.robot, record.robot}
+        case MetricClosureRecord(query, match):
+            return {query.log.robot, match.log.robot}
+        case _:
+            return {log.robot}

@@ -11,9 +11,10 @@ that was a moment before or on an earlier visit. What a log has of one place doe
 import math
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate, chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,8 +63,16 @@ class Descriptor(NamedTuple):
     inverse_norm: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Lent:
+    """Descriptors of one log that somebody else holds, as rows (K, D) of int8."""
+
+    log: int
+    rows: NDArray[np.int8]
+
+
 class _Rows:
-    """Descriptors of one length of one or more logs, as the rows of one growing matrix.
+    """Descriptors of one length of one or more logs: the rows of one growing matrix, and before them lent ones.
 
     Attributes:
         dimension: D.
@@ -74,6 +83,8 @@ class _Rows:
     def __init__(self, dimension: int, dtype: type[np.int8 | np.float32]) -> None:
         self.dimension = dimension
         self._count = 0
+        self._lent: list[_Lent] = []
+        self._lent_ends = [0]
         self._rows: NDArray[Any] = np.empty((CAPACITY_FIRST, dimension), dtype=dtype)
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
@@ -99,17 +110,17 @@ class _Rows:
     def indices(self) -> NDArray[np.int32]:
         return self._indices[: self._count]
 
+    @property
+    def _first(self) -> int:
+        """Which is the first row of the matrix."""
+        return self._lent_ends[-1]
+
     def append(self, log: int, index: int, descriptor: Descriptor) -> None:
         """Add a row; the first one that is no int8 makes all of them float32."""
-        if self._count == len(self._rows):
-            more = max(CAPACITY_FIRST, self._count // 4)
-            self._rows = np.concatenate([self._rows, np.empty((more, self.dimension), dtype=self._rows.dtype)])
-            self._inverse_norms = np.resize(self._inverse_norms, self._count + more)
-            self._logs = np.resize(self._logs, self._count + more)
-            self._indices = np.resize(self._indices, self._count + more)
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
-        self._rows[self._count] = descriptor.row
+        self._make_room(1)
+        self._rows[self._count - self._first] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
@@ -118,6 +129,53 @@ class _Rows:
         self._count += 1
         self._unthinned[log] = self._unthinned.get(log, 0) + 1
 
+    def _make_room(self, more: int) -> None:
+        """Let so many rows follow in the matrix."""
+        held = self._count - self._first
+        if held + more > len(self._rows):
+            size = max(held + more, len(self._rows) + max(CAPACITY_FIRST, held // 4))
+            rows = np.empty((size, self.dimension), dtype=self._rows.dtype)
+            rows[:held] = self._rows[:held]
+            self._rows = rows
+        if self._count + more > len(self._logs):
+            size = self._count + max(CAPACITY_FIRST, self._count // 4, more)
+            self._inverse_norms = np.resize(self._inverse_norms, size)
+            self._logs = np.resize(self._logs, size)
+            self._indices = np.resize(self._indices, size)
+
+    # Rows that somebody else holds
+
+    def lend(self, log: int, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
+        """Read newer descriptors of a log where somebody else holds them, if these are the same, and hold none."""
+        held = self._rows_of(log)
+        at = bisect_left(held, indices[0], key=self._indices.item)
+        own = np.array(held[at : at + len(indices)], dtype=np.intp)
+        if self._rows.dtype != np.int8 or len(own) != len(indices) or own.min() < self._first + self._thinned:
+            return
+        if self._indices[own].tolist() != list(indices) or not np.array_equal(self._rows[own - self._first], rows):
+            return
+        rest = np.setdiff1d(np.arange(self._first, self._count), own, assume_unique=True)
+        self._rows = np.concatenate([self._rows[rest - self._first], self._rows[:CAPACITY_FIRST]])
+        self._order_columns(self._first, np.concatenate([own, rest]))
+        self._lent.append(_Lent(log, rows))
+        self._lent_ends.append(self._first + len(rows))
+
+    def _take_back(self, log: int) -> None:
+        """Hold the oldest rows of a log here again, as many as are looked through at one time."""
+        while (place := next((k for k, lent in enumerate(self._lent) if lent.log == log), None)) is not None:
+            first, end = self._lent_ends[place], self._lent_ends[place + 1]
+            waiting = self._logs[self._first + self._thinned : self._count] == log
+            before = self._indices[self._first + self._thinned : self._count][waiting] < self._indices[first]
+            if int(before.sum()) >= THINNED_AT_ONCE:
+                return
+            self._make_room(end - first)
+            held = self._count - self._first
+            self._rows[held : held + end - first] = self._lent.pop(place).rows
+            self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
+            self._order_columns(first, np.concatenate([np.arange(end, self._count), np.arange(first, end)]))
+
+    # Old rows
+
     def thin(self, log: int, held: int) -> None:
         """Keep a log's newest so many rows whole, and at most so many that stand for its older ones.
 
@@ -125,10 +183,13 @@ class _Rows:
         the same ones to stay: they ask for the same pairs then, instead of each for its own.
         """
         while self._unthinned[log] >= held + THINNED_AT_ONCE:
-            oldest = self._thinned + np.flatnonzero(self._logs[self._thinned : self._count] == log)[:THINNED_AT_ONCE]
+            self._take_back(log)
+            begin = self._first + self._thinned
+            waiting = begin + np.flatnonzero(self._logs[begin : self._count] == log)
+            oldest = waiting[np.argsort(self._indices[waiting], kind="stable")][:THINNED_AT_ONCE]
             stay = oldest[self._stays(log, oldest, self._standing(log))]
-            others = np.setdiff1d(np.arange(self._thinned, self._count), oldest, assume_unique=True)
-            self._order(self._thinned, np.concatenate([stay, others]))
+            others = np.setdiff1d(np.arange(begin, self._count), oldest, assume_unique=True)
+            self._order(begin, np.concatenate([stay, others]))
             self._thinned += len(stay)
             self._unthinned[log] -= len(oldest)
             while len(self._standing(log)) > held and self._same_place.get(log, 0.0) > -1.0:
@@ -142,12 +203,12 @@ class _Rows:
             block = standing[first : first + THINNED_AT_ONCE]
             stay = np.concatenate([stay, block[self._stays(log, block, stay)]])
         gone = np.setdiff1d(standing, stay, assume_unique=True)
-        self._order(0, np.setdiff1d(np.arange(self._count), gone, assume_unique=True))
+        self._order(self._first, np.setdiff1d(np.arange(self._first, self._count), gone, assume_unique=True))
         self._thinned -= len(gone)
 
     def _standing(self, log: int) -> NDArray[np.intp]:
         """Places of a log's rows that stand for older ones."""
-        return np.flatnonzero(self._logs[: self._thinned] == log)
+        return self._first + np.flatnonzero(self._logs[self._first : self._first + self._thinned] == log)
 
     def _stays(self, log: int, block: NDArray[np.intp], before: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which rows (K,) of a log neither one of those before them nor one before it in the block stands for."""
@@ -162,15 +223,31 @@ class _Rows:
         return stays
 
     def _order(self, first: int, order: NDArray[np.intp]) -> None:
-        """Put these rows after the first so many, and leave out what is not among them."""
+        """Put these rows of the matrix after the first so many rows, and leave out what is not among them."""
+        self._rows[first - self._first : first - self._first + len(order)] = self._rows[order - self._first]
+        self._order_columns(first, order)
+
+    def _order_columns(self, first: int, order: NDArray[np.intp]) -> None:
         self._by_log.clear()
-        for values in (self._rows, self._inverse_norms, self._logs, self._indices):
+        for values in (self._inverse_norms, self._logs, self._indices):
             values[first : first + len(order)] = values[order]
         self._count = first + len(order)
 
     def _units(self, places: NDArray[np.intp]) -> Floats:
         """Rows (K, D) of unit length."""
-        return np.asarray(self._rows[places].astype(np.float32) * self._inverse_norms[places, None])
+        if places.min(initial=self._first) >= self._first:
+            rows = self._rows[places - self._first].astype(np.float32)
+        else:
+            rows = np.array([self._row(place) for place in places.tolist()], dtype=np.float32)
+        return np.asarray(rows * self._inverse_norms[places, None])
+
+    def _row(self, place: int) -> NDArray[Any]:
+        if place >= self._first:
+            return np.asarray(self._rows[place - self._first])
+        number = bisect_right(self._lent_ends, place) - 1
+        return np.asarray(self._lent[number].rows[place - self._lent_ends[number]])
+
+    # Comparing
 
     def similarities(self, descriptors: Sequence[Descriptor]) -> Floats:
         """Cosine similarities (B, N) of B descriptors with all rows."""
@@ -192,26 +269,45 @@ class _Rows:
         if index not in indices:
             return None
         near = near[: bisect_right(indices, index + reach)]
-        return self._rows[near] * self._inverse_norms[near, None], indices.index(index)
+        return self._units(np.array(near, dtype=np.intp)), indices.index(index)
 
     def _rows_of(self, log: int) -> "array[int]":
         """Rows of a log, in the order of its keyframes."""
         rows = self._by_log.get(log)
         if rows is None:
-            rows = self._by_log[log] = array("i", np.flatnonzero(self.logs == log).tolist())
+            places = np.flatnonzero(self.logs == log)
+            in_order = places[np.argsort(self._indices[places], kind="stable")]
+            rows = self._by_log[log] = array("i", in_order.tolist())
         return rows
 
     def _products(self, queries: Floats) -> Floats:
         """Products (B, N) of queries (B, D) with all rows."""
-        if self._rows.dtype == np.float32:
+        if not self._lent and self._rows.dtype == np.float32:
             return np.asarray(queries @ self._rows[: self._count].T)
         products = np.empty((len(queries), self._count), dtype=np.float32)
         floats = np.empty((ROWS_AT_ONCE, self.dimension), dtype=np.float32)
-        for first in range(0, self._count, ROWS_AT_ONCE):
-            rows = self._rows[first : min(first + ROWS_AT_ONCE, self._count)]
-            np.copyto(floats[: len(rows)], rows)
-            products[:, first : first + len(rows)] = queries @ floats[: len(rows)].T
+        at = 0
+        for rows in self._pieces():
+            part = floats[: sum(map(len, rows))]
+            np.concatenate(rows, out=part, casting="same_kind")
+            products[:, at : at + len(part)] = queries @ part.T
+            at += len(part)
         return products
+
+    def _pieces(self) -> Iterator[list[NDArray[Any]]]:
+        """All rows in their order, at most so many at one time as are compared together."""
+        together: list[NDArray[Any]] = []
+        room = ROWS_AT_ONCE
+        held = self._rows[: self._count - self._first]
+        own = (held[k : k + ROWS_AT_ONCE] for k in range(0, len(held), ROWS_AT_ONCE))
+        for rows in chain((lent.rows for lent in self._lent), own):
+            if len(rows) > room:
+                yield together
+                together, room = [], ROWS_AT_ONCE
+            together.append(rows)
+            room -= len(rows)
+        if together:
+            yield together
 
 
 class PlaceRecognition:
@@ -286,6 +382,13 @@ class PlaceRecognition:
                 found += self._among_all(keyframe, descriptor)
                 others = []
         return found + self._among_own(others)
+
+    def lend(self, log: LogId, indices: Sequence[int], rows: NDArray[np.int8]) -> None:
+        """Somebody holds descriptors of a log's keyframes as rows (K, D) that never change: compare them there."""
+        number = self._numbers.get(log)
+        others = self._others.get(rows.shape[1])
+        if indices and number is not None and others is not None and self._dimensions[number] == others.dimension:
+            others.lend(number, indices, rows)
 
     def agreement(self, pair: CandidatePair) -> float | None:
         """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""

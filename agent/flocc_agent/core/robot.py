@@ -4,7 +4,7 @@ The driver calls `handle` for each event and `tick` when `deadline` is due; both
 order. Same seed and same events give the same effects, on virtual time and on a robot.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
@@ -567,7 +567,7 @@ class Robot:
         new, effects, batch = self.gossip.append(record)
         return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
 
-    def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
+    def _take(self, new_records: Sequence[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records; places are recognised at the end."""
         described: list[tuple[KeyframeId, Array]] = []
         effects: list[Effect] = []
@@ -589,7 +589,15 @@ class Robot:
                         effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     pass  # what was measured, and what a later version says, concerns the graph only
-        return effects + (self._recognise(described, now) if described else [])
+        effects += self._recognise(described, now) if described else []
+        for new in new_records:
+            if (new.number + 1) % BLOCK_RECORDS == 0:
+                self._lend_rows(new.log, new.number // BLOCK_RECORDS)
+        return effects
+
+    def _lend_rows(self, log: LogId, block: int) -> None:
+        """Descriptors of a full block are held once, by the log."""
+        self.recognition.lend(log, *self.gossip.logs[log].descriptors(block))
 
     def _may_match(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe can be registered; of a pruned map not all have a latent."""
@@ -627,6 +635,9 @@ class Robot:
                 self._partnered |= {(query, match.log), (match, query.log)}
         self._take([new for new in news if isinstance(new.record, KeyframeRecord)], now)
         self._partnered.clear()
+        for log, copy in self.gossip.logs.items():
+            for block in range(len(copy) // BLOCK_RECORDS):
+                self._lend_rows(log, block)
         for keyframe in restored.latents:
             self.closing.on_held(keyframe)
         self.corrections.restore(restored.correction, restored.frame_changed)

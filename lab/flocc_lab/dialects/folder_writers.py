@@ -29,13 +29,11 @@ class FolderForm:
         reader: Name of the reader that takes it.
         write: Writes it into a folder and returns what is to be given to flocc.
         is_odometry: Whether its poses are odometry, not ground truth.
-        has_camera: Whether it brings its intrinsics.
     """
 
     reader: str
     write: Callable[[Path], Path]
     is_odometry: bool = False
-    has_camera: bool = True
 
 
 def drawn(zero_s: float = ZERO_S, step_s: float = 0.1) -> Trajectory:
@@ -87,7 +85,14 @@ def _asl(path: Path, truth: str, camera: bool) -> Path:
         picture(path / "mav0" / "cam0" / "data" / f"{ns(stamp_s)}.png", k)
     rows = "".join(line([ns(row[0]), *wxyz(row), *[0.5] * 9], ",") for row in rows_of(drawn()))
     _text(path / "mav0" / truth / "data.csv", f"{EUROC_HEADER}\n{rows}")
-    if camera:
+    if not camera:
+        _text(
+            path / "dso" / "camchain.yaml",
+            "cam0:\n  T_cam_imu:\n  - [1.0, 0.0, 0.0, 0.1]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n"
+            "  - [0.0, 0.0, 0.0, 1.0]\n  camera_model: pinhole\n  distortion_coeffs: [0.003, 0.0007, -0.002, 0.0002]\n"
+            "  distortion_model: equidistant\n  intrinsics: [30.0, 30.0, 16.0, 12.0]\n  resolution: [32, 24]\n",
+        )
+    else:
         _text(
             path / "mav0" / "cam0" / "sensor.yaml",
             "sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n"
@@ -176,7 +181,7 @@ FOLDERS: dict[str, FolderForm] = {
     "own folder": FolderForm("plain", _plain, is_odometry=True),
     "TUM RGB-D": FolderForm("tum", _tum),
     "EuRoC": FolderForm("euroc", lambda path: _asl(path, "state_groundtruth_estimate0", True)),
-    "TUM-VI": FolderForm("euroc", lambda path: _asl(path, "mocap0", False), has_camera=False),
+    "TUM-VI": FolderForm("euroc", lambda path: _asl(path, "mocap0", False)),
     "KITTI odometry": FolderForm("kitti", _kitti),
     "KITTI raw": FolderForm("kitti-raw", _kitti_raw),
     "7-Scenes": FolderForm("7scenes", _sevenscenes),

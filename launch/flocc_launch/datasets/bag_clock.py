@@ -6,8 +6,14 @@ never mixed with the other.
 """
 
 from dataclasses import dataclass
+from statistics import median, median_low
+from typing import Any
 
 from flocc_launch.datasets.bag_layout import Layout, RobotTopics
+from flocc_launch.datasets.bag_messages import stamp_ns
+from flocc_launch.datasets.bag_reader import Bag, BagTopic
+
+SAMPLE_MAX = 9
 
 STRAY_MAX_NS = 60 * 10**9
 """A header further off the recorder's time than the first ones is a stamp that went wrong."""
@@ -36,18 +42,21 @@ class ClockChoice:
 
 def choose_clock(layout: Layout, robot: RobotTopics) -> ClockChoice:
     """Take the headers' clock where images and odometry have one and the same, else the recorder's."""
-    image = layout.head(robot.image)
-    poses = layout.head(robot.poses.topic) if robot.poses is not None and robot.poses.edge is None else None
     where = layout.bag.path
-    heads = [(robot.image, image), *([(robot.poses.topic, poses)] if robot.poses else [])]
-    unset = [topic.name for topic, head in heads if head is not None and head.stamp_ns == 0]
+    image = _stamps(layout.bag, robot.image)
+    moves = robot.poses is not None and robot.poses.edge is None
+    poses = _stamps(layout.bag, robot.poses.topic) if robot.poses is not None and moves else []
+    unset = [
+        topic.name
+        for topic, stamps in ((robot.image, image), *([(robot.poses.topic, poses)] if robot.poses else []))
+        if stamps and median(header_ns for header_ns, _ in stamps) == 0
+    ]
     if unset:
         return ClockChoice(True, f"{where}: stamps of {', '.join(unset)} are zero; the recorder's time is used for all")
-    known = image or poses
-    offset_ns = known.stamp_ns - known.bag_ns if known is not None else None
-    if image is None or poses is None:
+    offset_ns = _offset_ns(image or poses) if image or poses else None
+    if not image or not poses:
         return ClockChoice(False, offset_ns=offset_ns)
-    apart_s = ((image.stamp_ns - image.bag_ns) - (poses.stamp_ns - poses.bag_ns)) * 1e-9
+    apart_s = (_offset_ns(image) - _offset_ns(poses)) * 1e-9
     if abs(apart_s) <= APART_MAX_S:
         return ClockChoice(False, offset_ns=offset_ns)
     return ClockChoice(
@@ -55,3 +64,18 @@ def choose_clock(layout: Layout, robot: RobotTopics) -> ClockChoice:
         f"{where}: {robot.image.name} and {robot.poses} are stamped by clocks {apart_s:+.3f} s apart; the recorder's "
         "time is used for both",
     )
+
+
+def _stamps(bag: Bag, topic: BagTopic) -> list[tuple[int, int]]:
+    """Headers' and the recorder's times of a topic's first messages, nanoseconds."""
+    return [(_header_ns(message), bag_ns) for bag_ns, message in bag.firsts(topic.name, SAMPLE_MAX)]
+
+
+def _header_ns(message: Any) -> int:
+    posed = getattr(message, "poses", None)
+    return stamp_ns((posed[-1] if posed is not None and len(posed) else message).header)
+
+
+def _offset_ns(stamps: list[tuple[int, int]]) -> int:
+    """What headers are ahead of the recorder; one message that was kept back says little."""
+    return median_low(header_ns - bag_ns for header_ns, bag_ns in stamps)

@@ -25,11 +25,12 @@ from flocc_launch.datasets.bag_messages import (
 )
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
-from flocc_launch.datasets.intrinsics import read_lens
+from flocc_launch.datasets.intrinsics import believable, read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.pixels import ImageWriter, levels_note
 from flocc_launch.datasets.source import DatasetError, Lens
+from flocc_launch.datasets.stamp_gaps import StampGaps
 from flocc_launch.datasets.writer import PoseWriter, Progress, RecordingWriter
 
 logger = logging.getLogger(__name__)
@@ -210,7 +211,7 @@ def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens
         raise DatasetError(f"{bag.path}: topic {robot.info.name} has no message that can be read")
     T_body_camera, note = (None, None) if options.odometry else layout.mounting(robot)
     try:
-        lens = lens_of(first[1], robot.info, robot.image)
+        lens = believable(lens_of(first[1], robot.info, robot.image), f"topic {robot.info.name}")
     except DatasetError as error:
         raise DatasetError(f"{bag.path}: {error}; name a camera file with --camera") from error
     lens = lens if T_body_camera is None else replace(lens, T_body_camera=T_body_camera)
@@ -288,6 +289,7 @@ class _Conversion:
     _done_s: float | None = field(init=False, default=None)
     _pictures: ImageWriter = field(init=False)
     _last_pose: tuple[float, ...] = ()
+    _stamps: StampGaps = field(default_factory=StampGaps)
     _first_info: bytes | None = None
     _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
@@ -343,7 +345,7 @@ class _Conversion:
         """Finish the recording of the journey that runs."""
         writer, log = self._writer, self._log
         try:
-            writer.flush()
+            writer.sort()
             log.finish(self.zero_ns)
             self._write_beside(writer)
         finally:
@@ -412,9 +414,8 @@ class _Conversion:
             stamp_s = (taken_ns - self.zero_ns) * 1e-9
             if self._done_s is not None and stamp_s <= self._done_s + 1e-9:
                 return
-            last_s = self._writer.last_stamp_s
-            if last_s is not None and stamp_s <= last_s:
-                tally.step_back(last_s, stamp_s)
+            if not self._stamps.fits(taken_ns):
+                tally.step_back(self._writer.last_stamp_s or 0.0, stamp_s)
                 return
             self._writer.add(stamp_s, *self._encoded(message))
             self._image_span_s = _wider(self._image_span_s, stamp_s)

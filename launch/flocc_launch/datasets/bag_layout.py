@@ -6,8 +6,10 @@ images, as a live agent takes it. Odometry may be a topic of poses, or an edge o
 with what there is.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, StaticFrames, pose_of_transform
 from flocc_agent.runtime.ros2.types import BadMessage
-from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES, stamp_ns
+from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.source import DatasetError
 
@@ -25,6 +27,7 @@ TRANSFORMS_READ_MAX = 2000
 STILL_MAX = 1e-4
 """By how much a transform that stays as it is may differ from its first one: metres, and parts of a rotation."""
 FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
+PARTS_OF_NAMES, LETTERS_OR_DIGITS = r"[a-z0-9]+", r"[a-z]+|\d+"
 TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk")
 
 
@@ -35,15 +38,11 @@ class Head:
     Attributes:
         frame: Its `frame_id`, without a leading slash.
         child: The frame that it moves, or "".
-        stamp_ns: In its header.
-        bag_ns: When it was recorded.
         coding: Encoding or format of an image.
     """
 
     frame: str
     child: str
-    stamp_ns: int
-    bag_ns: int
     coding: str = ""
 
 
@@ -127,7 +126,7 @@ class Layout:
         """What a topic's first message says, or None where it has none."""
         if topic.name not in self._heads:
             found = self.bag.first(topic.name)
-            self._heads[topic.name] = None if found is None else _head(found[0], found[1])
+            self._heads[topic.name] = None if found is None else _head(found[1])
         return self._heads[topic.name]
 
     def robots(self) -> list[RobotTopics]:
@@ -141,12 +140,26 @@ class Layout:
         parts = {name: [topic for topic in images if topic.name in topics] for name, topics in groups.items()}
         found = {name: self._poses_of(name, group) for name, group in parts.items()}
         own = {name: poses for name, poses in found.items() if poses is not None}
-        if len(own) > 1 and len({str(poses) for poses in own.values()}) == len(own):
+        if len({str(poses) for poses in own.values()}) < len(own) or (not own and len(parts) > 1):
+            parts, own = self._told_apart_by_odometry(images)
+        if len(own) > 1 or (own and len(parts) > 1):
             self.left_out = [
-                f"{name} has images but no odometry of its own, and is left out" for name in found if name not in own
+                f"{name} has images but no odometry of its own, and is left out" for name in parts if name not in own
             ]
             return [self._robot(name, parts[name], poses) for name, poses in own.items()]
         return [self._robot("", images, None)]
+
+    def _told_apart_by_odometry(
+        self, images: list[BagTopic]
+    ) -> tuple[dict[str, list[BagTopic]], dict[str, PoseSource]]:
+        """Images and odometry by what tells topics of odometry apart, as `cam_r1` and `odom_r1` of `odom_r2`."""
+        for word in (PARTS_OF_NAMES, LETTERS_OR_DIGITS):
+            poses = _of_distinct_words(self._own_poses(), word)
+            parts = {name: [t for t in images if f"-{name}-" in f"-{_words(t.name, word)}-"] for name in poses}
+            taken = [topic.name for group in parts.values() for topic in group]
+            if len(poses) > 1 and sorted(taken) == sorted(t.name for t in images) and all(parts.values()):
+                return parts, {name: PoseSource(topic) for name, topic in poses.items()}
+        return {"": images}, {}
 
     def _of_types(self, types: Sequence[str]) -> list[BagTopic]:
         return [topic for topic in self.bag.topics.values() if topic.type in types]
@@ -227,12 +240,40 @@ class Layout:
             return self._named_edge(name)
         if name is not None:
             return PoseSource(named(self.bag, POSE_TYPES, name))
+        own = self._own_poses()
+        near = [t for t in own if not self._is_another_robot(image, t)]
+        if own and not near:
+            raise DatasetError(
+                f"{self.bag.path}: {listed(own)} is another robot's odometry than that of {image.name}, by its name or "
+                "frames; name it with --odometry-topic if it is not"
+            )
+        odometry = [t for t in near if t.type == "nav_msgs/msg/Odometry"]
+        if len(near) == 1 or len(odometry) == 1:
+            return PoseSource((odometry or near)[0])
+        return None if near else self.edge_of(image)
+
+    def _own_poses(self) -> list[BagTopic]:
+        """Topics of poses, without those that are ground truth by their names where there are others."""
         candidates = self._of_types(POSE_TYPES)
-        own = [t for t in candidates if not any(word in t.name.lower() for word in TRUTH_WORDS)] or candidates
-        odometry = [t for t in own if t.type == "nav_msgs/msg/Odometry"]
-        if len(own) == 1 or len(odometry) == 1:
-            return PoseSource((odometry or own)[0])
-        return None if own else self.edge_of(image)
+        return [t for t in candidates if not any(word in t.name.lower() for word in TRUTH_WORDS)] or candidates
+
+    def _is_another_robot(self, image: BagTopic, poses: BagTopic) -> bool:
+        """Whether poses are another robot's than images, by namespaces of one kind or those of frames."""
+        here, there = _root(image.name), _root(poses.name)
+        if here and there and here != there and self._are_siblings(here, there):
+            return True
+        head, camera = self.head(poses), self._frame(image)
+        if head is None or self.static.between(head.child, camera) is not None:
+            return False
+        roots = {_root(frame) for frame in (head.frame, head.child)} - {""}
+        return bool(_root(camera) and roots) and _root(camera) not in roots
+
+    def _are_siblings(self, one: str, other: str) -> bool:
+        """Whether two namespaces are of one kind: named alike but for a number, or with topics of the same names."""
+        if re.sub(r"\d+", "#", one) == re.sub(r"\d+", "#", other):
+            return True
+        below = [{t.partition(f"/{ns}/")[2] for t in self.bag.topics if t.startswith(f"/{ns}/")} for ns in (one, other)]
+        return bool(below[0] & below[1])
 
     def other_poses(self, robot: RobotTopics) -> list[str]:
         """Topics of poses in a robot's namespace that are not taken as its odometry."""
@@ -286,6 +327,11 @@ class Layout:
                 f"{self.bag.path}: no chain of static transforms leads from {body}, which {robot.poses} moves, to "
                 f"{camera}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
             )
+        if camera and (carrier := self.static.parent(camera)) is not None:
+            raise DatasetError(
+                f"{self.bag.path}: the camera ({camera}) sits on {carrier}, but {robot.poses} does not say which frame "
+                "it moves; name a camera file with T_body_camera (--camera)"
+            )
         return np.eye(4), (
             f"{self.bag.path}: nothing says where the camera ({camera or 'no frame'}) sits on the body "
             f"({body or 'no frame'}); they are taken as one: name a camera file with T_body_camera (--camera) if not"
@@ -327,22 +373,54 @@ class Layout:
         if poses.edge is not None:
             return poses.edge[1]
         head = self.head(poses.topic)
-        return head.child if head else ""
+        return (head.child or self._moved_in(head.frame)) if head else ""
+
+    def _moved_in(self, frame: str) -> str:
+        """The frame that /tf moves in another one, through fixed ones (map, odom, base_link), or "" where unclear."""
+        for _ in range(len(FIXED_FRAMES)):
+            children = [child for parent, child in self.edges if parent == frame]
+            if len(children) != 1:
+                break
+            frame = children[0]
+            if frame.rsplit("/", 1)[-1] not in FIXED_FRAMES:
+                return frame
+        return ""
 
 
-def _head(bag_ns: int, message: Any) -> Head:
+def _head(message: Any) -> Head:
     header = getattr(message, "header", None)
     if header is None:
-        return Head("", "", bag_ns, bag_ns)
-    poses = getattr(message, "poses", None)
-    stamped = poses[-1].header if poses is not None and len(poses) else header
+        return Head("", "")
     coding = getattr(message, "encoding", None) or getattr(message, "format", None) or ""
-    child = getattr(message, "child_frame_id", "").lstrip("/")
-    return Head(header.frame_id.lstrip("/"), child, stamp_ns(stamped), bag_ns, coding)
+    return Head(header.frame_id.lstrip("/"), getattr(message, "child_frame_id", "").lstrip("/"), coding)
 
 
 def _parent(name: str) -> str:
     return name.rsplit("/", 1)[0]
+
+
+def _root(name: str) -> str:
+    """The first part of the name of a topic or frame that has several, or ""."""
+    first, _, rest = name.strip("/").partition("/")
+    return first if rest else ""
+
+
+def _words(name: str, word: str) -> str:
+    return "-".join(re.findall(word, name.lower()))
+
+
+def _alike(lists: list[list[str]]) -> int:
+    """In how many of their first words lists are the same."""
+    return sum(1 for _ in takewhile(lambda words: len(set(words)) == 1, zip(*lists, strict=False)))
+
+
+def _of_distinct_words(topics: list[BagTopic], word: str) -> dict[str, BagTopic]:
+    """Topics by what is between the words that all their names begin and end with; empty where one has nothing."""
+    words = {topic.name: _words(topic.name, word).split("-") for topic in topics}
+    front = _alike(list(words.values()))
+    back = _alike([each[front:][::-1] for each in words.values()])
+    between = {"-".join(words[topic.name][front : len(words[topic.name]) - back]): topic for topic in topics}
+    return between if len(between) == len(topics) and all(between) else {}
 
 
 def _by_namespace(names: Sequence[str]) -> dict[str, list[str]]:

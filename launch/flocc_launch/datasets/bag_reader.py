@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -207,15 +207,17 @@ class Bag:
         except SALVAGE_ERRORS as error:
             self.damage = f"{self.path}: is damaged or cut off: {error}"
 
-    def first(self, name: str, tries: int = 20) -> tuple[int, Any] | None:
+    def first(self, name: str) -> tuple[int, Any] | None:
         """Bag time and content of a topic's first message that can be decoded, or None."""
-        for number, (topic, stamp_ns, message) in enumerate(self.raw([name])):
+        return next(self.firsts(name), None)
+
+    def firsts(self, name: str, tries: int = 20) -> Iterator[tuple[int, Any]]:
+        """Bag time and content of those of a topic's first messages that can be decoded."""
+        for topic, stamp_ns, message in islice(self.raw([name]), tries):
             try:
-                return stamp_ns, self.decoded(message, topic)
+                yield stamp_ns, self.decoded(message, topic)
             except DatasetError:
-                if number + 1 >= tries:
-                    break
-        return None
+                continue
 
     def decoded(self, raw: bytes, topic: BagTopic) -> Any:
         """Decode a message.

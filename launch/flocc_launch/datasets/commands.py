@@ -20,7 +20,7 @@ from flocc_launch.datasets.bag_messages import IMAGE_TYPES
 from flocc_launch.datasets.bag_reader import Bag, is_bag
 from flocc_launch.datasets.clocks import ClockFit, measured
 from flocc_launch.datasets.cut import cut
-from flocc_launch.datasets.detect import check_times, read_source, team_folder
+from flocc_launch.datasets.detect import check_times, not_taken, read_source, team_folder
 from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
@@ -28,7 +28,6 @@ from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
     convert_video,
-    files_beside,
     is_video,
     lens_beside,
     odometry_beside,
@@ -275,8 +274,7 @@ def infos(path: Path, format_name: str | None = None, form: str | None = None) -
             yield info(entry, None, form)
         except FloccError as error:
             logger.warning("%s", error)
-    taken = set(team.values()) | {file for entry in team.values() if is_video(entry) for file in files_beside(entry)}
-    others = [entry.name for entry in sorted(path.iterdir()) if entry not in taken and entry.name[0] != "."]
+    others = not_taken(path, team)
     if others:
         logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
 

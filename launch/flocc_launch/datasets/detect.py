@@ -24,13 +24,12 @@ from flocc_launch.datasets.pixels import size_of, usable_images
 from flocc_launch.datasets.plain import is_plain, read_plain
 from flocc_launch.datasets.reconstructions import (
     colmap_folder,
-    has_binary_model,
     read_colmap,
     read_replica,
     read_transforms,
 )
 from flocc_launch.datasets.source import DatasetError, Source
-from flocc_launch.datasets.video import is_video
+from flocc_launch.datasets.video import files_beside, is_video
 
 CLOCKS_DIFFER = (
     "both must be of one clock: flocc dataset clock measures how far they are apart, and --time-offset mends it"
@@ -80,7 +79,7 @@ def _taken_inside(path: Path) -> list[str]:
     """What of a folder would be taken by itself, else of its folders (KITTI's `sequences/00`)."""
     for pattern in ("*", "*/*"):
         entries = sorted(islice(path.glob(pattern), INSIDE_MAX)) if path.is_dir() else []
-        found = [entry for entry in entries if is_dataset(entry) or is_bag(entry) or is_video(entry)]
+        found = [entry for entry in entries if _is_taken(entry)]
         if found:
             return [str(entry.relative_to(path)) for entry in found]
     return []
@@ -103,19 +102,46 @@ def is_dataset(path: Path) -> bool:
 def team_folder(path: Path) -> dict[str, Path]:
     """Data sets, bags and videos in a folder that is none itself, by the robot's name; empty where it is one.
 
+    A robot's folder that is none itself may hold one.
+
     Raises:
         DatasetError: Two would have one name.
     """
     if not path.is_dir() or is_bag(path) or is_dataset(path) or marked_kind(path) is not None:
         return {}
-    entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
     found: dict[str, Path] = {}
-    for folder in (entry for entry in entries if is_bag(entry) or is_dataset(entry) or is_video(entry)):
-        name = robot_name(folder.stem if folder.is_file() else folder.name)
+    for entry in _entries(path):
+        taken = [entry] if _is_taken(entry) else _only_taken(entry)
+        if not taken:
+            continue
+        name = robot_name(entry.stem if entry.is_file() else entry.name)
         if name in found:
-            raise DatasetError(f"{folder}: its robot would be called {name}, as that of {found[name]}")
-        found[name] = folder
+            raise DatasetError(f"{entry}: its robot would be called {name}, as that of {found[name]}")
+        found[name] = taken[0]
     return found
+
+
+def not_taken(path: Path, team: dict[str, Path]) -> list[str]:
+    """What lies in a team's folder and belongs to none of its robots."""
+    beside = {file for entry in team.values() if is_video(entry) for file in files_beside(entry)}
+    used = {*team.values(), *(entry.parent for entry in team.values()), *beside}
+    return [entry.name for entry in _entries(path) if entry not in used]
+
+
+def _entries(path: Path) -> list[Path]:
+    return sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
+
+
+def _is_taken(entry: Path) -> bool:
+    return is_bag(entry) or is_dataset(entry) or is_video(entry)
+
+
+def _only_taken(folder: Path) -> list[Path]:
+    """The one data set, bag or video of a robot's folder; nothing where it holds several, or is of a known kind."""
+    if not folder.is_dir() or marked_kind(folder) is not None:
+        return []
+    found = [entry for entry in islice(_entries(folder), INSIDE_MAX) if _is_taken(entry)]
+    return found if len(found) == 1 else []
 
 
 def _known_format(path: Path) -> str | None:
@@ -127,7 +153,7 @@ def _known_format(path: Path) -> str | None:
         return "7scenes"
     if image_folder(path) is not None:
         return "kitti-raw"
-    if colmap_folder(path) is not None or has_binary_model(path):
+    if colmap_folder(path) is not None:
         return "colmap"
     if (path / "transforms.json").exists():
         return "transforms"

@@ -65,7 +65,7 @@ def read_euroc(path: Path) -> Source:
     lens = (
         read_lens(mav / "cam0" / "sensor.yaml")
         if (mav / "cam0" / "sensor.yaml").exists()
-        else camera_file(path, images)
+        else camera_file(path, images) or camera_file(path / "dso", images)
     )
     odometry, truth, notes = trajectories_beside(path)
     file = next((mav / name / "data.csv" for name in EUROC_TRUTHS if (mav / name / "data.csv").exists()), None)

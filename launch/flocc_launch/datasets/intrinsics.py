@@ -21,6 +21,8 @@ FOLLOWED = (("cam0_calib", "body_T_cam0"), ("relative_config_imucam", None))
 """Keys of VINS-Fusion's and OpenVINS's settings that name the calibration, and where the mounting then is."""
 
 
+FOCAL_RATIO_MIN, FOCAL_RATIO_MAX = 0.02, 200.0
+"""Focal length over the image's side: a lens of 360 degrees has about 0.1, a telescope 50."""
 MOUNTING_MAX_M = 20.0
 """A camera further from its body was measured in another unit."""
 FORM_ERRORS = (
@@ -49,10 +51,10 @@ def read_lens(path: Path, size: Size | None = None) -> Lens:
     path, chosen = _file_and_camera(path)
     if path.suffix == ".toml":
         camera, T_body_camera = read_camera(path)
-        return _believable(Lens(CameraModel.of_camera(camera), T_body_camera), path)
+        return believable(Lens(CameraModel.of_camera(camera), T_body_camera), path)
     text = read_text(path)
     try:
-        return _believable(_lens(path, text, chosen, size), path)
+        return believable(_lens(path, text, chosen, size), path)
     except FORM_ERRORS as error:
         sentence = (
             str(error) if isinstance(error, ValueError | RecordingError) else f"is not of the form it seems ({error!r})"
@@ -64,7 +66,7 @@ def read_lens(path: Path, size: Size | None = None) -> Lens:
         raise DatasetError(f"{path}: {sentence}") from error
 
 
-def _believable(lens: Lens, path: Path) -> Lens:
+def believable(lens: Lens, path: Path | str) -> Lens:
     """The lens, whose numbers are pixels and metres.
 
     Raises:
@@ -78,6 +80,11 @@ def _believable(lens: Lens, path: Path) -> Lens:
         raise DatasetError(
             f"{path}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of images of {size}; the "
             "intrinsics are of images of another size"
+        )
+    focals = (camera.fx / camera.width, camera.fy / camera.height)
+    if min(focals) < FOCAL_RATIO_MIN or max(focals) > FOCAL_RATIO_MAX:
+        raise DatasetError(
+            f"{path}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are none of images of {size}"
         )
     if t_m > MOUNTING_MAX_M:
         raise DatasetError(f"{path}: the camera is {t_m:g} m from its body; write the mounting in metres")

@@ -32,6 +32,7 @@ FOLDERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
      "make groundtruth.tum of extrinsic.txt, which is world to camera"),
     ("Spectacular AI's recording", ("data.jsonl", "calibration.json"),
      "make odometry.tum of the output, and name frames/ by stamps"),
+    ("TUM-VI's folder for DSO", ("camchain.yaml", "imu.txt", "cam0"), "name the folder above it, which holds mav0"),
     ("a KITTI-360 sequence", ("data_2d_raw",), "name images by stamps and make groundtruth.tum of data_poses/"),
 )  # fmt: skip
 FILES: dict[str, tuple[str, str]] = {

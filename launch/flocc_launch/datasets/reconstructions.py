@@ -35,20 +35,36 @@ CAMERA_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera looks along -z with y up; ours along z with y down."""
 
 COUNTED = re.compile(r"#\s*Number of images:\s*(\d+)")
+FRAME_KEYS = {
+    "file_path", "transform_matrix", "timestamp", "colmap_im_id", "depth_file_path", "sharpness",
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "camera_angle_x",
+}  # fmt: skip
+"""What a frame of transforms.json says that is used, or that says nothing of poses, lenses and stamps."""
 COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap_text")
 
 
 def colmap_folder(path: Path) -> Path | None:
-    """Where a folder has COLMAP's cameras.txt and images.txt, or None."""
-    places = (path / name for name in COLMAP_FOLDERS)
-    return next(
-        (place for place in places if (place / "cameras.txt").exists() and (place / "images.txt").exists()), None
-    )
+    """Where a folder has COLMAP's model: the one of most images, and the first of those; None without any."""
+    models = colmap_models(path)
+    return max(models, key=_images_in) if len(models) > 1 else next(iter(models), None)
 
 
-def has_binary_model(path: Path) -> bool:
-    """Whether a folder has COLMAP's model in its binary form."""
-    return any((path / name / "images.bin").exists() for name in COLMAP_FOLDERS)
+def colmap_models(path: Path) -> list[Path]:
+    """Folders with a model of COLMAP, in text or binary form; a reconstruction that fell apart has several."""
+    numbered = (place for place in sorted((path / "sparse").glob("*")) if place.name.isdecimal())
+    places = dict.fromkeys((*(path / name for name in COLMAP_FOLDERS), *numbered))
+    return [place for place in places if _is_text_model(place) or (place / "images.bin").exists()]
+
+
+def _is_text_model(place: Path) -> bool:
+    return (place / "cameras.txt").exists() and (place / "images.txt").exists()
+
+
+def _images_in(place: Path) -> int:
+    """How many images a model has: two lines each in text, the first number of its binary form."""
+    if not _is_text_model(place):
+        return int.from_bytes((place / "images.bin").read_bytes()[:8], "little")
+    return sum(not text.startswith("#") for _, text in numbered_lines(place / "images.txt")) // 2
 
 
 def read_colmap(path: Path) -> Source:
@@ -58,7 +74,7 @@ def read_colmap(path: Path) -> Source:
         DatasetError: It is the binary form, a line is of another form, or no image is there.
     """
     place = colmap_folder(path)
-    if place is None:
+    if place is None or not _is_text_model(place):
         raise DatasetError(
             f"{path}: is a model of COLMAP in its binary form; write it as text: colmap model_converter --input_path "
             "FOLDER --output_path FOLDER --output_type TXT"
@@ -79,7 +95,14 @@ def read_colmap(path: Path) -> Source:
     lens = read_lens(place / f"cameras.txt#{next(iter(used))}")
     _refuse_other_order(place, images, seen, lens)
     source = _source(path, "colmap", _image_folder(path), poses, lens)
-    return replace(source, notes=(*source.notes, *_cut_rows(file, cut, len(poses))))
+    return replace(source, notes=(*source.notes, *_cut_rows(file, cut, len(poses)), *_other_models(path, place)))
+
+
+def _other_models(path: Path, place: Path) -> list[str]:
+    """What is to be said of models that are not taken: their poses are of other frames and scales."""
+    others = [str(other.relative_to(path)) for other in colmap_models(path) if other != place]
+    told = f"{path}: the model {place.relative_to(path)} was taken; not those of other frames: {', '.join(others)}"
+    return [told] if others else []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,9 +212,31 @@ def read_transforms(path: Path) -> Source:
     if wrong is not None:
         raise DatasetError(f"{file}: the transform_matrix of {wrong} is not 4x4")
     world = {name: checked_pose(T @ CAMERA_OF_OPENGL, f"{file}: {name}") for name, T in poses.items()}
-    return _source(
-        path, "transforms", path, world, None, file, {str(f["file_path"]): f.get("timestamp") for f in frames}
-    )
+    scale = _applied_scale(table, file)
+    for T in world.values():
+        T[:3, 3] /= scale
+    stamps = {str(f["file_path"]): f.get("timestamp") for f in frames}
+    source = _source(path, "transforms", path, world, None, file, stamps)
+    scaled = f"{file}: applied_scale is {scale:g}; distances are those before it, the poses' divided by it"
+    unused = sorted({key for f in frames for key in f} - FRAME_KEYS)
+    told = f"{file}: not used of its frames: {', '.join(unused[:12])}"
+    return replace(source, notes=(*source.notes, *([scaled] if scale != 1.0 else []), *([told] if unused else [])))
+
+
+def _applied_scale(table: dict[str, Any], file: Path) -> float:
+    """What nerfstudio multiplied distances by when it wrote the file.
+
+    Raises:
+        DatasetError: It is no length, or the applied transform is not rigid.
+    """
+    scale, moved = table.get("applied_scale", 1.0), table.get("applied_transform")
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < float("inf"):
+        raise DatasetError(f"{file}: applied_scale must be a number above 0, not {str(scale)[:40]!r}")
+    if moved is not None:
+        R = np.array(moved, float)[:3, :3]
+        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
+            raise DatasetError(f"{file}: applied_transform is not rigid, so the scale of the poses is not known")
+    return float(scale)
 
 
 def _image_folder(path: Path) -> Path:

@@ -75,8 +75,9 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def odometry_beside(path: Path) -> Path | None:
-    """The trajectory of a video: of its own name, or one of the plain names in its folder."""
-    stems = (path.stem, *ODOMETRY_STEMS)
+    """The trajectory of a video: of its own name, or one of the plain names where it is its folder's only video."""
+    alone = sum(is_video(entry) for entry in path.parent.iterdir()) == 1
+    stems = (path.stem, *(ODOMETRY_STEMS if alone else ()))
     names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
     return next((path.parent / name for name in names if (path.parent / name).is_file()), None)
 

@@ -40,7 +40,7 @@ class RecordingWriter:
     Attributes:
         path: The folder.
         count: Images that it holds.
-        last_stamp_s: Stamp of the last one, or None; a resumed conversion goes on after it.
+        last_stamp_s: The latest stamp, or None; a resumed conversion goes on after it.
     """
 
     def __init__(self, path: Path, identity: str) -> None:
@@ -58,6 +58,7 @@ class RecordingWriter:
         (path / "images").mkdir(exist_ok=True)
         self.count = 0
         self.last_stamp_s: float | None = None
+        self._is_sorted = True
         listing = path / "images.txt"
         if listing.exists():
             os.truncate(listing, self._take_up(listing))
@@ -98,18 +99,13 @@ class RecordingWriter:
         self._file.flush()
 
     def add(self, stamp_s: float, encoded: bytes, suffix: str) -> None:
-        """Append one encoded image; stamps must increase. A thread writes it while the next one is read.
+        """Append one encoded image. A thread writes it while the next one is read; `sort` ends what came out of order.
 
         Args:
             stamp_s: When it was taken, seconds.
             encoded: The image file's bytes.
             suffix: Of its name, with the dot.
-
-        Raises:
-            ValueError: The stamp is not after the last one.
         """
-        if self.last_stamp_s is not None and stamp_s <= self.last_stamp_s:
-            raise ValueError(f"stamp {stamp_s} is not after {self.last_stamp_s}")
         while len(self._pending) >= PENDING_MAX:
             self._pending.popleft().result()
         name = f"images/{self.count:06d}{suffix}"
@@ -117,7 +113,23 @@ class RecordingWriter:
         self._batch_bytes += len(encoded)
         if self._batch_bytes >= BATCH_BYTES or len(self._batch) >= BATCH_IMAGES:
             self._hand_over()
-        self.count, self.last_stamp_s = self.count + 1, stamp_s
+        self._count(stamp_s)
+
+    def _count(self, stamp_s: float) -> None:
+        self.count += 1
+        if self.last_stamp_s is None or stamp_s > self.last_stamp_s:
+            self.last_stamp_s = stamp_s
+        else:
+            self._is_sorted = False
+
+    def sort(self) -> None:
+        """Bring the lines of `images.txt` into the order of stamps, where images came in another one."""
+        self.flush()
+        if not self._is_sorted:
+            listing, partial = self.path / "images.txt", self.path / "images.part"
+            lines = listing.read_text(encoding="utf-8").splitlines(keepends=True)
+            partial.write_text("".join(sorted(lines, key=lambda line: float(line.split(" ", 1)[0]))), encoding="utf-8")
+            partial.replace(listing)
 
     def write_lens(self, lens: Lens) -> None:
         """Write `camera.toml` of a lens that an agent's camera can say."""
@@ -144,7 +156,8 @@ class RecordingWriter:
                 stamp, _, name = line.decode().partition(" ")
                 if not line.endswith(b"\n") or not (self.path / name.strip()).is_file():
                     break
-                kept, self.count, self.last_stamp_s = kept + len(line), self.count + 1, float(stamp)
+                kept += len(line)
+                self._count(float(stamp))
         return kept
 
 

@@ -4,13 +4,13 @@ One data set is cut by time into robots; a folder of several is a robot each. Wh
 """
 
 import statistics
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flocc_launch.datasets.bag_convert import robots_of_bag
 from flocc_launch.datasets.bag_reader import is_bag
 from flocc_launch.datasets.commands import needed_drift
-from flocc_launch.datasets.detect import detect_format, is_dataset, read_source, team_folder
+from flocc_launch.datasets.detect import detect_format, is_dataset, not_taken, read_source, team_folder
 from flocc_launch.datasets.drift import kind_of
 from flocc_launch.datasets.names import robot_name as name_of
 from flocc_launch.datasets.source import DatasetError, Source
@@ -37,12 +37,14 @@ class OwnData:
         folders: One data set or bag, or one of each robot by its name.
         sources: Those of `folders` that are no bags, read.
         parts: Into how many robots one data set is cut; 1 where every folder is a robot.
+        left: What of a team's folder is not taken.
     """
 
     path: Path
     folders: dict[str, Path]
     sources: dict[str, Source]
     parts: int
+    left: tuple[str, ...] = ()
 
     @classmethod
     def open(cls, path: Path, agents: int | None = None) -> "OwnData":
@@ -58,12 +60,13 @@ class OwnData:
         single = is_bag(path) or is_dataset(path) or is_video(path)
         folders = _single(path) if single else _team(path)
         if not single and len(folders) == 1:
-            return cls.open(next(iter(folders.values())), agents)
+            return replace(cls.open(next(iter(folders.values())), agents), left=tuple(not_taken(path, folders)))
         single = single and len(folders) == 1
         if not single and agents not in (None, len(folders)):
             raise DatasetError(f"{path}: holds {len(folders)} robots ({', '.join(folders)}), not {agents}")
         sources = {name: read_source(folder) for name, folder in folders.items() if is_dataset(folder)}
-        return cls(path, folders, sources, (agents or ROBOTS) if single else 1)
+        left = () if path in folders.values() else tuple(not_taken(path, folders))
+        return cls(path, folders, sources, (agents or ROBOTS) if single else 1, left)
 
     @property
     def single(self) -> bool:
@@ -95,7 +98,10 @@ class OwnData:
             {kind_of(self.sources[name].format, truth) for name in made if (truth := self.sources[name].truth)}
         )
         drift = f"; odometry is made of ground truth, with seeded drift as of {' and '.join(kinds)}" if made else ""
-        return f"data: {self.path}, {taken}{spacing}{drift}{self._pairs()}"
+        return f"data: {self.path}, {taken}{spacing}{drift}{self._not_taken()}{self._pairs()}"
+
+    def _not_taken(self) -> str:
+        return f"; not taken: {', '.join(self.left[:12])}" if self.left else ""
 
     def _pairs(self) -> str:
         """How topics of a bag of several robots belong together."""

@@ -1,11 +1,15 @@
 """Copies of logs: blocks of bytes that give back every record and checksum, shared within a process."""
 
+import zlib
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from flocc_agent.core.log_copy import BLOCK_RECORDS, EncodedRecords, LogCopy
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.records import KeyframeRecord, RejectionRecord, UnknownRecord, chain, encode_record
+from flocc_protocol.records import KeyframeRecord, RejectionRecord, UnknownRecord, chain, decode_record, encode_record
 
 COUNT = 2 * BLOCK_RECORDS + 3
 SEAL = bytes(64)
@@ -100,3 +104,35 @@ def test_records_agree_only_where_bytes_and_checksum_do(first: int) -> None:
     assert copy.agrees(first, before, [*DATA[first:], b"more"])
     assert not copy.agrees(first, before + 1, DATA[first:])
     assert first == COUNT or not copy.agrees(first, before, [b"other"])
+
+
+def test_descriptors_stand_apart_and_records_come_back_whole() -> None:
+    """Also where some keyframes have none, or one of floats or of another length, and between other records."""
+    others = (None, Array.of(np.ones(4)), Array.int8(np.ones(300)))
+    rejection = RejectionRecord(KeyframeId(LogId("r1"), 0), KeyframeId(LogId("r2"), 0), "no", 0, 0)
+    data, index = list[bytes](), 0
+    for k in range(COUNT):
+        if k % 5 == 4:
+            data.append(encode_record(rejection))
+            continue
+        described = keyframe(index)
+        data.append(encode_record(described if k % 3 else replace(described, descriptor=others[k % 9 // 3])))
+        index += 1
+    for seal in (b"", SEAL):
+        sealed = [each + seal for each in data]
+        copy = copied(sealed, len(seal))
+        assert list(copy.encoded) == sealed
+        assert [copy.checksum_at(n) for n in range(0, COUNT, 7)] == [
+            zlib.crc32(b"".join(sealed[:n])) for n in range(0, COUNT, 7)
+        ]
+        for block in range(2):
+            indices, rows = copy.descriptors(block)
+            expected = [
+                (record.index, record.descriptor.data)
+                for each in data[block * BLOCK_RECORDS : (block + 1) * BLOCK_RECORDS]
+                if isinstance(record := decode_record(each), KeyframeRecord)
+                and record.descriptor is not None
+                and record.descriptor.shape == (4,)
+                and record.descriptor.dtype == "i1"
+            ]
+            assert [(index, row.tobytes()) for index, row in zip(indices, rows, strict=True)] == expected

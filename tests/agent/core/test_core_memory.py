@@ -17,15 +17,14 @@ from flocc_protocol.messages import Envelope, RecordBatch, Records, decode, enco
 from flocc_protocol.records import KeyframeRecord, chain, encode_record
 
 LOGS = (LogId("r2"), LogId("r3"))
-KEYFRAMES = 300
-ROW_SLACK = 1.25
-"""Matrices of descriptors grow by a quarter."""
-REST_BYTES = 700
-"""Pose, stamp, number, checksum and what Python puts around them and around the bytes."""
+KEYFRAMES = 1000
+"""Of each log: the interpreter's own caches, some 35 kB, and the logs' last blocks then hardly count."""
+COST_BYTES_MAX = {128: 400, 512: 900}
+"""The record's bytes, its descriptor among them, pose, stamp, number, checksum and what Python puts around them."""
 
 
 @pytest.mark.parametrize("dimension", [128, 512])
-def test_a_keyframe_costs_its_bytes_a_row_of_floats_and_little_more(dimension: int) -> None:
+def test_a_keyframe_costs_its_bytes_and_little_more(dimension: int) -> None:
     rng = np.random.default_rng(0)
     never_alike = PlaceRecognitionParameters(similarity_threshold=1.0)
     robot = Robot(LogId("r1"), 0, 1, CoreParameters(place_recognition=never_alike), 0.0)
@@ -55,4 +54,4 @@ def test_a_keyframe_costs_its_bytes_a_row_of_floats_and_little_more(dimension: i
     finally:
         tracemalloc.stop()
     print(f"{cost_bytes:.0f} bytes for a keyframe of {record_bytes} bytes")
-    assert cost_bytes < record_bytes + ROW_SLACK * 4 * dimension + REST_BYTES
+    assert cost_bytes < COST_BYTES_MAX[dimension]

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from flocc_agent.core.log_copy import BLOCK_RECORDS, LogCopy
 from flocc_agent.core.parameters import PlaceRecognitionParameters
 from flocc_agent.core.place_recognition import Found, PlaceRecognition, direction
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.records import KeyframeRecord, encode_record
 
 OWN, OTHERS = LogId("r1"), (LogId("r2"), LogId("r3"))
 OWN_FIRST = KeyframeId(OWN, 0)
@@ -80,3 +82,59 @@ def test_every_keyframe_has_a_partner_in_each_other_log_where_anything_is_alike_
     first, second = (next(each for each in keyframes if each[0].log == log) for log in (OTHERS[0], OWN))
     assert recognition.on_keyframes([first]) == []
     assert [candidate.pair.other(OWN_FIRST) for _, candidate in recognition.on_keyframes([second])] == [first[0]]
+
+
+class Logs:
+    """Copies of logs, which lend place recognition the descriptors of their full blocks."""
+
+    def __init__(self) -> None:
+        self._copies: dict[LogId, LogCopy] = {}
+
+    def add(self, recognition: PlaceRecognition, keyframe: KeyframeId, array: Array) -> list[Found]:
+        copy = self._copies.setdefault(keyframe.log, LogCopy())
+        copy.append(encode_record(KeyframeRecord(keyframe.index, 0.0, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), array)))
+        found = recognition.on_keyframes([(keyframe, array)])
+        if len(copy) % BLOCK_RECORDS == 0:
+            recognition.lend(keyframe.log, *copy.descriptors(len(copy) // BLOCK_RECORDS - 1))
+        return found
+
+
+@pytest.mark.parametrize("held", [10**6, 300, 200])
+@pytest.mark.parametrize("of_floats", [None, OTHERS[1]])
+def test_rows_that_a_log_holds_are_compared_as_those_held_here(held: int, of_floats: LogId | None) -> None:
+    ints, floats = drawn(64), drawn(64, "f4")
+    keyframes = [floats[k] if each[0].log == of_floats else each for k, each in enumerate(ints)]
+    parameters = PlaceRecognitionParameters(similarity_threshold=0.6)
+    lent, alone = (PlaceRecognition(OWN, parameters, keyframes_held=held) for _ in range(2))
+    logs, around = Logs(), 0
+    for keyframe, array in keyframes:
+        found = logs.add(lent, keyframe, array)
+        assert found == alone.on_keyframes([(keyframe, array)])
+        for _, candidate in found:
+            assert lent.agreement(candidate.pair) == alone.agreement(candidate.pair)
+            around += 1
+    assert around > 100
+    assert lent.rows == alone.rows
+    assert lent.best_similarities == alone.best_similarities
+
+
+def test_rows_that_a_log_holds_are_not_held_twice() -> None:
+    recognition, logs = PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.6)), Logs()
+    for keyframe, array in drawn(64):
+        logs.add(recognition, keyframe, array)
+    (rows,) = recognition._others.values()
+    assert len(rows) == len(OTHERS) * KEYFRAMES
+    assert len(rows._rows) <= len(OTHERS) * (KEYFRAMES % BLOCK_RECORDS) + BLOCK_RECORDS
+
+
+def test_rows_that_are_others_than_those_held_here_are_not_taken() -> None:
+    recognition = PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.6))
+    keyframes = [each for each in drawn(64) if each[0].log == OTHERS[0]]
+    recognition.on_keyframes(keyframes[:100])
+    rows = np.array([np.frombuffer(array.data, np.int8) for _, array in keyframes])
+    for indices, lent in ((range(64), rows[1:65]), (range(90, 110), rows[90:110]), (range(64), rows[:64, :32])):
+        recognition.lend(OTHERS[0], list(indices), lent)
+    recognition.lend(OTHERS[1], list(range(64)), rows[:64])
+    recognition.lend(OTHERS[0], [], rows[:0])
+    (held,) = recognition._others.values()
+    assert held._lent == []

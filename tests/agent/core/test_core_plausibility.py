@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from flocc_agent.core.closure_ends import Tie
 from flocc_agent.core.correction_evidence import Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import BENT, TORN, contradiction
@@ -13,7 +14,6 @@ from flocc_agent.core.pose_graph import WORLD, MeasuredFactor, landmark
 from flocc_agent.geometry import pose
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import LogCorrection
-from flocc_protocol.records import ClosureRecord
 
 OWN, OTHER = LogId("r2"), LogId("r1")
 STEP_M = 0.5
@@ -32,9 +32,8 @@ class _Held:
     def odometry(self, log: LogId) -> Float:
         return self.T_odom if log == OWN else self.T_map
 
-    def ties(self, log: LogId, ties_max: int) -> Sequence[ClosureRecord]:
-        T = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-        return [ClosureRecord(KeyframeId(OWN, k), KeyframeId(OTHER, k), T, 60, 100, 0.6) for k in self._met]
+    def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
+        return [Tie(k, KeyframeId(OTHER, k), 0.0) for k in self._met]
 
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         ends = [KeyframeId(OWN, k) for k in self._fixed]

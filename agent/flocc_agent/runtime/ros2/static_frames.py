@@ -59,6 +59,11 @@ class StaticFrames:
         both._parents.update(self._parents)
         return both
 
+    def parent(self, frame: str) -> str | None:
+        """The frame that carries another one, or None."""
+        found = self._parents.get(frame)
+        return None if found is None else found[0]
+
     def between(self, a: str, b: str) -> Float | None:
         """`T_a_b`, or None where no chain of static transforms connects the two."""
         of_a, of_b = self._ancestors(a), self._ancestors(b)
