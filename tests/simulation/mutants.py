@@ -393,7 +393,6 @@ MUTANTS = (
     Mutant("every correction is doubted", plausibility, "contradiction", always("so")),
     Mutant("all odometry counts as broken", CorrectionEvidence, "explains", always(False)),
     Mutant("closures always count as torn", CorrectionEvidence, "is_torn", always(True)),
-    Mutant("an own solution bears out every correction", Doubts, "_bears_out", always(True)),
     Mutant("what is held back is never looked at again", Doubts, "to_look_at", always(None)),
     Mutant("nothing ties a robot to its map", GraphAssembly, "joined", always(False)),
     # prospects
