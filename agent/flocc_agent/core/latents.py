@@ -189,7 +189,8 @@ class Latents:
         self._parameters = parameters
         self._held: set[KeyframeId] = set()
         self._fetches: dict[KeyframeId, _Fetch] = {}
-        self._relayed: dict[KeyframeId, None] = {}
+        self._relayed: dict[KeyframeId, float] = {}
+        self._wished_s: dict[KeyframeId, float] = {}
         self._lost_until_s: dict[KeyframeId, float] = {}
 
     def __contains__(self, keyframe: object) -> bool:
@@ -199,6 +200,7 @@ class Latents:
         """Tables with their maximum."""
         return {
             "relayed": (len(self._relayed), RELAYS_MAX),
+            "wished for": (len(self._wished_s), PAUSED_MAX),
             "lost": (len(self._lost_until_s), RELAYS_MAX),
             "fetches": (len(self._fetches), PAUSED_MAX + self._parameters.fetches_max),
         }
@@ -246,7 +248,10 @@ class Latents:
         return tuple(self._lost_until_s)
 
     def on_wants(self, wants: Iterable[KeyframeId], now: float) -> bool:
-        """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new."""
+        """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new.
+
+        What came is held for a while, however many others are wished for, until who wished for it heard of it.
+        """
         new = False
         for keyframe in wants:
             if keyframe in self._lost_until_s:
@@ -254,21 +259,31 @@ class Latents:
             elif keyframe.log != self._own:
                 new |= keyframe not in self._relayed
                 self._relayed.pop(keyframe, None)
-                self._relayed[keyframe] = None
+                self._relayed[keyframe] = now
         while len(self._relayed) > RELAYS_MAX:
-            del self._relayed[next(iter(self._relayed))]
+            oldest = next(iter(self._relayed))
+            del self._relayed[next((k for k in self._relayed if not self._is_awaited(k, now)), oldest)]
         return new
 
-    def wants(self, needed: Iterable[KeyframeId], reach: Reach, now: float) -> tuple[KeyframeId, ...]:
+    def _is_awaited(self, keyframe: KeyframeId, now: float) -> bool:
+        """Whether a latent came that a neighbour wished for just now."""
+        return keyframe in self._held and now < self._relayed[keyframe] + WANTS_TURN_S
+
+    def wants(
+        self, needed: Iterable[KeyframeId], reach: Reach, now: float, still: tuple[KeyframeId, ...] = ()
+    ) -> tuple[KeyframeId, ...]:
         """A few of the needed latents, and of those relayed, that nobody in range can give.
 
-        Others have their turn every `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
+        Those that are wished for `still`, then those whose last turn was longest ago: others have theirs every
+        `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
         """
         wanted = dict.fromkeys(k for k in (*needed, *self._relayed) if self.is_out_of_reach(k, reach))
-        count = WANTS_MAX
-        turns = -(-len(wanted) // count)
-        first = count * (int(now // WANTS_TURN_S) % turns) if turns else 0
-        return tuple(wanted)[first : first + count]
+        others = [keyframe for keyframe in wanted if keyframe not in still]
+        others.sort(key=lambda keyframe: self._wished_s.get(keyframe, float("-inf")))
+        wishes = (*still, *others)[:WANTS_MAX]
+        for keyframe in wishes:
+            remember(self._wished_s, keyframe, now, PAUSED_MAX)
+        return wishes
 
     def is_out_of_reach(self, keyframe: KeyframeId, reach: Reach) -> bool:
         """Whether a latent is not here and nobody in range can give it."""

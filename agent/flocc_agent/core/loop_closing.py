@@ -244,8 +244,9 @@ class LoopClosing:
         turn = int(now // WANTS_TURN_S)
         still = tuple(k for k in self._wanted if self.latents.is_out_of_reach(k, self._reach))
         if turn != self._turn or len(still) < WANTS_MAX:
+            still = still if turn == self._turn else ()
             self._turn = turn
-            still = self.latents.wants(self._out_of_reach(), self._reach, now)
+            still = self.latents.wants(self._out_of_reach(), self._reach, now, still)
         self._wanted = still
         return still
 

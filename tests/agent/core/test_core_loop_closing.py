@@ -16,7 +16,7 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
 )
-from flocc_agent.core.latents import BACKLOG_MAX, RELAYS_MAX, RETRY_S, Latents, Peer, Reach
+from flocc_agent.core.latents import BACKLOG_MAX, RELAYS_MAX, RETRY_S, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, registrar_of
 from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -333,9 +333,38 @@ def test_a_latent_is_asked_of_its_owner_whatever_it_served() -> None:
 def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     latents = Latents(R1, PARAMETERS)
     for k in range(50):
-        latents.on_wants([keyframe(f"r3/{k}")], 0.0)
+        latents.on_wants([keyframe(f"r3/{k}")], float(k))
         latents.add(keyframe(f"r3/{k}"))
     assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - RELAYS_MAX, 50))
+
+
+def test_wishes_have_their_turns_although_some_are_granted_meanwhile() -> None:
+    latents, needed = Latents(R1, PARAMETERS), [keyframe(f"r3/{k}") for k in range(40)]
+    wished: set[KeyframeId] = set()
+    for turn in range(5):
+        wishes = latents.wants(needed[turn:], reach(r2=()), turn * WANTS_TURN_S)  # the first ones come, one a turn
+        assert not wished & set(wishes)
+        wished |= set(wishes)
+    assert wished == set(needed)
+
+
+def test_what_is_wished_for_still_is_wished_for_until_its_turn_is_over() -> None:
+    latents, needed = Latents(R1, PARAMETERS), [keyframe(f"r3/{k}") for k in range(20)]
+    first = latents.wants(needed, reach(r2=()), 0.0)
+    assert latents.wants(needed, reach(r2=()), 0.5, first[1:]) == (*first[1:], needed[8])
+
+
+def test_what_came_for_a_neighbour_is_held_however_many_others_are_wished_for() -> None:
+    latents, came = Latents(R1, PARAMETERS), keyframe("r3/0")
+    latents.on_wants([came], 0.0)
+    latents.add(came)
+    for k in range(1, 100):
+        latents.on_wants([keyframe(f"r3/{k}")], 0.0)
+    assert latents.holds() == (came,)
+    assert latents.sizes()["relayed"] == (RELAYS_MAX, RELAYS_MAX)
+    for k in range(1, 100):
+        latents.on_wants([keyframe(f"r3/{k}")], WANTS_TURN_S)
+    assert latents.holds() == ()
 
 
 def handed(machine: LoopClosing, now: float) -> list[CandidatePair]:
