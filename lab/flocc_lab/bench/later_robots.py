@@ -85,10 +85,9 @@ class Later:
 
     def verdict(self) -> dict[str, object]:
         """The figures, and whether they are what is asked for."""
-        both = self.ate_m is not None and self.ate_at_once_m is not None
-        ratio = self.ate_m / self.ate_at_once_m if self.ate_m is not None and self.ate_at_once_m is not None else None
+        ratio = None if self.ate_m is None or self.ate_at_once_m is None else self.ate_m / self.ate_at_once_m
         arrivals = [{**asdict(each), "in_time": each.in_time} for each in self.arrivals]
-        met = all(each.in_time for each in self.arrivals) and both and ratio is not None and ratio <= ERROR_RATIO_MAX
+        met = all(each.in_time for each in self.arrivals) and ratio is not None and ratio <= ERROR_RATIO_MAX
         return {**asdict(self), "arrivals": arrivals, "ratio": ratio, "met": met}
 
 
