@@ -34,7 +34,7 @@ from flocc_launch.maps.map_merging import MERGER, like_pairs, merge_maps
 from flocc_launch.maps.map_pruning import prune_map
 from flocc_launch.maps.map_saving import save_map
 from flocc_launch.maps.opening import MapUse
-from flocc_launch.maps.solving import NotSolved, solved_map
+from flocc_launch.maps.solving import NotSolved, laid_onto, solved_map
 from flocc_launch.maps.writing import MapContent, write_map
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.recordings import recordings
@@ -235,6 +235,20 @@ def test_what_a_robot_adds_is_the_next_edition_and_the_frame_stays(block: Path, 
     assert {log: new.records[log] for log in old.records} == old.records
     third = mission(tmp_path / "third", AGAIN, MapUse(tmp_path / "next"))
     assert (third.map_frames, third.maps_used) == (["map/r1"], [str(tmp_path / "next")])
+
+
+def test_the_next_edition_is_what_all_its_logs_give_together_where_the_map_lay(tmp_path: Path) -> None:
+    mission(tmp_path / "first", {"r1": BLOCK["r1"]})
+    save_map(tmp_path / "first", tmp_path / "map")
+    mission(tmp_path / "run", {"r1": BLOCK["r2"]}, MapUse(tmp_path / "map"))
+    assert save_map(tmp_path / "run", tmp_path / "next").edition == 2
+    before, after = MapFolder.open(tmp_path / "map"), MapFolder.open(tmp_path / "next")
+    together = solved_map("both", after.records).saved.T_map_camera
+    assert set(together) == set(after.poses()) == {LogId("r1"), LogId("r1", 1)}
+    T = laid_onto(together, after.poses())
+    for log, poses in after.poses().items():
+        np.testing.assert_allclose(T @ together[log], poses, atol=1e-3)
+    np.testing.assert_allclose(laid_onto(after.poses(), before.poses()), np.eye(4), atol=1e-6)
 
 
 def test_a_fixed_map_does_not_move(block: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The solution of a map: all logs in one frame, with covariances and the closures that it used."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +10,24 @@ from flocc_agent.backend.alignment import evenly
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.gossip import NewRecord
-from flocc_agent.core.pose_graph import ClosureState, Component, OptimisationFailed, map_frame
+from flocc_agent.core.pose_graph import (
+    ClosureState,
+    Component,
+    GraphSolution,
+    OptimisationFailed,
+    PoseGraph,
+    map_frame,
+)
 from flocc_agent.core.saved_map import SavedClosure, SavedMap
-from flocc_agent.geometry import upper_triangle
+from flocc_agent.geometry import nearest_rotation, upper_triangle
 from flocc_agent.runtime.map_folder import UPPER
 from flocc_launch.maps.gathering import Logs, opened_record
 from flocc_protocol.errors import DecodeError, FloccError
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
+Solved = tuple[GraphSolution, Component]
+"""A solution, and its component that becomes the map."""
 
 COVARIANCES_MAX = 2000
 """Keyframes whose covariance is computed; of more, so many evenly spread ones."""
@@ -50,6 +59,9 @@ def solved_map(
 ) -> SolvedMap:
     """Solve the pose graph of logs, and keep the part with the most keyframes, or the one of a frame.
 
+    A mission in a map that may move has all of the map's measurements beside its own: they are solved anew together, as
+    if all robots had been there at one time, and laid onto the poses that the map had.
+
     Args:
         where: Whose logs they are, for sentences.
         logs: Records of each log, as stores keep them.
@@ -72,6 +84,8 @@ def solved_map(
     if isinstance(solution, OptimisationFailed):
         raise NotSolved(f"{where}: its pose graph cannot be solved: {solution.reason}")
     component = _chosen(where, solution.components, frame, saved)
+    if saved is not None and not saved.is_fixed:
+        solution, component = _solved_anew(graph, saved, config, chosen, (solution, component))
     own = {log for log in logs if log in component.logs or not _has_poses(log, described)}
     used = {
         (r.query, r.match): SavedClosure(r.scale, r.weight)
@@ -85,6 +99,34 @@ def solved_map(
         {log: f"is in a map of its own, {_frame_of(log, solution.components)}" for log in logs if log not in own},
         solution.warnings,
     )
+
+
+def _solved_anew(
+    graph: PoseGraph, saved: SavedMap, config: BackendConfig | None, wanted: list[KeyframeId], in_map: Solved
+) -> Solved:
+    """The solution of all measurements at once, in the map's frame; that in the map where this one joins less."""
+    from flocc_agent.backend.optimiser import optimise
+
+    solution = optimise(replace(graph, saved=None), config or BackendConfig(), None, wanted)
+    if isinstance(solution, OptimisationFailed):
+        return in_map
+    found = next((c for c in solution.components if set(in_map[1].logs) <= set(c.logs)), None)
+    if found is None:
+        return in_map
+    T_map_solved = laid_onto(found.T_map_keyframe, saved.T_map_camera)
+    T = {log: np.asarray(T_map_solved @ poses) for log, poses in found.T_map_keyframe.items()}
+    logs = (*saved.logs, *(log for log in found.logs if log not in saved.logs))
+    return solution, replace(found, logs=logs, T_map_keyframe=T)
+
+
+def laid_onto(poses: Mapping[LogId, Float], onto: Mapping[LogId, Float]) -> Float:
+    """The pose (4, 4) of one solution in the frame of another, by all camera poses that both have."""
+    pairs = [(poses[log][: len(T)], T[: len(poses[log])]) for log, T in onto.items() if log in poses]
+    ours, theirs = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    found = np.eye(4)
+    found[:3, :3] = nearest_rotation(np.einsum("nij,nkj->ik", theirs[:, :3, :3], ours[:, :3, :3]))
+    found[:3, 3] = (theirs[:, :3, 3] - ours[:, :3, 3] @ found[:3, :3].T).mean(axis=0)
+    return found
 
 
 def _assembled(where: str, logs: Logs, saved: SavedMap | None) -> tuple[GraphAssembly, set[LogId]]:
