@@ -1,7 +1,8 @@
 """The solution of a map: all logs in one frame, with covariances and the closures that it used."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from flocc_agent.config import BackendConfig
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.pose_graph import (
+    ClosureResult,
     ClosureState,
     Component,
     GraphSolution,
@@ -29,6 +31,8 @@ Float = NDArray[np.float64]
 Solved = tuple[GraphSolution, Component]
 """A solution, and its component that becomes the map."""
 
+CONTRADICTING_MIN = 2
+"""Logs that contradict a keyframe that is named."""
 COVARIANCES_MAX = 2000
 """Keyframes whose covariance is computed; of more, so many evenly spread ones."""
 
@@ -46,12 +50,14 @@ class SolvedMap:
         covariances: (N, 21) upper triangles by log, NaN where there is none.
         left_out: Logs that are not part of it, with the reason.
         warnings: What the solver said.
+        contradicted: Keyframe -> the logs that contradict it, as text, where several do.
     """
 
     saved: SavedMap
     covariances: Mapping[LogId, NDArray[np.float32]]
     left_out: Mapping[LogId, str]
     warnings: Sequence[str] = ()
+    contradicted: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def solved_map(
@@ -98,7 +104,28 @@ def solved_map(
         {log: _triangles(log, len(poses[log]), component) for log in component.logs},
         {log: f"is in a map of its own, {_frame_of(log, solution.components)}" for log in logs if log not in own},
         solution.warnings,
+        contradicted(solution.closures, own),
     )
+
+
+def contradicted(closures: Iterable[ClosureResult], own: Set[LogId]) -> dict[str, tuple[str, ...]]:
+    """Keyframes of these logs that several others contradict, more than agree with them, and which.
+
+    A log contradicts a keyframe where a closure between them was rejected as an outlier, and none was used: what it
+    shows has changed, or looks like another place.
+    """
+    logs: dict[ClosureState, dict[KeyframeId, set[LogId]]] = {state: defaultdict(set) for state in ClosureState}
+    for closure in closures:
+        query, match = closure.query, closure.match
+        if query.log != match.log and {query.log, match.log} <= own:
+            logs[closure.state][query].add(match.log)
+            logs[closure.state][match].add(query.log)
+    found = {}
+    for keyframe, against in sorted(logs[ClosureState.REJECTED].items()):
+        agree = logs[ClosureState.USED].get(keyframe, set())
+        if len(against - agree) >= max(CONTRADICTING_MIN, len(agree) + 1):
+            found[str(keyframe)] = tuple(map(str, sorted(against - agree)))
+    return found
 
 
 def _solved_anew(
