@@ -6,6 +6,7 @@ at the same time.
 python -m flocc_lab.bench.later_robots ../shared/data/street r1,r2 runs/later perception.method=learned
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping
@@ -166,15 +167,20 @@ def posed(opened: MapFolder, paths: Mapping[str, Path]) -> dict[str, tuple[Float
     return found
 
 
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Print what `measure` found and whether it is enough, as JSON."""
-    data, first, out, *changes = arguments
-    fixed = "--map-fixed" in changes
-    sets = dict(parsed_change(text) for text in changes if text != "--map-fixed")
-    scenario = read_scenario(data, sets)
-    result = measure(scenario, recordings(scenario), first.split(","), Path(out), fixed)
+    parser = argparse.ArgumentParser(prog="flocc_lab.bench.later_robots")
+    parser.add_argument("data", help="Scenario, or own data.")
+    parser.add_argument("first", help="Robots that make the map, with commas.")
+    parser.add_argument("out", type=Path, help="Folder of all runs.")
+    parser.add_argument("sets", nargs="*", help="Other values for keys, KEY=VALUE.")
+    parser.add_argument("--agents", type=int, help="Robots into which one data set is cut.")
+    parser.add_argument("--map-fixed", action="store_true", help="The map does not move.")
+    given = parser.parse_args()
+    scenario = read_scenario(given.data, dict(map(parsed_change, given.sets)), given.agents)
+    result = measure(scenario, recordings(scenario), given.first.split(","), given.out, given.map_fixed)
     sys.stdout.write(json.dumps(result.verdict()) + "\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()
