@@ -226,6 +226,29 @@ def test_nothing_stays_where_nothing_is_on_the_lens() -> None:
     assert not finder.cells().any()
 
 
+def test_what_a_robot_turns_around_stays_and_is_scene() -> None:
+    """A wall at 3 m that is kept in view: what the turn moves, the way to the side moves back."""
+    finder = OverlayFinder(CAMERA)
+    texture, K = _texture(5), np.array([[280.0, 0.0, 159.5], [0.0, 280.0, 119.5], [0.0, 0.0, 1.0]])
+    wall_of_texture = np.array([[3.0 / 280.0, 0.0, -5.4], [0.0, 3.0 / 280.0, -3.9], [0.0, 0.0, 1.0]])
+    for x in 0.15 * np.arange(-5, 6):
+        T = pose(so3_exp(np.array([0.0, -np.arctan(x / 3.0), 0.0])), np.array([x, 0.0, 0.0]))
+        R = T[:3, :3].T
+        H = K @ np.column_stack([R[:, 0], R[:, 1], R @ (np.array([0.0, 0.0, 3.0]) - T[:3, 3])]) @ wall_of_texture
+        assert not finder.add(np.asarray(cv2.warpPerspective(texture, H, (320, 240)), np.uint8), T)
+        assert not finder.cells().any()
+
+
+def test_broad_blobs_resemble_themselves_a_few_pixels_on_and_are_scene() -> None:
+    finder = OverlayFinder(CAMERA)
+    small = np.random.default_rng(6).integers(0, 256, (18, 25), dtype=np.uint8)
+    texture = np.asarray(cv2.resize(small, (1000, 720), interpolation=cv2.INTER_CUBIC), np.uint8)
+    for angle in np.radians(np.arange(12)):
+        T = pose(so3_exp(np.array([0.0, angle, 0.0])), np.zeros(3))
+        finder.add(picture(T, texture), T)
+        assert not finder.cells().any()
+
+
 def test_a_frozen_picture_is_not_encoded_and_told_at_the_second_one() -> None:
     perception = build_perception(PerceptionConfig())
     watch = CameraWatch()

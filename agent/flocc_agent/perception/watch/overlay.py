@@ -1,10 +1,12 @@
 """What moves with the camera is not the scene: parts of the picture that stay at their pixel while the robot turns.
 
 The picture is looked at in small cells. A cell is tested against an earlier picture where the turn between the two, by
-odometry, must have moved whatever is out there by several pixels, however far it is. Compared are the gradients along
-that shift, so that an edge in its direction, such as a horizon, counts for nothing. What is out there correlates with
-nothing on average; what moves with the camera always does, if it lets the scene shine through, or if a part of it
-changes, only a little less. A robot that only drives straight shows nothing, and nothing is hidden.
+odometry, must have moved whatever is out there by several pixels, at whatever depth: a robot that goes to the right and
+turns to the left keeps something in view, and there it tests nothing. Compared are the gradients along that shift, so
+that an edge in its direction, such as a horizon, counts for nothing, and of fine structure only: a broad blob resembles
+itself a few pixels on. What is out there correlates with nothing on average; what moves with the camera always does, if
+it lets the scene shine through, or if a part of it changes, only a little less. A robot that only drives straight shows
+nothing, and nothing is hidden.
 
 Two pictures whose cells all stay are one picture: the camera is frozen.
 """
@@ -33,7 +35,14 @@ CONTRAST_MIN = 3.0
 CORNER_MIN = 2.0
 """Smaller eigenvalue of a window's gradients: with less it is an edge at best."""
 SHIFT_MIN_PX = 4.0
-"""A turn that moves a cell by less tests nothing."""
+"""A motion that moves what a cell shows by less, at some depth, tests nothing."""
+NEAR_STEPS = 3.0
+NEAR_MIN_M = 0.3
+"""The nearest that something may be: so many lengths of the motion between two pictures, and at least the second."""
+FINE_SIGMA_PX = 3.0
+"""What is smoother is left out: it resembles itself where it has moved by few pixels."""
+BEYOND_PX = 10
+"""Three times the former and a bit."""
 GRADIENT_MIN = 1.25
 """Grey levels a pixel, root mean square in a window along the shift, below which noise decides."""
 MOVED_MIN_M = 0.05
@@ -45,7 +54,7 @@ EARLIER_MAX = 6
 """Earlier pictures kept to compare with."""
 TESTS_MIN = 6
 STAYED_MIN = 0.3
-STAYED_CHANCE = 2.0
+STAYED_CHANCE = 3.0
 """Mean correlation of a cell that stays: at least the first, and the second over the number of tests more."""
 SUPPORT_MIN = 3.0
 """Cells that stay, of the nine around one, itself among them: one or two are chance."""
@@ -117,29 +126,43 @@ class OverlayFinder:
         deviation = np.sqrt(np.maximum(self._averaged(reduced * reduced) - mean * mean, 0.0))
         corners = self._at(np.asarray(cv2.cornerMinEigenVal(reduced, WINDOW_PX)))
         has_corners = (deviation > CONTRAST_MIN) & (corners > CORNER_MIN)
-        right, down = (
-            np.asarray(cv2.Sobel(reduced, cv2.CV_32F, *axis, scale=0.125), np.float32) for axis in ((1, 0), (0, 1))
-        )
+        right, down = _fine_gradient(reduced)
         squares = self._averaged(right * right), self._averaged(right * down), self._averaged(down * down)
         return _Picture(reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera)
 
     def _test(self, now: _Picture, earlier: _Picture) -> None:
-        """Add how much of each cell stays between two pictures, of those that the turn must have moved."""
-        rays = self._rays @ between(now.T_odom_camera, earlier.T_odom_camera)[:3, :3].T
-        depth = np.maximum(rays[..., 2], 1e-3)
-        shift = (rays[..., :2] / depth[..., None] - self._rays[..., :2]) * self._focal_px
+        """Add how much of each cell stays between two pictures, of those that the motion must have moved."""
+        shift = self._least_shift_px(between(now.T_odom_camera, earlier.T_odom_camera))
         length = np.linalg.norm(shift, axis=-1)
         along = shift / np.maximum(length, 1e-6)[..., None]
         (right, down), (right_before, down_before) = now.gradient, earlier.gradient
         crossed = self._averaged(right * down_before + down * right_before)
         both = _along(along, (self._averaged(right * right_before), 0.5 * crossed, self._averaged(down * down_before)))
-        squares = _along(along, now.squares), _along(along, earlier.squares)
+        squares = [np.maximum(_along(along, one.squares), 0.0) for one in (now, earlier)]
         tested = (length > SHIFT_MIN_PX) & (np.maximum(*squares) > GRADIENT_MIN**2)
         self._tests += tested
         self._stayed += tested * both / np.maximum(np.sqrt(squares[0] * squares[1]), 0.5 * GRADIENT_MIN**2)
         fades = self._tests > TESTS_MAX
         self._tests[fades] *= 0.5
         self._stayed[fades] *= 0.5
+
+    def _least_shift_px(self, T_now_earlier: Float) -> Float:
+        """(rows, columns, 2) by how much the motion moves what lies in each cell, at the depth that it moves least.
+
+        Whatever lies between the nearest depth and infinity moves along this direction by at least as much.
+        """
+        moved_m = T_now_earlier[:3, 3]
+        far = self._rays @ T_now_earlier[:3, :3].T
+        near = far + moved_m / max(NEAR_STEPS * float(np.linalg.norm(moved_m)), NEAR_MIN_M)
+        first, last = self._shift_px(far), self._shift_px(near)
+        way = last - first
+        at = -np.sum(first * way, axis=-1) / np.maximum(np.sum(way * way, axis=-1), 1e-12)
+        return np.asarray(first + np.clip(at, 0.0, 1.0)[..., None] * way)
+
+    def _shift_px(self, rays: Float) -> Float:
+        """(rows, columns, 2) from each cell's own ray to that, in the reduced picture."""
+        depth = np.maximum(rays[..., 2], 1e-3)[..., None]
+        return np.asarray((rays[..., :2] / depth - self._rays[..., :2]) * self._focal_px)
 
     def _is_same(self, now: _Picture, earlier: _Picture) -> bool:
         if not self._moved(between(now.T_odom_camera, earlier.T_odom_camera)):
@@ -165,6 +188,18 @@ class OverlayFinder:
     def _at(self, values: NDArray[np.generic]) -> Float32:
         columns, rows = self._centres
         return np.asarray(values[np.ix_(rows, columns)], np.float32)
+
+
+def _fine_gradient(grey: Float32) -> tuple[Float32, Float32]:
+    """(H, W) grey levels a pixel to the right and down, without what is smooth.
+
+    Slopes go on beyond the border: where they ended there, every border would be an edge that stays.
+    """
+    beyond = np.pad(grey, BEYOND_PX, mode="reflect", reflect_type="odd")
+    fine = beyond - cv2.GaussianBlur(beyond, (0, 0), FINE_SIGMA_PX)
+    right, down = (cv2.Sobel(fine, cv2.CV_32F, *axis, scale=0.125) for axis in ((1, 0), (0, 1)))
+    inside = slice(BEYOND_PX, -BEYOND_PX)
+    return np.asarray(right[inside, inside], np.float32), np.asarray(down[inside, inside], np.float32)
 
 
 def _along(direction: Float, products: tuple[Float32, Float32, Float32]) -> Float:
