@@ -137,7 +137,8 @@ def _solved_anew(
     solution = optimise(replace(graph, saved=None), config or BackendConfig(), None, wanted)
     if isinstance(solution, OptimisationFailed):
         return in_map
-    found = next((c for c in solution.components if set(in_map[1].logs) <= set(c.logs)), None)
+    joined = {*saved.logs, *in_map[1].logs}
+    found = next((c for c in solution.components if joined <= set(c.logs)), None)
     if found is None:
         return in_map
     T_map_solved = laid_onto(found.T_map_keyframe, saved.T_map_camera)
