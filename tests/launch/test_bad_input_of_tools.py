@@ -210,7 +210,7 @@ def test_a_page_on_a_port_in_use_is_one_sentence(
 
 
 @pytest.mark.swarm
-@pytest.mark.parametrize(("command", "said"), [("doctor", "nobody is there: in 3 s no agent"), ("view", "no ")])
+@pytest.mark.parametrize(("command", "said"), [("doctor", "nobody is there: in 1.5 s no agent"), ("view", "no ")])
 def test_a_swarm_that_nobody_answers_for_is_one_sentence(
     command: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -223,6 +223,6 @@ def test_a_swarm_that_nobody_answers_for_is_one_sentence(
         'name = "me"\nswarm = "nobody"\n[transport]\nmulticast = false\ncontrol_listen = ["tcp/127.0.0.1:0"]\n'
         f"[transport.roster.r1]\n{peer}\n"
     )
-    save = ["--save", str(tmp_path / "run.rrd")] if command == "view" else []
-    assert run(monkeypatch, command, "--config", str(config), *save) == 2
+    more = ["--save", str(tmp_path / "run.rrd")] if command == "view" else ["--timeout", "0.5"]
+    assert run(monkeypatch, command, "--config", str(config), *more) == 2
     assert sentence(capsys).startswith(f"error: swarm nobody: {said}")

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 from tests.launch.bag_fixtures import ZERO_NS, BagScript, walking
 
 from flocc_agent.runtime.recording import Recording
@@ -192,6 +193,124 @@ def test_a_body_that_odometry_does_not_name_is_found_on_tf_or_refused(tmp_path: 
         script.transform("/tf", ZERO_NS, ("camera" if frame == "odom" else "odom", frame))
     bag = script.write(tmp_path / "run", "mcap")
     assert Recording.open(convert(bag, tmp_path / "found")).T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
+
+
+def test_a_mounting_that_static_transforms_give_twice_is_refused(tmp_path: Path) -> None:
+    script = mounted(walking(False))
+    script.transform("/tf_static", ZERO_NS + 9 * S, ("housing", "camera"), (0.0, 0.1, 0.0), FORWARD)
+    with pytest.raises(DatasetError, match="place camera, between body and camera, in more than one way"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("images", "info"), [("cam0", "cam1"), ("stereo/left", "stereo/right")])
+@pytest.mark.parametrize("frame", ["", "camera"])
+def test_intrinsics_of_the_other_camera_are_not_taken(tmp_path: Path, images: str, info: str, frame: str) -> None:
+    script = robot_of(BagScript(False), f"/{images}/image_raw", "/odom", 0.0, (frame, "body"))
+    script.messages = [
+        (name.replace(images, info) if "info" in name else name, *rest) for name, *rest in script.messages
+    ]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("stamped", ["now", "never", "each"])
+def test_a_path_gives_where_its_end_is(tmp_path: Path, stamped: str) -> None:
+    script = walking(False, odometry=None)
+    for k in range(1, 6):
+        now_ns = ZERO_NS + k * S
+        each = {"now": [now_ns] * (k + 1), "never": [0] * (k + 1), "each": [ZERO_NS + j * S for j in range(k + 1)]}
+        script.path("/path", each[stamped], now_ns)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    first = 0 if stamped == "each" else 1
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(first, 5)])
+
+
+@pytest.mark.parametrize(("topic", "fixed"), [("/goal_pose", "map"), ("/plan", "map"), ("/marker/pose", "camera")])
+def test_poses_of_goals_and_of_what_is_seen_are_no_odometry(tmp_path: Path, topic: str, fixed: str) -> None:
+    script = walking(False, odometry=None)
+    script.fixed = fixed
+    for k in range(11):
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+        script.pose_stamped(topic, ZERO_NS + k * S // 2, 50.0)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])
+
+
+@pytest.mark.parametrize(
+    ("ways", "said"),
+    [((0.0, 0.0), "nothing moves"), ((1.0, 3.0), "rotations never change though the path turns"), ((1.0, 1.0), "")],
+)
+def test_odometry_that_says_nothing_of_rotations_or_motion_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, ways: tuple[float, float], said: str
+) -> None:
+    script = walking(False, odometry=None)
+    for k in range(11):
+        along, across = (min(k, 5) * ways[0], max(k - 5, 0) * (ways[1] - ways[0]))
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "camera"), (along + max(k - 5, 0) * ways[0], across, 0))
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    told = [word for word in ("nothing moves", "rotations never change though the path turns") if word in caplog.text]
+    assert told == ([said] if said else [])
+
+
+def test_odometry_that_is_ground_truth_by_its_name_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = walking(False, odometry="/vicon/odom").write(tmp_path / "run", "mcap")
+    convert(bag, tmp_path / "out")
+    assert "odometry is /vicon/odom, ground truth by its name, which does not drift" in caplog.text
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_robots_with_transforms_of_their_own_may_have_the_same_frames(tmp_path: Path, moves: bool) -> None:
+    script = BagScript(False)
+    for number, name in enumerate(("r1", "r2")):
+        odometry = None if moves else f"/{name}/odom"
+        robot_of(script, f"/{name}/cam/image_raw", odometry, float(number), ("camera", "body"))
+        script.transform(f"/{name}/tf_static", ZERO_NS, ("body", "camera"), (0.1 + number, 0.0, 0.0))
+        for k in range(9 if moves else 0):
+            script.transform(f"/{name}/tf", ZERO_NS + k * S // 2, ("odom", "body"), (number + 0.5 * k, 0.0, 0.0))
+    script.messages.sort(key=lambda message: message[2])
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    found = [Recording.open(tmp_path / "out" / name) for name in ("r1", "r2")]
+    assert [recording.T_body_camera[0, 3] for recording in found] == pytest.approx([0.1, 1.1])
+    assert [recording.frames[0].T_odom_body[0, 3] for recording in found] == [0.0, 1.0]
+
+
+def test_one_robot_without_intrinsics_costs_no_other(tmp_path: Path) -> None:
+    script = team()
+    script.messages = [message for message in script.messages if message[0] != "/bob_2/cam/camera_info"]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out" / "alpha").frames) == 4
+
+
+def test_images_of_another_frame_and_repeated_ones_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = walking(False, count=12)
+    script.frame = "other"
+    script.compressed("/cam/image/compressed", ZERO_NS + S // 2)
+    script.frame = "camera"
+    repeated = [(name, kind, ns + 1000, message) for name, kind, ns, message in script.messages if "image" in name]
+    script.messages = sorted([*script.messages, *repeated[:-1]], key=lambda message: message[2])
+    bag = script.write(tmp_path / "run", "mcap")
+    assert len(Recording.open(convert(bag, tmp_path / "out")).frames) == 12
+    assert "12 of 25 messages repeat a stamp" in caplog.text
+    assert "1 of 25 messages were left out: an image is of the frame other, the first one of camera" in caplog.text
+
+
+def test_topics_without_messages_are_not_chosen_from(tmp_path: Path) -> None:
+    script = walking(False)
+    path = tmp_path / "run"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection("/rear/image_raw", "sensor_msgs/msg/Image", typestore=script.store)
+        writer.add_connection("/wheels/odom", "nav_msgs/msg/Odometry", typestore=script.store)
+        connections = {
+            (name, kind): writer.add_connection(name, kind, typestore=script.store)
+            for name, kind in dict.fromkeys(message[:2] for message in script.messages)
+        }
+        for name, kind, stamp_ns, message in script.messages:
+            raw = bytes(script.store.serialize_cdr(message, kind))
+            writer.write(connections[name, kind], stamp_ns, raw)
+    assert len(Recording.open(convert(path, tmp_path / "out")).frames) == 5
 
 
 @pytest.mark.parametrize("storage", ["bag", "db3"])

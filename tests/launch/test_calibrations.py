@@ -276,6 +276,13 @@ LISTS = [f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(9
         ("c.txt", "1 PINHOLE 160 120 150.5 151.5 abc 60\n", "camera 1 has abc where a number must be"),
         ("c.yaml", "width: 160\nheight: 120\nfx: 0.94\nfy: 1.26\ncx: 0.5\ncy: 0.5\n", "parts of the image's size"),
         ("c.yaml", FLAT.replace("80.0", "800.0"), r"\(800, 60\) lies outside of images of 160x120"),
+        (
+            "c.yaml",
+            FLAT.replace("151.5", "80.0").replace("cx: 80.0", "cx: 151.5"),
+            "would be fx cx fy cy, by their sizes",
+        ),
+        ("c.yaml", FLAT.replace("151.5", "1e-30"), "focal lengths of 150.5 and 1e-30 pixels are none of images"),
+        ("c.yaml", FLAT + "model_type: PINHOLE\nestimate_extrinsic: 2\n", "VINS' settings that do not know where the"),
         ("c.yaml", FLAT + "T_BS: [[1, 0, 0, 65], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n", "mounting in metres"),
         ("c.yaml", FLAT + "R: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nt: [0.1, 0, 0]\n", "the key 't' is not understood"),
         ("c.yaml", FLAT + "projection: equidistant\n", "the key 'projection' is not understood"),

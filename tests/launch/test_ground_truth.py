@@ -1,5 +1,6 @@
 """Evaluation destroys nothing that a person put into a run, and names what is wrong with ground truth."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -50,6 +51,24 @@ def test_a_given_truth_goes_before_the_recordings(tmp_path: Path) -> None:
         give(folder, robot, Trajectory(synthetic_run.stamps(made.truth[robot]), 2.0 * lifted(made.truth[robot]) / 2.0))
     assert finish(folder).ate_joint_m == pytest.approx(before.ate_joint_m, abs=1e-6)
     assert read_tum(folder.path / "groundtruth" / "r1.tum").T_fixed_body[0, 2, 3] > 99.0
+
+
+def test_a_recording_that_another_user_keeps_costs_its_pictures_and_not_the_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = synthetic_run.write(tmp_path / "run", Synthetic())
+    before = finish(folder)
+    barred = folder.path / "recordings" / "r2"
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != barred)
+    report = finish(folder)
+    assert report.ate_joint_m == before.ate_joint_m
+    (said,) = (warning for warning in report.warnings if "may not read" in warning)
+    assert said.startswith("The recordings of r2 lie where you may not read")
+    assert "ground truth" not in said
+    (folder.path / "groundtruth" / "r2.tum").unlink()
+    report = finish(folder)
+    assert any("nor ground truth of r2: put it into groundtruth/" in warning for warning in report.warnings)
+    assert {r.robot: r.corrected.ate_m is None for r in report.robot_details} == {"r1": False, "r2": True, "r3": False}
 
 
 def test_what_flocc_made_of_a_truth_is_made_again(tmp_path: Path) -> None:

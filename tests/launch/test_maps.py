@@ -615,9 +615,17 @@ def test_runs_that_hold_no_store_or_no_keyframe_give_no_map(tmp_path: Path, firs
         save_map(first, tmp_path / "map", frame="map/r9")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(BadMap, match="it is no map"):
+    with pytest.raises(BadMap, match="holds something else than a map; choose another --out"):
         save_map(first, tmp_path / "mine")
     assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_a_run_and_a_map_that_are_mistaken_for_each_other_are_told(first: Path, block: Path, tmp_path: Path) -> None:
+    for part in (first, first / "robots" / "r1", first / "robots" / "r1" / "store"):
+        with pytest.raises(BadMap, match=f"no map yet: flocc map save {part} --out FOLDER makes one of it"):
+            MapFolder.open(part)
+    with pytest.raises(BadMap, match="is a map already"):
+        save_map(block, tmp_path / "map")
 
 
 def test_two_missions_in_one_folder_are_told_apart(first: Path, tmp_path: Path) -> None:

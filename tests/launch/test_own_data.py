@@ -15,7 +15,9 @@ from flocc_agent.runtime.trajectory_text import read_tum
 from flocc_launch.datasets.commands import convert, info, info_lines, split
 from flocc_launch.datasets.detect import detect_format, read_source
 from flocc_launch.datasets.source import DatasetError
+from flocc_launch.scenarios.expectations import check_measurable
 from flocc_launch.scenarios.recordings import recordings
+from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.shipped import read_scenario
 
 COUNT = IMAGES * PASSES
@@ -49,6 +51,13 @@ def test_one_data_set_is_cut_into_robots(own: Path) -> None:
     assert (scenario.name, scenario.names(), scenario.seed) == ("my_data", ["r1", "r2"], 4)
     paths = recordings(scenario)
     assert [len(Recording.open(path).frames) for path in paths.values()] == [COUNT // 2, COUNT // 2]
+
+
+def test_an_error_can_be_expected_of_a_data_set_with_ground_truth(own: Path) -> None:
+    """Whatever its file is called: what counts is the recording that is made of it."""
+    asked = {"robots": {"red": {"recording": str(own)}}, "expectations": {"ate_max_m": 1.0}}
+    scenario = Scenario.model_validate(asked)
+    check_measurable(scenario, recordings(scenario))
 
 
 def test_keyframes_are_closer_where_robots_move_little(own: Path) -> None:

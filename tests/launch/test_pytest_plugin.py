@@ -76,6 +76,8 @@ def test_scenarios_that_pass_fail_or_cannot_be_used(pytester: pytest.Pytester) -
     assert "the check fails before" not in re.sub(r"raise AssertionError.*", "", lines)
     for told in ("the key 'radio.lossy' does not exist", "nowhere.toml", "not 'gazebo'", "flocc_run needs"):
         assert told in lines
+    assert "Traceback" not in lines
+    assert "pytest_plugin.py" not in lines, "what cannot be used is said without flocc's own lines"
 
 
 @pytest.mark.swarm

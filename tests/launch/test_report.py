@@ -167,6 +167,13 @@ def test_evaluate_says_what_the_report_holds(folder: RunFolder) -> None:
     )
 
 
+def test_without_ground_truth_no_line_is_full_of_dashes(tmp_path: Path) -> None:
+    text = evaluate(synthetic_run.write(tmp_path / "run", Synthetic(with_truth=False)).path)
+    assert "There is no ground truth" in text
+    told = [line for line in text.splitlines() if not line.startswith("expected")]
+    assert not [line for line in told if "–" in line or "ATE" in line]
+
+
 def test_what_was_missed_stands_in_the_first_line_in_red_on_a_terminal(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:

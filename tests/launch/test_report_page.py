@@ -2,6 +2,7 @@
 
 import re
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,6 +12,8 @@ from tests.launch.synthetic_run import Synthetic
 from tests.launch.test_dashboard import browse
 
 from flocc_launch.report import RunReport, finish
+from flocc_launch.report.figure_map import MapScene, map_figure, view_of
+from flocc_launch.report.figure_time import room_for
 from flocc_launch.report.html import page
 from flocc_launch.report.svg import Axis, thinned
 from flocc_launch.report.verdict import verdict
@@ -70,6 +73,29 @@ def test_the_page_shows_every_part(tmp_path: Path) -> None:
         assert text in html
     assert html.count('class="closure"') == report.closures.accepted + 1
     assert ">seed</td><td><code>7</code>" in html
+
+
+def test_without_ground_truth_no_tile_is_empty(tmp_path: Path) -> None:
+    tiles = {known: html_of(tmp_path / str(known), Synthetic(with_truth=known))[0] for known in (True, False)}
+    assert [html.count('class="tile"') for html in tiles.values()] == [7, 5]
+    assert "<b>–</b>" not in tiles[False]
+
+
+def test_names_that_begin_in_one_place_stand_below_each_other(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run")
+    finish(folder)
+    loaded = load(folder)
+    line = loaded.tracks["r1"].T_world_body[:, :3, 3]
+    scene = MapScene("After", "", dict.fromkeys(("anna", "ben", "carl"), line), {}, False)
+    names = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" class="name"', map_figure(scene, view_of([scene]), loaded))
+    assert len({x for x, _ in names}) == 1
+    heights = [float(y) for _, y in names]
+    assert [lower - upper for upper, lower in pairwise(heights)] == pytest.approx([14.0, 14.0], abs=0.2)
+
+
+def test_long_names_of_robots_have_room_beside_the_bars() -> None:
+    assert room_for(["r1", "r1 ↔ r2"]) == room_for([]) < 120
+    assert 170 < room_for(["r1", "carl_iphone ↔ ben_pixel"]) < room_for(["r" * 99]) < 400
 
 
 def test_the_page_says_why_maps_have_not_merged(tmp_path: Path) -> None:

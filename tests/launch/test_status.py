@@ -72,7 +72,7 @@ def test_an_agents_answer_is_read_and_a_strange_one_is_shown_as_such() -> None:
 @pytest.mark.swarm
 def test_a_swarm_that_nobody_is_in_is_one_sentence() -> None:
     config = TransportConfig(control_listen=("tcp/127.0.0.1:0",), multicast=False)
-    with pytest.raises(StatusError, match=r"swarm nobody: nobody is there: in 0\.2 s no agent"):
+    with pytest.raises(StatusError, match=r"swarm nobody: nobody is there: in 0\.6 s no agent"):
         status_of_swarm(config, "nobody", timeout_s=0.2)
 
 

@@ -19,9 +19,9 @@ from flocc_protocol.keys import Admin
 pytestmark = pytest.mark.swarm
 
 
-def agent(config: TransportConfig, robot: str = "r1") -> ZenohTransport:
+def agent(config: TransportConfig, robot: str = "r1", answer: bytes = b'{"keyframes": 7}') -> ZenohTransport:
     transport = ZenohTransport("test", robot, config)
-    transport.serve_admin(Admin.STATUS, lambda _: b'{"keyframes": 7}')
+    transport.serve_admin(Admin.STATUS, lambda _: answer)
     return transport
 
 
@@ -77,6 +77,21 @@ async def test_of_two_the_one_that_is_late_stands_in_the_table_and_in_the_doctor
     findings = {finding.cause: finding.robots for finding in diagnose_live(rows)}
     assert findings["no-answer"] == ("r2",)
     assert "no-keyframes" not in findings
+
+
+async def test_a_robot_that_only_a_neighbour_hears_stands_in_the_table() -> None:
+    config = loopback_configs(("r1",))["r1"]
+    async with agent(config, answer=b'{"neighbours": ["r2"]}'):
+        rows = await asked(config, 0.5)
+    assert [(row.robot, row.state) for row in rows] == [("r1", "running"), ("r2", NO_ANSWER)]
+
+
+async def test_an_agent_that_starts_late_is_waited_for() -> None:
+    config = loopback_configs(("r1",))["r1"]
+    asking = asyncio.create_task(asked(config, 3.0))
+    await asyncio.sleep(3.5)  # as long as an interpreter takes to start on a busy machine; the claim is about time
+    async with agent(config):
+        assert [row.robot for row in await asking] == ["r1"]
 
 
 async def test_another_swarm_is_named_where_the_one_asked_for_is_not_there() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend.chains import Chains
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, off_half_turns, state_of
 from flocc_agent.backend.initial import Aligned, trusted_closures
@@ -89,3 +90,19 @@ def posed(
         trusted_closures(in_order, is_held, initial) if aligned.is_warm and initial is not None else None,
         Places(problem, trajectories, closures, says, config.steepness),
     )
+
+
+def posed_by_chains(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    chains: Chains | None,
+    aligned: Aligned,
+    config: BackendConfig,
+    initial: GraphSolution | None = None,
+    held: Collection[int] = (),
+) -> Posed:
+    """The same by the component's chains, where its odometry is shortened to these."""
+    if chains is None:
+        return posed(trajectories, closures, aligned, config, initial, None, held)
+    shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
+    return posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, held)

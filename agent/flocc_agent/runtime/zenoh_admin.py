@@ -8,7 +8,7 @@ import asyncio
 import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,6 +33,10 @@ REQUEST_BYTES_MAX = 64 * 1024
 ANSWER_BYTES_MAX = 1024 * 1024
 OPERATOR = "operator"
 LOOK_PERIOD_S = 0.05
+SETTLE_S = 0.5
+"""Nobody more has been linked for so long: those who are there have been found."""
+FIND_TIMEOUTS = 3.0
+"""How many timeouts the first agent has to be found; a machine under load links late."""
 TOKENS_S = 1.0
 SCOUT_S = 1.0
 
@@ -109,7 +113,7 @@ class Survey:
 
     Attributes:
         answers: Answer by robot.
-        present: Robots of the swarm that are there, whether they answered or not.
+        present: Robots of the swarm that are there, by their own word or a neighbour's, whether they answered or not.
         others: Other swarms that are there.
         refuses: There are agents that speak to holders of keys only, and these are none, or not an operator's.
     """
@@ -120,6 +124,10 @@ class Survey:
     refuses: bool
 
 
+def _names_nobody(_: bytes) -> Iterable[str]:
+    return ()
+
+
 async def survey(
     config: TransportConfig,
     swarm: str,
@@ -128,6 +136,7 @@ async def survey(
     robot: str = "*",
     timeout_s: float = 3.0,
     tries: int = 2,
+    named: Callable[[bytes], Iterable[str]] = _names_nobody,
 ) -> Survey:
     """Ask agents in reach, as an operator, and once more where one that is there has not answered.
 
@@ -137,17 +146,25 @@ async def survey(
         admin: What is asked.
         request: Its content.
         robot: Whom to ask, '*' for everybody.
-        timeout_s: Time for finding agents, and again for the answers to each try.
+        timeout_s: Time for finding agents, thrice that for the first one, and again for the answers to each try.
         tries: How often who is silent is asked.
+        named: Whom an answer says to be there; the operator's own session may not have found them yet.
 
     Raises:
         TransportError: The network cannot be used as configured.
     """
-    return await asyncio.to_thread(_ask_blocking, config, swarm, admin, request, robot, timeout_s, tries)
+    return await asyncio.to_thread(_ask_blocking, config, swarm, admin, request, robot, timeout_s, tries, named)
 
 
 def _ask_blocking(
-    config: TransportConfig, swarm: str, admin: keys.Admin, request: bytes, robot: str, timeout_s: float, tries: int
+    config: TransportConfig,
+    swarm: str,
+    admin: keys.Admin,
+    request: bytes,
+    robot: str,
+    timeout_s: float,
+    tries: int,
+    named: Callable[[bytes], Iterable[str]],
 ) -> Survey:
     settings = session_settings(config, swarm, OPERATOR, Plane.CONTROL, dials_all=True)
     dialled = endpoints_to_dial(config, settings)
@@ -155,12 +172,13 @@ def _ask_blocking(
     try:
         _find(session, len(dialled), timeout_s)
         answers: dict[str, bytes] = {}
-        for _ in range(tries):
+        for left in reversed(range(tries)):
             answers |= _answers(session, keys.admin_key(swarm, robot, admin), request, timeout_s)
             there = _present(session)
-            present = {presence.robot for presence in there if presence.swarm == swarm}
-            if answers and present <= answers.keys():
+            present = _robots(there, swarm).union(*map(named, answers.values()))
+            if not left or (answers and present <= answers.keys()):
                 break
+            _await_linked(session, swarm, present, timeout_s)
         others = {presence.swarm for presence in there} - {swarm}
         refuses = not answers and _refuses(config, bool(present))
         return Survey(dict(sorted(answers.items())), tuple(sorted(present)), tuple(sorted(others)), refuses)
@@ -226,10 +244,29 @@ def _on_this_machine(config: TransportConfig) -> list[str]:
 
 
 def _find(session: zenoh.Session, count: int, timeout_s: float) -> None:
-    """Wait until as many agents as are dialled are linked, or where nobody is dialled for half of the time."""
-    deadline_s = time.monotonic() + (timeout_s if count else timeout_s / 2)
-    while time.monotonic() < deadline_s and (not count or len(session.info.peers_zid()) < count):
+    """Wait until as many agents as are dialled are linked, one at least, and no other one comes any more.
+
+    Those who are late cost `timeout_s`; somebody at all is waited for `FIND_TIMEOUTS` times as long.
+    """
+    began_s = changed_s = time.monotonic()
+    linked = 0
+    while (now_s := time.monotonic()) < began_s + timeout_s * (1.0 if linked else FIND_TIMEOUTS):
+        if (found := len(session.info.peers_zid())) != linked:
+            linked, changed_s = found, now_s
+        if linked >= max(count, 1) and now_s >= changed_s + SETTLE_S:
+            return
         time.sleep(LOOK_PERIOD_S)
+
+
+def _await_linked(session: zenoh.Session, swarm: str, expected: set[str], timeout_s: float) -> None:
+    """Wait until all robots that are said to be there have been found, at most so long."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s and not expected <= _robots(_present(session), swarm):
+        time.sleep(LOOK_PERIOD_S)
+
+
+def _robots(there: Iterable[keys.Presence], swarm: str) -> set[str]:
+    return {presence.robot for presence in there if presence.swarm == swarm}
 
 
 def _read(reply: zenoh.Reply) -> tuple[str, bytes] | None:

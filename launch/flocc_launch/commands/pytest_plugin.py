@@ -166,12 +166,13 @@ def run_marked(
     seed: int | None = None,
     **changes: Any,
 ) -> ScenarioRun:
-    """Run what a marker says.
+    """Run what a marker says; a scenario that cannot be used is one sentence, without flocc's own lines."""
+    from flocc_protocol.errors import FloccError
 
-    Raises:
-        FloccError: The scenario cannot be used.
-    """
     if driver not in ("simulate", "launch"):
         pytest.fail(f"flocc marker: driver is 'simulate' or 'launch', not {driver!r}", pytrace=False)
     run = runner.launch if driver == "launch" else runner.simulate
-    return run(scenario, seed=seed, **changes)
+    try:
+        return run(scenario, seed=seed, **changes)
+    except FloccError as error:
+        raise pytest.fail.Exception(str(error), pytrace=False) from None

@@ -22,7 +22,7 @@ ConfigOption = Annotated[Path | None, typer.Option(help="An agent's configuratio
 SwarmOption = Annotated[str | None, typer.Option(help="Name of a running swarm, found by scouting.")]
 
 TimeoutOption = Annotated[
-    float, typer.Option(min=0.1, help="Seconds for finding agents, and for each of two tries to be answered.")
+    float, typer.Option(min=0.1, help="Seconds for each of two tries to be answered; thrice that to find anybody.")
 ]
 
 

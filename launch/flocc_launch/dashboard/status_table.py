@@ -63,7 +63,7 @@ def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0)
         timeout_s: Time for finding agents, and again for their answers, for which they are asked twice.
 
     Returns:
-        One status per robot that answered, sorted.
+        One status per robot that answered, or whom one that did hears, sorted.
 
     Raises:
         StatusError: No agent answered; it says which of three reasons it has.
@@ -72,7 +72,7 @@ def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0)
     from flocc_agent.runtime.zenoh_admin import survey
     from flocc_protocol.keys import Admin
 
-    found = asyncio.run(survey(config, swarm, Admin.STATUS, timeout_s=timeout_s))
+    found = asyncio.run(survey(config, swarm, Admin.STATUS, timeout_s=timeout_s, named=neighbours_in))
     if not found.answers:
         raise StatusError(f"swarm {swarm}: {why_silent(found, config, timeout_s)}")
     late = [RobotStatus(robot=robot, state=NO_ANSWER) for robot in found.present if robot not in found.answers]
@@ -91,15 +91,21 @@ def why_silent(found: "Survey", config: TransportConfig, timeout_s: float) -> st
             f"{', '.join(found.present)} {are} there, but did not answer within {timeout_s:g} s, asked twice; "
             "a machine under load answers late: give a longer --timeout"
         )
-    where = f"{len(config.roster)} robots of the roster" if config.roster else "anybody that scouting finds"
+    where = f"the roster ({', '.join(sorted(config.roster))})" if config.roster else "anybody that scouting finds"
     there = f" (there: swarm {', '.join(found.others)})" if found.others else ""
     from flocc_agent.runtime.network_faults import with_faults
+    from flocc_agent.runtime.zenoh_admin import FIND_TIMEOUTS
 
     return with_faults(
-        f"nobody is there: in {timeout_s:g} s no agent of it was found{there}; asked {where}; "
+        f"nobody is there: in {FIND_TIMEOUTS * timeout_s:g} s no agent of it was found{there}; asked {where}; "
         "a machine under load is found late: give a longer --timeout",
         config,
     )
+
+
+def neighbours_in(answer: bytes) -> tuple[str, ...]:
+    """Whom an answer says to be there."""
+    return status_from("", answer).neighbours
 
 
 def status_from(robot: str, answer: bytes) -> RobotStatus:

@@ -18,7 +18,7 @@ from flocc_launch.report.figure_map import (
     compass,
     line_of,
     scale_bar,
-    start_of,
+    starts_of,
     view_of,
 )
 from flocc_launch.report.svg import element, svg, text_of
@@ -65,7 +65,7 @@ def _drawing(solved: SolvedMap) -> str:
     layers += _closures(solved, view)
     for name, points in lines_m.items():
         layers.append(element("g", line_of(points, view, "track"), class_=colour(names, name)))
-    layers += [start_of(name, points, view, colour(names, name)) for name, points in lines_m.items()]
+    layers += starts_of(scene, view, names)
     return svg(WIDTH_PX, view.height_px, *layers, scale_bar(view), compass(view), label=f"map of {', '.join(names)}")
 
 

@@ -68,7 +68,7 @@ def build(loaded: LoadedRun) -> RunReport:
         duration_s=loaded.end_s,
         wall_s=run.wall_s,
         robots=list(loaded.robots),
-        odometry_made=_odometry_made(run.recordings),
+        odometry_made=_odometry_made({robot: at for robot, at in run.recordings.items() if robot not in loaded.barred}),
         map_frames=frames_of(living),
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
@@ -269,6 +269,8 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
     for robot in loaded.robots:
         if robot not in loaded.results:
             found.append(f"{robot} left no result; its trajectory is odometry only.")
+    if loaded.barred:
+        found.append(barred_sentence(loaded))
     found += [*other_clocks(loaded.tracks), *frame_sentences(loaded.tracks)]
     found += [f"{doubt.sentence} {doubt.advice}" for doubt in camera_doubts(events)]
     unknown = Counter(event.fact.name for event in of_kind(events, UnknownFact))
@@ -276,6 +278,14 @@ def warnings_of(loaded: LoadedRun) -> list[str]:
         found.append(f"This version does not know events of the kind {name} ({count} in this run).")
     rounds = of_kind(events, RoundSolved)
     return found + ([f"Last optimisation: {text}" for text in told_of(rounds[-1].fact.warnings)] if rounds else [])
+
+
+def barred_sentence(loaded: LoadedRun) -> str:
+    """What a run lacks whose recordings lie where this user may not look, such as in another user's cache."""
+    untrue = [robot for robot in loaded.barred if loaded.tracks[robot].truth is None]
+    where = f"{', '.join(loaded.barred)} lie where you may not read ({next(iter(loaded.barred.values())).parent})"
+    truth = f", nor ground truth of {', '.join(untrue)}: put it into groundtruth/ of the run" if untrue else ""
+    return f"The recordings of {where}, so there are no pictures of them{truth}."
 
 
 def told_of(warnings: Sequence[str]) -> list[str]:

@@ -23,6 +23,8 @@ WIDTH_PX = 470.0
 HEIGHT_PX_MAX = 520.0
 HEIGHT_PX_MIN = 240.0
 MARGIN_PX = 30.0
+NAME_PX, NAME_LINE_PX = 8.0, 14.0
+"""Width of a letter of a robot's name, and how far names stand below each other."""
 AXIS_NAMES = "xyz"
 
 
@@ -139,7 +141,7 @@ def map_figure(scene: MapScene, view: MapView, loaded: LoadedRun, album: Album =
     if scene.with_closures:
         layers.append(pairs_layer(scene, view, loaded, album))
         layers.append(views_layer(scene, view, loaded, album))
-    layers.extend(start_of(robot, points, view, colour(robots, robot)) for robot, points in scene.lines_m.items())
+    layers.extend(starts_of(scene, view, robots))
     layers.append(scale_bar(view))
     layers.append(compass(view))
     return svg(WIDTH_PX, view.height_px, *layers, label=f"{scene.name}: {scene.caption}")
@@ -158,18 +160,35 @@ def line_of(points_m: Float, view: MapView, class_: str) -> str:
     return "".join(path((view(points_m[i]) for i in run), class_) for run in runs if len(run))
 
 
-def start_of(robot: str, points_m: Float, view: MapView, class_: str) -> str:
-    """A dot and the robot's name where its line starts."""
-    known = points_m[np.isfinite(points_m).all(axis=1)]
-    if not len(known):
-        return ""
-    x, y = view(known[0])
-    right = x < WIDTH_PX - 60
-    name = element(
-        "text", text_of(robot), x=x + (9 if right else -9), y=y - 7, class_="name",
-        text_anchor="start" if right else "end",
-    )  # fmt: skip
-    return element("g", element("circle", cx=x, cy=y, r=5, class_="dot"), name, class_=class_)
+def starts_of(scene: MapScene, view: MapView, robots: Sequence[str]) -> list[str]:
+    """A dot and the robot's name where each line starts; names of one place stand below each other."""
+    taken: list[tuple[float, float, float]] = []
+    drawn = []
+    for robot, points_m in scene.lines_m.items():
+        known = points_m[np.isfinite(points_m).all(axis=1)]
+        if not len(known):
+            continue
+        x, y = view(known[0])
+        width = NAME_PX * len(robot)
+        right = x + width < WIDTH_PX - 20
+        low = x + 9 if right else x - 9 - width
+        name_y = free_y(y - 7, low, low + width, taken)
+        taken.append((low, low + width, name_y))
+        name = element(
+            "text", text_of(robot), x=x + (9 if right else -9), y=name_y, class_="name",
+            text_anchor="start" if right else "end",
+        )  # fmt: skip
+        drawn.append(element("g", element("circle", cx=x, cy=y, r=5, class_="dot"), name, class_=colour(robots, robot)))
+    return drawn
+
+
+def free_y(wished: float, low: float, high: float, taken: Sequence[tuple[float, float, float]]) -> float:
+    """The first height at or below the wished one at which a name from `low` to `high` hides no other one."""
+    y = wished
+    for other_low, other_high, other_y in sorted(taken, key=lambda name: name[2]):
+        if low < other_high and other_low < high and abs(y - other_y) < NAME_LINE_PX:
+            y = other_y + NAME_LINE_PX
+    return y
 
 
 def pairs_layer(scene: MapScene, view: MapView, loaded: LoadedRun, album: Album) -> str:

@@ -16,7 +16,9 @@ from flocc_launch.runs.timeline import Link
 from flocc_protocol.ids import LogId
 
 WIDTH_PX = 960.0
-LEFT_PX = 118.0
+LEFT_PX, LEFT_PX_MAX = 118.0, 320.0
+NAME_PX = 7.0
+"""Width of a letter of a row's name."""
 RIGHT_PX = 18.0
 ROW_PX = 21.0
 BAR_PX = 15.0
@@ -49,12 +51,13 @@ class Row:
 
 def time_figure(loaded: LoadedRun, report: RunReport) -> str:
     """Draw everything that happened over time."""
-    axis = Axis(0.0, max(loaded.end_s, 1e-3), LEFT_PX, WIDTH_PX - RIGHT_PX)
     groups = [
         ("Map frame", frame_rows(loaded)),
         ("Leader followed", leader_rows(loaded)),
         ("Neighbours heard", link_rows(loaded)),
     ]
+    left_px = room_for([row.name for _, rows in groups for row in rows])
+    axis = Axis(0.0, max(loaded.end_s, 1e-3), left_px, WIDTH_PX - RIGHT_PX)
     marked = moments(loaded, report)
     top = LANE_PX * len(marked)
     drawn: list[str] = []
@@ -70,6 +73,11 @@ def time_figure(loaded: LoadedRun, report: RunReport) -> str:
     y += HEADING_PX + CURVE_PX
     behind = time_grid(axis, top + HEADING_PX - 4, y)
     return svg(WIDTH_PX, y + 34, behind, *drawn, draw_moments(marked, axis, y), label="What happened over time")
+
+
+def room_for(names: Sequence[str]) -> float:
+    """Width of the names at the left, in pixels."""
+    return min(max(LEFT_PX, 24 + NAME_PX * max(map(len, names), default=0)), LEFT_PX_MAX)
 
 
 def heading_of(text: str, y: float) -> str:

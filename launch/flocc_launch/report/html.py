@@ -9,6 +9,7 @@ from flocc_launch.report.model import RunReport
 from flocc_launch.report.svg import element, text_of
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.loaded_run import LoadedRun
+from flocc_launch.runs.plain_numbers import unbroken
 
 
 def write_html(path: Path, report: RunReport, loaded: LoadedRun, album: Album = EMPTY) -> None:
@@ -21,7 +22,7 @@ def page(report: RunReport, loaded: LoadedRun, album: Album = EMPTY) -> str:
     body = element(
         "main",
         sections.kicker(report),
-        element("h1", text_of(verdict(report))),
+        element("h1", text_of(unbroken(verdict(report)))),
         sections.tiles(report),
         sections.findings(loaded),
         sections.expectations(report),

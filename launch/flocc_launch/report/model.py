@@ -208,3 +208,7 @@ class RunReport(Record):
     doubted_cameras: list[str] = Field(default_factory=list)
     """Robots whose pictures contradict their odometry or calibration, or are frozen; the warnings say how."""
     warnings: list[str]
+
+    def has_truth(self) -> bool:
+        """Whether any robot's errors are known."""
+        return any(e is not None for r in self.robot_details for e in (r.corrected.ate_m, r.odometry.ate_m))

@@ -35,12 +35,14 @@ def when(start: str | float) -> str:
 
 
 def tiles(report: RunReport) -> str:
-    """The figures that matter most."""
+    """The figures that matter most; errors only where something of the truth is known."""
+    known = report.has_truth()
+    during = (number(report.iate_m, "m"), f"mean ATE during the run; F1 of closures {number(report.if1)}")
     shown = [
         (seconds(report.merged_after_s), "until one map" if report.merged_after_s else "not merged into one map"),
-        ate_tile(report),
+        *((ate_tile(report),) if known else ()),
         (count_of(report.closures.accepted_inter_robot), "closures between robots accepted"),
-        (number(report.iate_m, "m"), f"mean ATE during the run; F1 of closures {number(report.if1)}"),
+        *((during,) if known else ()),
         (count_of(report.closures.rejected), "candidates rejected"),
         (size_of(sum(report.bytes.values())) if report.bytes else "–", "sent by all robots"),
         (seconds(report.duration_s), duration_text(report)),

@@ -1,6 +1,6 @@
 """A report for the terminal: the verdict, the figures, expectations, warnings."""
 
-from flocc_launch.report.model import RunReport
+from flocc_launch.report.model import RobotReport, RunReport
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.plain_numbers import count_of, number, plain, seconds, size_of
 
@@ -28,10 +28,7 @@ def sentences(report: RunReport, verbose: bool = False) -> list[str]:
         f"merged after  {seconds(report.merged_after_s)}",
         f"closures      {count_of(closures.accepted)} accepted ({count_of(closures.accepted_inter_robot)} between "
         f"robots), {count_of(closures.rejected)} rejected of {count_of(closures.candidates)} candidates",
-        f"joint ATE     {number(report.ate_joint_m, 'm')}{of_the_dead(report)}; odometry at its true starts "
-        f"{number(report.ate_joint_odometry_m, 'm')}, aligned {number(report.ate_joint_odometry_aligned_m, 'm')}",
-        f"during it     ATE {number(report.iate_m, 'm')}; odometry {number(report.iate_odometry_m, 'm')} "
-        f"(mean of {count_of(report.iate_moments)} rounds in one map); F1 of closures {number(report.if1)}",
+        *error_lines(report),
         f"sent          {size_of(bytes_sent) if report.bytes else '–'}"
         + "".join(f", {kind} {size_of(n)}" for kind, n in by_size(report) if verbose),
         f"leaders       {', '.join(f'{span.leader} (term {span.term})' for span in report.leaders) or 'none'}",
@@ -43,6 +40,22 @@ def sentences(report: RunReport, verbose: bool = False) -> list[str]:
         f"expected      {e.name} {plain(e.limit)}: {plain(e.value)}, {judged(e.met)}" for e in report.expectations
     ]
     return lines + [f"note          {warning}" for warning in report.warnings]
+
+
+def error_lines(report: RunReport) -> list[str]:
+    """Errors of all robots together; nothing where there is no ground truth, which the verdict says."""
+    lines = []
+    if any(e is not None for e in (report.ate_joint_m, report.ate_joint_odometry_m, *report.ate_dead_m.values())):
+        lines.append(
+            f"joint ATE     {number(report.ate_joint_m, 'm')}{of_the_dead(report)}; odometry at its true starts "
+            f"{number(report.ate_joint_odometry_m, 'm')}, aligned {number(report.ate_joint_odometry_aligned_m, 'm')}"
+        )
+    if report.iate_m is not None or report.if1 is not None:
+        lines.append(
+            f"during it     ATE {number(report.iate_m, 'm')}; odometry {number(report.iate_odometry_m, 'm')} "
+            f"(mean of {count_of(report.iate_moments)} rounds in one map); F1 of closures {number(report.if1)}"
+        )
+    return lines
 
 
 def by_size(report: RunReport) -> list[tuple[str, int]]:
@@ -84,12 +97,21 @@ def stage_lines(report: RunReport) -> list[str]:
 
 
 def robot_lines(report: RunReport) -> list[str]:
-    """A table of robots."""
-    head = f"{'robot':<14}{'keyframes':>10}{'ATE, m':>10}{'odometry':>10}{'RPE, m':>10}{'odometry':>10}  map frame"
-    rows = [
-        f"{robot.robot:<14}{robot.keyframes:>10}{number(robot.corrected.ate_m):>10}{number(robot.odometry.ate_m):>10}"
-        f"{number(robot.corrected.rpe_translation_m):>10}{number(robot.odometry.rpe_translation_m):>10}"
-        f"  {robot.map_frame or '–'}"
-        for robot in report.robot_details
+    """A table of robots; errors are left out where no robot has ground truth."""
+    robots, known = report.robot_details, report.has_truth()
+    errors = f"{'ATE, m':>10}{'odometry':>10}{'RPE, m':>10}{'odometry':>10}" if known else ""
+    return [
+        f"{'robot':<14}{'keyframes':>10}{errors}  map frame",
+        *(
+            f"{robot.robot:<14}{robot.keyframes:>10}{errors_of(robot) if known else ''}  {robot.map_frame or '–'}"
+            for robot in robots
+        ),
+        "",
     ]
-    return [head, *rows, ""]
+
+
+def errors_of(robot: RobotReport) -> str:
+    """The cells of one robot's errors, each beside that of its odometry."""
+    corrected, odometry = robot.corrected, robot.odometry
+    cells = (corrected.ate_m, odometry.ate_m, corrected.rpe_translation_m, odometry.rpe_translation_m)
+    return "".join(f"{number(cell):>10}" for cell in cells)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from flocc_agent.core.reports import Fact
 from flocc_agent.runtime.event_lines import Reported
@@ -27,6 +28,8 @@ class LoadedRun:
     followings: tuple[Following, ...]
     links: tuple[Link, ...]
     end_s: float
+    barred: Mapping[str, Path]
+    """Recordings that this user may not read, by robot."""
 
 
 def load(folder: RunFolder) -> LoadedRun:
@@ -48,4 +51,5 @@ def load(folder: RunFolder) -> LoadedRun:
         followings=tuple(followings(events, end)),
         links=tuple(links(events, end)),
         end_s=end,
+        barred=folder.barred(),
     )

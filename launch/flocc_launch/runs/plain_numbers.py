@@ -1,6 +1,9 @@
 """Numbers for people: three significant digits, counts, durations, sizes."""
 
 import math
+import re
+
+UNIT = re.compile(r"(\d) (m|s|min|h|%|[kMG]?B)\b")
 
 
 def number(value: float | None, unit: str = "") -> str:
@@ -47,3 +50,8 @@ def size_of(count: float | None) -> str:
         if count >= scale:
             return number(count / scale, unit)
     return f"{count:.0f} B"
+
+
+def unbroken(text: str) -> str:
+    """A sentence whose numbers stay on one line with their units."""
+    return UNIT.sub("\\1\u00a0\\2", text)

@@ -9,6 +9,7 @@ missing or of another type, is a `RunFolderError` that names the file.
 """
 
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -147,9 +148,22 @@ class RunFolder:
         return {robot: result for robot, result in found.items() if result is not None}
 
     def recording(self, robot: str) -> Path | None:
-        """Folder of a robot's recording, or None where the run names none."""
+        """Folder of a robot's recording, or None where the run names none, or one that this user may not read."""
         name = self.run().recordings.get(robot)
-        return None if name is None else (self.path / name)
+        return None if name is None or not _may_read(self.path / name) else self.path / name
+
+    def barred(self) -> dict[str, Path]:
+        """Recordings that this user may not read, by robot: another user's cache, most often."""
+        named = {robot: self.path / name for robot, name in self.run().recordings.items() if name is not None}
+        return {robot: path for robot, path in sorted(named.items()) if not _may_read(path)}
+
+
+def _may_read(recording: Path) -> bool:
+    """Whether a recording may be looked into; one that is not there may."""
+    try:
+        return os.access(recording, os.R_OK | os.X_OK) or not recording.exists()
+    except PermissionError:
+        return False
 
 
 def _whole_lines(path: Path) -> Iterator[Reported[Fact]]:

@@ -25,7 +25,7 @@ def check_measurable(scenario: Scenario, recordings: Mapping[str, Path]) -> None
         ExpectationError: An error against ground truth is expected of a robot without, or a merge of one robot alone.
     """
     asked = scenario.expectations.limits()
-    given = {name: scenario.robot(name).recording or recordings.get(name) for name in scenario.names()}
+    given = {name: recordings.get(name) or scenario.robot(name).recording for name in scenario.names()}
     untrue = [name for name, path in given.items() if path is not None and not (path / "groundtruth.tum").exists()]
     for name in OF_GROUND_TRUTH:
         if name in asked and untrue:
