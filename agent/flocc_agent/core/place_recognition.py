@@ -125,8 +125,10 @@ class _Rows:
         """Add a row; the first one that is no int8 makes all of them float32."""
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
-        self._make_room(1)
-        self._rows[self._count - self._first] = descriptor.row
+        place = self._count - self._first
+        if place == len(self._rows) or self._count == len(self._logs):
+            self._make_room(1)
+        self._rows[place] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index

@@ -4,7 +4,7 @@ The driver calls `handle` for each event and `tick` when `deadline` is due; both
 order. Same seed and same events give the same effects, on virtual time and on a robot.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
@@ -552,12 +552,15 @@ class Robot:
         new, effects, batch = self.gossip.append(record)
         return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
 
-    def _take(self, new_records: Sequence[NewRecord], now: float) -> list[Effect]:
+    def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records; places are recognised at the end."""
         described: list[tuple[KeyframeId, Array]] = []
         effects: list[Effect] = []
+        filled: list[tuple[LogId, int]] = []
         for new in new_records:
             self.assembly.add(new)
+            if (new.number + 1) % BLOCK_RECORDS == 0:
+                filled.append((new.log, new.number))
             match new.record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
@@ -575,9 +578,8 @@ class Robot:
                 case _:
                     pass  # what was measured, and what a later version says, concerns the graph only
         effects += self._recognise(described, now) if described else []
-        for new in new_records:
-            if (new.number + 1) % BLOCK_RECORDS == 0:
-                self._lend_rows(new.log, new.number // BLOCK_RECORDS)
+        for log, number in filled:
+            self._lend_rows(log, number // BLOCK_RECORDS)
         return effects
 
     def _lend_rows(self, log: LogId, block: int) -> None:

@@ -41,7 +41,7 @@ class Complete:
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
         for effect in step.effects:
             if isinstance(effect, PersistRecord) and effect.log == step.station.log:
-                record = decoded(effect.data)[0]
+                record = decoded(effect.data)
                 if isinstance(record, KeyframeRecord):
                     self._recorded[life] += 1
                     self._describe(effect.data, record)

@@ -200,7 +200,7 @@ class Once:
                     yield from self._registers(step, pair)
 
     def _note_record(self, log: LogId, number: int, data: bytes) -> None:
-        record = decoded(data)[0]
+        record = decoded(data)
         unseen = isinstance(record, RejectionRecord) and record.reason == UNLIKELY
         if isinstance(record, ClosureRecord | RejectionRecord) and not unseen:
             self._records[CandidatePair.of(record.query, record.match)].add((log, number, data))
