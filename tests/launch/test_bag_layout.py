@@ -1,5 +1,6 @@
 """Topics, frames and clocks of a bag belong together as the bag says, or the bag is refused with what there is."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -252,10 +253,59 @@ def test_odometry_that_says_nothing_of_rotations_or_motion_is_told(
     assert told == ([said] if said else [])
 
 
+@pytest.mark.parametrize("other", ["/odometry/gps", "/vicon/odom", "/amcl_pose"])
+def test_what_says_where_a_robot_is_does_not_stand_before_its_odometry(tmp_path: Path, other: str) -> None:
+    for source in ("tf", "/pose"):
+        script = walking(False, odometry=None)
+        for k in range(11):
+            stamp_ns = ZERO_NS + k * S // 2
+            (script.pose_stamped if other == "/amcl_pose" else script.odometry)(other, stamp_ns, 500.0)
+            script.transform("/tf", stamp_ns, ("body", "camera"), (0.1, 0.0, 0.0))
+            script.transform("/tf", stamp_ns, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+            if source != "tf":
+                script.pose_stamped(source, stamp_ns, 0.5 * k)
+        bag = script.write(tmp_path / source.strip("/"), "mcap")
+        recording = Recording.open(convert(bag, tmp_path / f"out{source.strip('/')}"))
+        assert [frame.T_odom_body[0, 3] for frame in recording.frames] == pytest.approx([k + 0.2 for k in range(5)])
+        assert recording.T_body_camera[0, 3] == pytest.approx(0.1)
+
+
+def test_a_robot_with_two_odometries_is_not_left_out_of_its_team(tmp_path: Path) -> None:
+    script = team()
+    for k in range(4):
+        script.odometry("/Alpha/vio/odom", ZERO_NS + k * S, 0.0)
+        script.pose_stamped("/bob_2/amcl_pose", ZERO_NS + k * S, 70.0)
+    script.messages.sort(key=lambda message: message[2])
+    with pytest.raises(DatasetError, match=r"has 2 odometry topics, name one with .* /Alpha/vio/odom"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    script.messages = [message for message in script.messages if "/vio/" not in message[0]]
+    convert(script.write(tmp_path / "other", "mcap"), tmp_path / "found")
+    assert Recording.open(tmp_path / "found" / "bob_2").frames[0].T_odom_body[0, 3] == 10.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "topic", "edge", "said"),
+    [
+        ("", "/tf_static", ("body", "lidar"), "leads from body, which /odom moves, to none"),
+        ("camera", "/tf_static", ("camera", "body"), "the camera (camera) sits on body, but /pose does not say"),
+        ("camera", "/tf", ("body", "camera"), "the camera (camera) sits on body, but /pose does not say"),
+    ],
+)
+def test_a_bag_that_places_cameras_but_not_this_one_is_refused(
+    tmp_path: Path, frame: str, topic: str, edge: tuple[str, str], said: str
+) -> None:
+    script = robot_of(BagScript(False), "/cam/image_raw", "/odom" if not frame else None, 0.0, (frame, "body"))
+    for k in range(4 if frame else 0):
+        script.pose_stamped("/pose", ZERO_NS + k * S, float(k))
+    script.transform(topic, ZERO_NS, edge)
+    with pytest.raises(DatasetError, match=re.escape(said)):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
 def test_odometry_that_is_ground_truth_by_its_name_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = walking(False, odometry="/vicon/odom").write(tmp_path / "run", "mcap")
     convert(bag, tmp_path / "out")
-    assert "odometry is /vicon/odom, ground truth by its name, which does not drift" in caplog.text
+    assert "odometry is /vicon/odom, by its name no odometry, but ground truth or GPS" in caplog.text
 
 
 @pytest.mark.parametrize("moves", [False, True])

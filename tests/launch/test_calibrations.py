@@ -281,6 +281,12 @@ LISTS = [f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(9
             FLAT.replace("151.5", "80.0").replace("cx: 80.0", "cx: 151.5"),
             "would be fx cx fy cy, by their sizes",
         ),
+        ("c.yaml", FLAT.replace("cx: 80.0", "cx: 60.5").replace("cy: 60.0", "cy: 79.5"), "or cx and cy, are exchanged"),
+        (
+            "c.json",
+            '{"K": [[150, 0, 80], [0, 150, 60], [0, 0, 1]], "D": [[0.1], [0], [0], [0]]}',
+            "in a column are what",
+        ),
         ("c.yaml", FLAT.replace("151.5", "1e-30"), "focal lengths of 150.5 and 1e-30 pixels are none of images"),
         ("c.yaml", FLAT + "model_type: PINHOLE\nestimate_extrinsic: 2\n", "VINS' settings that do not know where the"),
         ("c.yaml", FLAT + "T_BS: [[1, 0, 0, 65], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n", "mounting in metres"),

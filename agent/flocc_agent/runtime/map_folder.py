@@ -134,6 +134,7 @@ class MapManifest(MapPart):
         pruned: Latents were left out on purpose, and such keyframes are no candidates.
         closures: How many the solution used.
         left_out: Logs of the swarm that are not part of it, with the reason.
+        contradicted: Keyframes that several logs contradict, and which.
         records: File of the logs.
         solution: File of the solution.
         latent_file: File of the latents.
@@ -155,6 +156,7 @@ class MapManifest(MapPart):
     pruned: bool = False
     closures: int = 0
     left_out: dict[str, str] = Field(default_factory=dict)
+    contradicted: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     records: FileSum
     solution: FileSum
     latent_file: FileSum

@@ -6,6 +6,7 @@ at the same time.
 python -m flocc_lab.bench.later_robots ../shared/data/street r1,r2 runs/later perception.method=learned
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping
@@ -85,10 +86,9 @@ class Later:
 
     def verdict(self) -> dict[str, object]:
         """The figures, and whether they are what is asked for."""
-        both = self.ate_m is not None and self.ate_at_once_m is not None
-        ratio = self.ate_m / self.ate_at_once_m if self.ate_m is not None and self.ate_at_once_m is not None else None
+        ratio = None if self.ate_m is None or self.ate_at_once_m is None else self.ate_m / self.ate_at_once_m
         arrivals = [{**asdict(each), "in_time": each.in_time} for each in self.arrivals]
-        met = all(each.in_time for each in self.arrivals) and both and ratio is not None and ratio <= ERROR_RATIO_MAX
+        met = all(each.in_time for each in self.arrivals) and ratio is not None and ratio <= ERROR_RATIO_MAX
         return {**asdict(self), "arrivals": arrivals, "ratio": ratio, "met": met}
 
 
@@ -167,15 +167,20 @@ def posed(opened: MapFolder, paths: Mapping[str, Path]) -> dict[str, tuple[Float
     return found
 
 
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Print what `measure` found and whether it is enough, as JSON."""
-    data, first, out, *changes = arguments
-    fixed = "--map-fixed" in changes
-    sets = dict(parsed_change(text) for text in changes if text != "--map-fixed")
-    scenario = read_scenario(data, sets)
-    result = measure(scenario, recordings(scenario), first.split(","), Path(out), fixed)
+    parser = argparse.ArgumentParser(prog="flocc_lab.bench.later_robots")
+    parser.add_argument("data", help="Scenario, or own data.")
+    parser.add_argument("first", help="Robots that make the map, with commas.")
+    parser.add_argument("out", type=Path, help="Folder of all runs.")
+    parser.add_argument("sets", nargs="*", help="Other values for keys, KEY=VALUE.")
+    parser.add_argument("--agents", type=int, help="Robots into which one data set is cut.")
+    parser.add_argument("--map-fixed", action="store_true", help="The map does not move.")
+    given = parser.parse_args()
+    scenario = read_scenario(given.data, dict(map(parsed_change, given.sets)), given.agents)
+    result = measure(scenario, recordings(scenario), given.first.split(","), given.out, given.map_fixed)
     sys.stdout.write(json.dumps(result.verdict()) + "\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -198,7 +198,7 @@ def _conversion(layout: Layout, robot: RobotTopics, out: Path, options: BagOptio
     if others:
         notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
     if robot.poses is not None and is_truth(robot.poses.topic):
-        notes.append(f"{layout.bag.path}: odometry is {robot.poses}, ground truth by its name, which does not drift")
+        notes.append(f"{layout.bag.path}: odometry is {robot.poses}, by its name no odometry, but ground truth or GPS")
     notes += [clock.note] if clock.note else []
     return _Conversion(layout.bag, robot, lens, options, clock, out, identity, notes=notes)
 

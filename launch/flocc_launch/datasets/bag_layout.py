@@ -30,7 +30,8 @@ WANTED_POSES = re.compile(
     r"plan|goal|setpoint|target|waypoint|initial_?pose|desired|reference|command|cmd", re.IGNORECASE
 )
 """Leaves of topics that say where a robot is to be, not where it is."""
-TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk")
+TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk", "gps", "gnss", "amcl")
+"""In the names of topics that say where a robot is in a map, not how it moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +90,22 @@ class RobotTopics:
 
 @dataclass(slots=True, eq=False)
 class Frames:
-    """What topics of transforms say: frames that do not move, edges with their topics, and whether any are static."""
+    """What topics of transforms say.
+
+    Attributes:
+        static: Frames that do not move.
+        edges: Parents and children of other transforms, with their topics.
+        has_static: Whether there is any static transform.
+        moved: Those of `edges` that did not stay as they were.
+        named: All frames, with one that a transform connects with each.
+    """
 
     static: StaticFrames = field(default_factory=StaticFrames)
     edges: dict[tuple[str, str], str] = field(default_factory=dict)
     has_static: bool = False
+    moved: set[tuple[str, str]] = field(default_factory=set)
+    named: dict[str, str] = field(default_factory=dict)
+    _first: dict[tuple[str, str], tuple[Any, Float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, bag: Bag, topics: Sequence[BagTopic]) -> "Frames":
@@ -108,6 +120,10 @@ class Frames:
         return frames
 
     def _take(self, message: Any, topic: BagTopic) -> None:
+        for each in message.transforms:
+            parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+            self.named[child] = parent
+            self.named.setdefault(parent, child)
         if topic.name.rsplit("/", 1)[-1] == "tf_static":
             self.static.add(message)
             self.has_static = True
@@ -115,6 +131,15 @@ class Frames:
         for each in message.transforms:
             edge = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
             self.edges.setdefault(edge, topic.name)
+            T = pose_of_transform(each.transform, topic.name)
+            if np.abs(T - self._first.setdefault(edge, (each, T))[1]).max() > STILL_MAX:
+                self.moved.add(edge)
+
+    def carrying(self, camera: str) -> list[tuple[str, str]]:
+        """Edges that move a body on which a camera sits, by transforms that do not."""
+        still = [each for edge, (each, _) in self._first.items() if edge not in self.moved]
+        frames = self.static.with_others(still)
+        return [edge for edge in self.moved if frames.between(edge[1], camera) is not None]
 
 
 @dataclass(slots=True, eq=False)
@@ -176,7 +201,7 @@ class Layout:
     ) -> tuple[dict[str, list[BagTopic]], dict[str, PoseSource]]:
         """Images and odometry by what tells topics of odometry apart, as `cam_r1` and `odom_r1` of `odom_r2`."""
         for word in (PARTS_OF_NAMES, LETTERS_OR_DIGITS):
-            poses = _of_distinct_words(self._own_poses(), word)
+            poses = _of_distinct_words(_best(self._own_poses()), word)
             parts = {name: [t for t in images if f"-{name}-" in f"-{_words(t.name, word)}-"] for name in poses}
             taken = [topic.name for group in parts.values() for topic in group]
             if len(poses) > 1 and sorted(taken) == sorted(t.name for t in images) and all(parts.values()):
@@ -187,10 +212,16 @@ class Layout:
         return [topic for topic in self.bag.topics.values() if topic.type in types and topic.count != 0]
 
     def _poses_of(self, name: str, images: list[BagTopic]) -> PoseSource | None:
-        own = [t for t in self._of_types(POSE_TYPES) if name in t.name.strip("/").split("/")[:-1]]
-        if len(own) == 1:
-            return PoseSource(own[0])
-        return None if own else self.edge_of(images[0])
+        own = [t for t in self._own_poses() if name in t.name.strip("/").split("/")[:-1]]
+        if len(_best(own)) > 1:
+            only(self.bag, _best(own), "odometry", "--odometry-topic")
+        return self._source_of(own, images[0])
+
+    def _source_of(self, topics: list[BagTopic], image: BagTopic) -> PoseSource | None:
+        """The only topic of odometry among those of poses, else an edge of /tf, else what says where a robot is."""
+        best = _best(topics)
+        edge = self.edge_of(image) if all(map(is_truth, best)) else None
+        return edge or (PoseSource(best[0]) if len(best) == 1 else None)
 
     def _robot(self, name: str, images: list[BagTopic], poses: PoseSource | None) -> RobotTopics:
         image = self.chosen_image(images)
@@ -269,19 +300,15 @@ class Layout:
                 f"{self.bag.path}: {listed(own)} is another robot's odometry than that of {image.name}, by its name or "
                 "frames; name it with --odometry-topic if it is not"
             )
-        odometry = [t for t in near if t.type == "nav_msgs/msg/Odometry"]
-        if len(near) == 1 or len(odometry) == 1:
-            return PoseSource((odometry or near)[0])
-        return None if near else self.edge_of(image)
+        return self._source_of(near, image)
 
     def _own_poses(self) -> list[BagTopic]:
-        """Topics of poses, without those that are ground truth by their names where there are others."""
-        candidates = [
+        """Topics of a robot's poses, without those of goals and of what it sees."""
+        return [
             t
             for t in self._of_types(POSE_TYPES)
             if not WANTED_POSES.search(t.name.rsplit("/", 1)[-1]) and not self._is_of_something_seen(t)
         ]
-        return [t for t in candidates if not is_truth(t)] or candidates
 
     def _is_of_something_seen(self, poses: BagTopic) -> bool:
         """Whether poses that name no child are in the frame of a camera, as those of markers and objects are."""
@@ -330,7 +357,7 @@ class Layout:
     def edge_of(self, image: BagTopic) -> PoseSource | None:
         """The transform that moves the body on which the camera is mounted, or None."""
         camera, frames = self._frame(image), self.frames(image)
-        moving = [e for e in frames.edges if frames.static.between(e[1], camera) is not None or e[1] == camera]
+        moving = sorted(frames.carrying(camera)) if camera else []
         if not moving:
             moving = [
                 e for e in frames.edges if e[0].rsplit("/", 1)[-1] in FIXED_FRAMES and (e[1], e[0]) not in frames.edges
@@ -351,7 +378,7 @@ class Layout:
         body = self._body(robot.poses, frames)
         if camera == body and camera:
             return np.eye(4), None
-        if (moved := frames.static.moved_between(body, camera)) is not None:
+        if body and (moved := frames.static.moved_between(body, camera)) is not None:
             raise DatasetError(
                 f"{self.bag.path}: static transforms place {moved}, between {body} and {camera}, in more than one way; "
                 "name a camera file with T_body_camera (--camera)"
@@ -361,14 +388,15 @@ class Layout:
             T_body_camera = self._between_on_tf(frames, body, camera)
         if T_body_camera is not None:
             return T_body_camera, None
-        if body and camera and frames.has_static:
+        beside = frames.named.get(camera) if camera else None
+        if body and (frames.has_static or beside is not None):
             raise DatasetError(
                 f"{self.bag.path}: no chain of static transforms leads from {body}, which {robot.poses} moves, to "
-                f"{camera}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
+                f"{camera or 'none'}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
             )
-        if camera and (carrier := frames.static.parent(camera)) is not None:
+        if beside is not None:
             raise DatasetError(
-                f"{self.bag.path}: the camera ({camera}) sits on {carrier}, but {robot.poses} does not say which frame "
+                f"{self.bag.path}: the camera ({camera}) sits on {beside}, but {robot.poses} does not say which frame "
                 "it moves; name a camera file with T_body_camera (--camera)"
             )
         return np.eye(4), (
@@ -490,6 +518,12 @@ def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
         if lefts[0].lower().replace("left", "right") == other.lower():
             return topics[lefts[0]]
     return None
+
+
+def _best(topics: list[BagTopic]) -> list[BagTopic]:
+    """Of topics of poses those that are no ground truth, and of these odometry, as far as there are any."""
+    own = [topic for topic in topics if not is_truth(topic)] or topics
+    return [topic for topic in own if topic.type == "nav_msgs/msg/Odometry"] or own
 
 
 def is_truth(topic: BagTopic) -> bool:

@@ -126,6 +126,7 @@ def _write(out: Path, content: MapContent) -> MapManifest:
         pruned=content.pruned,
         closures=len(saved.closures),
         left_out={str(log): reason for log, reason in content.solved.left_out.items()},
+        contradicted=dict(content.solved.contradicted),
         records=records,
         solution=solution,
         latent_file=latent_file,

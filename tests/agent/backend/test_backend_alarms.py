@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.agent.backend.plain_team import plain_team
 
 from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, pose, so3_exp
-from flocc_lab.graph_family.family_spec import Lengths, drawn
-from flocc_lab.graph_family.graphs import Member, made
+from flocc_lab.graph_family.family_spec import Lengths
+from flocc_lab.graph_family.graphs import Member
 from flocc_lab.graph_family.methods import settings
 from flocc_lab.graph_family.single_false import outcome
 from flocc_protocol.ids import KeyframeId, LogId
@@ -22,25 +23,8 @@ FIRST, SECOND = LogId("r00"), LogId("r01")
 
 
 def two_robots(lengths: Lengths = Lengths.METRIC, noise_factor: float = 1.0, robots: int = 2) -> Member:
-    spec = replace(
-        drawn(8),
-        keyframes=(120,) * robots,
-        scale_off=(1.0,) * robots,
-        lengths=lengths,
-        closures=60,
-        odometry=(0.002, 0.02),
-        closure=(0.01, 0.05),
-        odometry_factor=noise_factor,
-        closure_factor=noise_factor,
-        heavy_tails=False,
-        outliers=0.0,
-        groups=0,
-        weak=False,
-        opposite=False,
-        parallel=False,
-        planar=True,
-    )
-    return made(spec)
+    noise = {"odometry_factor": noise_factor, "closure_factor": noise_factor}
+    return plain_team(8, (120,) * robots, lengths=lengths, **noise)
 
 
 def said(member: Member, query: KeyframeId, match: KeyframeId, error: Float) -> LoopClosure:

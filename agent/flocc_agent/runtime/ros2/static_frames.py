@@ -66,11 +66,6 @@ class StaticFrames:
         both._parents.update(self._parents)
         return both
 
-    def parent(self, frame: str) -> str | None:
-        """The frame that carries another one, or None."""
-        found = self._parents.get(frame)
-        return None if found is None else found[0]
-
     def moved_between(self, a: str, b: str) -> str | None:
         """A frame of the chain between two that was given more than one place, or None."""
         return min(self._moved & (set(self._ancestors(a)) ^ set(self._ancestors(b))), default=None)
