@@ -76,14 +76,14 @@ class Objective:
         prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
         return float(0.5 * (np.sum(squared) + prior))
 
-    def closure_residuals(self, state: State) -> Float:
+    def closure_residuals(self, state: State, hold: bool = False) -> Float:
         """Squared residuals (L,) of the closures."""
-        return residuals(taken(self.edges, self.closures), state, hold=False).squared()
+        return residuals(taken(self.edges, self.closures), state, hold).squared()
 
-    def agreeing(self, state: State) -> Bool:
+    def agreeing(self, state: State, hold: bool = False) -> Bool:
         """Whether each closure (L,) is within its bound; a held one also where no scale may pass zero."""
         edges, bounds = taken(self.edges, self.closures), self.bounds()
-        agree = residuals(edges, state, hold=False).squared() <= bounds
+        agree = residuals(edges, state, hold).squared() <= bounds
         if self.held is not None and np.any(self.held & agree):
             agree &= ~self.held | (residuals(edges, state, hold=True).squared() <= bounds)
         return np.asarray(agree)

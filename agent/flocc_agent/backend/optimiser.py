@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flocc_agent.backend.alarms import held_closures
+from flocc_agent.backend.alarms import fitted_lengths, held_closures
 from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import Aligned, component_with, initial_poses
+from flocc_agent.backend.initial import Aligned, component_with, initial_poses, lengths_at
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
@@ -246,6 +246,7 @@ def _solve_connected(
     """Align the odom frames, pose the problem, solve it, collect what consumers get (Sec. III-C)."""
     times = [time.perf_counter()]
     aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
+    aligned = aligned._replace(lengths_m=fitted_lengths(kept.trajectories, kept.taking_part, config))
     times.append(time.perf_counter())
     chains = chains_of(kept.trajectories, kept.taking_part, wanted, config)
     found = _solve_aligned(kept, chains, aligned, config, initial)
@@ -284,7 +285,7 @@ def _solve_aligned(
     def anew(scales: Mapping[LogId, float]) -> Posed:
         """The component, begun with the ways of logs made longer or shorter."""
         longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
-        again = initial_poses(longer, kept.left, config.steepness, None)
+        again = initial_poses(longer, kept.left, config.steepness, None)._replace(lengths_m=aligned.lengths_m)
         return posed_by_chains(kept.trajectories, kept.taking_part, chains, again, config, None, kept.held)
 
     return solve_with_scales(begun, initial, anew)
@@ -295,7 +296,8 @@ def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: 
     problem, state = found.posed.problem, found.solved.state
     scales = problem.scales_applied(state)
     T = chains.lengthened(problem.by_log(state.poses()), scales)
-    whole = posed(kept.trajectories, kept.taking_part, Aligned(T, False), config, None, None, kept.held)
+    aligned = Aligned(T, False, lengths_at(kept.taking_part, T))
+    whole = posed(kept.trajectories, kept.taking_part, aligned, config, None, None, kept.held)
     whole = whole.with_scaled(scales)
     start = replace(whole.start, scale=state.scale)
     whole = replace(whole, start=start, trusted=found.posed.trusted)

@@ -77,7 +77,7 @@ def posed(
     Where the closures' keyframes are named by their places in chains, `recorded` has them under their own numbers.
     Closures that are `held` count once the poses that others give agree with them.
     """
-    problem = build(trajectories, closures, config, recorded)
+    problem = build(trajectories, closures, config, recorded).with_lengths(aligned.lengths_m)
     in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     says = votes(trajectories, closures, recorded or closures, config)
@@ -104,5 +104,5 @@ def posed_by_chains(
     """The same by the component's chains, where its odometry is shortened to these."""
     if chains is None:
         return posed(trajectories, closures, aligned, config, initial, None, held)
-    shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
+    shorter = aligned._replace(T_map_keyframe=chains.shortened(aligned.T_map_keyframe))
     return posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, held)

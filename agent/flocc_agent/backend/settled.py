@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.descent import Solved, descend
-from flocc_agent.backend.initial import Aligned, extended
+from flocc_agent.backend.edges import directions
+from flocc_agent.backend.initial import Aligned, extended, lengths_at
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import SavedLog
 from flocc_agent.backend.odometry_scale import scales_before
@@ -169,7 +170,7 @@ def _solved(
     }
     T = {log: extended(np.asarray(before.T_map_keyframe[log]), trajectory) for log, trajectory in trajectories.items()}
     chains = chains_of(trajectories, closures, (), config)
-    began = posed_by_chains(trajectories, closures, chains, Aligned(T, True), config)
+    began = posed_by_chains(trajectories, closures, chains, Aligned(T, True, lengths_at(closures, T)), config)
     began = began.with_scaled(scales_before(began, (before,)))
     ids = began.problem.closure_ids
     is_new = np.array([k in fresh for k in ids], dtype=bool)
@@ -222,9 +223,10 @@ def _grown(trajectories: Mapping[LogId, Trajectory], component: Component) -> di
 def _agreed(began: Posed, wanted: Bool, is_new: Bool, closures: Sequence[LoopClosure]) -> Solved | None:
     """Solve with wanted closures, less the new ones that disagree alone; None where more than that is wrong."""
     objective, state, taken = began.objective, began.start, wanted
+    as_angles = bool(np.any(directions(objective.edges)))
     for _ in range(2):
-        solved = descend(objective, state, objective.weights(taken.astype(float)))
-        agree = objective.closure_residuals(solved.state) <= objective.bounds()
+        solved = descend(objective, state, objective.weights(taken.astype(float)), hold=as_angles)
+        agree = objective.closure_residuals(solved.state, as_angles) <= objective.bounds()
         wrong = np.flatnonzero(agree != taken)
         if len(wrong) == 0:
             return solved if solved.converged else None
