@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.averaging import averaged
-from flocc_agent.backend.descent import Objective, Solved, descend
+from flocc_agent.backend.descent import Objective, Solved, descend, voted_cost
 from flocc_agent.backend.edges import State, directions, residuals
 from flocc_agent.backend.graduated import graduated
 from flocc_agent.backend.placing import Places
@@ -75,18 +75,18 @@ def lowest(objective: Objective, state: State) -> Solved:
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
     """GNC by several schedules from one state; the lowest truncated cost wins."""
-    says = places.votes if places is not None else 1.0
+    says = places.votes if places is not None else np.ones(len(objective.bounds()))
     found = [scheduled(objective, state, ratio) for ratio in START_RATIOS]
     if np.any(directions(objective.edges)):
         found = [as_angles(objective, solved) for solved in found]
         found.append(scheduled(objective, state, START_RATIOS[-1], hold=True))
-    solved = min(found, key=lambda solved: objective.truncated_cost(solved.state, says))
+    solved = min(found, key=lambda solved: voted_cost(objective, solved.state, says))
     return replaced(objective, solved, places) if places is not None else solved
 
 
 def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     """Try other places for robots as long as one lowers the truncated cost."""
-    cost, tried = objective.truncated_cost(solved.state, places.votes), 0
+    cost, tried = voted_cost(objective, solved.state, places.votes), 0
     for _ in range(PLACEMENTS_MAX):
         chosen = solved.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN
         better = None
@@ -94,8 +94,8 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
             tried += 1
             moved = descend(objective, placement.state, objective.weights(placement.chosen.astype(float)), 5)
             there = selected(objective, moved.state, moved.iterations)
-            if objective.truncated_cost(there.state, places.votes) < cost:
-                better, cost = there, objective.truncated_cost(there.state, places.votes)
+            if (lower := voted_cost(objective, there.state, places.votes)) < cost:
+                better, cost = there, lower
                 break
         if better is None:
             break
