@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import evenly
-from flocc_agent.backend.descent import Solved, voted_cost
+from flocc_agent.backend.descent import Solved
 from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import SavedLog
@@ -92,7 +92,7 @@ class SolvedWithScales:
     def penalised_cost(self) -> float:
         """The truncated cost, and for each scale what it must save at least."""
         price = 0.5 * DEMANDED_SIGMAS**2 * self.estimates.excess
-        cost = voted_cost(self.posed.objective, self.solved.state, self.posed.places.votes)
+        cost = self.posed.objective.truncated_cost(self.solved.state, self.posed.places.votes)
         return cost + price * len(self.posed.problem.scaled)
 
 
