@@ -51,6 +51,24 @@ def chain(
     )
 
 
+@pytest.mark.parametrize("name", ["T_cam_imu", "T_imu_cam"])
+def test_a_camera_placed_in_the_one_before_it_sits_where_the_chain_says(tmp_path: Path, name: str) -> None:
+    """Kalibr's `T_cn_cnm1`: what was not asked for is not taken as the identity."""
+    T_body_cam0 = np.array(T, float).reshape(4, 4)
+    T_cam1_cam0 = np.array([[0, -1, 0, -0.11], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]], float)
+    given = np.linalg.inv(T_body_cam0) if name == "T_cam_imu" else T_body_cam0
+    first = chain("pinhole", [150.5, 151.5, 80.0, 60.0], "radtan", [0, 0, 0, 0]) + f"  {name}: {given.tolist()}\n"
+    placed = f"  T_cn_cnm1: {T_cam1_cam0.tolist()}\n"
+    others = "".join(
+        chain("pinhole", [140.5, 141.5, 80.0, 60.0], "radtan", [0, 0, 0, 0], f"cam{k}") + placed for k in (1, 2)
+    )
+    for number in (1, 2):
+        lens = read(tmp_path, first + others, f"chain.yaml#cam{number}")
+        T_cam_cam0 = np.linalg.matrix_power(T_cam1_cam0, number)
+        np.testing.assert_allclose(lens.T_body_camera, T_body_cam0 @ np.linalg.inv(T_cam_cam0), atol=1e-9)
+        assert not any("T_cn_cnm1" in note for note in lens.notes)
+
+
 def test_orbslam_settings_keep_their_distortion_and_their_fisheye(tmp_path: Path) -> None:
     """Case 01."""
     assert read(tmp_path, ORB3).camera == CameraModel(

@@ -276,6 +276,29 @@ def test_what_is_no_image_is_left_out_and_said(own: Path, tmp_path: Path, caplog
     assert len(Recording.open(tmp_path / "out").frames) == COUNT - 1
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "sentence"),
+    [
+        ("every", 5, "is a folder, but --every counts for a bag and a video only"),
+        ("truth", Path("gt.tum"), "is a folder, but --truth counts for a bag only"),
+        ("image_topic", "/camera", "is a folder, but --image-topic counts for a bag only"),
+        ("time_offset_s", float("nan"), "--time-offset must be a finite number of seconds, not nan"),
+    ],
+)
+def test_an_option_that_says_nothing_of_a_folder_is_refused(
+    own: Path, tmp_path: Path, option: str, value: object, sentence: str
+) -> None:
+    with pytest.raises(DatasetError, match=sentence):
+        convert(own, tmp_path / "out", **{option: value})  # type: ignore[arg-type]
+
+
+def test_images_of_which_none_can_be_read_say_why(own: Path, tmp_path: Path) -> None:
+    for file in (own / "images").iterdir():
+        file.write_bytes(b"<html>404 not found</html>")
+    with pytest.raises(DatasetError, match=r"no image in it can be read: .*\.(jpg|png): "):
+        convert(own, tmp_path / "out")
+
+
 def test_info_counts_the_images_that_have_a_pose(own: Path) -> None:
     lines = (own / "groundtruth.txt").read_text().splitlines(keepends=True)
     (own / "groundtruth.txt").write_text("".join(lines[:1] + lines[11:]))

@@ -63,6 +63,32 @@ def test_odometry_of_another_clock_is_refused(video: Path, tmp_path: Path) -> No
         convert(video, tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "flag"),
+    [("time_offset_s", 5.0, "--time-offset"), ("truth", Path("gt.tum"), "--truth"), ("format_name", "tum", "--format")],
+)
+def test_an_option_that_says_nothing_of_a_video_is_refused(
+    video: Path, tmp_path: Path, option: str, value: object, flag: str
+) -> None:
+    beside(video)
+    with pytest.raises(DatasetError, match=rf"walk.mp4: is a video, but {flag} counts for a (folder|bag) only"):
+        convert(video, tmp_path / "out", **{option: value})  # type: ignore[arg-type]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_video_of_a_wide_lens_keeps_the_field_of_view_that_is_chosen(video: Path, tmp_path: Path) -> None:
+    beside(video)
+    (video.parent / "camera.yaml").write_text(
+        "width: 64\nheight: 48\nfx: 30\nfy: 30\ncx: 32\ncy: 24\ndistortion_model: equidistant\n"
+        "distortion: [0.0, 0.0, 0.0, 0.0]\n"
+    )
+    for view_deg in (60.0, 80.0):
+        camera = Recording.open(convert(video, tmp_path / str(view_deg), view_deg=view_deg)).camera
+        assert 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) == pytest.approx(view_deg, abs=2)
+    with pytest.raises(DatasetError, match="holds another recording"):
+        convert(video, tmp_path / "60.0", view_deg=80.0)
+
+
 def test_a_video_is_launched_and_one_that_is_none_is_refused(
     video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -179,6 +179,11 @@ def _by_numbers(table: Table, count: int) -> Columns | None:
         raise _of_first_row(table, count)
     if (count in (12, 16) and _are_matrices(rows)) or (count in (13, 17) and _are_matrices(rows[:, 1:])):
         return None
+    if count in (16, 17) and _are_matrices(rows[:, -16:].reshape(-1, 4, 4).swapaxes(1, 2).reshape(-1, 16)):
+        raise RecordingError(
+            f"{table.path}:{table.rows[0][0]}: the matrices stand column by column (Eigen, MATLAB, OpenGL); "
+            "write them row by row, the last row 0 0 0 1"
+        )
     if table.path.suffix == ".tum":
         return _declared_tum(table, rows, count)
     if count == 17 and _units_at(rows, 4):

@@ -3,7 +3,7 @@
 import logging
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -46,6 +46,16 @@ USED_NAMES = re.compile(
     re.IGNORECASE,
 )
 """Names of what readers use beside images."""
+COUNTS_FOR = {
+    "--format": ("folder",),
+    "--image-topic": ("bag",),
+    "--odometry-topic": ("bag",),
+    "--truth": ("bag",),
+    "--every": ("bag", "video"),
+    "--jpeg": ("bag",),
+    "--time-offset": ("folder",),
+}
+"""Options of `convert` that say something of some kinds of sources only."""
 ODOMETRY_MADE = "odometry_made.txt"
 """In a recording: how its odometry was made of ground truth."""
 
@@ -339,7 +349,21 @@ def convert(
     Raises:
         DatasetError: Nothing can be used; or a part was bad, and the message says so and what was kept.
     """
-    if is_bag(path):
+    kind = "bag" if is_bag(path) else "video" if is_video(path) else "folder"
+    given = {
+        "--format": format_name is not None,
+        "--image-topic": image_topic is not None,
+        "--odometry-topic": odometry_topic is not None,
+        "--truth": truth is not None,
+        "--every": every != 1,
+        "--jpeg": jpeg,
+        "--time-offset": time_offset_s != 0.0,
+    }
+    if path.exists():
+        _refuse_unused(path, kind, [option for option, is_given in given.items() if is_given])
+    if not math.isfinite(time_offset_s):
+        raise DatasetError(f"--time-offset must be a finite number of seconds, not {time_offset_s}")
+    if kind == "bag":
         options = BagOptions(
             image_topic,
             odometry_topic,
@@ -353,8 +377,9 @@ def convert(
             view_rad=None if view_deg is None else math.radians(view_deg),
         )
         return convert_bag(path, out, options, progress)
-    if is_video(path):
-        for note in convert_video(path, out, camera, odometry, form, every, progress):
+    if kind == "video":
+        view_rad = None if view_deg is None else math.radians(view_deg)
+        for note in convert_video(path, out, camera, odometry, form, every, progress, view_rad):
             logger.warning("%s", note)
         return out
     own_form = form if odometry is None else None
@@ -363,13 +388,21 @@ def convert(
     identity = _identity(
         f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
     )
-    given = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
-    moved = given or _odometry(source, drift, np.random.default_rng([seed, 0]))
+    own = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
+    moved = own or _odometry(source, drift, np.random.default_rng([seed, 0]))
     _tell_uncovered(source, moved)
     write_source(source, out, moved, identity, progress)
-    _note_drift(out, drift if given is None else None)
+    _note_drift(out, drift if own is None else None)
     _complain(source, out, len(source.images))
     return out
+
+
+def _refuse_unused(path: Path, kind: str, options: Sequence[str]) -> None:
+    """Refuses options that say nothing of such a source: what a person asked for is never left undone in silence."""
+    for option in options:
+        if kind not in COUNTS_FOR[option]:
+            kinds = " and ".join(f"a {each}" for each in COUNTS_FOR[option])
+            raise DatasetError(f"{path}: is a {kind}, but {option} counts for {kinds} only; leave it out")
 
 
 def split(

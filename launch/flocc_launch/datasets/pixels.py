@@ -155,9 +155,10 @@ def size_of(images: Sequence[tuple[float, Path]]) -> tuple[int, int]:
     Raises:
         DatasetError: None can.
     """
+    first: DatasetError | None = None
     for _, file in images:
         try:
             return image_size(file)
-        except DatasetError:
-            continue
-    raise DatasetError(f"{images[0][1].parent}: no image in it can be read")
+        except DatasetError as error:
+            first = first or error
+    raise DatasetError(f"{images[0][1].parent}: no image in it can be read: {first}")

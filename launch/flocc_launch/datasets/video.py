@@ -6,7 +6,7 @@ A video says neither where the camera was nor how its lens draws. Both stand bes
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,7 @@ def convert_video(
     form: str | None = None,
     every: int = 1,
     progress: Progress | None = None,
+    view_rad: float | None = None,
 ) -> tuple[str, ...]:
     """Write a video as a recording.
 
@@ -118,6 +119,7 @@ def convert_video(
         form: Of the trajectory.
         every: Keeps one frame of so many.
         progress: Called with frames done and frames in all.
+        view_rad: Horizontal field of view that is kept of a wide lens; None takes as much as there is.
 
     Returns:
         What was left out, one sentence each.
@@ -133,11 +135,15 @@ def convert_video(
     lens = lens_beside(path, size) if camera is None else read_lens(camera, size)
     if lens is None:
         raise DatasetError(f"{path}: intrinsics are missing; name a camera file with --camera")
+    lens = replace(lens, view_rad=view_rad) if view_rad is not None else lens
     trajectory, notes = read_trajectory(file, form)
     faults = video_faults(path, file, trajectory, lens, head)
     if faults:
         raise DatasetError(faults[0])
-    with RecordingWriter(out, f"video {path.resolve()} every={every} odometry={file}") as writer:
+    identity = f"video {path.resolve()} every={every} odometry={file}"
+    if lens.camera.agent_camera() is None:
+        identity += f" of {lens.camera} view={lens.view_rad}"
+    with RecordingWriter(out, identity) as writer:
         images = ImageWriter(lens)
         writer.write_lens(images.lens)
         writer.write_trajectories(trajectory.relative_to_first(), None)

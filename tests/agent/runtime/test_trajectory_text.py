@@ -164,6 +164,15 @@ REFUSED = {
     "damaged.tum": (GOOD + "1 2\n" * 5, r"damaged.tum:11: 8 numbers are needed, 2 were found \(and 4 other rows of 15"),
     "clock.tum": (tum(rows()[5:] + rows()[:5]), r"clock.tum:6: time goes backwards, .* 5 rows of 10 lie before"),
     "kitti.txt": ("1 0 0 1 0 1 0 2 0 0 1 3\n" * 3, "kitti.txt: holds 3 matrices without stamps"),
+    "eigen.txt": (
+        "".join(
+            row(
+                s, math.cos(a), math.sin(a), 0, 0, -math.sin(a), math.cos(a), 0, 0, 0, 0, 1, 0, *t, 1, separator=" "
+            )
+            for a, (s, t, _) in zip((0.05 * k + 0.3 for k in range(10)), rows(), strict=True)
+        ),
+        "eigen.txt:1: the matrices stand column by column",
+    ),
     "redwood.log": (
         "1 0 0 5\n0 1 0 5\n0 0 1 5\n0 0 0 1\n" * 2,
         r"redwood.log:1: has 4 columns \(matrices in blocks of four rows\)",

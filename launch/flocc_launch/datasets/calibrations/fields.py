@@ -391,7 +391,7 @@ def _mounting(keys: Keys) -> Float:
     for names, turned in ((BODY_CAMERA, False), (CAMERA_BODY, True)):
         for name in names:
             if (given := keys.take(name)) is not None:
-                T = _pose(given, name)
+                T = pose_of(given, name)
                 found.append((name, inverse(T) if turned else T))
     if (apart := _rotation_and_translation(keys)) is not None:
         found.append(("extrinsicRotation", apart))
@@ -401,7 +401,12 @@ def _mounting(keys: Keys) -> Float:
     return found[0][1] if found else np.eye(4)
 
 
-def _pose(given: Any, name: str) -> Float:
+def pose_of(given: Any, name: str) -> Float:
+    """The pose that a key gives as 12 or 16 numbers or as Basalt's map.
+
+    Raises:
+        ValueError: It is no pose.
+    """
     if isinstance(given, dict) and {"px", "qw"} <= given.keys():
         order = ("px", "py", "pz", "qw", "qx", "qy", "qz")
         return _checked(pose_from_tq(np.array([float(given[key]) for key in order])), name)

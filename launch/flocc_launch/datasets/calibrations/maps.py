@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from flocc_agent.geometry import inverse
+from flocc_launch.datasets.calibrations.fields import BODY_CAMERA, CAMERA_BODY, pose_of
 from flocc_launch.datasets.calibrations.taken_keys import Keys, flat_numbers, plain
 
 Map = dict[str, Any]
@@ -39,7 +41,25 @@ def _has(*names: str) -> Callable[[Map], bool]:
 
 def _kalibr(document: Map) -> Cameras:
     rest = {key: value for key, value in document.items() if not _is_camera(key, value)}
-    return {key: _tidied({**rest, **value}) for key, value in document.items() if _is_camera(key, value)}
+    cameras = {key: _tidied({**rest, **value}) for key, value in document.items() if _is_camera(key, value)}
+    _mount_along_chain(cameras)
+    return cameras
+
+
+def _mount_along_chain(cameras: Cameras) -> None:
+    """Gives a camera that is placed only in the one before it (`T_cn_cnm1`) that one's mounting, carried on."""
+    by_number = {int(re.sub(r"\D", "", key)): camera for key, camera in cameras.items()}
+    for number in sorted(by_number):
+        camera, before = by_number[number], by_number.get(number - 1, {})
+        if "T_cn_cnm1" not in camera or any(name in camera for name in (*BODY_CAMERA, *CAMERA_BODY)):
+            continue
+        for name in (*BODY_CAMERA, *CAMERA_BODY):
+            if name in before:
+                T_now_before = pose_of(camera.pop("T_cn_cnm1"), "T_cn_cnm1")
+                T_before = pose_of(before[name], name)
+                T_now = T_now_before @ T_before if name in CAMERA_BODY else T_before @ inverse(T_now_before)
+                camera[name] = T_now.tolist()
+                break
 
 
 def _is_camera(key: str, value: Any) -> bool:
