@@ -311,3 +311,9 @@ def umeyama(source: Float, target: Float, with_scale: bool = False) -> tuple[flo
     variance = float(((source - mean_source) ** 2).sum() / len(source))
     scale = float(singular_values @ signs / variance) if with_scale and variance > 0 else 1.0
     return scale, pose(R, mean_target - scale * R @ mean_source)
+
+
+def in_units(covariance: Float, unit_m: float) -> Float:
+    """A covariance (6, 6) of a rotation and a translation in metres, the translation in units so many metres long."""
+    units = np.repeat((1.0, 1.0 / unit_m), 3)
+    return np.asarray(covariance * units[:, None] * units)

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_ends import Tie, tie_of
+from flocc_agent.core.closure_ends import Tie, length_m, tie_of
 from flocc_agent.core.correction_evidence import TIES_MIN, Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import contradiction
@@ -87,7 +87,8 @@ class CorrectedRobot:
 
     def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
         """The newest ones."""
-        return [tie_of(log, c) for c in reversed(self.closures) if log in (c.query.log, c.match.log)][:ties_max]
+        newest = [c for c in reversed(self.closures) if log in (c.query.log, c.match.log)][:ties_max]
+        return [tie_of(log, c.query, c.match, length_m(c)) for c in newest]
 
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """Fixes."""

@@ -26,6 +26,7 @@ from flocc_launch.simulation.liveness import not_everywhere
 from flocc_launch.simulation.safety import Once
 from flocc_launch.simulation.simulate import playbacks_of, swarm_of
 from flocc_launch.simulation.swarm import Swarm
+from flocc_protocol.records import decode_record
 
 GOSSIP_KINDS = ("records", "want-records")
 SETTLE_S = 60.0
@@ -59,14 +60,21 @@ def scale(robots: int, minutes: float, area_m: float = 120.0) -> dict[str, Any]:
     swarm.run_until(60.0 * minutes)
     done_s = time.process_time()
     received = sum((traffic.received for traffic in swarm.network.traffic.values()), Counter[str]())
-    held = [len(station.core.gossip.logs) for station in swarm.running() if station.core]
+    cores = [station.core for station in swarm.running() if station.core]
+    written = Counter[str]()
+    for core in cores:
+        for data in core.gossip.logs[core.log].encoded:
+            written[type(decode_record(data)).__name__] += len(data)
+    held_bytes = sum(len(data) for core in cores for copy in core.gossip.logs.values() for data in copy.encoded)
     return {
         "robots": robots,
         "area_m": area_m,
         "virtual_s": 60.0 * minutes,
         "keyframes": sum(len(playback.captures) for playback in playbacks.values()),
-        "logs_held_least": min(held),
-        "closures": max(station.core.assembly.closures for station in swarm.running() if station.core),
+        "logs_held_least": min(len(core.gossip.logs) for core in cores),
+        "closures": max(core.assembly.closures for core in cores),
+        "record_bytes": dict(written.most_common()),
+        "held_ratio": round(held_bytes / len(cores) / sum(written.values()), 3),
         "messages_received_bytes": sum(received.values()),
         "received_bytes": dict(received.most_common()),
         "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),

@@ -56,7 +56,7 @@ def mission(robots: int, minutes: float, held: int) -> dict[str, Any]:
 
 
 def _run(robots: int, minutes: float, held: int) -> dict[str, Any]:
-    swarm = _swarm(robots, minutes, held)
+    swarm = town_swarm(robots, minutes, held)
     quarters = []
     for quarter in range(1, 5):
         began = time.process_time()
@@ -77,7 +77,8 @@ def _run(robots: int, minutes: float, held: int) -> dict[str, Any]:
     }
 
 
-def _swarm(robots: int, minutes: float, held: int) -> Swarm:
+def town_swarm(robots: int, minutes: float, held: int) -> Swarm:
+    """A swarm in a town of 60 m, with this many keyframes held."""
     fields = {
         "name": "mission",
         "tracks": {"robots": robots, "seed": 3, "area_m": 60.0, "length_m": 42.0 * minutes},

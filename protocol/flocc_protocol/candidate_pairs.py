@@ -49,7 +49,7 @@ class CandidatePair(_PairFields):
     @classmethod
     def of(cls, a: KeyframeId, b: KeyframeId) -> "CandidatePair":
         """Sort two keyframes into a pair."""
-        return cls(min(a, b), max(a, b))
+        return cls(a, b) if a < b else cls(b, a)
 
 
 PAIR = struct(CandidatePair, low=KEYFRAME_ID, high=KEYFRAME_ID)

@@ -1,14 +1,16 @@
 """Claims about the published protocol for distributed back ends: its numbers hold in what is drawn."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.core.pose_graph import LoopClosure
-from flocc_agent.geometry import inverse, se3_log
+from flocc_agent.backend.optimiser import optimise
+from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure
+from flocc_agent.geometry import inverse, se3_log, umeyama
+from flocc_lab.graph_family.methods import settings
 from flocc_lab.graph_family.team_walks import (
     BETWEEN_RANGE_M,
     BETWEEN_STEPS,
@@ -23,6 +25,7 @@ from flocc_lab.graph_family.team_walks import (
     TeamSpec,
     team_graph,
 )
+from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 
@@ -142,3 +145,35 @@ def test_a_share_of_closures_is_wrong_where_asked(team: TeamGraph) -> None:
         [np.linalg.norm(se3_log(inverse(true_between(bad, c)) @ c.T_query_match_unscaled)) for c in bad.graph.closures]
     )
     assert off[bad.is_right].max() < 0.6 < np.median(off[~bad.is_right])
+
+
+def test_a_direction_keeps_its_uncertainty_as_an_angle(team: TeamGraph) -> None:
+    for metric, unit in zip(team.graph.closures, team.without_lengths().graph.closures, strict=True):
+        if unit.metric:
+            continue
+        assert metric.covariance is not None
+        assert unit.covariance is not None
+        length_m = np.linalg.norm(metric.T_query_match_unscaled[:3, 3])
+        np.testing.assert_allclose(np.diag(unit.covariance), np.diag(metric.covariance) / [1, 1, 1, *[length_m**2] * 3])
+
+
+def test_lengths_that_nobody_knows_cost_little_and_shrink_nothing() -> None:
+    """With the error of a direction in metres a map costs less the smaller it is: 0.5 m instead of 0.13 here."""
+    team = team_graph(TeamSpec(seed=2000, robots=6, poses=60))
+    found = {}
+    for name, graph in (("metric", team.graph), ("unknown", team.without_lengths().graph)):
+        solution = optimise(graph, settings())
+        assert isinstance(solution, GraphSolution)
+        assert all(c.state is ClosureState.USED for c in solution.closures)
+        (component,) = solution.components
+        found[name], moved = aligned(component.T_map_keyframe, team.T_world_keyframe)
+        assert moved == pytest.approx(1.0, abs=0.01)
+    assert found["unknown"] < 1.6 * found["metric"] + 0.02
+
+
+def aligned(found: Mapping[LogId, Float], truth: Mapping[LogId, Float]) -> tuple[float, float]:
+    """ATE in metres, and how many times too small the map is."""
+    p, q = (np.concatenate([poses[log][:, :3, 3] for log in sorted(truth)]) for poses in (found, truth))
+    scale, _ = umeyama(p, q, with_scale=True)
+    _, T = umeyama(p, q)
+    return float(np.sqrt(np.mean(np.sum((p @ T[:3, :3].T + T[:3, 3] - q) ** 2, axis=1)))), scale

@@ -27,6 +27,7 @@ class BagScript:
             )
         self.messages: list[tuple[str, str, int, Any]] = []
         self.frame, self.child = "camera", "body"
+        self.fixed = "odom"
 
     def type(self, name: str) -> Any:
         return self.store.types[name]
@@ -34,10 +35,11 @@ class BagScript:
     def add(self, topic: str, kind: str, stamp_ns: int, message: Any) -> None:
         self.messages.append((topic, kind, stamp_ns, message))
 
-    def header(self, stamp_ns: int) -> Any:
+    def header(self, stamp_ns: int, frame: str | None = None) -> Any:
         time = self.type("builtin_interfaces/msg/Time")(stamp_ns // 10**9, stamp_ns % 10**9)
         make = self.type("std_msgs/msg/Header")
-        return make(0, time, self.frame) if self.ros1 else make(time, self.frame)
+        frame = self.frame if frame is None else frame
+        return make(0, time, frame) if self.ros1 else make(time, frame)
 
     def pose(self, x: float, q_xyzw: tuple[float, float, float, float] = (0, 0, 0, 1)) -> Any:
         point = self.type("geometry_msgs/msg/Point")(x, 2.0, 0.5)
@@ -106,13 +108,14 @@ class BagScript:
 
     def pose_stamped(self, topic: str, stamp_ns: int, x: float) -> None:
         kind = "geometry_msgs/msg/PoseStamped"
-        self.add(topic, kind, stamp_ns, self.type(kind)(self.header(stamp_ns), self.pose(x)))
+        self.add(topic, kind, stamp_ns, self.type(kind)(self.header(stamp_ns, self.fixed), self.pose(x)))
 
-    def path(self, topic: str, stamps_ns: list[int]) -> None:
+    def path(self, topic: str, stamps_ns: list[int], recorded_ns: int | None = None) -> None:
         posed = self.type("geometry_msgs/msg/PoseStamped")
-        poses = [posed(self.header(ns), self.pose(float(k))) for k, ns in enumerate(stamps_ns)]
+        poses = [posed(self.header(ns, self.fixed), self.pose(float(k))) for k, ns in enumerate(stamps_ns)]
         kind = "nav_msgs/msg/Path"
-        self.add(topic, kind, stamps_ns[-1], self.type(kind)(self.header(stamps_ns[-1]), poses))
+        recorded_ns = stamps_ns[-1] if recorded_ns is None else recorded_ns
+        self.add(topic, kind, recorded_ns, self.type(kind)(self.header(recorded_ns, self.fixed), poses))
 
     def camera_info(self, topic: str, stamp_ns: int, focal_px: float = 30.0) -> None:
         region = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)

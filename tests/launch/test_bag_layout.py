@@ -1,10 +1,12 @@
 """Topics, frames and clocks of a bag belong together as the bag says, or the bag is refused with what there is."""
 
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 from tests.launch.bag_fixtures import ZERO_NS, BagScript, walking
 
 from flocc_agent.runtime.recording import Recording
@@ -192,6 +194,173 @@ def test_a_body_that_odometry_does_not_name_is_found_on_tf_or_refused(tmp_path: 
         script.transform("/tf", ZERO_NS, ("camera" if frame == "odom" else "odom", frame))
     bag = script.write(tmp_path / "run", "mcap")
     assert Recording.open(convert(bag, tmp_path / "found")).T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
+
+
+def test_a_mounting_that_static_transforms_give_twice_is_refused(tmp_path: Path) -> None:
+    script = mounted(walking(False))
+    script.transform("/tf_static", ZERO_NS + 9 * S, ("housing", "camera"), (0.0, 0.1, 0.0), FORWARD)
+    with pytest.raises(DatasetError, match="place camera, between body and camera, in more than one way"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(("images", "info"), [("cam0", "cam1"), ("stereo/left", "stereo/right")])
+@pytest.mark.parametrize("frame", ["", "camera"])
+def test_intrinsics_of_the_other_camera_are_not_taken(tmp_path: Path, images: str, info: str, frame: str) -> None:
+    script = robot_of(BagScript(False), f"/{images}/image_raw", "/odom", 0.0, (frame, "body"))
+    script.messages = [
+        (name.replace(images, info) if "info" in name else name, *rest) for name, *rest in script.messages
+    ]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("stamped", ["now", "never", "each"])
+def test_a_path_gives_where_its_end_is(tmp_path: Path, stamped: str) -> None:
+    script = walking(False, odometry=None)
+    for k in range(1, 6):
+        now_ns = ZERO_NS + k * S
+        each = {"now": [now_ns] * (k + 1), "never": [0] * (k + 1), "each": [ZERO_NS + j * S for j in range(k + 1)]}
+        script.path("/path", each[stamped], now_ns)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    first = 0 if stamped == "each" else 1
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(first, 5)])
+
+
+@pytest.mark.parametrize(("topic", "fixed"), [("/goal_pose", "map"), ("/plan", "map"), ("/marker/pose", "camera")])
+def test_poses_of_goals_and_of_what_is_seen_are_no_odometry(tmp_path: Path, topic: str, fixed: str) -> None:
+    script = walking(False, odometry=None)
+    script.fixed = fixed
+    for k in range(11):
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+        script.pose_stamped(topic, ZERO_NS + k * S // 2, 50.0)
+    frames = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")).frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])
+
+
+@pytest.mark.parametrize(
+    ("ways", "said"),
+    [((0.0, 0.0), "nothing moves"), ((1.0, 3.0), "rotations never change though the path turns"), ((1.0, 1.0), "")],
+)
+def test_odometry_that_says_nothing_of_rotations_or_motion_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, ways: tuple[float, float], said: str
+) -> None:
+    script = walking(False, odometry=None)
+    for k in range(11):
+        along, across = (min(k, 5) * ways[0], max(k - 5, 0) * (ways[1] - ways[0]))
+        script.transform("/tf", ZERO_NS + k * S // 2, ("odom", "camera"), (along + max(k - 5, 0) * ways[0], across, 0))
+    convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+    told = [word for word in ("nothing moves", "rotations never change though the path turns") if word in caplog.text]
+    assert told == ([said] if said else [])
+
+
+@pytest.mark.parametrize("other", ["/odometry/gps", "/vicon/odom", "/amcl_pose"])
+def test_what_says_where_a_robot_is_does_not_stand_before_its_odometry(tmp_path: Path, other: str) -> None:
+    for source in ("tf", "/pose"):
+        script = walking(False, odometry=None)
+        for k in range(11):
+            stamp_ns = ZERO_NS + k * S // 2
+            (script.pose_stamped if other == "/amcl_pose" else script.odometry)(other, stamp_ns, 500.0)
+            script.transform("/tf", stamp_ns, ("body", "camera"), (0.1, 0.0, 0.0))
+            script.transform("/tf", stamp_ns, ("odom", "body"), (0.5 * k, 0.0, 0.0))
+            if source != "tf":
+                script.pose_stamped(source, stamp_ns, 0.5 * k)
+        bag = script.write(tmp_path / source.strip("/"), "mcap")
+        recording = Recording.open(convert(bag, tmp_path / f"out{source.strip('/')}"))
+        assert [frame.T_odom_body[0, 3] for frame in recording.frames] == pytest.approx([k + 0.2 for k in range(5)])
+        assert recording.T_body_camera[0, 3] == pytest.approx(0.1)
+
+
+def test_a_robot_with_two_odometries_is_not_left_out_of_its_team(tmp_path: Path) -> None:
+    script = team()
+    for k in range(4):
+        script.odometry("/Alpha/vio/odom", ZERO_NS + k * S, 0.0)
+        script.pose_stamped("/bob_2/amcl_pose", ZERO_NS + k * S, 70.0)
+    script.messages.sort(key=lambda message: message[2])
+    with pytest.raises(DatasetError, match=r"has 2 odometry topics, name one with .* /Alpha/vio/odom"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    script.messages = [message for message in script.messages if "/vio/" not in message[0]]
+    convert(script.write(tmp_path / "other", "mcap"), tmp_path / "found")
+    assert Recording.open(tmp_path / "found" / "bob_2").frames[0].T_odom_body[0, 3] == 10.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "topic", "edge", "said"),
+    [
+        ("", "/tf_static", ("body", "lidar"), "leads from body, which /odom moves, to none"),
+        ("camera", "/tf_static", ("camera", "body"), "the camera (camera) sits on body, but /pose does not say"),
+        ("camera", "/tf", ("body", "camera"), "the camera (camera) sits on body, but /pose does not say"),
+    ],
+)
+def test_a_bag_that_places_cameras_but_not_this_one_is_refused(
+    tmp_path: Path, frame: str, topic: str, edge: tuple[str, str], said: str
+) -> None:
+    script = robot_of(BagScript(False), "/cam/image_raw", "/odom" if not frame else None, 0.0, (frame, "body"))
+    for k in range(4 if frame else 0):
+        script.pose_stamped("/pose", ZERO_NS + k * S, float(k))
+    script.transform(topic, ZERO_NS, edge)
+    with pytest.raises(DatasetError, match=re.escape(said)):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out")
+
+
+def test_odometry_that_is_ground_truth_by_its_name_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = walking(False, odometry="/vicon/odom").write(tmp_path / "run", "mcap")
+    convert(bag, tmp_path / "out")
+    assert "odometry is /vicon/odom, by its name no odometry, but ground truth or GPS" in caplog.text
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_robots_with_transforms_of_their_own_may_have_the_same_frames(tmp_path: Path, moves: bool) -> None:
+    script = BagScript(False)
+    for number, name in enumerate(("r1", "r2")):
+        odometry = None if moves else f"/{name}/odom"
+        robot_of(script, f"/{name}/cam/image_raw", odometry, float(number), ("camera", "body"))
+        script.transform(f"/{name}/tf_static", ZERO_NS, ("body", "camera"), (0.1 + number, 0.0, 0.0))
+        for k in range(9 if moves else 0):
+            script.transform(f"/{name}/tf", ZERO_NS + k * S // 2, ("odom", "body"), (number + 0.5 * k, 0.0, 0.0))
+    script.messages.sort(key=lambda message: message[2])
+    convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    found = [Recording.open(tmp_path / "out" / name) for name in ("r1", "r2")]
+    assert [recording.T_body_camera[0, 3] for recording in found] == pytest.approx([0.1, 1.1])
+    assert [recording.frames[0].T_odom_body[0, 3] for recording in found] == [0.0, 1.0]
+
+
+def test_one_robot_without_intrinsics_costs_no_other(tmp_path: Path) -> None:
+    script = team()
+    script.messages = [message for message in script.messages if message[0] != "/bob_2/cam/camera_info"]
+    with pytest.raises(DatasetError, match="intrinsics are missing or unclear"):
+        convert(script.write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert len(Recording.open(tmp_path / "out" / "alpha").frames) == 4
+
+
+def test_images_of_another_frame_and_repeated_ones_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = walking(False, count=12)
+    script.frame = "other"
+    script.compressed("/cam/image/compressed", ZERO_NS + S // 2)
+    script.frame = "camera"
+    repeated = [(name, kind, ns + 1000, message) for name, kind, ns, message in script.messages if "image" in name]
+    script.messages = sorted([*script.messages, *repeated[:-1]], key=lambda message: message[2])
+    bag = script.write(tmp_path / "run", "mcap")
+    assert len(Recording.open(convert(bag, tmp_path / "out")).frames) == 12
+    assert "12 of 25 messages repeat a stamp" in caplog.text
+    assert "1 of 25 messages were left out: an image is of the frame other, the first one of camera" in caplog.text
+
+
+def test_topics_without_messages_are_not_chosen_from(tmp_path: Path) -> None:
+    script = walking(False)
+    path = tmp_path / "run"
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection("/rear/image_raw", "sensor_msgs/msg/Image", typestore=script.store)
+        writer.add_connection("/wheels/odom", "nav_msgs/msg/Odometry", typestore=script.store)
+        connections = {
+            (name, kind): writer.add_connection(name, kind, typestore=script.store)
+            for name, kind in dict.fromkeys(message[:2] for message in script.messages)
+        }
+        for name, kind, stamp_ns, message in script.messages:
+            raw = bytes(script.store.serialize_cdr(message, kind))
+            writer.write(connections[name, kind], stamp_ns, raw)
+    assert len(Recording.open(convert(path, tmp_path / "out")).frames) == 5
 
 
 @pytest.mark.parametrize("storage", ["bag", "db3"])

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from tests.doc_props import FOCAL, HEIGHT, WIDTH, photographs, walk
+from tests.doc_props import FOCAL, HEIGHT, IMAGES, WIDTH, photographs, walk
 from tests.launch.bag_fixtures import BagScript
 
 from flocc_agent import AgentConfig
@@ -39,9 +39,9 @@ def in_examples(*words: str, folder: Path, **environment: str) -> subprocess.Com
 
 
 def walked_bag(path: Path) -> None:
-    """What a robot saw that walked along two painted walls, with its odometry; the camera is the body."""
+    """What a robot saw that walked once along two painted walls, with its odometry; the camera is the body."""
     script = BagScript(True)
-    stamps_s, poses = walk()
+    stamps_s, poses = (walked[:IMAGES] for walked in walk())
     for stamp_s, T, pixels in zip(stamps_s, poses, photographs(poses), strict=True):
         stamp_ns = round(1e9 * stamp_s)
         x, y, z, qw, qx, qy, qz = (float(value) for value in tq_from_pose(T))
@@ -76,8 +76,8 @@ def test_a_scenario_runs_in_a_test_suite_of_ones_own(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_teams_bags_become_one_report(tmp_path: Path) -> None:
     (tmp_path / "bags").mkdir()
-    for robot in ("rover", "drone"):
-        walked_bag(tmp_path / "bags" / f"{robot}.bag")
+    walked_bag(tmp_path / "bags/rover.bag")
+    shutil.copyfile(tmp_path / "bags/rover.bag", tmp_path / "bags/drone.bag")
     script = EXAMPLES / "team_from_bags.sh"
     ran = in_examples("sh", str(script), "bags", "out", folder=tmp_path, FLOCC_CACHE=str(tmp_path / "cache"))
     assert ran.returncode == 0, f"{ran.stdout[-2000:]}\n{ran.stderr[-2000:]}"

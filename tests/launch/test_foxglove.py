@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from rosbags.typesys import get_types_from_msg
 from tests.launch.bag_fixtures import HEIGHT, WIDTH, ZERO_NS, walking
 
@@ -175,3 +176,28 @@ def test_a_message_that_ends_too_early_is_no_message() -> None:
     assert types.decode("foxglove.PoseInFrame", raw)["pose"]["position"]["y"] == 2.0
     with pytest.raises(ValueError, match="ends too early"):
         types.decode("foxglove.PoseInFrame", raw[:-3])
+
+
+@pytest.mark.parametrize("cut", [0, 9])
+def test_an_mcap_that_was_made_of_a_ros_1_bag_is_read(tmp_path: Path, cut: int) -> None:
+    bag = walking(True)
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1")
+        channels: dict[str, int] = {}
+        for topic, kind, stamp_ns, message in bag.messages:
+            if topic not in channels:
+                text = bag.store.generate_msgdef(kind, ros_version=1)[0].encode()
+                schema = writer.register_schema(kind.replace("/msg/", "/"), "ros1msg", text)
+                channels[topic] = writer.register_channel(topic, "ros1", schema)
+            writer.add_message(channels[topic], stamp_ns, bytes(bag.store.serialize_ros1(message, kind)), stamp_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    path.write_bytes(path.read_bytes()[: path.stat().st_size - cut])
+    if cut:
+        with pytest.raises(DatasetError, match="is damaged or cut off"):
+            convert(path, tmp_path / "out")
+    else:
+        convert(path, tmp_path / "out")
+    frames = Recording.open(tmp_path / "out").frames
+    assert [frame.T_odom_body[0, 3] for frame in frames] == pytest.approx([k + 0.2 for k in range(5)])

@@ -150,6 +150,16 @@ def test_the_default_finds_the_outliers_among_real_robots_closures(shared: Path,
     assert result["outliers_used"] <= 0.05 * result["labelled_outliers"]
 
 
+@pytest.mark.data
+def test_a_right_closure_that_two_wrong_ones_contradict_and_six_others_do_not_is_not_held(
+    shared: Path, tmp_path: Path
+) -> None:
+    """On kth_r3_00 proradio `a/661 - c/1` joins the end of a robot's way to where all began: 2.70 m without it."""
+    result = optimise_file(data(shared, COSMO.format("proradio")), tmp_path)
+    assert result["ate_m"] <= 1.35 * 1.09
+    assert not any({c["query"], c["match"]} == {"a/661", "c/1"} for c in result["closures_excluded"])
+
+
 def information(*diagonal: float, cross: tuple[int, int, float] | None = None) -> str:
     """A g2o line's upper triangle, translation first."""
     M = np.diag(diagonal)

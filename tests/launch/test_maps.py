@@ -19,6 +19,7 @@ import pytest
 from tests.launch.map_missions import AGAIN, BLOCK, FAR, mission, scenario
 
 from flocc_agent.config import TlsConfig
+from flocc_agent.core.pose_graph import ClosureResult, ClosureState
 from flocc_agent.core.reports import FoundInMap, MapOpened
 from flocc_agent.geometry import symmetric
 from flocc_agent.runtime.map_folder import BadMap, LensModel, MapFolder, read_manifest
@@ -30,11 +31,12 @@ from flocc_launch.commands.main import main
 from flocc_launch.graph_files.g2o import read_g2o
 from flocc_launch.maps.gathering import gathered
 from flocc_launch.maps.map_export import export_map
+from flocc_launch.maps.map_info import map_lines
 from flocc_launch.maps.map_merging import MERGER, like_pairs, merge_maps
 from flocc_launch.maps.map_pruning import prune_map
 from flocc_launch.maps.map_saving import save_map
 from flocc_launch.maps.opening import MapUse
-from flocc_launch.maps.solving import NotSolved, solved_map
+from flocc_launch.maps.solving import NotSolved, SolvedMap, contradicted, laid_onto, solved_map
 from flocc_launch.maps.writing import MapContent, write_map
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.recordings import recordings
@@ -43,7 +45,7 @@ from flocc_launch.simulation.sessions import map_of_sessions
 from flocc_launch.simulation.simulate import simulate
 from flocc_launch.swarm.launching import launch
 from flocc_protocol.errors import FloccError
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 
 
 @pytest.fixture(scope="module")
@@ -235,6 +237,57 @@ def test_what_a_robot_adds_is_the_next_edition_and_the_frame_stays(block: Path, 
     assert {log: new.records[log] for log in old.records} == old.records
     third = mission(tmp_path / "third", AGAIN, MapUse(tmp_path / "next"))
     assert (third.map_frames, third.maps_used) == (["map/r1"], [str(tmp_path / "next")])
+
+
+def test_the_next_edition_is_what_all_its_logs_give_together_where_the_map_lay(tmp_path: Path) -> None:
+    mission(tmp_path / "first", {"r1": BLOCK["r1"]})
+    save_map(tmp_path / "first", tmp_path / "map")
+    mission(tmp_path / "run", {"r1": BLOCK["r2"]}, MapUse(tmp_path / "map"))
+    assert save_map(tmp_path / "run", tmp_path / "next").edition == 2
+    before, after = MapFolder.open(tmp_path / "map"), MapFolder.open(tmp_path / "next")
+    together = solved_map("both", after.records).saved.T_map_camera
+    assert set(together) == set(after.poses()) == {LogId("r1"), LogId("r1", 1)}
+    T = laid_onto(together, after.poses())
+    for log, poses in after.poses().items():
+        np.testing.assert_allclose(T @ together[log], poses, atol=1e-3)
+    np.testing.assert_allclose(laid_onto(after.poses(), before.poses()), np.eye(4), atol=1e-6)
+
+
+def test_keyframes_that_several_logs_contradict_are_named() -> None:
+    r1, r2, r3, r4 = map(LogId, ("r1", "r2", "r3", "r4"))
+
+    def closure(log: LogId, match: KeyframeId, state: ClosureState) -> ClosureResult:
+        return ClosureResult(KeyframeId(log, 0), match, state, 1.0, 1.0, 0.0)
+
+    used, rejected = ClosureState.USED, ClosureState.REJECTED
+    changed, lone, disputed, mixed = (KeyframeId(r1, k) for k in range(4))
+    closures = [
+        *(closure(log, changed, rejected) for log in (r2, r3)),
+        closure(r2, changed._replace(index=9), ClosureState.EXCLUDED),
+        closure(r2, lone, rejected),
+        *(
+            closure(log, disputed, state)
+            for log, state in ((r2, rejected), (r3, rejected), (r4, used), (LogId("z"), used))
+        ),
+        *(closure(r2, mixed, state) for state in (used, rejected)),
+        closure(r3, mixed, rejected),
+    ]
+    found = contradicted(closures, {r1, r2, r3, r4})
+    assert found == {"r1/0": ("r2", "r3"), "r1/2": ("r2", "r3")}
+    assert contradicted(closures, {r1, r2}) == {}
+
+
+def test_map_info_names_contradicted_keyframes_those_of_most_logs_first(block: Path, tmp_path: Path) -> None:
+    opened = MapFolder.open(block)
+    named = {f"r1/{k}": ("r2", "r3") for k in range(11)} | {"r2/5": ("r1", "r3", "r4")}
+    solved = SolvedMap(opened.saved(), opened.covariances(), {}, contradicted=named)
+    write_map(tmp_path / "map", MapContent("m", opened.records, solved, opened.manifest.front_end, {}, ()))
+    prune_map(tmp_path / "map", tmp_path / "pruned", 2.0, 30.0)
+    for folder in (tmp_path / "map", tmp_path / "pruned"):
+        lines = [line for line in map_lines(MapFolder.open(folder)) if line[0].startswith("contradicted")]
+        assert lines[:2] == [("contradicted r2/5", "by r1, r3, r4"), ("contradicted r1/0", "by r2, r3")]
+        assert lines[-1] == ("contradicted", "2 keyframes more, in map.json")
+        assert len(lines) == 11
 
 
 def test_a_fixed_map_does_not_move(block: Path, tmp_path: Path) -> None:
@@ -615,9 +668,17 @@ def test_runs_that_hold_no_store_or_no_keyframe_give_no_map(tmp_path: Path, firs
         save_map(first, tmp_path / "map", frame="map/r9")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(BadMap, match="it is no map"):
+    with pytest.raises(BadMap, match="holds something else than a map; choose another --out"):
         save_map(first, tmp_path / "mine")
     assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
+
+
+def test_a_run_and_a_map_that_are_mistaken_for_each_other_are_told(first: Path, block: Path, tmp_path: Path) -> None:
+    for part in (first, first / "robots" / "r1", first / "robots" / "r1" / "store"):
+        with pytest.raises(BadMap, match=f"no map yet: flocc map save {part} --out FOLDER makes one of it"):
+            MapFolder.open(part)
+    with pytest.raises(BadMap, match="is a map already"):
+        save_map(block, tmp_path / "map")
 
 
 def test_two_missions_in_one_folder_are_told_apart(first: Path, tmp_path: Path) -> None:

@@ -19,6 +19,18 @@ def test_a_job_of_two_minutes_says_a_line_every_fifteen_seconds(capsys: pytest.C
     ]
 
 
+def test_a_slow_start_does_not_make_the_estimate_long(capsys: pytest.CaptureFixture[str]) -> None:
+    now_s = 0.0
+    lines = ProgressLines("preparing data", "picture", lambda: now_s)
+    for done in range(1, 31):
+        now_s += 40.0 if done == 1 else 1.0
+        lines.tell(done, 60)
+    assert capsys.readouterr().err.splitlines() == [
+        "preparing data: picture 2 of 60, about 58 s left",
+        "preparing data: picture 17 of 60, about 43 s left",
+    ]
+
+
 def test_a_short_job_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     now_s = 0.0
     lines = ProgressLines("preparing data", "picture", lambda: now_s)

@@ -81,6 +81,15 @@ def test_without_ground_truth_no_tile_is_empty(tmp_path: Path) -> None:
     assert "<b>–</b>" not in tiles[False]
 
 
+def test_errors_during_the_run_are_left_out_where_no_round_had_one_map(tmp_path: Path) -> None:
+    html, report = html_of(tmp_path / "apart", Synthetic(merged_s=None))
+    assert report.iate_m is None
+    assert not re.search("during the run|During the run|0 rounds", html)
+    assert f"<b>{number(report.if1)}</b><span>F1 of closures</span>" in html
+    html, _ = html_of(tmp_path / "merged")
+    assert ">during the run<" in html
+
+
 def test_names_that_begin_in_one_place_stand_below_each_other(tmp_path: Path) -> None:
     folder = synthetic_run.write(tmp_path / "run")
     finish(folder)

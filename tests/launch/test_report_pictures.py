@@ -125,6 +125,18 @@ def test_what_is_not_there_is_not_shown(seen: RunFolder, tmp_path: Path) -> None
     assert ("<image" in html, 'class="sheet"' in html, "What they saw" in html) == (False, False, False)
 
 
+def test_codes_of_synthetic_perception_are_not_shown_as_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FLOCC_CACHE", str(tmp_path / "cache"))
+    changes = {"duration_s": 6.0, "simulation.optimiser": "quick", "settle_s": 0.5}
+    scenario = read_scenario("meeting", changes)
+    simulate(scenario, tmp_path / "run", recordings=recordings(scenario))
+    folder = RunFolder.open(tmp_path / "run")
+    assert any(len(track) for track in load(folder).tracks.values())
+    assert album_of(folder, load(folder)) == EMPTY
+
+
 def test_fewer_or_no_pictures_are_shown_on_demand(seen: RunFolder, tmp_path: Path) -> None:
     run = Path(shutil.copytree(seen.path, tmp_path / "run"))
     told: list[tuple[int, int]] = []

@@ -97,3 +97,33 @@ def test_dates_with_a_counter_or_half_a_day(written: Callable[[int], str], first
 @pytest.mark.parametrize("written", [lambda k: "9" * 400 + str(k), lambda k: "9" * 400 + f".{k}"])
 def test_a_number_without_an_end_is_no_stamp(written: Callable[[int], str]) -> None:
     assert stamps_of_names([written(k) for k in range(10)], "images")[0] is None
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["1700000000.10_left", "1700000000.12_right", "1700000000.20_left"], r"several cameras \(left, right\)"),
+        (
+            ["img_CAMERA1_1.25_left", "img_CAMERA1_1.30_right", "img_CAMERA1_1.40_left"],
+            r"several cameras \(camera1_left, ",
+        ),
+        (["1700000000100-cam0", "1700000000120-cam1", "1700000000200-cam0"], r"several cameras \(cam0, cam1\)"),
+        (["cam_1_000001", "cam_2_000001", "cam_2_000002"], r"several cameras \(cam_1, cam_2\)"),
+        (["221359.900", "221400.150"], "can be seconds, or hours, minutes and seconds"),
+    ],
+)
+def test_names_of_several_cameras_or_of_a_clock_are_refused(names: list[str], said: str) -> None:
+    with pytest.raises(DatasetError, match=said):
+        stamps_of_names(names, "folder")
+
+
+def test_a_fraction_behind_an_s_is_read() -> None:
+    names = [f"vlcsnap-2023-11-14-22h13m{20 + k}s250" for k in range(3)]
+    assert stamps_of_names(names, "folder")[0] == [1_700_000_000.25 + k for k in range(3)]
+
+
+def test_names_that_hold_one_camera_or_words_like_it_are_read() -> None:
+    assert stamps_of_names(["cam1", "cam2", "cam3"], "folder")[0] is None
+    for form in ("{}_left", "cam0_{}", "leftover_{}_camera12345"):
+        names = [form.format(1_700_000_000_100 + 100 * k) for k in range(3)]
+        assert stamps_of_names(names, "folder")[0] == pytest.approx([1_700_000_000.1 + 0.1 * k for k in range(3)])

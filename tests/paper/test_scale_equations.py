@@ -75,7 +75,8 @@ def test_an_independent_scale_is_a_between_factor_whose_covariance_grows_along_t
     """Eliminating `s ~ N(1, sigma^2)` is exact: the widened residual is the least over all scales."""
     rng = np.random.default_rng(1)
     covariance = np.diag(rng.uniform(0.01, 0.1, 6))
-    measured = closure(3, 5, pose(so3_exp(rng.normal(size=3)), rng.normal(size=3)), covariance=covariance)
+    T = pose(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    measured = closure(3, 5, T, covariance=covariance, scale_initial=1.0)
     one = problem([measured], formulation=Formulation.INDEPENDENT, weight_by_probability=False)
     state = state_of(np.concatenate([straight().T_odom_keyframe, straight().T_odom_keyframe]))
     row, sigma = one.closure_rows.start, float(one.edges.sigma[one.closure_rows.start])

@@ -380,6 +380,7 @@ MUTANTS = (
     Mutant("the newest records are forgotten at a restart", Robot, "_restore_log", _restores_all_but_the_newest),
     # loop closing
     Mutant("pairs are not handed to stronger robots", Reach, "stronger", always(None)),
+    Mutant("stronger robots have no room for pairs", Reach, "room", always(0)),
     Mutant("the lower owner registers all pairs", loop_closing, "registrar_of", lambda _: lambda pair: pair.low.log),
     Mutant("latents are fetched again", Latents, "_may_fetch", _refetches),
     Mutant("nobody fetches a latent", Latents, "fetch", always([])),

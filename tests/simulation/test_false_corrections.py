@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from tests.agent.core.virtual_time import EveryoneSigns
 
+from flocc_agent.core import plausibility
+from flocc_agent.core.correction_evidence import Placed
 from flocc_agent.core.effects import Deliver, Effect
 from flocc_agent.core.events import Event
 from flocc_agent.core.knots import corrected
-from flocc_agent.core.plausibility import HELD_BACK_S, UNTIED
+from flocc_agent.core.plausibility import BENT, HELD_BACK_S, UNTIED
 from flocc_agent.core.reports import LeaderFollowed, PeerRefused
 from flocc_agent.core.robot import DISTRUSTED_FIRST_S, Robot
 from flocc_launch.scenarios.scenario import Scenario
@@ -174,3 +176,44 @@ def test_who_lied_is_followed_again_after_a_while_and_another_leader_corrects_me
     assert followed[-1] == LIAR
     assert followed.count(LIAR) > 1
     assert "r1" in followed
+
+
+def doubts_all(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """One robot finds something to say against every correction."""
+    judged = plausibility.contradiction
+
+    def contradicted(placed: Placed, *others: Any) -> str | None:
+        return BENT if placed.own.log.robot == name else judged(placed, *others)
+
+    monkeypatch.setattr(plausibility, "contradiction", contradicted)
+
+
+@pytest.mark.parametrize("keys", [False, True], ids=["open", "keys"])
+def test_a_robot_that_doubts_an_honest_leader_solves_the_graph_itself_and_believes_it_then(
+    monkeypatch: pytest.MonkeyPatch, keys: bool
+) -> None:
+    doubts_all(monkeypatch, "r2")
+    made = swarm(monkeypatch, keys)
+    made.run_until(1.5 * HELD_BACK_S)
+    doubting = made.stations["r2"].core
+    assert doubting is not None
+    assert doubting.corrections.applied is not None
+    assert leaders(made) == [LIAR, LIAR]
+    assert not refused(made)
+    made.run_until(5.0 * HELD_BACK_S)
+    leader = made.stations[LIAR].core
+    assert leader is not None
+    newest = leader.corrections.of(doubting.log)
+    assert newest is not None
+    assert doubting.corrections.applied.version == newest.version
+
+
+def test_a_lie_that_only_an_own_solution_refutes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = swarm(monkeypatch, keys=True)
+    jumps = Jumps(made)
+    made.run_until(LIES_AT_S)
+    doubts_all(monkeypatch, "r2")
+    let_it_lie(made, lambda message: shifted(message, 40.0), 2 * HELD_BACK_S)
+    made.run_until(LIES_AT_S + 2 * HELD_BACK_S)
+    assert jumps.worst_m < JUMP_M
+    assert BENT in str(refused(made))

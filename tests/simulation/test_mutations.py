@@ -173,7 +173,7 @@ def test_a_robot_that_sends_before_it_writes_loses_what_it_published(monkeypatch
 
 def test_a_table_without_a_maximum_breaks_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     def hoard(self: Latents, wants: Any, now: float) -> bool:
-        self._relayed.update(dict.fromkeys(KeyframeId(self._own, k) for k in range(99)))
+        self._relayed.update({KeyframeId(self._own, k): now for k in range(99)})
         return True
 
     monkeypatch.setattr(Latents, "on_wants", hoard)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from flocc_agent.backend.pair_closures import PairClosures, Way, by_logs, measured
+from flocc_agent.backend.pair_closures import LENGTH_MIN_M, PairClosures, Way, by_logs, measured
+from flocc_agent.backend.problem import without_unit
 from flocc_agent.backend.relayed import relayed
 from flocc_agent.backend.together import (
     AGREEING_MIN,
@@ -48,6 +49,7 @@ PLANAR_RAD = 1e-6
 AGREEING_PARTNERS_MIN, NO_MISTAKE_RATIO = 2, 0.5
 """A closure with which so many others agree, and this part of those that speak against it, is not held for them."""
 FIXED_M = 1e-6
+LENGTH_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,8 +132,7 @@ def held_closures(
     if config.formulation is Formulation.BASE or config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
         return {}
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
-    pairs = by_logs({k: closure for k, closure in closures.items() if closure.support == 1})
-    of_pairs = {pair: measured(ids, closures, config) for pair, ids in pairs.items()}
+    of_pairs = measured_by_pair(ways, {k: c for k, c in closures.items() if c.support == 1}, config)
     bound, bound_of_one = (float(chdtri(freedom, 1.0 - config.inlier_probability)) for freedom in (6.0, 1.0))
     judges = [judges_of(pair, ways, of_pairs, bound) for pair in of_pairs]
     excess, of_all = excess_of(judges), excess_with_all(judges)
@@ -145,6 +146,25 @@ def held_closures(
     return held
 
 
+def measured_by_pair(
+    ways: Mapping[LogId, Way], closures: Mapping[int, LoopClosure], config: BackendConfig
+) -> dict[tuple[LogId, LogId], PairClosures]:
+    """Closures of each pair of robots, those without a unit as long as they fit their neighbours."""
+    pairs = by_logs(closures)
+    return {pair: with_fitted_lengths(pair, ways, measured(ids, closures, config)) for pair, ids in pairs.items()}
+
+
+def fitted_lengths(
+    trajectories: Mapping[LogId, Trajectory], closures: Mapping[int, LoopClosure], config: BackendConfig
+) -> dict[int, float]:
+    """How long the closures without a unit are, by number: for their neighbours, in the median of two robots."""
+    unknown = without_unit(list(closures.values()), config).tolist()
+    free = {k: closure for (k, closure), on in zip(closures.items(), unknown, strict=True) if on}
+    ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()} if free else {}
+    of_pairs = measured_by_pair(ways, free, config)
+    return {k: float(np.median(c.length_m)) for c in of_pairs.values() for k in c.ids.tolist()}
+
+
 def judges_of(
     pair: tuple[LogId, LogId],
     ways: Mapping[LogId, Way],
@@ -154,10 +174,7 @@ def judges_of(
     """Compare each closure with its nearest others, and with odometry where both keyframes are one robot's."""
     a, b, closures = ways[pair[0]], ways[pair[1]], of_pairs[pair]
     count = len(closures.ids)
-    at = np.stack([closures.i, closures.j], axis=1)
-    partners = own = np.arange(count)[:, None]
-    if count > 1:
-        partners = cKDTree(at).query(at, k=np.arange(2, min(PARTNERS + 1, count) + 1), p=1)[1]
+    partners, own = partners_of(closures), np.arange(count)[:, None]
     k, m = np.repeat(np.arange(count), partners.shape[1]), partners.ravel()
     said = said_by(a, b, closures, k, m)
     by_partners = compared(closures, k, *said).shaped(partners.shape)
@@ -172,6 +189,31 @@ def judges_of(
     return Judges(
         closures, partners, by_partners, by_odometry, *compared_with_all(closures, side_by_side(said_by_all), bound)
     )
+
+
+def partners_of(c: PairClosures) -> Int:
+    """Places (K, P) of the closures whose keyframes are nearest on both sides; its own where it is alone."""
+    count = len(c.ids)
+    if count < 2:
+        return np.arange(count)[:, None]
+    at = np.stack([c.i, c.j], axis=1)
+    return np.asarray(cKDTree(at).query(at, k=np.arange(2, min(PARTNERS + 1, count) + 1), p=1)[1])
+
+
+def with_fitted_lengths(pair: tuple[LogId, LogId], ways: Mapping[LogId, Way], c: PairClosures) -> PairClosures:
+    """Closures of one pair, those without a unit as long as they fit their partners best, in the median."""
+    if len(c.ids) < 2 or not np.any(c.by_length):
+        return c
+    partners = partners_of(c)
+    k, m = np.repeat(np.arange(len(c.ids)), partners.shape[1]), partners.ravel()
+    for _ in range(LENGTH_ROUNDS):
+        T, _, translation, along = said_by(ways[pair[0]], ways[pair[1]], c, k, m)
+        off = T[:, :3, 3] - c.T[k][:, :3, 3]
+        own = Ray(-c.u[k], c.length_sigma_m[k], c.shorter_max_m[k])
+        _, change = fitted(off, translation + c.translation[k], own, along)
+        middle = np.median(change[:, 0].reshape(partners.shape), axis=1)
+        c = c.with_lengths(np.maximum(c.length_m + middle, LENGTH_MIN_M))
+    return c
 
 
 def predictions(
@@ -198,6 +240,9 @@ def compared_with_all(c: PairClosures, said: Predictions, bound: float) -> tuple
     off = all_.t - c.T[:, :3, 3]
     covariance = all_.covariance + c.translation[:, None, None] * np.eye(3)
     squared, collapse, change = with_length(off, covariance, c.u, c.length_sigma_m, c.shorter_max_m)
+    if np.any(c.by_length):
+        covariance = all_.covariance + c.translation_at(change)[:, None, None] * np.eye(3)
+        squared, collapse, change = with_length(off, covariance, c.u, c.length_sigma_m, c.shorter_max_m)
     left = off - change[:, None] * c.u
     by_all = Compared(
         squared=squared + apart_rad**2 / variance_rad,
@@ -246,6 +291,9 @@ def compared(c: PairClosures, k: Int, T: Float, rotation: Float, translation: Fl
     off = T[:, :3, 3] - c.T[k][:, :3, 3]
     own = Ray(-c.u[k], c.length_sigma_m[k], c.shorter_max_m[k])
     free, bounded = fitted(off, variance_m, own, along)
+    if np.any(c.by_length):
+        variance_m = translation + c.translation_at(bounded[:, 0], k)
+        free, bounded = fitted(off, variance_m, own, along)
     off = off + bounded[:, :1] * own.u + bounded[:, 1:] * along.u
     turned = apart_rad**2 / variance_rad
     return Compared(
@@ -312,7 +360,8 @@ def alarms(judges: Judges, bound: float, bounds_of_all: tuple[float, float], exc
 
     Partners vote with their certainty; against a closure only those with more agreement of their own. Where half as
     many agree it is no single mistake: the solver decides, and says so. The bounds of what all say together are those
-    of the whole difference, and of a length that would have to collapse.
+    of the whole difference, and of a length that would have to collapse; that begins with the surest, which may be
+    wrong, so that it holds none with which several agree that together are surer than those that do not.
     """
     count, by = judges.size, judges.with_partners
     others = judges.partners != np.arange(count)[:, None]
@@ -329,7 +378,9 @@ def alarms(judges: Judges, bound: float, bounds_of_all: tuple[float, float], exc
         reasons[n] = _reason(by.at((n, p)), bool(by.falls[n, p]), excess, "closures around it")
     all_ = judges.with_all
     disagrees = (all_.squared > bounds_of_all[0]) | (judges.collapse > bounds_of_all[1])
-    for n in np.flatnonzero(judges.counts & disagrees).tolist():
+    supported = np.sum(certainty * agree, axis=1) > np.sum(certainty * (others & ~agree), axis=1)
+    supported &= agreeing >= AGREEING_MIN
+    for n in np.flatnonzero(judges.counts & disagrees & ~supported).tolist():
         reasons.setdefault(n, _reason(all_.at(n), bool(all_.falls[n]), excess, "the closures around it"))
     if judges.with_odometry is not None:
         own, alone = judges.with_odometry, ~np.any(agree, axis=1)

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend.descent import Solved
 from flocc_agent.backend.edges import residuals, state_of
-from flocc_agent.backend.problem import diagonal_covariance, odometry_edges
+from flocc_agent.backend.problem import Problem, diagonal_covariance, odometry_edges
 from flocc_agent.config import BackendConfig, Formulation
 from flocc_agent.core.pose_graph import Component, LoopClosure, Trajectory, stretched
 from flocc_agent.geometry import adjoints, inverse, poses_of_twists, twists_of_poses
@@ -143,6 +144,12 @@ def chains_of(
 
     renamed = {k: replace(c, query=named(c.query), match=named(c.match)) for k, c in closures.items()}
     return Chains(numbers, short, renamed, trajectories, closures, shares, config)
+
+
+def is_explained(chains: Chains, problem: Problem, solved: Solved) -> bool:
+    """Whether chains say what odometry of all their keyframes would say."""
+    strain = chains.strain(problem.by_log(solved.state.poses()), problem.scales_applied(solved.state))
+    return bool(np.isfinite(strain)) and abs(strain) <= STRAIN_RATIO_MAX * max(solved.cost, 1.0)
 
 
 def kept_numbers(held: Sequence[int], keyframes: int) -> Int:

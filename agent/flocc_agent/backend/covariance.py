@@ -19,6 +19,8 @@ logger = logging.getLogger(__name__)
 COVARIANCE_MAX = 1e30
 COVARIANCE_ROUNDS = 5
 """Of a large graph every so many rounds' covariances are computed: they cost as much as a round that adds little."""
+EVERY_ROUND_POSES_MAX = 2000
+"""Of a smaller graph that was eliminated every round's are."""
 
 
 def covariances_of(
@@ -59,10 +61,10 @@ def kept_covariances(
 ) -> Mapping[LogId, Float | None] | None:
     """The earlier round's covariances of the same logs, where they stand for this one; None where they are due.
 
-    They do where the solver does not leave them over (large graphs, solved by conjugate gradients), and for
-    `COVARIANCE_ROUNDS` rounds.
+    They do for `COVARIANCE_ROUNDS` rounds of a large graph, and where the solver does not leave them over.
     """
-    if earlier is None or wanted or objective.linear.leaves_covariances:
+    are_cheap = objective.linear.leaves_covariances and problem.poses <= EVERY_ROUND_POSES_MAX
+    if earlier is None or wanted or are_cheap:
         return None
     stand = earlier.covariance_rounds + 1 < COVARIANCE_ROUNDS and earlier.logs == problem.logs
     known = all(earlier.covariance_map_odom.get(log) is not None for log in problem.logs)

@@ -24,6 +24,9 @@ LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 the softest motions most, which are those that long chains need."""
 
 
+VOTED_STEPS_MAX = 3
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
     """Where a solver stopped.
@@ -73,14 +76,14 @@ class Objective:
         prior = np.sum(((state.scale - 1.0) / self.linear.scale_prior_sigma) ** 2)
         return float(0.5 * (np.sum(squared) + prior))
 
-    def closure_residuals(self, state: State) -> Float:
+    def closure_residuals(self, state: State, hold: bool = False) -> Float:
         """Squared residuals (L,) of the closures."""
-        return residuals(taken(self.edges, self.closures), state, hold=False).squared()
+        return residuals(taken(self.edges, self.closures), state, hold).squared()
 
-    def agreeing(self, state: State) -> Bool:
+    def agreeing(self, state: State, hold: bool = False) -> Bool:
         """Whether each closure (L,) is within its bound; a held one also where no scale may pass zero."""
         edges, bounds = taken(self.edges, self.closures), self.bounds()
-        agree = residuals(edges, state, hold=False).squared() <= bounds
+        agree = residuals(edges, state, hold).squared() <= bounds
         if self.held is not None and np.any(self.held & agree):
             agree &= ~self.held | (residuals(edges, state, hold=True).squared() <= bounds)
         return np.asarray(agree)
@@ -131,6 +134,18 @@ def descend(
             return Solved(here.state, weights, here.cost, solves, True)
         damping = 0.0 if damping <= DAMPING_MIN else damping / DAMPING_FACTOR**2
     return Solved(here.state, weights, here.cost, solves, False)
+
+
+def voted_cost(objective: Objective, state: State, votes: Float) -> float:
+    """The truncated cost in which closures count as many times as they have votes, where it is least near a state.
+
+    A state is where all closures count once. There many that agree bend odometry as many do; to hold that against them
+    while they count as few would let go of all of them.
+    """
+    agreeing = objective.agreeing(state)
+    if not np.all(votes[agreeing] == 1.0):
+        state = descend(objective, state, objective.weights(votes * agreeing), VOTED_STEPS_MAX).state
+    return objective.truncated_cost(state, votes)
 
 
 def _point(objective: Objective, state: State, weights: Float, hold: bool) -> Point:

@@ -15,6 +15,16 @@ derivative -R_hat^T t_hat (DESIGN.md section 7), so that Gaussian scales are eli
 A scale of odometry is asked for in another form: what was measured is noisy, and a factor of it is found too small, as
 in any regression on what is noisy. There c divides the poses, `e = [ 2 vec(q(R_hat^T R_ij)) ; R_hat^T p / c - d ]`.
 
+Where nothing is known of a closure's unit its uncertainty is known in that unit alone: a direction is a direction,
+however long. In metres such an edge costs less the nearer its poses are, and many of them shrink the map. At the end it
+is told by its angle theta instead, with `q = R_hat^T p` and u its whitened direction,
+
+    e_t = 2 sin(theta / 2) |L d| n |q| / sqrt(|q|^2 + NEAR_M^2) + (|q| / |d| - 1) / sigma * u,   n across u:
+
+the chord grows up to half a turn, so that there is a way back from the side, where a sine's slope is zero; poses that
+coincide have no direction, so that what is nearer than `NEAR_M` counts in metres; lengths have a wide prior. The search
+is made in metres at a length that is fitted to neighbours, where scales may pass through zero (`residuals`, `hold`).
+
 A scale is kept above `GAMMA_MIN`: an edge whose best scale lies below is held there, and pays for the distance to c.
 Updates are on the right: `R <- R Exp(omega)`, `t <- t + R v`; the tangent order is rotation, translation.
 """
@@ -33,6 +43,9 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 GAMMA_MIN = 1e-3
+TINY, ROOM_MIN = 1e-12, 1e-9
+NEAR_M = 1.0
+"""Poses that are nearer say little by their direction: they are counted as if they were so far apart."""
 HALF_TURN_COSINE = 1e-4
 """Cosine of half a rotation error below which that error is a half turn, where its square has no slope."""
 NUDGE_RAD = 3e-3
@@ -89,7 +102,8 @@ class Edges:
         sqrt_information_wide: (E, 6, 6) the same with the edge's own scale eliminated; equal where it has none.
         sigma: (E,) standard deviation of the own scale around c; 0 where it has none.
         cluster: (E,) index of the cluster scale, or -1 for the constant 1.
-        divides: (E,) whether that scale divides the poses, instead of multiplying the measurement; sigma is 0 there.
+        divides: (E,) whether a scale divides the poses, instead of multiplying the measurement: that of odometry (sigma
+            is 0), or an own one of which nothing is known: those edges are directions.
     """
 
     i: Int
@@ -164,7 +178,10 @@ def _unscaled(edges: Edges, state: State) -> tuple[Float, Float, Float]:
 
 
 def residuals(edges: Edges, state: State, hold: bool = True) -> Residuals:
-    """Whitened residuals of all edges, own scales eliminated; without `hold` a scale may pass its lower bound."""
+    """Whitened residuals of all edges, own scales eliminated.
+
+    Without `hold`, for the search, scales may pass their lower bound and directions are told in metres.
+    """
     e0, q_error, p = _unscaled(edges, state)
     c = cluster_scales(edges, state)
     e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
@@ -177,13 +194,49 @@ def residuals(edges: Edges, state: State, hold: bool = True) -> Residuals:
         e[held] = np.einsum("eij,ej->ei", L[held], e0[held] - GAMMA_MIN * edges.d[held])
         bound[held] = (GAMMA_MIN - c[held]) / edges.sigma[held]
     rho = np.ones(len(edges))
-    rows = np.flatnonzero(edges.divides)
+    rows = np.flatnonzero(edges.divides & (edges.sigma == 0))
     if len(rows):
         L, rho[rows] = L.copy(), 1.0 / c[rows]
         L[rows, :, 3:] *= rho[rows, None, None]
         measured = np.einsum("eij,ej->ei", edges.sqrt_information[rows], edges.d[rows])
         e[rows] = np.einsum("eij,ej->ei", L[rows], e0[rows]) - measured
+    rows = np.flatnonzero(directions(edges) & hold)
+    if len(rows):
+        L, bound[rows], held[rows] = L.copy(), 0.0, False
+        e[rows], L[rows] = _angles(taken(edges, rows), e0[rows])
     return Residuals(e, held, bound, q_error, p, L, rho)
+
+
+def directions(edges: Edges) -> Bool:
+    """Which edges (E,) measure a direction, in whose unit their uncertainty is told."""
+    return edges.divides & (edges.sigma > 0)
+
+
+def _angles(edges: Edges, e0: Float) -> tuple[Float, Float]:
+    """Whitened residuals (E, 6) of directions, and what poses enter by (E, 6, 6); e0 are those at gamma = 0."""
+    L, q = edges.sqrt_information, e0[:, 3:]
+    by_rho = np.einsum("eij,ej->ei", L[:, :, 3:], q)
+    measured = np.einsum("eij,ej->ei", L, edges.d)
+    far, size = np.linalg.norm(by_rho, axis=1), np.linalg.norm(measured, axis=1)
+    far = np.maximum(far, TINY)
+    u, ahead = by_rho / far[:, None], measured / size[:, None]
+    cosine = np.einsum("ei,ei->e", u, ahead)
+    room = np.maximum(1.0 + cosine, ROOM_MIN)
+    length_m, d_m = np.maximum(np.linalg.norm(q, axis=1), TINY), np.linalg.norm(edges.d, axis=1)
+    spread_m = np.sqrt(length_m**2 + NEAR_M**2)
+    chord = np.sqrt(2.0 / room) * length_m / spread_m
+    sine = (size * cosine)[:, None] * u - measured
+    prior = (length_m / d_m - 1.0) / edges.sigma
+    e = np.einsum("eij,ej->ei", L[:, :, :3], e0[:, :3]) + chord[:, None] * sine + prior[:, None] * u
+    u_by_q = (L[:, :, 3:] - u[:, :, None] * np.einsum("ei,eij->ej", u, L[:, :, 3:])[:, None, :]) / far[:, None, None]
+    sideways = np.einsum("eij,ei->ej", u_by_q, measured)
+    by_length = q / (length_m * d_m * edges.sigma)[:, None] + chord[:, None] * sideways
+    by_chord = q * (NEAR_M / (length_m * spread_m))[:, None] ** 2 - (0.5 / (room * size))[:, None] * sideways
+    by_pose = L.copy()
+    by_pose[:, :, 3:] = (chord * size * cosine + prior)[:, None, None] * u_by_q
+    by_pose[:, :, 3:] += u[:, :, None] * by_length[:, None, :]
+    by_pose[:, :, 3:] += (chord[:, None] * sine)[:, :, None] * by_chord[:, None, :]
+    return e, by_pose
 
 
 def off_half_turns(edges: Edges, state: State) -> State:
@@ -211,7 +264,12 @@ def scales_at(edges: Edges, state: State) -> Float:
     e0, _, _ = _unscaled(edges, state)
     c = cluster_scales(edges, state)
     e = np.einsum("eij,ej->ei", edges.sqrt_information_wide, e0 - c[:, None] * edges.d)
-    return np.where(edges.sigma > 0, np.maximum(own_scales(edges, e, c), GAMMA_MIN), c)
+    scales = np.where(edges.sigma > 0, np.maximum(own_scales(edges, e, c), GAMMA_MIN), c)
+    rows, q = directions(edges), e0[:, 3:]
+    ahead = np.einsum("ei,ei->e", q, edges.d[:, 3:]) > 0.0
+    lengths = np.linalg.norm(q[rows], axis=1) / np.linalg.norm(edges.d[rows], axis=1)
+    scales[rows] = np.where(ahead[rows], np.maximum(lengths, GAMMA_MIN), GAMMA_MIN)
+    return scales
 
 
 def jacobians(edges: Edges, at: Residuals) -> Jacobians:
@@ -235,7 +293,7 @@ def scale_slopes(edges: Edges, at: Residuals) -> Float:
     slopes = np.zeros((len(edges), 6))
     on = np.flatnonzero((edges.cluster >= 0) & ~at.held & ~edges.divides)
     slopes[on] = -np.einsum("eij,ej->ei", at.L[on], edges.d[on])
-    rows = np.flatnonzero(edges.divides)
+    rows = np.flatnonzero(edges.divides & (edges.cluster >= 0))
     q = np.einsum("eji,ej->ei", rotations.matrices(edges.q_hat[rows]), at.p[rows])
     slopes[rows] = -at.rho[rows, None] * np.einsum("eij,ej->ei", at.L[rows, :, 3:], q)
     return slopes

@@ -59,36 +59,36 @@ class Graduated:
     stages: tuple[Stage, ...]
 
 
-def graduated(objective: Objective, state: State, start_ratio: float) -> Graduated:
+def graduated(objective: Objective, state: State, start_ratio: float, hold: bool = False) -> Graduated:
     """Run the stages from a state; the control parameter starts at `start_ratio` at the latest."""
     config, bound = objective.config, objective.bounds()
-    squared = _squared(objective, state)
+    squared = _squared(objective, state, hold)
     control, stages = initial_control(config.solver, squared, bound, start_ratio), []
     iterations = 0
     while iterations < config.iterations_max:
         of_closures = gnc_weights(config.solver, squared, bound, control)
-        state, stage = _staged(objective, state, np.where(of_closures < WEIGHT_MIN, 0.0, of_closures), control)
+        state, stage = _staged(objective, state, np.where(of_closures < WEIGHT_MIN, 0.0, of_closures), control, hold)
         stages.append(stage)
         iterations += stage.iterations
-        squared = _squared(objective, state)
+        squared = _squared(objective, state, hold)
         if gnc_finished(config.solver, of_closures, control):
             break
         control = next_control(config, squared, bound, control, start_ratio)
     return Graduated(state, squared <= bound, iterations, tuple(stages))
 
 
-def _squared(objective: Objective, state: State) -> Float:
+def _squared(objective: Objective, state: State, hold: bool) -> Float:
     """Squared residuals (L,) of the closures; of those that are held infinite, so that they weigh nothing."""
-    squared = objective.closure_residuals(state)
+    squared = objective.closure_residuals(state, hold)
     return squared if objective.held is None else np.where(objective.held, np.inf, squared)
 
 
-def _staged(objective: Objective, state: State, of_closures: Float, control: float) -> tuple[State, Stage]:
+def _staged(objective: Objective, state: State, of_closures: Float, control: float, hold: bool) -> tuple[State, Stage]:
     """Go down the objective of one control parameter until a step changes its cost by little."""
     weights, iterations = objective.weights(of_closures), 0
-    before = cost = objective.cost(state, weights, hold=False)
+    before = cost = objective.cost(state, weights, hold)
     while True:
-        solved = descend(objective, state, weights, steps_max=objective.config.gnc_inner_steps)
+        solved = descend(objective, state, weights, steps_max=objective.config.gnc_inner_steps, hold=hold)
         iterations += solved.iterations
         state, decrease, cost = solved.state, cost - solved.cost, solved.cost
         if decrease <= MOVED_RATIO * cost or iterations >= STAGE_STEPS_MAX:

@@ -1,6 +1,7 @@
 """Where a component's poses start: at the last solution, or at the robust alignment of the odom frames."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +23,21 @@ class Aligned(NamedTuple):
     Attributes:
         T_map_keyframe: (N, 4, 4) of every log, in one frame.
         is_warm: These are the poses of an earlier solution.
+        lengths_m: How long closures without a unit are taken to be, by number, as far as something tells.
     """
 
     T_map_keyframe: dict[LogId, Float]
     is_warm: bool
+    lengths_m: Mapping[int, float] = MappingProxyType({})
+
+
+def lengths_at(closures: Mapping[int, LoopClosure], T_map_keyframe: Mapping[LogId, Float]) -> dict[int, float]:
+    """How far apart the keyframes of closures are, m."""
+    ends = {
+        k: (T_map_keyframe[c.query.log][c.query.index], T_map_keyframe[c.match.log][c.match.index])
+        for k, c in closures.items()
+    }
+    return {k: float(np.linalg.norm(T_query[:3, 3] - T_match[:3, 3])) for k, (T_query, T_match) in ends.items()}
 
 
 def initial_poses(

@@ -7,7 +7,7 @@ demands it: a cold round that rejected closures is solved with all scales free a
 wins. Where nothing was measured in metres only the ratios between robots show; their mean stays 1.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from flocc_agent.backend.mapped import SavedLog
 from flocc_agent.backend.posing import Posed
 from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, solve, solve_once
 from flocc_agent.config import Formulation, Solver
-from flocc_agent.core.pose_graph import GraphSolution, OdometryScale, is_landmark
+from flocc_agent.core.pose_graph import Component, GraphSolution, OdometryScale, is_landmark
 from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
@@ -104,7 +104,7 @@ def solve_with_scales(posed: Posed, initial: GraphSolution | None, anew: PosedAn
         initial: An earlier solution, whose scales are begun with.
         anew: Poses it again, from an alignment of the robots whose ways were made as long as given scales say.
     """
-    begun = posed.with_scaled(scales_before(posed, initial))
+    begun = posed.with_scaled(scales_before(posed, initial.components if initial is not None else ()))
     solved = solve(begun.objective, begun.start, begun.trusted, begun.places)
     told = told_before(posed, initial) if begun.is_confirmed(solved) else None
     if told is not None and len(posed.problem.edges) > ASKED_EVERY_ROUND_EDGES_MAX:
@@ -138,13 +138,12 @@ def told_before(posed: Posed, initial: GraphSolution | None) -> Estimates | None
     return None
 
 
-def scales_before(posed: Posed, initial: GraphSolution | None) -> dict[LogId, float]:
-    """Scales that an earlier solution applied."""
-    told = [c.odometry_scales for c in initial.components] if initial is not None else []
+def scales_before(posed: Posed, components: Iterable[Component]) -> dict[LogId, float]:
+    """Scales that an earlier solution of these components applied."""
     return {
         log: 1.0 / scale.ratio
-        for scales in told
-        for log, scale in scales.items()
+        for component in components
+        for log, scale in component.odometry_scales.items()
         if scale.is_applied and log in posed.problem.logs
     }
 

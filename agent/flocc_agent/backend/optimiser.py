@@ -12,15 +12,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from flocc_agent.backend.alarms import held_closures
-from flocc_agent.backend.chains import STRAIN_RATIO_MAX, Chains, chains_of
+from flocc_agent.backend.alarms import fitted_lengths, held_closures
+from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.filtering import Filtered, filtered
-from flocc_agent.backend.initial import Aligned, component_with, initial_poses
+from flocc_agent.backend.initial import Aligned, component_with, initial_poses, lengths_at
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import solver_keyframes, with_map, without_map
 from flocc_agent.backend.measured import with_factors, without_factors
 from flocc_agent.backend.odometry_scale import SolvedWithScales, solve_with_scales, with_mean_of_one
-from flocc_agent.backend.posing import Posed, posed
+from flocc_agent.backend.parted import less_exact, sentence
+from flocc_agent.backend.posing import Posed, posed, posed_by_chains
 from flocc_agent.backend.results import Solution, SolvedLogs, collect, excluded, odometry_component
 from flocc_agent.backend.screening import Screened, screen
 from flocc_agent.backend.settled import settled_round
@@ -185,14 +186,28 @@ def _solve_and_split(
     filtering_s = time.perf_counter() - began
     outcome = SolvedLogs((), {}, timings_s={"consistency": filtering_s})
     if kept.is_connected:
-        outcome = _solve_connected(kept, config, initial, wanted)
+        whole = kept
+        outcome, kept = _solve_and_choose(whole, config, initial, wanted)
+        if not kept.is_connected and (wider := less_exact(whole, kept, config)):
+            again = replace(whole, closures={**whole.closures, **wider})
+            outcome_again, kept_again = _solve_and_choose(again, config, initial, wanted)
+            if wider.keys() <= kept_again.left.keys():
+                warnings = (*outcome_again.warnings, sentence(wider))
+                outcome, kept = replace(outcome_again, warnings=warnings), kept_again
         outcome = replace(outcome, timings_s={"consistency": filtering_s, **outcome.timings_s})
-        kept = kept.released(outcome.closures)
-        outcome = replace(outcome, closures={k: r for k, r in outcome.closures.items() if k in kept.closures})
-        kept = kept.without({k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED})
     if kept.is_connected:
         return replace(outcome, closures={**outcome.closures, **kept.turned_away})
     return _split(kept, outcome, config, initial, wanted)
+
+
+def _solve_and_choose(
+    whole: Filtered, config: BackendConfig, initial: GraphSolution | None, wanted: Sequence[KeyframeId]
+) -> tuple[SolvedLogs, Filtered]:
+    """Solve a component; what it makes of it, and what is left once closures that disagree are turned away."""
+    outcome = _solve_connected(whole, config, initial, wanted)
+    kept = whole.released(outcome.closures)
+    outcome = replace(outcome, closures={k: r for k, r in outcome.closures.items() if k in kept.closures})
+    return outcome, kept.without({k: r for k, r in outcome.closures.items() if r.state is not ClosureState.USED})
 
 
 def _split(
@@ -231,10 +246,11 @@ def _solve_connected(
     """Align the odom frames, pose the problem, solve it, collect what consumers get (Sec. III-C)."""
     times = [time.perf_counter()]
     aligned = initial_poses(kept.trajectories, kept.left, config.steepness, initial)
+    aligned = aligned._replace(lengths_m=fitted_lengths(kept.trajectories, kept.taking_part, config))
     times.append(time.perf_counter())
     chains = chains_of(kept.trajectories, kept.taking_part, wanted, config)
     found = _solve_aligned(kept, chains, aligned, config, initial)
-    if chains is not None and not _is_explained(chains, found):
+    if chains is not None and not is_explained(chains, found.posed.problem, found.solved):
         found = _solve_all(kept, chains, found, config)
         chains = None
     solved, at = found.solved, found.posed
@@ -264,29 +280,15 @@ def _solve_aligned(
     kept: Filtered, chains: Chains | None, aligned: Aligned, config: BackendConfig, initial: GraphSolution | None
 ) -> SolvedWithScales:
     """Solve an aligned component, with all its keyframes or by its chains."""
-    if chains is None:
-        begun = posed(kept.trajectories, kept.taking_part, aligned, config, initial, None, kept.held)
-    else:
-        shorter = Aligned(chains.shortened(aligned.T_map_keyframe), aligned.is_warm)
-        begun = posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, kept.held)
+    begun = posed_by_chains(kept.trajectories, kept.taking_part, chains, aligned, config, initial, kept.held)
 
     def anew(scales: Mapping[LogId, float]) -> Posed:
         """The component, begun with the ways of logs made longer or shorter."""
         longer = {log: stretched(trajectory, scales.get(log, 1.0)) for log, trajectory in kept.trajectories.items()}
-        again = initial_poses(longer, kept.left, config.steepness, None)
-        if chains is None:
-            return posed(kept.trajectories, kept.taking_part, again, config, None, None, kept.held)
-        shorter = Aligned(chains.shortened(again.T_map_keyframe), again.is_warm)
-        return posed(chains.trajectories, chains.closures, shorter, config, None, chains.recorded, kept.held)
+        again = initial_poses(longer, kept.left, config.steepness, None)._replace(lengths_m=aligned.lengths_m)
+        return posed_by_chains(kept.trajectories, kept.taking_part, chains, again, config, None, kept.held)
 
     return solve_with_scales(begun, initial, anew)
-
-
-def _is_explained(chains: Chains, found: SolvedWithScales) -> bool:
-    """Whether chains say what odometry of all their keyframes would say."""
-    problem, solved = found.posed.problem, found.solved
-    strain = chains.strain(problem.by_log(solved.state.poses()), problem.scales_applied(solved.state))
-    return bool(np.isfinite(strain)) and abs(strain) <= STRAIN_RATIO_MAX * max(solved.cost, 1.0)
 
 
 def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: BackendConfig) -> SolvedWithScales:
@@ -294,7 +296,8 @@ def _solve_all(kept: Filtered, chains: Chains, found: SolvedWithScales, config: 
     problem, state = found.posed.problem, found.solved.state
     scales = problem.scales_applied(state)
     T = chains.lengthened(problem.by_log(state.poses()), scales)
-    whole = posed(kept.trajectories, kept.taking_part, Aligned(T, False), config, None, None, kept.held)
+    aligned = Aligned(T, False, lengths_at(kept.taking_part, T))
+    whole = posed(kept.trajectories, kept.taking_part, aligned, config, None, None, kept.held)
     whole = whole.with_scaled(scales)
     start = replace(whole.start, scale=state.scale)
     whole = replace(whole, start=start, trusted=found.posed.trusted)

@@ -1,12 +1,18 @@
 """Closures of one pair of robots side by side, and the ways of both: what alarms compare."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale, prior_sigmas
+from flocc_agent.backend.problem import (
+    closure_covariances,
+    diagonal_covariance,
+    initial_scale,
+    prior_sigmas,
+    without_unit,
+)
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import inverse
@@ -14,9 +20,12 @@ from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 COLLAPSED_RATIO = 0.1
 """A guessed length that becomes shorter than this part of the guess has collapsed; one without a guess, below zero."""
+LENGTH_MIN_M = 0.1
+"""No length without a unit is taken as shorter."""
 ODOMETRY_LENGTH_SIGMA = 0.05
 """What odometry's lengths may be off by, beside its noise."""
 
@@ -85,6 +94,7 @@ class PairClosures:
         shorter_max_m: (K,) by how much the length may become shorter before its scale has collapsed.
         rotation: (K,) variance, rad^2.
         translation: (K,) variance, m^2.
+        by_length: (K,) whether nothing is known of the unit, so that this is a direction's: it grows with the length.
     """
 
     ids: Int
@@ -97,6 +107,27 @@ class PairClosures:
     shorter_max_m: Float
     rotation: Float
     translation: Float
+    by_length: Bool
+
+    def translation_at(self, change_m: Float, of: Int | slice = slice(None)) -> Float:
+        """Variances (M,) of translations whose lengths are changed by (M,)."""
+        length_m = self.length_m[of]
+        ratio = np.maximum(length_m + change_m, LENGTH_MIN_M) / np.maximum(length_m, 1e-12)
+        return np.asarray(self.translation[of] * np.where(self.by_length[of], ratio, 1.0) ** 2)
+
+    def with_lengths(self, length_m: Float) -> "PairClosures":
+        """The same in which closures without a unit begin with other lengths (K,)."""
+        ratio = np.where(self.by_length, length_m / np.maximum(self.length_m, 1e-12), 1.0)
+        T = self.T.copy()
+        T[:, :3, 3] *= ratio[:, None]
+        return replace(
+            self,
+            T=T,
+            length_m=self.length_m * ratio,
+            length_sigma_m=self.length_sigma_m * ratio,
+            shorter_max_m=self.shorter_max_m * ratio,
+            translation=self.translation * ratio**2,
+        )
 
 
 def by_logs(closures: Mapping[int, LoopClosure]) -> dict[tuple[LogId, LogId], list[int]]:
@@ -132,4 +163,5 @@ def measured(ids: list[int], closures: Mapping[int, LoopClosure], config: Backen
         shorter_max_m=np.where(sigmas < 1.0, 1.0 - COLLAPSED_RATIO, 1.0) * length_m,
         rotation=variances[:, :3].max(axis=1),
         translation=variances[:, 3:].max(axis=1),
+        by_length=without_unit(chosen, config),
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.backend.chains import Chains
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State, off_half_turns, state_of
 from flocc_agent.backend.initial import Aligned, trusted_closures
@@ -76,7 +77,7 @@ def posed(
     Where the closures' keyframes are named by their places in chains, `recorded` has them under their own numbers.
     Closures that are `held` count once the poses that others give agree with them.
     """
-    problem = build(trajectories, closures, config, recorded)
+    problem = build(trajectories, closures, config, recorded).with_lengths(aligned.lengths_m)
     in_order = [(recorded or closures)[k] for k in problem.closure_ids]
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     says = votes(trajectories, closures, recorded or closures, config)
@@ -89,3 +90,19 @@ def posed(
         trusted_closures(in_order, is_held, initial) if aligned.is_warm and initial is not None else None,
         Places(problem, trajectories, closures, says, config.steepness),
     )
+
+
+def posed_by_chains(
+    trajectories: Mapping[LogId, Trajectory],
+    closures: Mapping[int, LoopClosure],
+    chains: Chains | None,
+    aligned: Aligned,
+    config: BackendConfig,
+    initial: GraphSolution | None = None,
+    held: Collection[int] = (),
+) -> Posed:
+    """The same by the component's chains, where its odometry is shortened to these."""
+    if chains is None:
+        return posed(trajectories, closures, aligned, config, initial, None, held)
+    shorter = aligned._replace(T_map_keyframe=chains.shortened(aligned.T_map_keyframe))
+    return posed(chains.trajectories, chains.closures, shorter, config, initial, chains.recorded, held)

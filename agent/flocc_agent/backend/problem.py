@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.clusters import cluster_labels
-from flocc_agent.backend.edges import NO_CLUSTER, Edges, State
+from flocc_agent.backend.edges import NEAR_M, NO_CLUSTER, Edges, State, directions, taken
 from flocc_agent.config import BackendConfig, Formulation, ScaleInitial
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.core.registration import closure_probability
@@ -16,6 +16,9 @@ from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+FITTED_SIGMA_RATIO = 5.0
+"""Relative standard deviation of the prior on a length that is fitted to neighbours, at least."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +65,30 @@ class Problem:
         """Scales of odometry at a state."""
         return dict(zip(self.scaled, state.scale[self.clusters :].tolist(), strict=True))
 
+    def with_lengths(self, lengths_m: Mapping[int, float]) -> "Problem":
+        """The same in which directions are as long as told by number, but at least `NEAR_M`."""
+        rows = np.flatnonzero(directions(self.edges))
+        if not len(rows):
+            return self
+        ids = [self.closure_ids[row - self.closure_rows.start] for row in rows.tolist()]
+        ratio = np.array([max(lengths_m.get(k, NEAR_M), NEAR_M) for k in ids])
+        part, scale_initial = taken(self.edges, rows), self.scale_initial.copy()
+        d, L = part.d * ratio[:, None], part.sqrt_information.copy()
+        sigma = np.maximum(part.sigma / ratio, FITTED_SIGMA_RATIO)
+        L[:, :, 3:] /= ratio[:, None, None]
+        covariances = np.asarray(np.linalg.inv(np.swapaxes(L, 1, 2) @ L), dtype=np.float64)
+        longer = {
+            "d": d,
+            "sqrt_information": L,
+            "sqrt_information_wide": widened(covariances, d, sigma),
+            "sigma": sigma,
+        }
+        whole = {name: getattr(self.edges, name).copy() for name in longer}
+        for name, values in longer.items():
+            whole[name][rows] = values
+        scale_initial[rows - self.closure_rows.start] *= ratio
+        return replace(self, edges=replace(self.edges, **whole), scale_initial=scale_initial)
+
     def with_scaled(self, logs: Collection[LogId], divides: bool = False) -> "Problem":
         """The same with a scale (true over measured length) for the odometry of these logs and no others.
 
@@ -70,7 +97,7 @@ class Problem:
         scaled = tuple(log for log in self.logs if log in logs)
         of_log = np.array([self.clusters + scaled.index(log) if log in scaled else NO_CLUSTER for log in self.logs])
         cluster, starts = self.edges.cluster.copy(), np.array([self.offsets[log] for log in self.logs])
-        of_poses = np.zeros(len(self.edges), dtype=bool)
+        of_poses = self.edges.divides.copy()
         of_odometry = slice(0, self.closure_rows.start)
         cluster[of_odometry] = of_log[np.searchsorted(starts, self.edges.i[of_odometry], side="right") - 1]
         of_poses[of_odometry] = divides & (cluster[of_odometry] >= 0)
@@ -174,9 +201,11 @@ def closure_edges(
     metric = plain_edges(i, j, T_hat, np.zeros((len(i), 6, 6)))
     covariances = closure_covariances(closures, scale_initial, config)
     labels, sigma, clusters = scale_model(recorded or closures, config)
+    told = without_unit(closures, config)
+    for k in np.flatnonzero(told).tolist():
+        covariances[k] = sideways(covariances[k], metric.d[k])
     L = sqrt_informations(covariances)
-    wide = sqrt_informations(covariances + sigma[:, None, None] ** 2 * metric.d[:, :, None] * metric.d[:, None, :])
-    return Edges(i, j, metric.q_hat, metric.d, L, wide, sigma, labels, metric.divides), clusters
+    return Edges(i, j, metric.q_hat, metric.d, L, widened(covariances, metric.d, sigma), sigma, labels, told), clusters
 
 
 def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, config: BackendConfig) -> Float:
@@ -191,6 +220,19 @@ def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, c
         if config.weight_by_probability:
             out[k] /= closure_probability(closure.match_ratio, config.steepness)
     return out
+
+
+def widened(covariances: Float, d: Float, sigma: Float) -> Float:
+    """Square-root informations (E, 6, 6) of measurements whose own scales are eliminated."""
+    return sqrt_informations(covariances + sigma[:, None, None] ** 2 * d[:, :, None] * d[:, None, :])
+
+
+def sideways(covariance: Float, d: Float) -> Float:
+    """A covariance (6, 6) in which the length of a translation is as uncertain as its direction, and apart from it."""
+    along = d / np.linalg.norm(d)
+    across = np.eye(6) - np.outer(along, along)
+    left = across @ covariance @ across
+    return np.asarray(left + 0.5 * np.trace(left[3:, 3:]) * np.outer(along, along))
 
 
 def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple[Int, Float, int]:
@@ -212,10 +254,10 @@ def scale_model(closures: Sequence[LoopClosure], config: BackendConfig) -> tuple
         sigma[free] = prior[free]
         return labels, sigma, 0
     raw = cluster_labels(closures, config.cluster_keyframes_max)
-    raw[~free] = NO_CLUSTER
+    raw[~free | without_unit(closures, config)] = NO_CLUSTER
     sizes = np.bincount(raw[raw >= 0], minlength=1)
     renumbered = np.cumsum(sizes > 1) - 1
-    together = free & (sizes[np.maximum(raw, 0)] > 1)
+    together = (raw >= 0) & (sizes[np.maximum(raw, 0)] > 1)
     labels[together] = renumbered[raw[together]]
     link = np.where(comparable(closures, config), config.scale_link_sigma_ratio, config.scale_link_unknown_sigma_ratio)
     sigma[free] = np.where(together, link, np.hypot(prior, link))[free]
@@ -227,6 +269,15 @@ def prior_sigmas(closures: Sequence[LoopClosure], config: BackendConfig) -> Floa
     known = np.array([c.scale_initial is not None for c in closures], dtype=bool)
     known &= config.scale_initial is not ScaleInitial.RAW
     return np.where(known, config.scale_prior_sigma_ratio, config.scale_prior_unknown_sigma_ratio)
+
+
+def without_unit(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:
+    """Whether nothing is known of each closure's unit (L,), in which its covariance is told."""
+    own = config.formulation in (Formulation.INDEPENDENT, Formulation.SMOOTHED)
+    free = own and config.scale_initial is not ScaleInitial.RAW
+    return np.array(
+        [free and not c.metric and c.scale_initial is None and c.covariance is not None for c in closures], dtype=bool
+    )
 
 
 def comparable(closures: Sequence[LoopClosure], config: BackendConfig) -> NDArray[np.bool_]:

@@ -1,44 +1,32 @@
-"""Rounds that solve what moves: what the last whole round placed is held, but for the newest part of each log.
+"""Rounds in which the choice of closures is settled, but for what is new.
 
-A round that follows a whole one opens the last keyframes of every log and what came since. All that other keyframes
-say reaches them through the keyframes that closures or odometry tie them to, and those stay where the whole round put
-them: they become one stiff log, as an opened map that does not move does. So a round costs what is new, not what was
-driven. The settled part is opened again, by a whole round, where the new part demands it: where a closure that was
-used disagrees, or one that was not agrees; where a second closure speaks against it at one place; where the new
-closures together cost more than noise explains, because they pull at what is held; and in any case when enough is new.
-A single closure that disagrees is turned away until then. What is uncertain in the settled part is added to what is
-uncertain in the open one.
+A whole round judges every closure: it screens it, compares it with others around it, lets robust weights choose, tries
+other places of robots and scales of their odometry. A round that follows one closely judges what came since, and solves
+all that was used together with it from where the round before ended, by the chains between closures: one or two linear
+systems, in which everything moves. A whole round follows where what is new demands it: where a closure that was used
+disagrees, or one that was not agrees; where a second new closure is turned away at one place; and in any case when
+enough is new. A single closure that disagrees is turned away until then.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import chdtri
 
 from flocc_agent.backend.alarms import held_closures
-from flocc_agent.backend.covariance import COVARIANCE_ROUNDS, keyframe_covariances
+from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.descent import Solved, descend
-from flocc_agent.backend.edges import state_of
-from flocc_agent.backend.initial import Aligned, extended
+from flocc_agent.backend.edges import directions
+from flocc_agent.backend.initial import Aligned, extended, lengths_at
 from flocc_agent.backend.linear import SingularSystem
-from flocc_agent.backend.mapped import (
-    FIRST,
-    STIFF_ROTATION_SIGMA_RAD,
-    STIFF_TRANSLATION_SIGMA_M,
-    SavedLog,
-    stiff_trajectory,
-)
-from flocc_agent.backend.measured import CERTAIN_RATIO, JOINS
+from flocc_agent.backend.mapped import SavedLog
+from flocc_agent.backend.odometry_scale import scales_before
 from flocc_agent.backend.pair_closures import by_logs
-from flocc_agent.backend.posing import Posed, posed
-from flocc_agent.backend.problem import diagonal_covariance
-from flocc_agent.backend.results import Solution, closure_results, excluded, odometry_component
+from flocc_agent.backend.posing import Posed, posed_by_chains
+from flocc_agent.backend.results import Solution, collect, excluded, odometry_component
 from flocc_agent.backend.screening import closure_complaints, screen
 from flocc_agent.backend.together import AGREEING_MIN
-from flocc_agent.backend.trueness import EXPECTED_FREEDOM, FACTOR_MAX, Inflation
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import (
     ClosureResult,
@@ -48,59 +36,25 @@ from flocc_agent.core.pose_graph import (
     LoopClosure,
     PoseGraph,
     Trajectory,
-    stretched,
 )
-from flocc_agent.geometry import adjoint, inverse
 from flocc_protocol.ids import KeyframeId, LogId
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Ends = tuple[KeyframeId, KeyframeId]
 
 SETTLED_KEYFRAMES_MIN = 2000
 """A smaller map is solved whole each time: that takes no time."""
-OPEN_KEYFRAMES = 100
-"""So many of a log's last keyframes stay open beside those that are new."""
 NEW_KEYFRAMES_RATIO, NEW_KEYFRAMES_MIN = 0.05, 200
 """With more new keyframes, as a part of the whole and at least, the next round is a whole one."""
 NEW_CLOSURES_RATIO, NEW_CLOSURES_MIN = 0.1, 50
-HELD_CLOSURES_RATIO, HELD_CLOSURES_MIN = 0.005, 8
-"""The same of new closures between two held keyframes: they move nothing before the next whole round."""
 BESIDE_KEYFRAMES = 100
 """Closures of the same two logs are at one place where both of their keyframes are so near to each other."""
 COMPARED_CLOSURES = 32
 """With so many of the nearest closures of its two logs a new one is compared before it is believed."""
-TENSION_PROBABILITY = 1e-3
-"""How rarely new closures cost more than this allows where the settled part is right."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Open:
-    """What of a component may move.
-
-    Attributes:
-        component: As the last whole round left it.
-        bases: Of each log the last keyframe that is held, its tie to the rest; 0 where all of the log may move.
-        tails: Odometry from there on, as long as the component says it is.
-        nodes: Held keyframes that something open is tied to, in order.
-        closures: Between open keyframes, or between them and the nodes, and new ones; by their number in the graph.
-    """
-
-    component: Component
-    bases: Mapping[LogId, int]
-    tails: Mapping[LogId, Trajectory]
-    nodes: tuple[KeyframeId, ...]
-    closures: Mapping[int, LoopClosure]
-
-    def is_open(self, keyframe: KeyframeId) -> bool:
-        """Whether a keyframe may move."""
-        base = self.bases[keyframe.log]
-        return keyframe.index > base or base == 0
 
 
 def settled_round(graph: PoseGraph, config: BackendConfig, initial: GraphSolution) -> GraphSolution | None:
-    """Solve what is new since the last whole round; None where everything is to be solved.
+    """Solve with the closures of the last whole round and what is new; None where all are to be judged.
 
     Args:
         graph: Odometry and closures from images; with anything else all rounds are whole.
@@ -199,28 +153,56 @@ def _solved(
     seen: Mapping[Ends, ClosureResult],
     before: Component,
     config: BackendConfig,
-) -> tuple[Component, dict[int, ClosureResult]] | None:
-    """One component, and results of its closures that were not seen before; None where it is to be opened."""
+) -> tuple[Component, Mapping[int, ClosureResult]] | None:
+    """One component, and results of its closures that count; None where all of them are to be judged."""
     logs = set(component.logs)
-    of_fresh = {k: graph.closures[k] for k in fresh}
-    if any((c.query.log in logs) != (c.match.log in logs) for c in of_fresh.values()):
+    if any((graph.closures[k].query.log in logs) != (graph.closures[k].match.log in logs) for k in fresh):
         return None
     if component.logs == (component.anchor,) and not any(c.query.log in logs for c in graph.closures):
         return odometry_component(component.anchor, graph.trajectories[component.anchor]), {}
-    opened = _opened(component, graph, fresh, seen)
-    if opened is None or screen(PoseGraph(opened.tails)).warnings:
+    trajectories = {log: graph.trajectories[log] for log in component.logs}
+    if screen(PoseGraph(_grown(trajectories, component))).warnings:
         return None
-    began = _posed(opened, _extended(opened, before), config)
+    closures = {
+        k: c
+        for k, c in enumerate(graph.closures)
+        if c.query.log in logs and c.match.log in logs and (k in fresh or _counts(seen, c))
+    }
+    T = {log: extended(np.asarray(before.T_map_keyframe[log]), trajectory) for log, trajectory in trajectories.items()}
+    chains = chains_of(trajectories, closures, (), config)
+    began = posed_by_chains(trajectories, closures, chains, Aligned(T, True, lengths_at(closures, T)), config)
+    began = began.with_scaled(scales_before(began, (before,)))
     ids = began.problem.closure_ids
     is_new = np.array([k in fresh for k in ids], dtype=bool)
-    old = np.array([k < 0 or _was(seen, graph.closures[k], ClosureState.USED) for k in ids], dtype=bool)
+    old = np.array([_was(seen, graph.closures[k], ClosureState.USED) for k in ids], dtype=bool)
     try:
         solved = _agreed(began, old | is_new, is_new, graph.closures)
-        if solved is None or _is_strained(opened, began, solved, old, is_new, _excess(component, seen)):
+        if solved is None or (chains is not None and not is_explained(chains, began.problem, solved)):
             return None
-        return _result(opened, graph, began, solved, fresh)
+        found = collect(_solution(began, solved, before, chains), ())
     except (SingularSystem, np.linalg.LinAlgError):
         return None
+    return found.components[0], found.closures
+
+
+def _solution(began: Posed, solved: Solved, before: Component, chains: Chains | None) -> Solution:
+    places, scales = began.places, before.odometry_scales
+    return Solution(
+        began.problem,
+        began.objective,
+        began.start,
+        solved,
+        places.trajectories,
+        places.closures,
+        before,
+        scales,
+        chains,
+    )
+
+
+def _counts(seen: Mapping[Ends, ClosureResult], closure: LoopClosure) -> bool:
+    """Whether the last whole round used a closure or turned it away."""
+    return (closure.query, closure.match) in seen and not _was(seen, closure, ClosureState.EXCLUDED)
 
 
 def _was(seen: Mapping[Ends, ClosureResult], closure: LoopClosure, state: ClosureState) -> bool:
@@ -228,71 +210,23 @@ def _was(seen: Mapping[Ends, ClosureResult], closure: LoopClosure, state: Closur
     return result is not None and result.state is state
 
 
-def _opened(component: Component, graph: PoseGraph, fresh: set[int], seen: Mapping[Ends, ClosureResult]) -> Open | None:
-    """Find what may move; None where too many new closures would move nothing."""
-    bases, tails = {}, {}
-    for log in component.logs:
-        bases[log] = base = max(len(component.T_map_keyframe[log]) - OPEN_KEYFRAMES - 1, 0)
-        trajectory = graph.trajectories[log]
-        covariances = trajectory.edge_covariances
-        tail = Trajectory(trajectory.T_odom_keyframe[base:], None if covariances is None else covariances[base:])
-        scale = component.odometry_scales.get(log)
-        tails[log] = stretched(tail, 1.0 / scale.ratio) if scale is not None and scale.is_applied else tail
-    some = Open(component, bases, tails, (), {})
-    closures = {
-        k: c
-        for k, c in enumerate(graph.closures)
-        if c.query.log in bases and c.match.log in bases
-        and c.match.log in bases
-        and (
-            k in fresh
-            or ((some.is_open(c.query) or some.is_open(c.match))
-                and not _was(seen, c, ClosureState.EXCLUDED) and (c.query, c.match) in seen)
-        )
-    }  # fmt: skip
-    held = sum(not some.is_open(c.query) and not some.is_open(c.match) for c in closures.values())
-    if held > max(HELD_CLOSURES_RATIO * len(seen), HELD_CLOSURES_MIN):
-        return None
-    ends = {end for c in closures.values() for end in (c.query, c.match) if not some.is_open(end)}
-    ends |= {KeyframeId(log, base) for log, base in bases.items() if base}
-    return Open(component, bases, tails, tuple(sorted(ends)), closures)
-
-
-def _posed(opened: Open, T_tails: Mapping[LogId, Float], config: BackendConfig) -> Posed:
-    """The open part and the stiff log, whose keyframes are named by their places; ties have numbers below zero."""
-    stiff = SavedLog(f"{FIRST}/settled")
-    places = {node: n for n, node in enumerate(opened.nodes)}
-
-    def named(end: KeyframeId) -> KeyframeId:
-        if opened.is_open(end):
-            return KeyframeId(end.log, end.index - opened.bases[end.log])
-        return KeyframeId(stiff, places[end])
-
-    renamed = {k: replace(c, query=named(c.query), match=named(c.match)) for k, c in opened.closures.items()}
-    trajectories, T = dict(opened.tails), dict(T_tails)
-    if opened.nodes:
-        trajectories[stiff] = stiff_trajectory(opened.component.T_map_keyframe, opened.nodes)
-        T[stiff] = _stiff_poses(opened)
-    S = diagonal_covariance(STIFF_ROTATION_SIGMA_RAD, STIFF_TRANSLATION_SIGMA_M)
-    tied = [log for log, base in sorted(opened.bases.items()) if base]
-    for n, log in enumerate(tied):
-        at = KeyframeId(stiff, places[KeyframeId(log, opened.bases[log])])
-        renamed[n - len(tied)] = LoopClosure(
-            at, KeyframeId(log, 0), np.eye(4), CERTAIN_RATIO, covariance=S, metric=True, support=JOINS
-        )
-    return posed(trajectories, renamed, Aligned(T, True), config, None)
-
-
-def _stiff_poses(opened: Open) -> Float:
-    return np.array([opened.component.T_map_keyframe[node.log][node.index] for node in opened.nodes])
+def _grown(trajectories: Mapping[LogId, Trajectory], component: Component) -> dict[LogId, Trajectory]:
+    """What each log grew by since a solution, from its last keyframe then on."""
+    grown = {}
+    for log, trajectory in trajectories.items():
+        base = len(component.T_map_keyframe[log]) - 1
+        S = trajectory.edge_covariances
+        grown[log] = Trajectory(trajectory.T_odom_keyframe[base:], None if S is None else S[base:])
+    return grown
 
 
 def _agreed(began: Posed, wanted: Bool, is_new: Bool, closures: Sequence[LoopClosure]) -> Solved | None:
     """Solve with wanted closures, less the new ones that disagree alone; None where more than that is wrong."""
     objective, state, taken = began.objective, began.start, wanted
+    as_angles = bool(np.any(directions(objective.edges)))
     for _ in range(2):
-        solved = descend(objective, state, objective.weights(taken.astype(float)))
-        agree = objective.closure_residuals(solved.state) <= objective.bounds()
+        solved = descend(objective, state, objective.weights(taken.astype(float)), hold=as_angles)
+        agree = objective.closure_residuals(solved.state, as_angles) <= objective.bounds()
         wrong = np.flatnonzero(agree != taken)
         if len(wrong) == 0:
             return solved if solved.converged else None
@@ -315,70 +249,3 @@ def _are_beside(closures: Sequence[LoopClosure], is_new: Bool) -> bool:
             of_pair.setdefault((low.log, high.log), []).append((low.index, high.index))
     apart = [np.abs(np.array(new[pair])[:, None] - np.array(pairs[pair])).max(axis=2) for pair in new]
     return any(np.any(np.count_nonzero(of_pair <= BESIDE_KEYFRAMES, axis=1) > 1) for of_pair in apart)
-
-
-def _is_strained(opened: Open, began: Posed, solved: Solved, old: Bool, is_new: Bool, excess: float) -> bool:
-    """Whether new closures cost more than noise explains, which is so many times larger than it should be."""
-    used = int(np.count_nonzero(is_new & (solved.weights[began.problem.closure_rows] > 0.0)))
-    if used == 0:
-        return False
-    T = _extended(opened, opened.component)
-    state = state_of(np.concatenate([T.get(log, _stiff_poses(opened)) for log in began.problem.logs]))
-    cost = began.objective.cost(state, began.objective.weights(old.astype(float)), hold=False)
-    return solved.cost - cost > 0.5 * float(chdtri(5.0 * used, TENSION_PROBABILITY)) * excess
-
-
-def _excess(component: Component, seen: Mapping[Ends, ClosureResult]) -> float:
-    """How many times larger a component's squared residuals are than their degrees of freedom."""
-    logs = set(component.logs)
-    used = sum(c.state is ClosureState.USED and c.query.log in logs for c in seen.values())
-    freedom = max(5.0 * used - 6.0 * (len(logs) - 1), 0.0)
-    return min((2.0 * component.cost + EXPECTED_FREEDOM) / (freedom + EXPECTED_FREEDOM), FACTOR_MAX)
-
-
-def _extended(opened: Open, component: Component) -> dict[LogId, Float]:
-    """Poses (N, 4, 4) of each log's tail: a solution's, and behind them by odometry."""
-    return {
-        log: extended(np.asarray(component.T_map_keyframe[log])[opened.bases[log] :], tail)
-        for log, tail in opened.tails.items()
-    }
-
-
-def _result(
-    opened: Open, graph: PoseGraph, began: Posed, solved: Solved, fresh: set[int]
-) -> tuple[Component, dict[int, ClosureResult]]:
-    """The component with its open part as solved, and the results of new closures."""
-    problem, earlier = began.problem, opened.component
-    T_open = problem.by_log(solved.state.poses())
-    T_map_keyframe = {
-        log: np.concatenate([np.asarray(earlier.T_map_keyframe[log])[:base], T_open[log]])
-        for log, base in opened.bases.items()
-    }
-    recorded = {k: graph.closures[k] if k >= 0 else began.places.closures[k] for k in problem.closure_ids}
-    solution = Solution(problem, began.objective, began.start, solved, began.places.trajectories, recorded)
-    of_new = {k: result for k, result in closure_results(solution).items() if k in fresh}
-    component = replace(
-        earlier,
-        T_map_keyframe=T_map_keyframe,
-        T_map_odom={log: T[-1] @ inverse(_last(graph.trajectories[log])) for log, T in T_map_keyframe.items()},
-        covariance_map_odom=_covariances(opened, graph, began, solved),
-        covariance_rounds=COVARIANCE_ROUNDS,
-    )
-    return component, of_new
-
-
-def _covariances(opened: Open, graph: PoseGraph, began: Posed, solved: Solved) -> dict[LogId, Float | None]:
-    """Of each log's `T_map_odom` (6, 6): the settled part's, and what its open part adds to it."""
-    earlier, problem = opened.component, began.problem
-    found = dict(earlier.covariance_map_odom)
-    logs = [log for log in earlier.logs if found.get(log) is not None]
-    ends = [problem.offsets[log] + len(opened.tails[log]) - 1 for log in logs]
-    for log, S in zip(logs, keyframe_covariances(began.objective, solved, ends) if ends else [], strict=True):
-        larger = Inflation(*earlier.covariance_factors.get(log, (1.0, 1.0)))
-        Ad = adjoint(_last(graph.trajectories[log]))
-        found[log] = np.asarray(earlier.covariance_map_odom[log]) + Ad @ larger.of(S) @ Ad.T
-    return found
-
-
-def _last(trajectory: Trajectory) -> Float:
-    return np.asarray(trajectory.T_odom_keyframe[-1], dtype=float)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.averaging import averaged
-from flocc_agent.backend.descent import Objective, Solved, descend
-from flocc_agent.backend.edges import State, residuals
+from flocc_agent.backend.descent import Objective, Solved, descend, voted_cost
+from flocc_agent.backend.edges import State, directions, residuals
 from flocc_agent.backend.graduated import graduated
 from flocc_agent.backend.placing import Places
 from flocc_agent.config import Solver
@@ -75,15 +75,18 @@ def lowest(objective: Objective, state: State) -> Solved:
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
     """GNC by several schedules from one state; the lowest truncated cost wins."""
-    says = places.votes if places is not None else 1.0
+    says = places.votes if places is not None else np.ones(len(objective.bounds()))
     found = [scheduled(objective, state, ratio) for ratio in START_RATIOS]
-    solved = min(found, key=lambda solved: objective.truncated_cost(solved.state, says))
+    if np.any(directions(objective.edges)):
+        found = [as_angles(objective, solved) for solved in found]
+        found.append(scheduled(objective, state, START_RATIOS[-1], hold=True))
+    solved = min(found, key=lambda solved: voted_cost(objective, solved.state, says))
     return replaced(objective, solved, places) if places is not None else solved
 
 
 def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     """Try other places for robots as long as one lowers the truncated cost."""
-    cost, tried = objective.truncated_cost(solved.state, places.votes), 0
+    cost, tried = voted_cost(objective, solved.state, places.votes), 0
     for _ in range(PLACEMENTS_MAX):
         chosen = solved.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN
         better = None
@@ -91,8 +94,8 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
             tried += 1
             moved = descend(objective, placement.state, objective.weights(placement.chosen.astype(float)), 5)
             there = selected(objective, moved.state, moved.iterations)
-            if objective.truncated_cost(there.state, places.votes) < cost:
-                better, cost = there, objective.truncated_cost(there.state, places.votes)
+            if (lower := voted_cost(objective, there.state, places.votes)) < cost:
+                better, cost = there, lower
                 break
         if better is None:
             break
@@ -100,19 +103,32 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     return solved
 
 
-def scheduled(objective: Objective, state: State, start_ratio: float) -> Solved:
+def scheduled(objective: Objective, state: State, start_ratio: float, hold: bool = False) -> Solved:
     """GNC, then plain inliers."""
-    stages = graduated(objective, state, start_ratio)
-    return selected(objective, stages.state, stages.iterations)
+    stages = graduated(objective, state, start_ratio, hold)
+    return selected(objective, stages.state, stages.iterations, hold)
 
 
 def held(objective: Objective, solved: Solved) -> Solved:
     """Move to the optimum whose scales all stay above their bound."""
+    if np.any(directions(objective.edges)):
+        return as_angles(objective, solved)
     at = residuals(objective.edges, solved.state)
     if not np.any(at.held & (solved.weights > 0.0)):
         return solved
     final = descend(objective, solved.state, solved.weights, hold=True)
     return Solved(final.state, final.weights, final.cost, solved.iterations + final.iterations, final.converged)
+
+
+def as_angles(objective: Objective, solved: Solved) -> Solved:
+    """Go on with directions told by their angles, and with the closures that agree so, until the choice stands."""
+    final = descend(objective, solved.state, solved.weights, hold=True)
+    iterations = solved.iterations + final.iterations
+    if objective.config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
+        return Solved(final.state, final.weights, final.cost, iterations, final.converged)
+    if np.array_equal(objective.agreeing(final.state, True), final.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN):
+        return Solved(final.state, final.weights, final.cost, iterations, final.converged)
+    return selected(objective, final.state, iterations, hold=True)
 
 
 def reweighted(objective: Objective, state: State) -> Solved:
@@ -158,14 +174,14 @@ def confirmed(objective: Objective, state: State, trusted: Bool) -> Solved | Non
     return Solved(solved.state, weights, solved.cost, solved.iterations, solved.converged)
 
 
-def selected(objective: Objective, state: State, iterations: int) -> Solved:
+def selected(objective: Objective, state: State, iterations: int, hold: bool = False) -> Solved:
     """Keep the closures within their bounds, solve with them alone, and repeat until the choice stands."""
-    chosen = objective.agreeing(state)
+    chosen = objective.agreeing(state, hold)
     for _ in range(SELECTIONS_MAX):
         weights = objective.weights(chosen.astype(float))
-        solved = descend(objective, state, weights)
+        solved = descend(objective, state, weights, hold=hold)
         state, iterations = solved.state, iterations + solved.iterations
-        again = objective.agreeing(state)
+        again = objective.agreeing(state, hold)
         if np.array_equal(again, chosen) or iterations >= objective.config.iterations_max:
             break
         chosen = again

@@ -12,7 +12,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_ends import Tie, TieColumns
+from flocc_agent.core.closure_ends import ClosureEnds, Tie
 from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
@@ -169,7 +169,7 @@ class GraphAssembly:
         self._records: dict[tuple[LogId, int], Record] | None = {} if record_at is None else None
         self._record_at = record_at or self._kept_record
         self._closures: dict[CandidatePair, tuple[LogId, int]] = {}
-        self._ties = TieColumns()
+        self._ends = ClosureEnds()
         self._unbuilt: set[CandidatePair] = set()
         self._reads_all = True
         self._built: list[CandidatePair] = []
@@ -227,7 +227,7 @@ class GraphAssembly:
 
     def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
         """The newest closures of a log; their records are not read."""
-        return self._ties.of(log, ties_max)
+        return self._ends.ties(log, ties_max)
 
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """What else was measured at a log's keyframes, or of them."""
@@ -240,7 +240,7 @@ class GraphAssembly:
         """
         if not self._reads_all and log in self._odometry and other in self._odometry:
             return True
-        links = self._ties.links()
+        links = self._ends.links()
         measured = self._measured.factors(self._odometry, self._known)
         links += [(factor.query.log, factor.match.log) for factor in measured]
         if self._saved is not None:
@@ -302,8 +302,8 @@ class GraphAssembly:
         held = self._closures.get(pair)
         if held is None or (new.log, new.number) < held:
             if held is not None:
-                self._ties.remove(pair.low, pair.high)
-            self._ties.put(record)
+                self._ends.remove(pair.low, pair.high)
+            self._ends.put(record)
             self._closures[pair] = (new.log, new.number)
             if self._records is not None:
                 self._records[new.log, new.number] = record

@@ -1,9 +1,16 @@
-"""Closures as one of their logs sees them: what a robot holds corrections against, without reading a record again."""
+"""Closures as their logs see them: what a robot holds corrections against, without reading a record again.
+
+Rules: every robot takes in every closure, and corrections are looked at now and then; so taking one in is five numbers
+at the ends of columns, and who asks for those of one log looks through all.
+"""
 
 import math
 from array import array
 from collections.abc import Sequence
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import ClosureRecord
@@ -17,78 +24,69 @@ class Tie(NamedTuple):
     length_m: float
 
 
-def tie_of(log: LogId, closure: ClosureRecord) -> Tie:
+def length_m(closure: ClosureRecord) -> float:
+    """How far apart its cameras are; 0 without a scale."""
+    x, y, z = closure.T_query_match_unscaled[:3]
+    return (closure.scale_initial or 0.0) * math.hypot(x, y, z)
+
+
+def tie_of(log: LogId, query: KeyframeId, match: KeyframeId, length_m: float) -> Tie:
     """A closure as one of its logs sees it."""
-    near, far = (closure.query, closure.match) if closure.query.log == log else (closure.match, closure.query)
-    return Tie(near.index, far, (closure.scale_initial or 0.0) * math.hypot(*closure.T_query_match_unscaled[:3]))
+    return Tie(query.index, match, length_m) if query.log == log else Tie(match.index, query, length_m)
 
 
-class _Columns:
-    """The ties of one log in the order in which they became known; logs by their number."""
-
-    __slots__ = ("far", "far_log", "length_m", "near")
-
-    def __init__(self) -> None:
-        self.near = array("I")
-        self.far_log = array("I")
-        self.far = array("I")
-        self.length_m = array("f")
-
-    def append(self, near: int, far_log: int, far: int, length_m: float) -> None:
-        self.near.append(near)
-        self.far_log.append(far_log)
-        self.far.append(far)
-        self.length_m.append(length_m)
-
-    def remove(self, near: int, far_log: int, far: int) -> None:
-        for k in range(len(self.near)):
-            if (self.near[k], self.far_log[k], self.far[k]) == (near, far_log, far):
-                for column in (self.near, self.far_log, self.far, self.length_m):
-                    del column[k]
-                return
-
-
-class TieColumns:
-    """The ties of all logs: 16 bytes for each end of a closure."""
+class ClosureEnds:
+    """All closures, in the order in which they became known: 20 bytes each."""
 
     def __init__(self) -> None:
         self._logs: list[LogId] = []
         self._numbers: dict[LogId, int] = {}
-        self._columns: dict[LogId, _Columns] = {}
-        self._links: dict[tuple[LogId, LogId], None] = {}
+        self._query_logs = array("I")
+        self._queries = array("I")
+        self._match_logs = array("I")
+        self._matches = array("I")
+        self._lengths_m = array("f")
 
     def put(self, closure: ClosureRecord) -> None:
         """Note a closure."""
-        logs = closure.query.log, closure.match.log
-        for log in dict.fromkeys(logs):
-            near, far, length_m = tie_of(log, closure)
-            self._columns_of(log).append(near, self._number(far.log), far.index, length_m)
-        self._links[min(logs), max(logs)] = None
+        (query_log, query), (match_log, match) = closure.query, closure.match
+        self._query_logs.append(self._number(query_log))
+        self._queries.append(query)
+        self._match_logs.append(self._number(match_log))
+        self._matches.append(match)
+        self._lengths_m.append(length_m(closure))
 
     def remove(self, one: KeyframeId, other: KeyframeId) -> None:
         """Forget the closure of a pair: another registration takes its place."""
-        for near, far in ((one, other), (other, one)):
-            self._columns_of(near.log).remove(near.index, self._number(far.log), far.index)
+        for k in self._of(one.log).tolist():
+            if {self._query(k), self._match(k)} == {one, other}:
+                for column in (self._query_logs, self._queries, self._match_logs, self._matches, self._lengths_m):
+                    del column[k]
+                return
 
-    def of(self, log: LogId, ties_max: int) -> Sequence[Tie]:
-        """The newest ties of a log, the newest first."""
-        held = self._columns.get(log)
-        if held is None:
-            return ()
-        return [
-            Tie(held.near[k], KeyframeId(self._logs[held.far_log[k]], held.far[k]), held.length_m[k])
-            for k in range(len(held.near) - 1, max(-1, len(held.near) - 1 - ties_max), -1)
-        ]
+    def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
+        """The newest ones of a log, the newest first."""
+        newest = self._of(log)[-ties_max:][::-1].tolist()
+        return [tie_of(log, self._query(k), self._match(k), self._lengths_m[k]) for k in newest]
 
     def links(self) -> list[tuple[LogId, LogId]]:
         """Pairs of logs with closures between them, or within one."""
-        return list(self._links)
+        numbers = sorted(set(zip(self._query_logs, self._match_logs, strict=True)))
+        return [(self._logs[query], self._logs[match]) for query, match in numbers]
 
-    def _columns_of(self, log: LogId) -> _Columns:
-        held = self._columns.get(log)
-        if held is None:
-            held = self._columns[log] = _Columns()
-        return held
+    def _of(self, log: LogId) -> NDArray[np.intp]:
+        """Where closures of a log stand."""
+        number = self._numbers.get(log)
+        if number is None:
+            return np.empty(0, dtype=np.intp)
+        query_logs, match_logs = (np.frombuffer(each, dtype=np.uintc) for each in (self._query_logs, self._match_logs))
+        return np.flatnonzero((query_logs == number) | (match_logs == number))
+
+    def _query(self, k: int) -> KeyframeId:
+        return KeyframeId(self._logs[self._query_logs[k]], self._queries[k])
+
+    def _match(self, k: int) -> KeyframeId:
+        return KeyframeId(self._logs[self._match_logs[k]], self._matches[k])
 
     def _number(self, log: LogId) -> int:
         number = self._numbers.get(log)

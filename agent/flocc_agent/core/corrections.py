@@ -294,6 +294,12 @@ class Corrections:
         why = self.doubts.given_up(now)
         return effects if why is None else [_untrue(held, why)]
 
+    def on_own_solution(self, solution: GraphSolution | None, now: float) -> list[Effect]:
+        """This robot solved the graph itself, None: in vain. What was held back and is borne out is applied."""
+        components = () if solution is None else solution.components
+        borne_out = self.doubts.on_solution(next((c for c in components if self._own in c.logs), None))
+        return [] if borne_out is None else self.take(borne_out, now)
+
     def _is_newer(self, version: CorrectionVersion | LogCorrection) -> bool:
         held = self._newest.get(version.log)
         return held is None or (version.term, version.round) > (held.term, held.round)

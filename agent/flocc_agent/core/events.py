@@ -14,6 +14,8 @@ from flocc_protocol.messages import CandidatePair, Envelope
 
 LATENT_UNKNOWN = "unknown"
 """Reason of a LatentFetchFailed: the holder answered that it does not hold the latent (any more)."""
+LATENT_FALSE = "wrong-hash"
+"""Another reason: what the holder served is not what the owner's log says, or not what the holder itself says."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -268,7 +268,7 @@ class Gossip:
         for number, data in enumerate(batch.records[held - batch.first :], held):
             try:
                 opened = data if self._sealer is None else self._opened(log, number, data)
-                record, _ = decoded(opened)
+                record = decoded(opened)
             except DecodeError as error:
                 return new, [*effects, *self._refused(peer, f"bad record of {log}: {error}")]
             if not copy.accepts(record) or number >= RECORDS_MAX:

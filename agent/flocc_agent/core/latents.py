@@ -8,7 +8,7 @@ In a swarm with keys the owner's log says what a latent is, so that a relay cann
 from array import array
 from bisect import insort
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 from flocc_agent.core.effects import Effect, FetchLatent
@@ -25,6 +25,10 @@ WANTS_MAX = 8
 """Latents out of reach that are asked of relays at one time; a message carries 16."""
 RELAYS_MAX = 16
 """Latents kept for others at one time: the wants of two robots."""
+FALSE_MAX = 64
+"""Of so many latents it is remembered that one robot in range served something else in their place."""
+BACKLOG_MAX = 64
+"""A stronger robot with which so many pairs wait is handed no more: who found them begins with them."""
 RETRY_S = 1.0
 """First pause after a failed fetch; it doubles up to `RETRY_MAX_S`."""
 RETRY_MAX_S = 16.0
@@ -54,6 +58,8 @@ class Reach:
     def __init__(self) -> None:
         self._peers: dict[str, Peer] = {}
         self._holders: dict[KeyframeId, list[str]] = {}
+        self._false: dict[str, dict[KeyframeId, None]] = {}
+        self._handed: dict[str, int] = {}
 
     def __contains__(self, name: object) -> bool:
         return name in self._peers
@@ -63,8 +69,10 @@ class Reach:
 
     def update(self, name: str, peer: Peer) -> bool:
         """Note a robot in range; whether that changes what can be had."""
-        known = self._peers.get(name)
+        known, false = self._peers.get(name), self._false.get(name)
+        peer = peer if false is None else replace(peer, holds=tuple(k for k in peer.holds if k not in false))
         self._peers[name] = peer
+        self._handed.pop(name, None)
         if known is None or known.holds != peer.holds:
             self._note_holds(name, known.holds if known else (), peer.holds)
         return known is None or (known.compute_class, known.holds, known.log) != (
@@ -78,8 +86,16 @@ class Reach:
         peer = self._peers.get(log.robot)
         return peer is not None and peer.log in (None, log)
 
+    def on_false(self, name: str, keyframe: KeyframeId) -> None:
+        """What a robot holds for others is not what the owner made; others are asked until it is out of range."""
+        if name in self._peers and name != keyframe.log.robot:
+            remember(self._false.setdefault(name, {}), keyframe, None, FALSE_MAX)
+            self.update(name, self._peers[name])
+
     def remove(self, name: str) -> None:
         """A robot is out of range."""
+        self._false.pop(name, None)
+        self._handed.pop(name, None)
         peer = self._peers.pop(name, None)
         if peer is not None:
             self._note_holds(name, peer.holds, ())
@@ -104,6 +120,20 @@ class Reach:
             if peer.compute_class > compute_class
         ]
         return min(better)[2] if better else None
+
+    def is_full(self, name: str) -> bool:
+        """Whether a robot in range has more than enough pairs to register."""
+        peer = self._peers.get(name)
+        return peer is not None and peer.load >= BACKLOG_MAX
+
+    def room(self, name: str) -> int:
+        """How many more pairs may be handed to a robot until it says again how many wait there: all here may do so."""
+        peer = self._peers[name]
+        return max(0, -(-(BACKLOG_MAX - peer.load) // len(self._peers)) - self._handed.get(name, 0))
+
+    def on_handed(self, name: str, pairs: int) -> None:
+        """So many pairs were handed to a robot."""
+        self._handed[name] = self._handed.get(name, 0) + pairs
 
     def holder(self, keyframe: KeyframeId) -> str | None:
         """Who in range can give a latent: its owner, or a robot that holds it."""
@@ -159,7 +189,8 @@ class Latents:
         self._parameters = parameters
         self._held: set[KeyframeId] = set()
         self._fetches: dict[KeyframeId, _Fetch] = {}
-        self._relayed: dict[KeyframeId, None] = {}
+        self._relayed: dict[KeyframeId, float] = {}
+        self._wished_s: dict[KeyframeId, float] = {}
         self._lost_until_s: dict[KeyframeId, float] = {}
 
     def __contains__(self, keyframe: object) -> bool:
@@ -169,6 +200,7 @@ class Latents:
         """Tables with their maximum."""
         return {
             "relayed": (len(self._relayed), RELAYS_MAX),
+            "wished for": (len(self._wished_s), PAUSED_MAX),
             "lost": (len(self._lost_until_s), RELAYS_MAX),
             "fetches": (len(self._fetches), PAUSED_MAX + self._parameters.fetches_max),
         }
@@ -216,7 +248,10 @@ class Latents:
         return tuple(self._lost_until_s)
 
     def on_wants(self, wants: Iterable[KeyframeId], now: float) -> bool:
-        """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new."""
+        """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new.
+
+        What came is held for a while, however many others are wished for, until who wished for it heard of it.
+        """
         new = False
         for keyframe in wants:
             if keyframe in self._lost_until_s:
@@ -224,21 +259,31 @@ class Latents:
             elif keyframe.log != self._own:
                 new |= keyframe not in self._relayed
                 self._relayed.pop(keyframe, None)
-                self._relayed[keyframe] = None
+                self._relayed[keyframe] = now
         while len(self._relayed) > RELAYS_MAX:
-            del self._relayed[next(iter(self._relayed))]
+            oldest = next(iter(self._relayed))
+            del self._relayed[next((k for k in self._relayed if not self._is_awaited(k, now)), oldest)]
         return new
 
-    def wants(self, needed: Iterable[KeyframeId], reach: Reach, now: float) -> tuple[KeyframeId, ...]:
+    def _is_awaited(self, keyframe: KeyframeId, now: float) -> bool:
+        """Whether a latent came that a neighbour wished for just now."""
+        return keyframe in self._held and now < self._relayed[keyframe] + WANTS_TURN_S
+
+    def wants(
+        self, needed: Iterable[KeyframeId], reach: Reach, now: float, still: tuple[KeyframeId, ...] = ()
+    ) -> tuple[KeyframeId, ...]:
         """A few of the needed latents, and of those relayed, that nobody in range can give.
 
-        Others have their turn every `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
+        Those that are wished for `still`, then those whose last turn was longest ago: others have theirs every
+        `WANTS_TURN_S`, so that latents which nobody can bring do not keep them waiting.
         """
         wanted = dict.fromkeys(k for k in (*needed, *self._relayed) if self.is_out_of_reach(k, reach))
-        count = WANTS_MAX
-        turns = -(-len(wanted) // count)
-        first = count * (int(now // WANTS_TURN_S) % turns) if turns else 0
-        return tuple(wanted)[first : first + count]
+        others = [keyframe for keyframe in wanted if keyframe not in still]
+        others.sort(key=lambda keyframe: self._wished_s.get(keyframe, float("-inf")))
+        wishes = (*still, *others)[:WANTS_MAX]
+        for keyframe in wishes:
+            remember(self._wished_s, keyframe, now, PAUSED_MAX)
+        return wishes
 
     def is_out_of_reach(self, keyframe: KeyframeId, reach: Reach) -> bool:
         """Whether a latent is not here and nobody in range can give it."""

@@ -7,11 +7,11 @@ recognition reads where they are.
 The chained checksum is one of all bytes so far: it is known after each block, and found again from there.
 """
 
-import zlib
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from hashlib import blake2b
 from itertools import accumulate
 from typing import overload
 from weakref import WeakValueDictionary
@@ -89,12 +89,6 @@ class _Block:
     def is_keyframe(self, k: int) -> bool:
         return self.data[(self.ends[k - 1] if k else 0) + CODE_AT] == KEYFRAME_CODE
 
-    def is_of(self, other: "_Block") -> bool:
-        """Whether both have the same records."""
-        return (self.data, self.ends, self.cuts) == (other.data, other.ends, other.cuts) and np.array_equal(
-            self.rows, other.rows
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class _ColdBlock:
@@ -104,18 +98,16 @@ class _ColdBlock:
     size_bytes: int
 
 
-_blocks: "WeakValueDictionary[int, _Block]" = WeakValueDictionary()
-"""By a checksum of their bytes."""
+_blocks: "WeakValueDictionary[bytes, _Block]" = WeakValueDictionary()
+"""By a hash of their bytes and of where records end."""
 
 
 def _block_of(records: Sequence[bytes]) -> _Block:
     """A block of these records; one that somebody in this process holds already."""
-    block = _Block.of(records)
-    key = zlib.crc32(block.rows.tobytes(), zlib.crc32(block.data))
-    held = _blocks.get(key)
-    if held is not None and held.is_of(block):
-        return held
-    _blocks[key] = block
+    key = blake2b(b"".join([array("I", map(len, records)).tobytes(), *records]), digest_size=16).digest()
+    block = _blocks.get(key)
+    if block is None:
+        block = _blocks[key] = _Block.of(records)
     return block
 
 
@@ -246,7 +238,7 @@ class _DecodedRecords(Sequence[Record]):
     __hash__ = None  # type: ignore[assignment]  # it grows
 
     def _decoded(self, data: bytes) -> Record:
-        return decoded(data[: len(data) - self._seal_bytes])[1]
+        return kept(decoded(data[: len(data) - self._seal_bytes]))
 
 
 class LogCopy:
@@ -278,7 +270,7 @@ class LogCopy:
     def other_records(self) -> Iterator[Record]:
         """The records that are no keyframes; keyframes are not even decoded."""
         others = (data for data in self.encoded if data[CODE_AT] != KEYFRAME_CODE)
-        return (decoded(data[: len(data) - self._seal_bytes])[1] for data in others)
+        return (kept(decoded(data[: len(data) - self._seal_bytes])) for data in others)
 
     @property
     def checksum(self) -> int:
@@ -322,10 +314,9 @@ class LogCopy:
 
 
 @lru_cache(maxsize=DECODED_MAX)
-def decoded(data: bytes) -> tuple[Record, Record]:
-    """A record, and what is kept of it, decoded once where several copies of a log live in one process."""
-    record = decode_record(data)
-    return record, kept(record)
+def decoded(data: bytes) -> Record:
+    """A record, decoded once where several copies of a log live in one process."""
+    return decode_record(data)
 
 
 def kept(record: Record) -> Record:

@@ -170,10 +170,13 @@ class LoopClosing:
             was_seen: Whether a registration says so, whose odometry pair had correspondences.
         """
         is_own = self._concerns(pair)
+        was_resolved = pair in self._resolved
         self.on_resolved(pair)
         if reason == UNLIKELY:
-            self._prospects.on_unlikely(pair)
-        elif was_seen:
+            self._prospects.on_unlikely(pair, was_resolved)
+        else:
+            self._prospects.on_settled(pair)
+        if was_seen and reason != UNLIKELY:
             self._prospects.on_judged(pair, is_closure=False, is_own=is_own)
         if not self._front_ends.on_rejection(pair, reason):
             return False
@@ -227,6 +230,11 @@ class LoopClosing:
         self.latents.on_failed(keyframe, now)
         self._changed = True
 
+    def on_false_latent(self, keyframe: KeyframeId, holder: str) -> None:
+        """What a robot served is not what the keyframe's owner made."""
+        self._reach.on_false(holder, keyframe)
+        self._chosen = None
+
     def on_wants(self, wants: Iterable[KeyframeId], now: float) -> None:
         """Latents that a neighbour cannot reach."""
         self._changed |= self.latents.on_wants(wants, now)
@@ -236,8 +244,9 @@ class LoopClosing:
         turn = int(now // WANTS_TURN_S)
         still = tuple(k for k in self._wanted if self.latents.is_out_of_reach(k, self._reach))
         if turn != self._turn or len(still) < WANTS_MAX:
+            still = still if turn == self._turn else ()
             self._turn = turn
-            still = self.latents.wants(self._out_of_reach(), self._reach, now)
+            still = self.latents.wants(self._out_of_reach(), self._reach, now, still)
         self._wanted = still
         return still
 
@@ -258,6 +267,9 @@ class LoopClosing:
         if self._reach.update(name, peer):
             self._offers.on_peer(name)
             self._chosen, self._changed = None, True
+        elif self._offers.waits_for(name):
+            self._offers.on_peer(name)
+            self._changed = True
 
     def on_lost(self, name: str, now: float) -> None:
         """A robot is out of range; the pairs that it was to register wait for `TAKEOVER_S`."""
@@ -278,6 +290,7 @@ class LoopClosing:
         for candidate in self._offers.taken_over(self._reach, now):
             self._hand_on_or_add(candidate, now)
         effects = self._offers.tell(self._reach, now)
+        self._take_back()
         if self.latents.free() > 0:
             effects += self.latents.fetch(self._worth_fetching(now), self._reach, now)
         effects += self._register(now)
@@ -309,26 +322,33 @@ class LoopClosing:
         """Listening is over: assign what was found meanwhile."""
         undecided, self._undecided = self._undecided, {}
         for candidate in undecided.values():
-            self._assign(candidate, now)
+            self._assign(candidate, now, told=True)  # by this robot's last life, perhaps
 
-    def _assign(self, candidate: Candidate, now: float) -> None:
+    def _assign(self, candidate: Candidate, now: float, told: bool = False) -> None:
         if now < self._listens_until_s:
             remember(self._undecided, candidate.pair, candidate, self._parameters.candidates_max)
             self._changed = True
             return
         owner = self._owner(candidate.pair)
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
-            self._offer(candidate, Recipient(owner.robot, owner), now)
+            self._offer(candidate, Recipient(owner.robot, owner), now, told=True)
             return
-        self._hand_on_or_add(candidate, now)
+        self._hand_on_or_add(candidate, now, told)
 
-    def _hand_on_or_add(self, candidate: Candidate, now: float) -> None:
+    def _hand_on_or_add(self, candidate: Candidate, now: float, told: bool = False) -> None:
         """A pair that is this robot's goes to a stronger one, where one is in range."""
         stronger = self._reach.stronger(self._compute_class)
         if stronger is not None:
-            self._offer(candidate, Recipient(stronger, None), now)
+            self._offer(candidate, Recipient(stronger, None), now, told)
             return
         self._add(candidate)
+
+    def _take_back(self) -> None:
+        """While a stronger robot has more than enough to do, a robot that has nothing to do helps."""
+        for _ in range(self.load, self._parameters.registrations_max + self._parameters.fetches_max):
+            candidate = self._offers.take_back(self._reach)
+            if candidate is not None:
+                self._add(candidate)
 
     def _owner(self, pair: CandidatePair) -> LogId:
         """Which of its owners registers a pair: one that is there."""
@@ -336,8 +356,8 @@ class LoopClosing:
             return pair.high.log
         return pair.low.log if pair.high.log in self._closed else registrar_of(pair)
 
-    def _offer(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
-        self._offers.add(candidate, recipient, now)
+    def _offer(self, candidate: Candidate, recipient: Recipient, now: float, told: bool) -> None:
+        self._offers.add(candidate, recipient, now, told)
         self._changed = True
         if len(self._offers) > self._parameters.candidates_max:
             self._offers.drop_worst()

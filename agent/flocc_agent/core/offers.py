@@ -1,8 +1,10 @@
 """Pairs that other robots are to register: told to them again and again, and taken over from those that are gone.
 
-Offers to one robot form a group with one due time, so that no step looks through all of them.
+Offers to one robot form a group with one due time, so that no step looks through all of them. A stronger robot is
+handed no more pairs than it can begin with soon; of those that wait for that this robot may take some back.
 """
 
+import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -39,11 +41,23 @@ class Recipient:
 
 @dataclass(slots=True)
 class _Offer:
-    """A pair that another robot is to register; `since_s`: when it was last within reach, or became an offer."""
+    """A pair that another robot is to register.
+
+    Attributes:
+        candidate: It.
+        next_s: When it is to be told.
+        since_s: When the other robot was last within reach, or it became an offer.
+        told: The other robot may know it.
+    """
 
     candidate: Candidate
     next_s: float
     since_s: float
+    told: bool
+
+    def is_due(self, now: float) -> bool:
+        """Whether it is to be told once more."""
+        return self.told and self.next_s <= now
 
 
 @dataclass(slots=True)
@@ -52,6 +66,10 @@ class _Group:
 
     offers: dict[CandidatePair, _Offer] = field(default_factory=dict)
     due_s: float = float("-inf")
+
+    def waiting(self) -> Iterator[Candidate]:
+        """Pairs that were not told yet."""
+        return (offer.candidate for offer in self.offers.values() if not offer.told)
 
 
 class Offers:
@@ -76,12 +94,12 @@ class Offers:
         near = (group for recipient, group in self._groups.items() if recipient.is_in(reach))
         return {pair: offer.candidate.similarity for group in near for pair, offer in group.offers.items()}
 
-    def add(self, candidate: Candidate, recipient: Recipient, now: float) -> None:
-        """Let another robot register a pair."""
+    def add(self, candidate: Candidate, recipient: Recipient, now: float, told: bool) -> None:
+        """Let another robot register a pair, of which it may have been told before."""
         self.remove(candidate.pair)
         self._recipients[candidate.pair] = recipient
         group = self._groups.setdefault(recipient, _Group())
-        group.offers[candidate.pair] = _Offer(candidate, now, now)
+        group.offers[candidate.pair] = _Offer(candidate, now, now, told)
         group.due_s = float("-inf")
 
     def remove(self, pair: CandidatePair) -> None:
@@ -96,7 +114,7 @@ class Offers:
     def drop_worst(self) -> None:
         """Forget the least similar pair."""
         offers = (offer.candidate for group in self._groups.values() for offer in group.offers.values())
-        self.remove(max(offers, key=lambda candidate: (-candidate.similarity, candidate.pair)).pair)
+        self.remove(max(offers, key=_most_similar).pair)
 
     def using(self, keyframe: KeyframeId) -> list[CandidatePair]:
         """Pairs of a keyframe."""
@@ -107,6 +125,23 @@ class Offers:
         for recipient, group in self._groups.items():
             if recipient.robot == robot:
                 group.due_s = float("-inf")
+
+    def waits_for(self, robot: str) -> bool:
+        """Whether a pair waits until a stronger robot has room."""
+        group = self._groups.get(Recipient(robot, None))
+        return group is not None and any(True for _ in group.waiting())
+
+    def take_back(self, reach: Reach) -> Candidate | None:
+        """The best pair that can be done of those that wait for a stronger robot which has more than enough to do."""
+        full = (group for recipient, group in self._groups.items() if reach.is_full(recipient.robot))
+        waiting = (c for group in full for c in group.waiting() if self._can_be_had(c.pair, reach))
+        best = min(waiting, key=_most_similar, default=None)
+        if best is not None:
+            self.remove(best.pair)
+        return best
+
+    def _can_be_had(self, pair: CandidatePair, reach: Reach) -> bool:
+        return not any(self._latents.is_out_of_reach(keyframe, reach) for keyframe in (pair.low, pair.high))
 
     def on_lost(self, robot: str, now: float) -> None:
         """A robot is out of range; the pairs that it was to register wait for `TAKEOVER_S`."""
@@ -127,10 +162,11 @@ class Offers:
             group = self._groups[recipient]
             if group.due_s > now or not recipient.is_in(reach):
                 continue
-            pairs = [pair for pair in sorted(group.offers) if group.offers[pair].next_s <= now][:OFFERS_MAX]
+            pairs = [pair for pair in sorted(group.offers) if group.offers[pair].is_due(now)]
+            pairs = [*pairs, *_handed(recipient, group, reach)][:OFFERS_MAX]
             for pair in pairs:
-                group.offers[pair].next_s = now + OFFER_PERIOD_S
-            next_s = min(offer.next_s for offer in group.offers.values())
+                group.offers[pair].next_s, group.offers[pair].told = now + OFFER_PERIOD_S, True
+            next_s = min((offer.next_s for offer in group.offers.values() if offer.told), default=float("inf"))
             group.due_s = max(next_s, now + OFFER_PERIOD_S / 8)  # sooner where some are left over
             if pairs:
                 offer = CandidateOffer(tuple(pairs), transferred=recipient.log is None)
@@ -155,10 +191,21 @@ class Offers:
     def _takeover_at_s(self, recipient: Recipient, offer: _Offer, reach: Reach) -> float:
         """When the finder may register a pair itself; later where it takes others to bring the latents.
 
-        At once where the robot is here and writes another log: nobody writes the pair's log any more.
+        At once where the robot was never told of it, or is here and writes another log: nobody writes the pair's log.
         """
-        if recipient.robot in reach:
+        if recipient.robot in reach or not offer.told:
             return offer.since_s
         pair = offer.candidate.pair
         at_hand = recipient.log is None or (pair.low in self._latents and pair.high in self._latents)
         return offer.since_s + TAKEOVER_S * (1 if at_hand else FAR_TAKEOVERS)
+
+
+def _handed(recipient: Recipient, group: _Group, reach: Reach) -> list[CandidatePair]:
+    """The most similar pairs for which a stronger robot has room; they count as handed."""
+    best = heapq.nsmallest(min(reach.room(recipient.robot), OFFERS_MAX), group.waiting(), key=_most_similar)
+    reach.on_handed(recipient.robot, len(best))
+    return [candidate.pair for candidate in best]
+
+
+def _most_similar(candidate: Candidate) -> tuple[float, CandidatePair]:
+    return -candidate.similarity, candidate.pair

@@ -26,6 +26,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 Floats = NDArray[np.float32]
+Places = NDArray[np.intp]
 
 NOTHING = -2.0
 """Similarity with a log of which no row is here: below every threshold."""
@@ -74,6 +75,8 @@ class _Lent:
 class _Rows:
     """Descriptors of one length of one or more logs: the rows of one growing matrix, and before them lent ones.
 
+    A row that goes is replaced by the last one, so a log's rows lie anywhere.
+
     Attributes:
         dimension: D.
         logs: Number (N,) of each row's log.
@@ -89,8 +92,11 @@ class _Rows:
         self._inverse_norms = np.empty(CAPACITY_FIRST, dtype=np.float32)
         self._logs = np.empty(CAPACITY_FIRST, dtype=np.int32)
         self._indices = np.empty(CAPACITY_FIRST, dtype=np.int32)
+        self._nearest = np.empty(CAPACITY_FIRST, dtype=np.float32)
+        """Of rows that stand for older ones: no earlier one that stands is more similar."""
         self._by_log: dict[int, array[int]] = {}
-        self._thinned = 0
+        self._standing: dict[int, int] = {}
+        """How many of a log's rows, its first ones, stand for older ones."""
         self._unthinned: dict[int, int] = {}
         self._same_place: dict[int, float] = {}
 
@@ -119,8 +125,10 @@ class _Rows:
         """Add a row; the first one that is no int8 makes all of them float32."""
         if self._rows.dtype != descriptor.row.dtype and self._rows.dtype == np.int8:
             self._rows = self._rows.astype(np.float32)
-        self._make_room(1)
-        self._rows[self._count - self._first] = descriptor.row
+        place = self._count - self._first
+        if place == len(self._rows) or self._count == len(self._logs):
+            self._make_room(1)
+        self._rows[place] = descriptor.row
         self._inverse_norms[self._count] = descriptor.inverse_norm
         self._logs[self._count] = log
         self._indices[self._count] = index
@@ -142,6 +150,7 @@ class _Rows:
             self._inverse_norms = np.resize(self._inverse_norms, size)
             self._logs = np.resize(self._logs, size)
             self._indices = np.resize(self._indices, size)
+            self._nearest = np.resize(self._nearest, size)
 
     # Rows that somebody else holds
 
@@ -150,27 +159,32 @@ class _Rows:
         held = self._rows_of(log)
         at = bisect_left(held, indices[0], key=self._indices.item)
         own = np.array(held[at : at + len(indices)], dtype=np.intp)
-        if self._rows.dtype != np.int8 or len(own) != len(indices) or own.min() < self._first + self._thinned:
+        if self._rows.dtype != np.int8 or len(own) != len(indices):
+            return
+        if at < self._standing.get(log, 0) or own.min() < self._first:
             return
         if self._indices[own].tolist() != list(indices) or not np.array_equal(self._rows[own - self._first], rows):
             return
-        rest = np.setdiff1d(np.arange(self._first, self._count), own, assume_unique=True)
-        self._rows = np.concatenate([self._rows[rest - self._first], self._rows[:CAPACITY_FIRST]])
-        self._order_columns(self._first, np.concatenate([own, rest]))
+        left = self._count - len(own)
+        order, holes = np.arange(self._first, left), np.sort(own[own < left])
+        order[holes - self._first] = np.setdiff1d(np.arange(left, self._count), own, assume_unique=True)
+        self._rows[holes - self._first] = self._rows[order[holes - self._first] - self._first]
+        size = len(order) + max(CAPACITY_FIRST, len(order) // 4)
+        if len(self._rows) > size:
+            self._rows = self._rows[:size].copy()
+        self._order_columns(self._first, np.concatenate([own, order]))
         self._lent.append(_Lent(log, rows))
         self._lent_ends.append(self._first + len(rows))
 
     def _take_back(self, log: int) -> None:
         """Hold the oldest rows of a log here again, as many as are looked through at one time."""
-        while (place := next((k for k, lent in enumerate(self._lent) if lent.log == log), None)) is not None:
-            first, end = self._lent_ends[place], self._lent_ends[place + 1]
-            waiting = self._logs[self._first + self._thinned : self._count] == log
-            before = self._indices[self._first + self._thinned : self._count][waiting] < self._indices[first]
-            if int(before.sum()) >= THINNED_AT_ONCE:
-                return
+        standing = self._standing.get(log, 0)
+        while (lowest := self.places(log)[standing : standing + THINNED_AT_ONCE].min()) < self._first:
+            number = bisect_right(self._lent_ends, lowest) - 1
+            first, end = self._lent_ends[number], self._lent_ends[number + 1]
             self._make_room(end - first)
             held = self._count - self._first
-            self._rows[held : held + end - first] = self._lent.pop(place).rows
+            self._rows[held : held + end - first] = self._lent.pop(number).rows
             self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
             self._order_columns(first, np.concatenate([np.arange(end, self._count), np.arange(first, end)]))
 
@@ -184,56 +198,74 @@ class _Rows:
         """
         while self._unthinned[log] >= held + THINNED_AT_ONCE:
             self._take_back(log)
-            begin = self._first + self._thinned
-            waiting = begin + np.flatnonzero(self._logs[begin : self._count] == log)
-            oldest = waiting[np.argsort(self._indices[waiting], kind="stable")][:THINNED_AT_ONCE]
-            stay = oldest[self._stays(log, oldest, self._standing(log))]
-            others = np.setdiff1d(np.arange(begin, self._count), oldest, assume_unique=True)
-            self._order(begin, np.concatenate([stay, others]))
-            self._thinned += len(stay)
-            self._unthinned[log] -= len(oldest)
-            while len(self._standing(log)) > held and self._same_place.get(log, 0.0) > -1.0:
-                self._thin_again(log)
+            first = self._standing.setdefault(log, 0)
+            bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
+            places = self.places(log)
+            self._standing[log] += THINNED_AT_ONCE
+            self._unthinned[log] -= THINNED_AT_ONCE
+            self._leave_out(log, self._represented(places[first : first + THINNED_AT_ONCE], places[:first], bound))
+            while self._standing[log] > held and self._same_place[log] > -1.0:
+                self._thin_again(log, held)
 
-    def _thin_again(self, log: int) -> None:
-        """Look through a log's rows that stand for others with a lower bound."""
+    def _thin_again(self, log: int, held: int) -> None:
+        """Look through a log's rows that stand for others with a lower bound, where that may make few enough."""
         self._same_place[log] -= SAME_PLACE_STEP
-        standing, stay = self._standing(log), np.empty(0, dtype=np.intp)
-        for first in range(0, len(standing), THINNED_AT_ONCE):
-            block = standing[first : first + THINNED_AT_ONCE]
-            stay = np.concatenate([stay, block[self._stays(log, block, stay)]])
-        gone = np.setdiff1d(standing, stay, assume_unique=True)
-        self._order(self._first, np.setdiff1d(np.arange(self._first, self._count), gone, assume_unique=True))
-        self._thinned -= len(gone)
+        bound, standing = self._same_place[log], self.places(log)[: self._standing[log]]
+        is_alone = self._nearest[standing] < bound
+        if np.count_nonzero(is_alone) > held:
+            return
+        stay, near, gone = standing[is_alone], standing[~is_alone], []
+        for first in range(0, len(near), THINNED_AT_ONCE):
+            block = near[first : first + THINNED_AT_ONCE]
+            gone.append(self._represented(block, stay, bound))
+            stay = np.concatenate([stay, np.setdiff1d(block, gone[-1], assume_unique=True)])
+        self._leave_out(log, np.concatenate(gone))
 
-    def _standing(self, log: int) -> NDArray[np.intp]:
-        """Places of a log's rows that stand for older ones."""
-        return self._first + np.flatnonzero(self._logs[self._first : self._first + self._thinned] == log)
+    def places(self, log: int) -> Places:
+        """Places of a log's rows, in the order of its keyframes."""
+        return np.array(self._rows_of(log), dtype=np.intp)
 
-    def _stays(self, log: int, block: NDArray[np.intp], before: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which rows (K,) of a log neither one of those before them nor one before it in the block stands for."""
-        bound = self._same_place.setdefault(log, SAME_PLACE_SIMILARITY)
-        rows = self._units(block)
-        stays = np.ones(len(block), dtype=bool)
-        for first in range(0, len(before), ROWS_AT_ONCE):
-            stays &= ~np.any(rows @ self._units(before[first : first + ROWS_AT_ONCE]).T >= bound, axis=1)
-        among = rows @ rows.T >= bound
+    def _represented(self, block: Places, others: Places, bound: float) -> Places:
+        """Which rows of a block others of their log stand for, or one before them in the block that stays."""
+        rows, nearest = self._units(block), np.full(len(block), NOTHING, dtype=np.float32)
+        for first in range(0, len(others), ROWS_AT_ONCE):
+            similarities = rows @ self._units(others[first : first + ROWS_AT_ONCE]).T
+            np.maximum(nearest, similarities.max(axis=1), out=nearest)
+        among, stays = rows @ rows.T, nearest < bound
         for k in np.flatnonzero(stays).tolist():
-            stays[k] = not np.any(among[k, :k] & stays[:k])
-        return stays
+            before = among[k, :k][stays[:k]]
+            nearest[k] = max(nearest[k], before.max(initial=NOTHING))
+            stays[k] = nearest[k] < bound
+        self._nearest[block] = nearest
+        return block[~stays]
 
-    def _order(self, first: int, order: NDArray[np.intp]) -> None:
-        """Put these rows of the matrix after the first so many rows, and leave out what is not among them."""
-        self._rows[first - self._first : first - self._first + len(order)] = self._rows[order - self._first]
-        self._order_columns(first, order)
+    def _leave_out(self, log: int, gone: Places) -> None:
+        """Take away rows of a log that others stand for."""
+        places = self.places(log)
+        self._by_log[log] = array("i", places[~np.isin(places, gone)].tolist())
+        self._standing[log] -= len(gone)
+        for place in np.sort(gone)[::-1].tolist():
+            self._count -= 1
+            if place != self._count:
+                self._move(self._count, place)
 
-    def _order_columns(self, first: int, order: NDArray[np.intp]) -> None:
+    def _move(self, place: int, to: int) -> None:
+        """Put a row where one is no longer needed."""
+        self._rows[to - self._first] = self._rows[place - self._first]
+        for values in (self._inverse_norms, self._logs, self._indices, self._nearest):
+            values[to] = values[place]
+        of_log = self._by_log.get(int(self._logs[to]))
+        if of_log is not None:
+            of_log[bisect_left(of_log, int(self._indices[to]), key=self._indices.item)] = to
+
+    def _order_columns(self, first: int, order: Places) -> None:
+        """Put what is known of these rows after that of the first so many."""
         self._by_log.clear()
-        for values in (self._inverse_norms, self._logs, self._indices):
+        for values in (self._inverse_norms, self._logs, self._indices, self._nearest):
             values[first : first + len(order)] = values[order]
         self._count = first + len(order)
 
-    def _units(self, places: NDArray[np.intp]) -> Floats:
+    def _units(self, places: Places) -> Floats:
         """Rows (K, D) of unit length."""
         if places.min(initial=self._first) >= self._first:
             rows = self._rows[places - self._first].astype(np.float32)
@@ -367,10 +399,11 @@ class PlaceRecognition:
                 best[name] = similarity
         return best
 
-    def on_keyframes(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> list[Found]:
+    def on_keyframes(self, keyframes: Sequence[tuple[KeyframeId, Array]]) -> list[Found]:
         """Add keyframes' descriptors in order, and find the candidates that each gives, best first."""
         found: list[Found] = []
         others: list[tuple[KeyframeId, Descriptor]] = []
+        self._meet(keyframes)
         for keyframe, place in keyframes:
             descriptor = comparable(place)
             if descriptor is None or not self._add(keyframe, descriptor):
@@ -407,14 +440,8 @@ class PlaceRecognition:
     def _add(self, keyframe: KeyframeId, descriptor: Descriptor) -> bool:
         """Keep a descriptor; one log has descriptors of one length, another length is another method."""
         log, dimension = keyframe.log, len(descriptor.row)
-        number = self._numbers.get(log)
-        if number is None:
-            number = self._numbers[log] = len(self._logs)
-            self._logs.append(log)
-            self._dimensions.append(dimension)
-            self._best.append(-1.0)
-            self._thin_all()
-        elif self._dimensions[number] != dimension:
+        number = self._numbers[log]
+        if self._dimensions[number] != dimension:
             return False
         if log == self._own:
             if self._own_rows is None:
@@ -429,8 +456,17 @@ class PlaceRecognition:
             rows.thin(number, self._share)
         return True
 
-    def _thin_all(self) -> None:
-        """With another log each has a smaller share, also one that gets no more keyframes."""
+    def _meet(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> None:
+        """Number logs that are new: each has a smaller share then, also one that gets no more keyframes."""
+        known = len(self._logs)
+        for keyframe, place in keyframes:
+            if keyframe.log not in self._numbers and (descriptor := comparable(place)) is not None:
+                self._numbers[keyframe.log] = len(self._logs)
+                self._logs.append(keyframe.log)
+                self._dimensions.append(len(descriptor.row))
+                self._best.append(-1.0)
+        if len(self._logs) == known:
+            return
         for rows in (*self._others.values(), *([] if self._own_rows is None else [self._own_rows])):
             for number in rows.numbers:
                 rows.thin(number, self._share)
@@ -451,8 +487,7 @@ class PlaceRecognition:
         np.maximum.at(best, others.logs, similarities)
         self._best = np.maximum(best, self._best).tolist()
         for number in np.flatnonzero(best >= self._parameters.similarity_threshold).tolist():
-            rows = np.flatnonzero(others.logs == number)
-            found += self._candidates(keyframe, self._logs[number], others.indices[rows], similarities[rows])
+            found += self._candidates(keyframe, number, others, similarities)
         return _sorted(found)
 
     def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
@@ -469,7 +504,7 @@ class PlaceRecognition:
             if highest > self._best[number]:
                 self._best[number] = highest
             if highest >= self._parameters.similarity_threshold:
-                found += _sorted(self._candidates(keyframe, self._own, own.indices, similarities[k]))
+                found += _sorted(self._candidates(keyframe, self._numbers[self._own], own, similarities[k]))
         return found
 
     def _is_compared(self, log: LogId) -> bool:
@@ -483,19 +518,27 @@ class PlaceRecognition:
         apart = keyframe.index - own.indices
         similarities = own.similarities([descriptor])[0]
         far = np.where(apart >= self._parameters.own_gap_keyframes, similarities, np.float32(-2.0))
-        return self._candidates(keyframe, self._own, own.indices, far)
+        return self._candidates(keyframe, self._numbers[self._own], own, far)
 
-    def _candidates(
-        self, keyframe: KeyframeId, log: LogId, indices: NDArray[np.int32], similarities: Floats
-    ) -> list[Found]:
-        """The most similar keyframes of one log, those above the threshold."""
-        best = [int(similarities.argmax())]
+    def _candidates(self, keyframe: KeyframeId, number: int, rows: _Rows, similarities: Floats) -> list[Found]:
+        """The most similar keyframes of one log, those above the threshold.
+
+        Args:
+            keyframe: That it is compared with.
+            number: The log's.
+            rows: Where the log is.
+            similarities: (N,) of all rows.
+        """
+        log, places = self._logs[number], rows.places(number)
+        of_log = similarities[places]
+        best = [int(of_log.argmax())]
         if self._parameters.best_matches > 1:
-            best = np.argsort(-similarities, kind="stable")[: self._parameters.best_matches].tolist()
+            best = np.argsort(-of_log, kind="stable")[: self._parameters.best_matches].tolist()
+        indices = rows.indices[places[best]].tolist()
         return [
-            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, int(indices[k]))), float(similarities[k])))
-            for k in best
-            if similarities[k] >= self._parameters.similarity_threshold
+            (keyframe, Candidate(CandidatePair.of(keyframe, KeyframeId(log, index)), similarity))
+            for index, similarity in zip(indices, of_log[best].tolist(), strict=True)
+            if similarity >= self._parameters.similarity_threshold
         ]
 
 

@@ -11,7 +11,8 @@ asked is coarse, and each question has an answer that no such surprise gives:
 
 Evidence is counted, not jumps: what is measured may be as odd as it likes, what nothing demands is a lie. A solution
 that passes may still be wrong by metres. What fails is held back for a while, since corrections of other logs and
-records may be on their way, and is refused then. See DESIGN.md 5.
+records may be on their way. Then this robot solves the graph itself, and refuses what its own solution does not bear
+out. See DESIGN.md 5.
 """
 
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.correction_evidence import VIEW_M, HeldGraph, Placed, evidence_of, missed_m, way_m
 from flocc_agent.core.knots import corrected, distances
+from flocc_agent.core.pose_graph import Component
 from flocc_agent.geometry import angle_rad, between
 from flocc_protocol.ids import LogId
 from flocc_protocol.messages import CorrectionVersion, LogCorrection
@@ -39,6 +41,8 @@ TIES_MAX, TIES_OF_JUMPS_MAX = 200, 2000
 """Closures that are looked at, the newest ones; where there are jumps that those do not explain, so many."""
 HELD_BACK_S = 10.0
 """Until then what a correction lacks to be believed may come; a lost short correction is asked for after a second."""
+SOLVED_S, SOLVES_EVERY_S = 60.0, 60.0
+"""So long an own solution is waited for; and so often one is made at most, whatever liars send."""
 LOOK_AGAIN_S = 0.25
 UNTIED = "nothing that this robot holds ties it to its map frame"
 """The records may be on a slow link still, so that this is waited for, and its leader is not doubted."""
@@ -132,11 +136,14 @@ class Doubts:
     Attributes:
         doubted: Leaders whose corrections were refused, until somebody clears it.
         confirmed: Leaders with whom another robot's solution agreed later, until somebody clears it.
+        wants_solution: Whether a solution of this robot's own is to decide, until somebody clears it.
     """
 
     def __init__(self, graph: HeldGraph | None) -> None:
         self.doubted: set[LogId] = set()
         self.confirmed: set[LogId] = set()
+        self.wants_solution = False
+        self._solves_s = float("-inf")
         self._graph = graph
         self._before: Placed | None = None
         self._checked: LogCorrection | None = None
@@ -179,7 +186,10 @@ class Doubts:
         return why
 
     def given_up(self, now: float) -> str | None:
-        """Refuse what was held back for long enough; what is to be told of it, None where nothing is."""
+        """Refuse what was held back for long enough; what is to be told of it, None where nothing is.
+
+        Before that a solution of this robot's own is asked for and waited for, unless there was one just now.
+        """
         held = self._held
         if held is None or held.since_s + HELD_BACK_S > now:
             return None
@@ -189,8 +199,35 @@ class Doubts:
         if held.why == UNTIED:
             self._held = replace(held, told=True)
             return None if held.told else held.why
+        if held.solves_s is None and self._solves_s + SOLVES_EVERY_S <= now:
+            self._solves_s, self.wants_solution = now, True
+            self._held = held = replace(held, solves_s=now)
+        if held.solves_s is not None and held.solves_s + SOLVED_S > now:
+            return None
         self._refuse(held.correction)
         return held.why
+
+    def on_solution(self, component: Component | None) -> LogCorrection | None:
+        """This robot solved the graph itself, None: in vain. The correction that is borne out, and will be believed."""
+        held = self._held
+        if held is None or held.solves_s is None:
+            return None
+        if component is None or not self._bears_out(component, held.correction):
+            self._held = replace(held, solves_s=float("-inf"))
+            return None
+        self._held, self._checked = None, held.correction
+        return held.correction
+
+    def _bears_out(self, component: Component, correction: LogCorrection) -> bool:
+        """Whether an own solution puts the keyframes of the log where a correction puts them."""
+        assert self._graph is not None
+        solved = np.asarray(component.T_map_keyframe.get(correction.log, ()))
+        odometry = self._graph.odometry(correction.log)[: len(solved)]
+        if component.anchor != correction.anchor or not len(odometry):
+            return False
+        told = corrected(correction, odometry, np.arange(len(odometry)))
+        shift_m, turn_rad = distances(solved[: len(odometry)], told)
+        return bool(shift_m.max() <= AGREE_M and turn_rad.max() <= AGREE_RAD)
 
     def _refuse(self, correction: LogCorrection) -> None:
         self._refused, self._held = correction, None
@@ -246,3 +283,5 @@ class _HeldBack:
     since_s: float
     why: str
     told: bool = False
+    solves_s: float | None = None
+    """When this robot began to solve the graph itself; long ago where that did not bear it out."""

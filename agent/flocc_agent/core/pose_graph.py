@@ -232,7 +232,7 @@ class GraphSolution:
         iterations: Linear solves that were done.
         solve_s: Wall time of the solve (0 on virtual time).
         measured: One result per measured factor of the graph, in its order.
-        whole: The last solution in which everything could move, where this one held what that had settled; else None.
+        whole: The last solution for which all closures were judged, where this one rests on its choice; else None.
     """
 
     components: tuple[Component, ...]

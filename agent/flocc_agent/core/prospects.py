@@ -79,7 +79,7 @@ class Prospects:
             is_closure: What became of it.
             is_own: Whether it is of this robot's keyframes, or was registered here.
         """
-        self._unlikely.pop(pair, None)
+        self.on_settled(pair)
         if is_own or len(self._fresh) + len(self._judged) < TAUGHT_BY_OTHERS_MAX:
             remember(self._fresh, pair, is_closure, JUDGED_MAX)
         if not is_closure:
@@ -90,9 +90,14 @@ class Prospects:
             del self._unlikely[other]
         return again
 
-    def on_unlikely(self, pair: CandidatePair) -> None:
-        """A pair was refused unseen."""
-        remember(self._unlikely, pair, None, UNLIKELY_MAX)
+    def on_unlikely(self, pair: CandidatePair, was_resolved: bool = False) -> None:
+        """A pair was refused unseen; another record of it may say more."""
+        if pair in self._unlikely or not was_resolved:
+            remember(self._unlikely, pair, None, UNLIKELY_MAX)
+
+    def on_settled(self, pair: CandidatePair) -> None:
+        """A record says more of a pair than that it was refused unseen."""
+        self._unlikely.pop(pair, None)
 
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record says what became of a pair."""

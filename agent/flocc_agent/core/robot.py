@@ -4,7 +4,7 @@ The driver calls `handle` for each event and `tick` when `deadline` is due; both
 order. Same seed and same events give the same effects, on virtual time and on a robot.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
@@ -13,9 +13,10 @@ from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, DistributedOptimisation
-from flocc_agent.core.effects import Broadcast, Effect, Encode, Report, Unicast
+from flocc_agent.core.effects import Broadcast, Effect, Encode, Optimise, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
+    LATENT_FALSE,
     LATENT_UNKNOWN,
     BlockIterated,
     BlockIterationFailed,
@@ -70,7 +71,7 @@ from flocc_agent.core.saved_map import SavedMap
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import (
     Answer,
     CandidateOffer,
@@ -303,6 +304,8 @@ class Robot:
                 return self._reject_lost(self.closing.on_latent_missing(pair, keyframe), keyframe, now)
             case GraphOptimised():
                 return self._on_optimised(event, now)
+            case GraphOptimisationFailed(term=term) if term == self._own_term:
+                return self.corrections.on_own_solution(None, now)
             case GraphOptimisationFailed(term, round_number, reason):
                 self.rounds.on_failed(term, round_number, now)
                 return [Report(RoundFailed(term=term, round=round_number, reason=reason))]
@@ -403,6 +406,9 @@ class Robot:
     def _reconsider(self, now: float) -> list[Effect]:
         """Look again at a correction that was not believed; where leaders sign, one that lies is not followed."""
         effects, doubts = self.corrections.reconsider(now), self.corrections.doubts
+        if doubts.wants_solution:
+            doubts.wants_solution = False
+            effects.append(Optimise(self._own_term, 0, self.assembly.graph(), None))
         if self._has_keys:
             for leader in sorted(doubts.doubted):
                 self._distrusted.on_failed(leader.robot, leader.robot, now)
@@ -457,8 +463,10 @@ class Robot:
         return [Unicast(sender.robot, Digests(self._boot, *digests, *versions))]
 
     def _on_fetch_failed(self, keyframe: KeyframeId, holder: str, reason: str, now: float) -> list[Effect]:
-        """Try again later, unless the owner itself no longer has the latent."""
+        """Try again later, with another holder if this one served a false one, unless its owner lost the latent."""
         self.closing.on_fetch_failed(keyframe, now)
+        if reason == LATENT_FALSE:
+            self.closing.on_false_latent(keyframe, holder)
         report = Report(LatentFailed(keyframe=keyframe, holder=holder, reason=reason))
         lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
         return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now)]
@@ -537,7 +545,14 @@ class Robot:
         record = judged(*roles, result, self._parameters.loop_closing)
         return [*self._append(record, now), Report(told(record, self.log))]
 
+    @property
+    def _own_term(self) -> Term:
+        """Under which a robot solves the graph for itself only; every leader's is above it."""
+        return Term(0, self.log)
+
     def _on_optimised(self, event: GraphOptimised, now: float) -> list[Effect]:
+        if event.term == self._own_term:
+            return self.corrections.on_own_solution(event.solution, now)
         if not self.rounds.on_solution(event.term, event.round, event.solution, now):
             return [Report(SolutionIgnored(term=event.term, round=event.round))]
         report = solution_report(event.term, event.round, event.solution)
@@ -552,12 +567,15 @@ class Robot:
         new, effects, batch = self.gossip.append(record)
         return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
 
-    def _take(self, new_records: Sequence[NewRecord], now: float) -> list[Effect]:
+    def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records; places are recognised at the end."""
         described: list[tuple[KeyframeId, Array]] = []
         effects: list[Effect] = []
+        filled: list[tuple[LogId, int]] = []
         for new in new_records:
             self.assembly.add(new)
+            if (new.number + 1) % BLOCK_RECORDS == 0:
+                filled.append((new.log, new.number))
             match new.record:
                 case KeyframeRecord(index, _, _, descriptor):
                     self.closing.on_keyframe(new.log)
@@ -575,9 +593,8 @@ class Robot:
                 case _:
                     pass  # what was measured, and what a later version says, concerns the graph only
         effects += self._recognise(described, now) if described else []
-        for new in new_records:
-            if (new.number + 1) % BLOCK_RECORDS == 0:
-                self._lend_rows(new.log, new.number // BLOCK_RECORDS)
+        for log, number in filled:
+            self._lend_rows(log, number // BLOCK_RECORDS)
         return effects
 
     def _lend_rows(self, log: LogId, block: int) -> None:

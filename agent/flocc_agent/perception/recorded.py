@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from flocc_agent.config import RecordedConfig
 from flocc_agent.core.interfaces import Camera, Image, OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
-from flocc_agent.geometry import hat, inverse, is_rigid, pose_from_tq, symmetric
+from flocc_agent.geometry import hat, in_units, inverse, is_rigid, pose_from_tq, symmetric
 from flocc_agent.perception.latent import BadLatent, failed_by
 from flocc_protocol.errors import FloccError
 
@@ -122,8 +122,10 @@ class RecordedPerception:
         T = found.T_query_match.copy()
         if self._keeps_scale:
             return Registration(T, CORRESPONDENCES, CORRESPONDENCES, 1.0, found.covariance)
-        T[:3, 3] /= float(np.linalg.norm(T[:3, 3])) or 1.0
-        return Registration(T, CORRESPONDENCES, CORRESPONDENCES, None, found.covariance)
+        unit_m = float(np.linalg.norm(T[:3, 3])) or 1.0
+        T[:3, 3] /= unit_m
+        covariance = None if found.covariance is None else in_units(found.covariance, unit_m)
+        return Registration(T, CORRESPONDENCES, CORRESPONDENCES, None, covariance)
 
 
 def read_recorded(path: Path) -> tuple[list[str], dict[tuple[str, str], RecordedPair]]:

@@ -20,7 +20,7 @@ _UNIT_NAMES = {
 }
 _METRES = {"": 1.0, "m": 1.0, "meter": 1.0, "meters": 1.0, "metres": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3}
 _UNIT_OF = {name: unit for unit, names in _UNIT_NAMES.items() for name in names}
-_STAMP = re.compile(r"(.*[._/])?(t|ts|time|times|stamp|timestamp|time_stamp|unix_?time|epoch|utc|clock)")
+_STAMP = re.compile(r"(.*[._/])?(t|ts|time|times|stamp|timestamp|timestamp_kf|time_stamp|unix_?time|epoch|utc|clock)")
 _HEADER_STAMP = re.compile(r"(.*[._/])?header[._/]stamp([._/]secs?)?")
 _POSITION = re.compile(
     r"|t|p|pose|pos|position|trans|translation|loc|location|[pt]_\w+|(.*[._/])?(position|translation)(_\w+)?"

@@ -38,6 +38,8 @@ Float = NDArray[np.float64]
 
 MAP_FORMAT = 1
 MANIFEST = "map.json"
+OF_MISSION = ("robots", "store", "robot.sqlite")
+"""What stands in the folder of a run, of an agent, or of a store."""
 LENGTH = struct.Struct("<I")
 LATENT_TABLE = "CREATE TABLE latents(keyframe TEXT PRIMARY KEY, sha256 BLOB NOT NULL, data BLOB NOT NULL) WITHOUT ROWID"
 UPPER = 21
@@ -132,6 +134,7 @@ class MapManifest(MapPart):
         pruned: Latents were left out on purpose, and such keyframes are no candidates.
         closures: How many the solution used.
         left_out: Logs of the swarm that are not part of it, with the reason.
+        contradicted: Keyframes that several logs contradict, and which.
         records: File of the logs.
         solution: File of the solution.
         latent_file: File of the latents.
@@ -153,6 +156,7 @@ class MapManifest(MapPart):
     pruned: bool = False
     closures: int = 0
     left_out: dict[str, str] = Field(default_factory=dict)
+    contradicted: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     records: FileSum
     solution: FileSum
     latent_file: FileSum
@@ -365,6 +369,8 @@ def read_manifest(path: Path) -> MapManifest:
     file = path / MANIFEST
     if not path.is_dir():
         raise BadMap(f"{path}: is not a folder")
+    if not file.is_file() and any((path / part).exists() for part in OF_MISSION):
+        raise BadMap(f"{path}: is of a mission and no map yet: flocc map save {path} --out FOLDER makes one of it")
     if not file.is_file():
         raise BadMap(f"{path}: has no {MANIFEST}: it is no map, or saving it did not end")
     try:

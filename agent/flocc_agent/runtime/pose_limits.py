@@ -116,6 +116,32 @@ def possible(stamps_s: Float, positions_m: Float) -> NDArray[np.bool_]:
     return good
 
 
+STILL_M = 1e-6
+TURNS_SAMPLED, TURN_COS_MAX = 20, 0.5
+"""A path of straight pieces turns where one of so many leads 60 degrees off the first."""
+
+
+def oddity(positions_m: Float, rotations: Float) -> str | None:
+    """What poses say that no robot's odometry does, though each can be: that nothing moves, or nothing but positions.
+
+    Args:
+        positions_m: (N, 3) in order of time.
+        rotations: (N, ...) matrices or quaternions.
+    """
+    if len(positions_m) < 3 or np.ptp(rotations, axis=0).max() > 0.0:
+        return None
+    if np.ptp(positions_m, axis=0).max() <= STILL_M:
+        return "all poses are one: nothing moves"
+    sampled = positions_m[np.linspace(0, len(positions_m) - 1, min(TURNS_SAMPLED, len(positions_m))).astype(int)]
+    moved_m = np.diff(sampled, axis=0)
+    length_m = np.linalg.norm(moved_m, axis=1)
+    far = moved_m[length_m > 0.5 * length_m.mean()]
+    ways = far / np.linalg.norm(far, axis=1, keepdims=True)
+    if np.min(ways @ ways[0]) < TURN_COS_MAX:
+        return "rotations never change though the path turns, as where only positions are known"
+    return None
+
+
 SPIKE_STEPS = 20.0
 SPIKE_MIN_M = 10.0
 SPIKE_POSES_MIN = 8

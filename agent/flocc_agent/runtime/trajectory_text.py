@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
 from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of, contradiction
 from flocc_agent.runtime.dated_rows import dated
-from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, possible, spikes
+from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, oddity, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
 from flocc_agent.runtime.text_tables import RecordingError, Table, is_number, read_table
@@ -81,6 +81,9 @@ def read_trajectory(
         RecordingError: Unreadable, of no known form or of more than one, or too much of it is damaged.
     """
     poses = read_poses(path, form, otherwise)
+    odd = oddity(poses.T_fixed_body[:, :3, 3], poses.T_fixed_body[:, :3, :3])
+    if odd is not None:
+        poses = replace(poses, notes=(*poses.notes, f"{path}: {odd}"))
     if poses.stamps_s is None:
         if stamps_s is None:
             raise RecordingError(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple, Protocol, TypeVar
 
+from flocc_agent.core.events import LATENT_FALSE, LATENT_UNKNOWN
 from flocc_protocol.errors import FloccError
 
 Receiver = Callable[[str, str, bytes], None]
@@ -30,13 +31,13 @@ class FetchProblem(Enum):
 
     NO_ANSWER = "no-answer"
     """The holder is out of reach, or every piece was lost; worth another try, which goes on where this one ended."""
-    UNKNOWN = "unknown"
+    UNKNOWN = LATENT_UNKNOWN
     """The holder answered that it does not hold it (any more)."""
     DEADLINE = "deadline"
     """Not complete in time; another try goes on where this one ended."""
     TOO_LARGE = "too-large"
     """The holder offers more bytes than this robot accepts."""
-    WRONG_HASH = "wrong-hash"
+    WRONG_HASH = LATENT_FALSE
     """The pieces do not add up to what was promised; they are discarded."""
     CLOSED = "closed"
     """The transport was closed meanwhile."""

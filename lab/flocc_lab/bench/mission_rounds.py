@@ -1,10 +1,11 @@
-"""What rounds cost while a mission grows, and how far a map whose settled part is held lies from one solved whole.
+"""What rounds cost while a mission grows, and how far maps lie from whole rounds' where only what is new is judged.
 
     python -m flocc_lab.bench.mission_rounds --robots 4 --keyframes 5000 --closures 1000 --outliers 0.05 --seed 1
 
 A drawn mission is solved from nothing when it has so many keyframes. From then on each round has ten closures more, and
-the keyframes that came meanwhile; all rounds are done twice, solved whole from the round before, and with what the last
-whole round placed held. Prints one JSON object: CPU seconds, ratios to the first solve, joint ATE against the truth.
+the keyframes that came meanwhile; all rounds are done twice, whole ones from the round before, and such as rest on the
+choice of closures of the last whole one where they can. Prints one JSON object: CPU seconds, ratios to the first solve,
+joint ATE against the truth.
 """
 
 import argparse
@@ -68,28 +69,28 @@ def measure(robots: int, keyframes: int, closures: int, outlier_ratio: float, ro
     first, full_s = _timed(mission.at(known), None)
     counts = [known + CLOSURES_PER_ROUND * (k + 1) for k in range(rounds)]
     whole = _rounds(mission, counts, replace(first, iterations=0))
-    held = _rounds(mission, counts, first)
-    ratios = np.array(held["ate_m"]) / np.array(whole["ate_m"])
+    settled = _rounds(mission, counts, first)
+    ratios = np.array(settled["ate_m"]) / np.array(whole["ate_m"])
     return {
         "keyframes": sum(len(T) for T in mission.at(counts[-1]).trajectories.values()),
         "closures": counts[-1],
         "from_nothing_s": round(full_s, 2),
         "whole": _told(whole, full_s),
-        "held": _told(held, full_s),
+        "settled": _told(settled, full_s),
         "ate_ratio": {"mean": round(float(ratios.mean()), 4), "worst": round(float(ratios.max()), 4)},
     }
 
 
 def _rounds(mission: Mission, counts: list[int], first: GraphSolution) -> dict[str, list[float]]:
-    """CPU seconds, error, and whether all was solved, of each round; a start that solved nothing is never held."""
-    solution, holds = first, first.iterations > 0
+    """CPU seconds, error, and whether each round was whole; from a start that solved nothing all are."""
+    solution, follows = first, first.iterations > 0
     done: dict[str, list[float]] = {"cpu_s": [], "ate_m": [], "whole": []}
     for count in counts:
         solution, cpu_s = _timed(mission.at(count), solution)
         done["cpu_s"].append(cpu_s)
         done["ate_m"].append(mission.ate_m(solution))
         done["whole"].append(float(solution.whole is None))
-        solution = solution if holds else replace(solution, iterations=0)
+        solution = solution if follows else replace(solution, iterations=0)
     return done
 
 

@@ -116,7 +116,7 @@ def lm_row(path: Path, repeats: int = 3) -> str:
     )
     excluded = screen(file.graph).excluded
     closures = {k: c for k, c in enumerate(file.graph.closures) if k not in excluded}
-    T_start, _ = initial_poses(file.graph.trajectories, closures, config.steepness, None)
+    T_start = initial_poses(file.graph.trajectories, closures, config.steepness, None).T_map_keyframe
     problem = build(file.graph.trajectories, closures, config)
     factors, values = between_factors(problem, T_start)
     state = state_of(np.concatenate([T_start[log] for log in problem.logs]))
@@ -144,7 +144,7 @@ def _gtsam_scale_task(file: GraphFile, config: BackendConfig) -> float:
     graph = file.graph
     excluded = screen(graph).excluded
     closures = {k: c for k, c in enumerate(graph.closures) if k not in excluded}
-    T_start, _ = initial_poses(graph.trajectories, closures, config.steepness, None)
+    T_start = initial_poses(graph.trajectories, closures, config.steepness, None).T_map_keyframe
     problem = build(graph.trajectories, closures, config)
     factors, values = between_factors(problem, T_start)
     known = [*range(problem.closure_rows.start), factors.size() - 1]

@@ -18,7 +18,6 @@ Float32 = NDArray[np.float32]
 POINT_BYTES, HALF_POINT_BYTES = 8, 4
 RANK_RATIO = 1e-6
 """Directions in which samples spread less than this part of their greatest spread are rounding, not data."""
-RootSift = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

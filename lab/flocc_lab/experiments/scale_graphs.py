@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory, components_of
-from flocc_agent.geometry import inverse
+from flocc_agent.geometry import in_units, inverse
 from flocc_lab.bench.generated_graph import Noise, generate
 from flocc_lab.experiments.benchmarks import cosmo_file
 from flocc_lab.experiments.experiment import ExperimentError, Settings
@@ -113,8 +113,7 @@ def _cosmo(settings: ScaleSettings, source: str, rng: np.random.Generator) -> Dr
 def _in_units(closure: LoopClosure, unit_m: float) -> LoopClosure:
     T = np.array(closure.T_query_match_unscaled)
     T[:3, 3] /= unit_m
-    units = np.diag([1.0] * 3 + [1.0 / unit_m] * 3)
-    covariance = None if closure.covariance is None else units @ closure.covariance @ units
+    covariance = None if closure.covariance is None else in_units(closure.covariance, unit_m)
     return replace(closure, T_query_match_unscaled=T, covariance=covariance, metric=False)
 
 

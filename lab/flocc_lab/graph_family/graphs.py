@@ -11,6 +11,7 @@ from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import inverse, pose, se3_exp, so3_exp
 from flocc_lab.graph_family.family_spec import GROUP_CLOSURES, WEAK_CLOSURES, Lengths, Spec, drawn
 from flocc_lab.graph_family.ways import true_poses
+from flocc_launch.graph_files.graph_file import unit_length
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -130,12 +131,10 @@ def _measured(rng: np.random.Generator, pair: Pair, T_query_match: Float, spec: 
     query, match = pair
     sigma = np.repeat(spec.closure, 3)
     metric = spec.lengths is Lengths.METRIC or (spec.lengths is Lengths.UNIT and query.log == match.log)
-    length_m = max(float(np.linalg.norm(T[:3, 3])), 1e-6)
     if metric:
         return LoopClosure(query, match, T, covariance=np.diag(sigma**2), metric=True)
     if spec.lengths is Lengths.UNIT:
-        T[:3, 3] /= length_m
-        return LoopClosure(query, match, T, covariance=np.diag(sigma**2))
+        return unit_length(LoopClosure(query, match, T, covariance=np.diag(sigma**2)))
     metres_per_unit = float(np.exp(rng.normal(0.0, UNITS_SIGMA_RATIO)))
     T[:3, 3] /= metres_per_unit
     sigma[3:] /= metres_per_unit

@@ -128,7 +128,7 @@ def gtsam_gnc(member: Member) -> MethodAnswer:
 
 def _gtsam_group(graph: PoseGraph, closures: Mapping[int, Any], used: NDArray[np.bool_]) -> dict[LogId, Float]:
     config = settings()
-    T_start, _ = initial_poses(graph.trajectories, closures, config.steepness, None)
+    T_start = initial_poses(graph.trajectories, closures, config.steepness, None).T_map_keyframe
     problem = build(graph.trajectories, closures, config)
     factors, values = between_factors(problem, T_start)
     odometry = [*range(problem.closure_rows.start), factors.size() - 1]

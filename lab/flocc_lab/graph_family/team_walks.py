@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import inverse, se3_exp, so3_exp
+from flocc_launch.graph_files.graph_file import unit_length
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -90,7 +91,7 @@ class TeamGraph:
 
     def without_lengths(self) -> "TeamGraph":
         """The same measurements, of closures between robots the direction only; those of one robot stay metric."""
-        closures = [c if c.query.log == c.match.log else _direction(c) for c in self.graph.closures]
+        closures = [c if c.query.log == c.match.log else unit_length(c) for c in self.graph.closures]
         return replace(self, graph=PoseGraph(self.graph.trajectories, closures))
 
 
@@ -176,12 +177,3 @@ def _measured(rng: np.random.Generator, truth: Mapping[LogId, Float], pair: Pair
         T = se3_exp(np.append(rng.uniform(-np.pi, np.pi, 3), rng.normal(0.0, FALSE_SIGMA_M, 3)))
     covariance = np.diag(np.repeat(np.square(TEAM_CLOSURE_SIGMA), 3))
     return LoopClosure(*pair, T, covariance=covariance, metric=True)
-
-
-def _direction(closure: LoopClosure) -> LoopClosure:
-    """A closure of length one whose covariance is that of the measurement in its new units."""
-    T = closure.T_query_match_unscaled.copy()
-    length_m = max(float(np.linalg.norm(T[:3, 3])), 1e-6)
-    T[:3, 3] /= length_m
-    sigma = np.repeat((TEAM_CLOSURE_SIGMA[0], TEAM_CLOSURE_SIGMA[1] / length_m), 3)
-    return replace(closure, T_query_match_unscaled=T, covariance=np.diag(sigma**2), metric=False)

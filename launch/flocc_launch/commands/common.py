@@ -71,21 +71,29 @@ def progress_bar(what: str, unit: str = "picture") -> Iterator[Callable[[int, in
 
 
 class ProgressLines:
-    """Progress as lines of a log, the first of which comes only when a job takes long."""
+    """Progress as lines of a log, the first of which comes only when a job takes long.
+
+    What comes before the first piece is done (workers that start) counts for no other one.
+    """
 
     def __init__(self, what: str, unit: str, clock: Callable[[], float]) -> None:
         self._what, self._unit, self._clock = what, unit, clock
-        self._begin_s = self._said_s = clock()
+        self._said_s = clock()
+        self._first: tuple[float, int] | None = None
 
     def tell(self, done: int, total: int) -> None:
         """Say how far the job is and what it will still take, if the last line is old enough."""
         now_s = self._clock()
-        if now_s - self._said_s < PROGRESS_LINE_PERIOD_S or done == 0:
+        if self._first is None:
+            self._first = (now_s, done) if done else None
+            return
+        first_s, first = self._first
+        if now_s - self._said_s < PROGRESS_LINE_PERIOD_S or done <= first:
             return
         from flocc_launch.runs.plain_numbers import duration
 
         self._said_s = now_s
-        left_s = (now_s - self._begin_s) / done * (total - done)
+        left_s = (now_s - first_s) / (done - first) * (total - done)
         typer.echo(f"{self._what}: {self._unit} {done} of {total}, about {duration(left_s)} left", err=True)
 
 

@@ -35,12 +35,16 @@ def save(
     """Save the map of a run, or of a running swarm: its logs, latents and solution, in one step."""
     if (run is None) == (swarm is None and config is None):
         raise typer.BadParameter("give a run folder, or --swarm NAME, or --config of an agent", param_hint="RUN")
+    from flocc_launch.maps.map_info import contradicted_lines
+
     manifest = _saved_swarm(swarm, config, out, name, frame) if run is None else _saved_run(run, out, name, frame)
     for log, reason in manifest.left_out.items():
         typer.echo(f"left out: {log} {reason}")
     keyframes = sum(entry.keyframes for entry in manifest.logs)
     if not manifest.pruned and manifest.latents < keyframes:
         typer.echo(f"without latents: {keyframes - manifest.latents} keyframes, where no robot can be found")
+    for named, logs in contradicted_lines(manifest):
+        typer.echo(f"{named}: {logs}")
     typer.echo(f"{manifest.frame}: {len(manifest.logs)} logs, {keyframes} keyframes, {manifest.closures} closures")
     typer.echo(f"map: {out.resolve()}")
 

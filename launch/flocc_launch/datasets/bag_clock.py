@@ -7,10 +7,9 @@ never mixed with the other.
 
 from dataclasses import dataclass
 from statistics import median, median_low
-from typing import Any
 
 from flocc_launch.datasets.bag_layout import Layout, RobotTopics
-from flocc_launch.datasets.bag_messages import stamp_ns
+from flocc_launch.datasets.bag_messages import header_ns
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
 
 SAMPLE_MAX = 9
@@ -49,7 +48,7 @@ def choose_clock(layout: Layout, robot: RobotTopics) -> ClockChoice:
     unset = [
         topic.name
         for topic, stamps in ((robot.image, image), *([(robot.poses.topic, poses)] if robot.poses else []))
-        if stamps and median(header_ns for header_ns, _ in stamps) == 0
+        if stamps and median(stamp_ns for stamp_ns, _ in stamps) == 0
     ]
     if unset:
         return ClockChoice(True, f"{where}: stamps of {', '.join(unset)} are zero; the recorder's time is used for all")
@@ -68,14 +67,9 @@ def choose_clock(layout: Layout, robot: RobotTopics) -> ClockChoice:
 
 def _stamps(bag: Bag, topic: BagTopic) -> list[tuple[int, int]]:
     """Headers' and the recorder's times of a topic's first messages, nanoseconds."""
-    return [(_header_ns(message), bag_ns) for bag_ns, message in bag.firsts(topic.name, SAMPLE_MAX)]
-
-
-def _header_ns(message: Any) -> int:
-    posed = getattr(message, "poses", None)
-    return stamp_ns((posed[-1] if posed is not None and len(posed) else message).header)
+    return [(header_ns(message), bag_ns) for bag_ns, message in bag.firsts(topic.name, SAMPLE_MAX)]
 
 
 def _offset_ns(stamps: list[tuple[int, int]]) -> int:
     """What headers are ahead of the recorder; one message that was kept back says little."""
-    return median_low(header_ns - bag_ns for header_ns, bag_ns in stamps)
+    return median_low(stamp_ns - bag_ns for stamp_ns, bag_ns in stamps)

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.runtime.pictures import FULL, PictureError
+from flocc_agent.runtime.pose_limits import oddity
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_clock import ClockChoice, choose_clock
-from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, listed, only
+from flocc_launch.datasets.bag_layout import Layout, PoseSource, RobotTopics, is_truth, listed, only
 from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
     IMAGE_TYPES,
@@ -37,6 +38,7 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT_MESSAGES = 1000
 STRAY = "the stamp is zero, or more than a minute off that of the others"
+UNTURNED_MAX = 1000
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
 HEADER_BYTES = 12
@@ -143,9 +145,14 @@ def _convert_robots(
     Raises:
         DatasetError: Something is wrong with the recording of a robot; of several such, the first is raised.
     """
-    runs = [_conversion(layout, robot, out, options) for out, robot in robots.items()]
-    _pass_over(layout.bag, runs, progress)
-    faults = []
+    runs, faults = [], []
+    for out, robot in robots.items():
+        try:
+            runs.append(_conversion(layout, robot, out, options))
+        except DatasetError as error:
+            faults.append(error)
+    if runs:
+        _pass_over(layout.bag, runs, progress)
     for run in runs:
         try:
             run.judge()
@@ -190,6 +197,8 @@ def _conversion(layout: Layout, robot: RobotTopics, out: Path, options: BagOptio
     others = layout.other_poses(robot)
     if others:
         notes.append(f"{layout.bag.path}: odometry is {robot.poses}; not taken: {', '.join(others)} (--odometry-topic)")
+    if robot.poses is not None and is_truth(robot.poses.topic):
+        notes.append(f"{layout.bag.path}: odometry is {robot.poses}, by its name no odometry, but ground truth or GPS")
     notes += [clock.note] if clock.note else []
     return _Conversion(layout.bag, robot, lens, options, clock, out, identity, notes=notes)
 
@@ -225,6 +234,7 @@ class Tally:
     Attributes:
         seen: Messages.
         damaged: Of them, those that cannot be used.
+        repeated: Of them, those with the stamp of the one before.
         backwards: Of them, those that go back in time.
         reason: Of the first damaged one.
         step: Of the first that goes back.
@@ -232,6 +242,7 @@ class Tally:
 
     seen: int = 0
     damaged: int = 0
+    repeated: int = 0
     backwards: int = 0
     reason: str = ""
     step: str = ""
@@ -249,8 +260,10 @@ class Tally:
     def sentences(self, topic: BagTopic) -> list[str]:
         """What was left out."""
         damaged = f"topic {topic.name}: {self.damaged} of {self.seen} messages were left out: {self.reason}"
+        twice = f"topic {topic.name}: {self.repeated} of {self.seen} messages repeat a stamp, and were left out"
         back = f"topic {topic.name}: {self.step}; {self.backwards} of {self.seen} messages were left out"
-        return [*([damaged] if self.damaged else []), *([back] if self.backwards else [])]
+        told = ((damaged, self.damaged), (twice, self.repeated), (back, self.backwards))
+        return [sentence for sentence, count in told if count]
 
     def is_too_much(self) -> bool:
         """Whether the topic cannot be trusted."""
@@ -290,6 +303,8 @@ class _Conversion:
     _pictures: ImageWriter = field(init=False)
     _last_pose: tuple[float, ...] = ()
     _stamps: StampGaps = field(default_factory=StampGaps)
+    _frame: str | None = None
+    _unturned: list[tuple[float, ...]] | None = field(default_factory=list)
     _first_info: bytes | None = None
     _infos_differ: int = 0
     _image_span_s: tuple[float, float] | None = None
@@ -382,11 +397,22 @@ class _Conversion:
                 if is_new:
                     self._begin_journey(good_ns, bag_ns)
                 self._pose_span_s = _wider(self._pose_span_s, (good_ns - self.zero_ns) * 1e-9)
+                if good_ns > self._log.last_ns:
+                    self._see_motion(good)
                 if len(posed) == 1 and good_ns == self._log.last_ns and good != self._last_pose:
                     self.poses.damage("the stamp is that of the pose before")
                 elif not self._log.add(good_ns, good) and len(posed) == 1:
                     self.poses.step_back(self._log.last_ns * 1e-9, good_ns * 1e-9)
                 self._last_pose = good
+
+    def _see_motion(self, numbers: tuple[float, ...]) -> None:
+        """Keep positions as long as all rotations are the first one, thinned where there are many."""
+        if self._unturned is None or (self._unturned and numbers[3:] != self._unturned[0][3:]):
+            self._unturned = None
+            return
+        self._unturned.append(numbers)
+        if len(self._unturned) > UNTURNED_MAX:
+            del self._unturned[1::2]
 
     def _begin_journey(self, stamp_ns: int, bag_ns: int) -> None:
         """Go on in another recording, since odometry is of another frame from here."""
@@ -406,6 +432,7 @@ class _Conversion:
             return
         try:
             message = self.bag.decoded(raw, topic)
+            self._see_frame(message.header.frame_id)
             taken_ns = bag_ns if self.clock.is_bag else stamp_ns(message.header)
             if taken_ns == 0 or (not self.clock.is_bag and self.clock.is_off(taken_ns, bag_ns)):
                 raise DatasetError(STRAY)
@@ -414,6 +441,9 @@ class _Conversion:
             stamp_s = (taken_ns - self.zero_ns) * 1e-9
             if self._done_s is not None and stamp_s <= self._done_s + 1e-9:
                 return
+            if stamp_s == self._writer.last_stamp_s:
+                tally.repeated += 1
+                return
             if not self._stamps.fits(taken_ns):
                 tally.step_back(self._writer.last_stamp_s or 0.0, stamp_s)
                 return
@@ -421,6 +451,16 @@ class _Conversion:
             self._image_span_s = _wider(self._image_span_s, stamp_s)
         except DatasetError as error:
             tally.damage(_bare(error, topic))
+
+    def _see_frame(self, frame: str) -> None:
+        """See that images are of the frame of the first one.
+
+        Raises:
+            DatasetError: They are of another, as of another camera on the same topic.
+        """
+        self._frame = frame if self._frame is None else self._frame
+        if frame != self._frame:
+            raise DatasetError(f"an image is of the frame {frame or 'no name'}, the first one of {self._frame}")
 
     def _encoded(self, message: Any) -> tuple[bytes, str]:
         encoded, suffix = image_file(message, self.robot.image, self.options.jpeg)
@@ -470,6 +510,9 @@ class _Conversion:
         if self.watch.outliers:
             jumps = f"{self.watch.outliers} single poses jump, and were left out"
             self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {jumps}")
+        unturned = np.array(self._unturned or np.empty((0, 7)))
+        if (odd := oddity(unturned[:, :3], unturned[:, 3:])) is not None:
+            self.notes.append(f"{self.bag.path}: topic {self.robot.poses}: {odd}")
         tallies = [(self.images, self.robot.image)]
         if self.robot.poses is not None:
             tallies.append((self.poses, self.robot.poses.topic))

@@ -9,13 +9,13 @@ with what there is.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, StaticFrames, pose_of_transform
+from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, STILL_MAX, StaticFrames, pose_of_transform
 from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
@@ -24,11 +24,14 @@ from flocc_launch.datasets.source import DatasetError
 Float = NDArray[np.float64]
 
 TRANSFORMS_READ_MAX = 2000
-STILL_MAX = 1e-4
-"""By how much a transform that stays as it is may differ from its first one: metres, and parts of a rotation."""
 FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
 PARTS_OF_NAMES, LETTERS_OR_DIGITS = r"[a-z0-9]+", r"[a-z]+|\d+"
-TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk")
+WANTED_POSES = re.compile(
+    r"plan|goal|setpoint|target|waypoint|initial_?pose|desired|reference|command|cmd", re.IGNORECASE
+)
+"""Leaves of topics that say where a robot is to be, not where it is."""
+TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk", "gps", "gnss", "amcl")
+"""In the names of topics that say where a robot is in a map, not how it moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,41 +89,85 @@ class RobotTopics:
 
 
 @dataclass(slots=True, eq=False)
+class Frames:
+    """What topics of transforms say.
+
+    Attributes:
+        static: Frames that do not move.
+        edges: Parents and children of other transforms, with their topics.
+        has_static: Whether there is any static transform.
+        moved: Those of `edges` that did not stay as they were.
+        named: All frames, with one that a transform connects with each.
+    """
+
+    static: StaticFrames = field(default_factory=StaticFrames)
+    edges: dict[tuple[str, str], str] = field(default_factory=dict)
+    has_static: bool = False
+    moved: set[tuple[str, str]] = field(default_factory=set)
+    named: dict[str, str] = field(default_factory=dict)
+    _first: dict[tuple[str, str], tuple[Any, Float]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, bag: Bag, topics: Sequence[BagTopic]) -> "Frames":
+        """Read topics of transforms from the front, static ones and others."""
+        frames = cls()
+        for topic in topics:
+            for _, _, raw in islice(bag.raw([topic.name]), TRANSFORMS_READ_MAX):
+                try:
+                    frames._take(bag.decoded(raw, topic), topic)
+                except (DatasetError, BadMessage):
+                    continue
+        return frames
+
+    def _take(self, message: Any, topic: BagTopic) -> None:
+        for each in message.transforms:
+            parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+            self.named[child] = parent
+            self.named.setdefault(parent, child)
+        if topic.name.rsplit("/", 1)[-1] == "tf_static":
+            self.static.add(message)
+            self.has_static = True
+            return
+        for each in message.transforms:
+            edge = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
+            self.edges.setdefault(edge, topic.name)
+            T = pose_of_transform(each.transform, topic.name)
+            if np.abs(T - self._first.setdefault(edge, (each, T))[1]).max() > STILL_MAX:
+                self.moved.add(edge)
+
+    def carrying(self, camera: str) -> list[tuple[str, str]]:
+        """Edges that move a body on which a camera sits, by transforms that do not."""
+        still = [each for edge, (each, _) in self._first.items() if edge not in self.moved]
+        frames = self.static.with_others(still)
+        return [edge for edge in self.moved if frames.between(edge[1], camera) is not None]
+
+
+@dataclass(slots=True, eq=False)
 class Layout:
     """A bag's topics with what their first messages say, and its transforms."""
 
     bag: Bag
-    static: StaticFrames = field(default_factory=StaticFrames)
-    edges: dict[tuple[str, str], str] = field(default_factory=dict)
-    has_static: bool = False
     left_out: list[str] = field(default_factory=list)
+    _frames: dict[tuple[str, ...], Frames] = field(default_factory=dict)
     _heads: dict[str, Head | None] = field(default_factory=dict)
 
     @classmethod
     def of(cls, bag: Bag) -> "Layout":
-        """Read the transforms of a bag."""
-        layout = cls(bag)
-        for topic in bag.topics.values():
-            if topic.type in TRANSFORMS_TYPES:
-                layout._read_transforms(topic)
-        return layout
+        """The layout of a bag; what it holds is read where it is asked for."""
+        return cls(bag)
 
-    def _read_transforms(self, topic: BagTopic) -> None:
-        is_static = topic.name.rsplit("/", 1)[-1] == "tf_static"
-        for number, (_, _, raw) in enumerate(self.bag.raw([topic.name])):
-            if number >= TRANSFORMS_READ_MAX:
-                break
-            try:
-                message = self.bag.decoded(raw, topic)
-                if is_static:
-                    self.static.add(message)
-                    self.has_static = True
-            except (DatasetError, BadMessage):
-                continue
-            if not is_static:
-                for each in message.transforms:
-                    edge = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
-                    self.edges.setdefault(edge, topic.name)
+    def frames(self, image: BagTopic | None = None) -> Frames:
+        """Transforms of a camera's robot: all but those in a namespace of other cameras only (`/r2/tf`)."""
+        cameras = [topic.name for topic in self._of_types(IMAGE_TYPES)]
+        topics = []
+        for topic in self._of_types(TRANSFORMS_TYPES):
+            below = [name for name in cameras if name.startswith(f"{_parent(topic.name)}/")]
+            if image is None or not below or image.name in below:
+                topics.append(topic)
+        key = tuple(topic.name for topic in topics)
+        if key not in self._frames:
+            self._frames[key] = Frames.of(self.bag, topics)
+        return self._frames[key]
 
     def head(self, topic: BagTopic) -> Head | None:
         """What a topic's first message says, or None where it has none."""
@@ -154,7 +201,7 @@ class Layout:
     ) -> tuple[dict[str, list[BagTopic]], dict[str, PoseSource]]:
         """Images and odometry by what tells topics of odometry apart, as `cam_r1` and `odom_r1` of `odom_r2`."""
         for word in (PARTS_OF_NAMES, LETTERS_OR_DIGITS):
-            poses = _of_distinct_words(self._own_poses(), word)
+            poses = _of_distinct_words(_best(self._own_poses()), word)
             parts = {name: [t for t in images if f"-{name}-" in f"-{_words(t.name, word)}-"] for name in poses}
             taken = [topic.name for group in parts.values() for topic in group]
             if len(poses) > 1 and sorted(taken) == sorted(t.name for t in images) and all(parts.values()):
@@ -162,13 +209,19 @@ class Layout:
         return {"": images}, {}
 
     def _of_types(self, types: Sequence[str]) -> list[BagTopic]:
-        return [topic for topic in self.bag.topics.values() if topic.type in types]
+        return [topic for topic in self.bag.topics.values() if topic.type in types and topic.count != 0]
 
     def _poses_of(self, name: str, images: list[BagTopic]) -> PoseSource | None:
-        own = [t for t in self._of_types(POSE_TYPES) if name in t.name.strip("/").split("/")[:-1]]
-        if len(own) == 1:
-            return PoseSource(own[0])
-        return None if own else self.edge_of(images[0])
+        own = [t for t in self._own_poses() if name in t.name.strip("/").split("/")[:-1]]
+        if len(_best(own)) > 1:
+            only(self.bag, _best(own), "odometry", "--odometry-topic")
+        return self._source_of(own, images[0])
+
+    def _source_of(self, topics: list[BagTopic], image: BagTopic) -> PoseSource | None:
+        """The only topic of odometry among those of poses, else an edge of /tf, else what says where a robot is."""
+        best = _best(topics)
+        edge = self.edge_of(image) if all(map(is_truth, best)) else None
+        return edge or (PoseSource(best[0]) if len(best) == 1 else None)
 
     def _robot(self, name: str, images: list[BagTopic], poses: PoseSource | None) -> RobotTopics:
         image = self.chosen_image(images)
@@ -208,7 +261,7 @@ class Layout:
         Raises:
             DatasetError: The one beside the images is of another frame.
         """
-        infos = self._of_types((CAMERA_TYPE,))
+        infos = [t for t in self._of_types((CAMERA_TYPE,)) if not _are_of_two_cameras(t.name, image.name)]
         base = image.name.removesuffix("/compressed")
         near = [t for t in infos if t.name in (f"{base}/camera_info", f"{_parent(base)}/camera_info")]
         near = near or [t for t in infos if _parent(t.name) == _parent(base)]
@@ -247,15 +300,21 @@ class Layout:
                 f"{self.bag.path}: {listed(own)} is another robot's odometry than that of {image.name}, by its name or "
                 "frames; name it with --odometry-topic if it is not"
             )
-        odometry = [t for t in near if t.type == "nav_msgs/msg/Odometry"]
-        if len(near) == 1 or len(odometry) == 1:
-            return PoseSource((odometry or near)[0])
-        return None if near else self.edge_of(image)
+        return self._source_of(near, image)
 
     def _own_poses(self) -> list[BagTopic]:
-        """Topics of poses, without those that are ground truth by their names where there are others."""
-        candidates = self._of_types(POSE_TYPES)
-        return [t for t in candidates if not any(word in t.name.lower() for word in TRUTH_WORDS)] or candidates
+        """Topics of a robot's poses, without those of goals and of what it sees."""
+        return [
+            t
+            for t in self._of_types(POSE_TYPES)
+            if not WANTED_POSES.search(t.name.rsplit("/", 1)[-1]) and not self._is_of_something_seen(t)
+        ]
+
+    def _is_of_something_seen(self, poses: BagTopic) -> bool:
+        """Whether poses that name no child are in the frame of a camera, as those of markers and objects are."""
+        head = self.head(poses)
+        cameras = {self._frame(topic) for topic in self._of_types(IMAGE_TYPES)} - {""}
+        return head is not None and not head.child and poses.type != "nav_msgs/msg/Odometry" and head.frame in cameras
 
     def _is_another_robot(self, image: BagTopic, poses: BagTopic) -> bool:
         """Whether poses are another robot's than images, by namespaces of one kind or those of frames."""
@@ -263,7 +322,7 @@ class Layout:
         if here and there and here != there and self._are_siblings(here, there):
             return True
         head, camera = self.head(poses), self._frame(image)
-        if head is None or self.static.between(head.child, camera) is not None:
+        if head is None or self.frames(image).static.between(head.child, camera) is not None:
             return False
         roots = {_root(frame) for frame in (head.frame, head.child)} - {""}
         return bool(_root(camera) and roots) and _root(camera) not in roots
@@ -288,24 +347,25 @@ class Layout:
     def _named_edge(self, name: str) -> PoseSource:
         topic_name, _, frames = name.partition(":")
         topic = named(self.bag, TRANSFORMS_TYPES, topic_name)
-        found = [edge for edge in self.edges if ".".join(edge) == frames and self.edges[edge] == topic.name]
+        known = Frames.of(self.bag, [topic]).edges
+        found = [edge for edge in known if ".".join(edge) == frames]
         if not found:
-            edges = ", ".join(f"{topic.name}:{a}.{b}" for a, b in sorted(self.edges))
+            edges = ", ".join(f"{topic.name}:{a}.{b}" for a, b in sorted(known))
             raise DatasetError(f"{self.bag.path}: has no transform {name}; there are {edges or 'none'}")
         return PoseSource(topic, found[0])
 
     def edge_of(self, image: BagTopic) -> PoseSource | None:
         """The transform that moves the body on which the camera is mounted, or None."""
-        camera = self._frame(image)
-        moving = [edge for edge in self.edges if self.static.between(edge[1], camera) is not None or edge[1] == camera]
+        camera, frames = self._frame(image), self.frames(image)
+        moving = sorted(frames.carrying(camera)) if camera else []
         if not moving:
             moving = [
-                e for e in self.edges if e[0].rsplit("/", 1)[-1] in FIXED_FRAMES and (e[1], e[0]) not in self.edges
+                e for e in frames.edges if e[0].rsplit("/", 1)[-1] in FIXED_FRAMES and (e[1], e[0]) not in frames.edges
             ]
             moving = [e for e in moving if e[1].rsplit("/", 1)[-1] not in FIXED_FRAMES]
         if len(moving) != 1:
             return None
-        return PoseSource(self.bag.topics[self.edges[moving[0]]], moving[0])
+        return PoseSource(self.bag.topics[frames.edges[moving[0]]], moving[0])
 
     def mounting(self, robot: RobotTopics) -> tuple[Float, str | None]:
         """`T_body_camera`, and a sentence where nothing says it.
@@ -314,22 +374,29 @@ class Layout:
             DatasetError: The bag has transforms, but none from the body to the camera.
         """
         camera = self._frame(robot.image)
-        body = self._body(robot.poses)
+        frames = self.frames(robot.image)
+        body = self._body(robot.poses, frames)
         if camera == body and camera:
             return np.eye(4), None
-        T_body_camera = self.static.between(body, camera) if body and camera else None
-        if T_body_camera is None and body and camera and self.edges:
-            T_body_camera = self._between_on_tf(body, camera)
+        if body and (moved := frames.static.moved_between(body, camera)) is not None:
+            raise DatasetError(
+                f"{self.bag.path}: static transforms place {moved}, between {body} and {camera}, in more than one way; "
+                "name a camera file with T_body_camera (--camera)"
+            )
+        T_body_camera = frames.static.between(body, camera) if body and camera else None
+        if T_body_camera is None and body and camera and frames.edges:
+            T_body_camera = self._between_on_tf(frames, body, camera)
         if T_body_camera is not None:
             return T_body_camera, None
-        if body and camera and self.has_static:
+        beside = frames.named.get(camera) if camera else None
+        if body and (frames.has_static or beside is not None):
             raise DatasetError(
                 f"{self.bag.path}: no chain of static transforms leads from {body}, which {robot.poses} moves, to "
-                f"{camera}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
+                f"{camera or 'none'}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
             )
-        if camera and (carrier := self.static.parent(camera)) is not None:
+        if beside is not None:
             raise DatasetError(
-                f"{self.bag.path}: the camera ({camera}) sits on {carrier}, but {robot.poses} does not say which frame "
+                f"{self.bag.path}: the camera ({camera}) sits on {beside}, but {robot.poses} does not say which frame "
                 "it moves; name a camera file with T_body_camera (--camera)"
             )
         return np.eye(4), (
@@ -337,13 +404,13 @@ class Layout:
             f"({body or 'no frame'}); they are taken as one: name a camera file with T_body_camera (--camera) if not"
         )
 
-    def _between_on_tf(self, body: str, camera: str) -> Float | None:
+    def _between_on_tf(self, frames: Frames, body: str, camera: str) -> Float | None:
         """`T_body_camera` where transforms that stay as they are stand on /tf, as ROS 1 repeats them; None without any.
 
         Raises:
             DatasetError: The camera moves on the body.
         """
-        topics = list(dict.fromkeys(self.edges.values()))
+        topics = list(dict.fromkeys(frames.edges.values()))
         first: dict[tuple[str, str], tuple[Any, Float]] = {}
         moving: set[tuple[str, str]] = set()
         for topic, _, raw in self.bag.raw(topics):
@@ -357,9 +424,9 @@ class Layout:
             except (DatasetError, BadMessage):
                 continue
         still = [each for edge, (each, _) in first.items() if edge not in moving]
-        T_body_camera = self.static.with_others(still).between(body, camera)
+        T_body_camera = frames.static.with_others(still).between(body, camera)
         every = [each for each, _ in first.values()]
-        if T_body_camera is None and self.static.with_others(every).between(body, camera) is not None:
+        if T_body_camera is None and frames.static.with_others(every).between(body, camera) is not None:
             raise DatasetError(
                 f"{self.bag.path}: the camera ({camera}) moves on the body ({body}), as {', '.join(topics)} says; "
                 "flocc takes a fixed one: name the frame that carries it as odometry, or a camera file with "
@@ -367,24 +434,25 @@ class Layout:
             )
         return T_body_camera
 
-    def _body(self, poses: PoseSource | None) -> str:
+    def _body(self, poses: PoseSource | None, frames: Frames) -> str:
         if poses is None:
             return ""
         if poses.edge is not None:
             return poses.edge[1]
         head = self.head(poses.topic)
-        return (head.child or self._moved_in(head.frame)) if head else ""
+        return (head.child or _moved_in(frames, head.frame)) if head else ""
 
-    def _moved_in(self, frame: str) -> str:
-        """The frame that /tf moves in another one, through fixed ones (map, odom, base_link), or "" where unclear."""
-        for _ in range(len(FIXED_FRAMES)):
-            children = [child for parent, child in self.edges if parent == frame]
-            if len(children) != 1:
-                break
-            frame = children[0]
-            if frame.rsplit("/", 1)[-1] not in FIXED_FRAMES:
-                return frame
-        return ""
+
+def _moved_in(frames: Frames, frame: str) -> str:
+    """The frame that /tf moves in another one, through fixed ones (map, odom, base_link), or "" where unclear."""
+    for _ in range(len(FIXED_FRAMES)):
+        children = [child for parent, child in frames.edges if parent == frame]
+        if len(children) != 1:
+            break
+        frame = children[0]
+        if frame.rsplit("/", 1)[-1] not in FIXED_FRAMES:
+            return frame
+    return ""
 
 
 def _head(message: Any) -> Head:
@@ -435,6 +503,13 @@ def _by_namespace(names: Sequence[str]) -> dict[str, list[str]]:
     return groups
 
 
+def _are_of_two_cameras(one: str, other: str) -> bool:
+    """Whether topics lie in namespaces that differ in nothing but a number, or left and right."""
+    places = [_parent(name.removesuffix("/compressed")).lower() for name in (one, other)]
+    kinds = [re.sub(r"\d+|left|right|front|rear|back", "#", place) for place in places]
+    return places[0] != places[1] and kinds[0] == kinds[1]
+
+
 def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
     """The left one of two cameras whose names differ in nothing else."""
     lefts = [name for name in topics if "left" in name.lower()]
@@ -443,6 +518,17 @@ def _left_of(topics: dict[str, BagTopic]) -> BagTopic | None:
         if lefts[0].lower().replace("left", "right") == other.lower():
             return topics[lefts[0]]
     return None
+
+
+def _best(topics: list[BagTopic]) -> list[BagTopic]:
+    """Of topics of poses those that are no ground truth, and of these odometry, as far as there are any."""
+    own = [topic for topic in topics if not is_truth(topic)] or topics
+    return [topic for topic in own if topic.type == "nav_msgs/msg/Odometry"] or own
+
+
+def is_truth(topic: BagTopic) -> bool:
+    """Whether a topic of poses is ground truth, by its name."""
+    return any(word in topic.name.lower() for word in TRUTH_WORDS)
 
 
 def named(bag: Bag, types: Sequence[str], name: str) -> BagTopic:

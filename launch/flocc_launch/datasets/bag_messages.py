@@ -107,14 +107,27 @@ def poses(message: Any, topic: BagTopic) -> Iterator[tuple[int, tuple[float, ...
         DatasetError: A number is not finite, or a quaternion is not of unit length.
     """
     if topic.type == "nav_msgs/msg/Path":
-        for posed in message.poses:
-            yield stamp_ns(posed.header), _numbers(posed.pose, topic)
+        for posed in _stamped_poses(message):
+            yield stamp_ns(posed.header) or stamp_ns(message.header), _numbers(posed.pose, topic)
         return
     if topic.type == "geometry_msgs/msg/TransformStamped":
         yield stamp_ns(message.header), transform_numbers(message.transform, topic)
         return
     pose = message.pose if topic.type == "geometry_msgs/msg/PoseStamped" else message.pose.pose
     yield stamp_ns(message.header), _numbers(pose, topic)
+
+
+def _stamped_poses(path: Any) -> Any:
+    """Poses of a path that say when they were; only the last one, the present, where all have one stamp or none."""
+    stamps_ns = {stamp_ns(posed.header) for posed in path.poses}
+    return path.poses[-1:] if len(stamps_ns) == 1 else path.poses
+
+
+def header_ns(message: Any) -> int:
+    """When a message's content was, nanoseconds; of a path, its last pose."""
+    posed = getattr(message, "poses", None)
+    last = stamp_ns(posed[-1].header) if posed is not None and len(posed) else 0
+    return last or stamp_ns(message.header)
 
 
 def transform_numbers(transform: Any, topic: BagTopic) -> tuple[float, ...]:

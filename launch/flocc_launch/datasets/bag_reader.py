@@ -15,8 +15,8 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any
 
-from flocc_launch.datasets.bag_salvage import Salvage, decompression_errors
-from flocc_launch.datasets.foxglove import ROS_TYPES, ForeignMcap, as_ros, is_foreign, short_name
+from flocc_launch.datasets.bag_salvage import Salvage, decompression_errors, mcap_encoding, mcap_is_whole
+from flocc_launch.datasets.foxglove import FOREIGN, ROS_TYPES, ForeignMcap, as_ros, short_name
 from flocc_launch.datasets.source import DatasetError
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
@@ -188,7 +188,7 @@ class Bag:
             return
         self.gap = f"{self.path}: is damaged behind {last_ns * 1e-9:.3f} s, and what is whole was read: {said}"
         try:
-            for name, stamp_ns, message in Salvage(storage).messages(list(names)):
+            for name, stamp_ns, message in Salvage(storage, self._ros1).messages(list(names)):
                 if stamp_ns > last_ns:
                     yield topics[name], stamp_ns, message
         except SALVAGE_ERRORS as error:
@@ -268,20 +268,23 @@ class Bag:
         if file is None:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}")
         try:
-            foreign = file.suffix == ".mcap" and is_foreign(file)
+            encoding = mcap_encoding(file) if file.suffix == ".mcap" else ""
         except SALVAGE_ERRORS:
-            foreign = False
-        if foreign:
+            encoding = ""
+        if encoding in FOREIGN:
             self._open_foreign(file)
             return
-        self._salvage = Salvage(file)
+        is_mcap_of_ros1 = encoding == "ros1"
+        self._ros1 = self._ros1 or is_mcap_of_ros1
+        self._salvage = Salvage(file, self._ros1)
         try:
             self.topics = {name: BagTopic(name, kind, None) for name, kind in self._salvage.topics().items()}
         except SALVAGE_ERRORS as error:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}") from error
         if not self.topics:
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
-        self.damage = f"{self.path}: is damaged or cut off: {reason}"
+        if not (is_mcap_of_ros1 and mcap_is_whole(file)):
+            self.damage = f"{self.path}: is damaged or cut off: {reason}"
 
     def _open_foreign(self, file: Path) -> None:
         """Open an MCAP file of protobuf or JSON, of which Foxglove's messages are read."""

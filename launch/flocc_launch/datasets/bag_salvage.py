@@ -31,9 +31,9 @@ RECORD_BYTES_MAX = 1 << 32
 class Salvage:
     """A damaged bag's messages, and a decoder for them."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, ros1: bool) -> None:
         self._path = path
-        self._ros1 = path.suffix == ".bag"
+        self._ros1 = ros1
         self._types: Any = None
 
     def topics(self) -> dict[str, str]:
@@ -129,15 +129,22 @@ def _ros1_message(
     operation = header.get("op")
     if operation == b"\x07":
         fields = _ros1_fields(data)
-        kind = fields["type"].decode()
-        normal = kind if "/msg/" in kind else kind.replace("/", "/msg/")
         definition = fields["message_definition"].decode(errors="replace")
-        connections[struct.unpack("<I", header["conn"])[0]] = (header["topic"].decode(), normal, definition)
+        connections[struct.unpack("<I", header["conn"])[0]] = (
+            header["topic"].decode(),
+            _ros2_name(fields["type"].decode()),
+            definition,
+        )
     elif operation == b"\x02":
         connection = connections.get(struct.unpack("<I", header["conn"])[0])
         seconds, nanoseconds = struct.unpack("<II", header["time"])
         if connection is not None:
             yield (*connection, seconds * 10**9 + nanoseconds, data)
+
+
+def _ros2_name(kind: str) -> str:
+    """A message type as ROS 2 calls it: `sensor_msgs/msg/Image` of `sensor_msgs/Image`."""
+    return kind if "/msg/" in kind else kind.replace("/", "/msg/")
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +171,24 @@ def mcap_messages(path: Path) -> Iterator[McapMessage]:
             yield from _messages_of(*record, schemas, channels)
 
 
+def mcap_encoding(path: Path) -> str:
+    """How an MCAP file's first message is encoded: cdr, ros1, protobuf, json ...; "" where it has none."""
+    first = next(mcap_messages(path), None)
+    return first.encoding if first is not None else ""
+
+
+def mcap_is_whole(path: Path) -> bool:
+    """Whether an MCAP file ends as its recorder ends it."""
+    with path.open("rb") as file:
+        file.seek(-min(len(MCAP_MAGIC), path.stat().st_size), os.SEEK_END)
+        return file.read() == MCAP_MAGIC
+
+
 def _mcap_records(path: Path) -> Iterator[Record]:
     for message in mcap_messages(path):
-        described = message.schema_data.decode(errors="replace") if message.schema_encoding == "ros2msg" else ""
-        yield message.topic, message.schema, described, message.log_ns, message.data
+        is_ros = message.schema_encoding in ("ros1msg", "ros2msg")
+        described = message.schema_data.decode(errors="replace") if is_ros else ""
+        yield message.topic, _ros2_name(message.schema), described, message.log_ns, message.data
 
 
 def _mcap_record(read: Any) -> tuple[int, bytes] | None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flocc_launch.datasets.bag_salvage import McapMessage, mcap_messages
+from flocc_launch.datasets.bag_salvage import mcap_messages
 from flocc_launch.datasets.protobuf import Types
 
 ROS_TYPES = {
@@ -70,12 +70,6 @@ class ForeignMcap:
             raise ValueError(f"messages of {schema} are not read")
         fields = types.decode(schema, raw) if types is not None else json.loads(raw)
         return as_ros(name, fields)
-
-
-def is_foreign(path: Path) -> bool:
-    """Whether an MCAP file's first messages are of protobuf or JSON."""
-    first: McapMessage | None = next(mcap_messages(path), None)
-    return first is not None and first.encoding in FOREIGN
 
 
 def as_ros(name: str, message: Any) -> Any:

@@ -23,6 +23,9 @@ FOLLOWED = (("cam0_calib", "body_T_cam0"), ("relative_config_imucam", None))
 
 FOCAL_RATIO_MIN, FOCAL_RATIO_MAX = 0.02, 200.0
 """Focal length over the image's side: a lens of 360 degrees has about 0.1, a telescope 50."""
+EXCHANGED_OFF_MIN, EXCHANGED_NEAR_MAX = 0.15, 0.06
+"""By how much of a side a principal point is off the middle, and off that of images whose sides are exchanged."""
+SQUARE_RATIO, EQUAL_RATIO = 0.1, 0.01
 MOUNTING_MAX_M = 20.0
 """A camera further from its body was measured in another unit."""
 FORM_ERRORS = (
@@ -85,6 +88,19 @@ def believable(lens: Lens, path: Path | str) -> Lens:
     if min(focals) < FOCAL_RATIO_MIN or max(focals) > FOCAL_RATIO_MAX:
         raise DatasetError(
             f"{path}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are none of images of {size}"
+        )
+    sides, middle = np.array([camera.width, camera.height]), 2 * np.array([camera.cx, camera.cy])
+    off, exchanged = (np.abs(middle - each) / sides for each in (sides, sides[::-1]))
+    if off.min() > EXCHANGED_OFF_MIN and exchanged.max() < EXCHANGED_NEAR_MAX:
+        raise DatasetError(
+            f"{path}: the principal point ({camera.cx:g}, {camera.cy:g}) is the middle of images of "
+            f"{camera.height}x{camera.width}, not of {size}: width and height, or cx and cy, are exchanged"
+        )
+    is_square = abs(camera.fx - camera.fy) < SQUARE_RATIO * camera.fx
+    if not is_square and abs(camera.fx - camera.cx) < EQUAL_RATIO * camera.fx:
+        raise DatasetError(
+            f"{path}: {camera.fx:g} {camera.fy:g} {camera.cx:g} {camera.cy:g} would be fx cx fy cy, by their sizes, "
+            "where fx fy cx cy is read; write each under its name"
         )
     if t_m > MOUNTING_MAX_M:
         raise DatasetError(f"{path}: the camera is {t_m:g} m from its body; write the mounting in metres")

@@ -3,7 +3,7 @@
 A late one fills a gap that those before it left. After a clock was set back all fall among stamps that are there.
 """
 
-from bisect import bisect, insort
+from bisect import bisect_left, insort
 from collections import deque
 from itertools import pairwise
 from statistics import quantiles
@@ -30,7 +30,7 @@ class StampGaps:
         return fits
 
     def _fills_gap(self, stamp_ns: int) -> bool:
-        after = bisect(self._taken, stamp_ns)
+        after = bisect_left(self._taken, stamp_ns)
         if after == 0 or len(self._came) < 3:
             return False
         step_ns = quantiles((abs(b - a) for a, b in pairwise(self._came)), n=4)[0]

@@ -25,8 +25,10 @@ WAY_OUT = "list the images in images.txt with lines 'stamp_s relative/path'"
 
 _DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])[-_.T ]{0,3}"
-    r"([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d|60)(?:([-_.,]?)(\d{1,9}))?(?!\d)"
+    r"([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d|60)(?:([-_.,s]?)(\d{1,9}))?(?!\d)"
 )
+_CAMERA = re.compile(r"(?<![a-z])(?:left|right|cam(?:era)?[-_]?\d{1,2})(?![a-z\d])")
+"""What tells one camera of several in a name."""
 _AFTER_DATE = re.compile(r"\s*(?:(Z)\b|([+-])(\d\d):?(\d\d)(?!\d)|([AaPp])\.?[Mm]\b)")
 """What may follow a date: its zone, or the half of the day."""
 
@@ -41,6 +43,7 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     Raises:
         DatasetError: Names have two readings.
     """
+    _see_one_camera(stems, folder)
     dates = _dates_s(stems, folder)
     if dates is not None:
         return dates, "dates, read as UTC"
@@ -52,6 +55,20 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     if pair is not None:
         return pair
     return _one_number(columns, stems, folder)
+
+
+def _see_one_camera(stems: Sequence[str], folder: object) -> None:
+    """See that all images are of one camera, by names such as `..._left` and `..._right`.
+
+    Raises:
+        DatasetError: They are of several.
+    """
+    cameras = sorted({"_".join(_CAMERA.findall(stem.lower())) for stem in stems})
+    if all(cameras) and 1 < len(cameras) < len(stems):
+        raise DatasetError(
+            f"{folder}: names are of several cameras ({', '.join(cameras[:6])}); a folder holds the images of one: "
+            f"move the others elsewhere, or {WAY_OUT}"
+        )
 
 
 def _dates_s(stems: Sequence[str], folder: object) -> list[float] | None:
@@ -148,6 +165,7 @@ def _one_number(columns: list[tuple[str, ...]], stems: Sequence[str], folder: ob
     if len(decimal) == 1:
         _check_padding(decimal[0], folder)
         _check_minutes(columns, decimal[0], stems, folder)
+        _check_clock(decimal[0], folder)
         unit = since_1970(float(decimal[0][0])) or "seconds"
         return [float(word) / round(1 / UNITS_S[unit]) for word in decimal[0]], unit
     long = [c for c in columns if all(word.isdigit() and _is_long(word) for word in c) and _varies(c)]
@@ -201,6 +219,18 @@ def _check_minutes(
         raise DatasetError(
             f"{folder}: names such as {stems[-1]} have {before[-1][-1]} before the seconds, which can be minutes or "
             f"count cameras; {WAY_OUT}"
+        )
+
+
+def _check_clock(words: Sequence[str], folder: object) -> None:
+    """Refuse what looks like seconds, and like hours, minutes and seconds without anything between them.
+
+    Raises:
+        DatasetError: All numbers do.
+    """
+    if all(re.fullmatch(r"(?:[01]\d|2[0-3])(?:[0-5]\d){2}\.\d+", word) for word in words):
+        raise DatasetError(
+            f"{folder}: names such as {words[-1]} can be seconds, or hours, minutes and seconds; {WAY_OUT}"
         )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
-from flocc_agent.geometry import adjoint, inverse, umeyama
+from flocc_agent.geometry import adjoint, in_units, inverse, umeyama
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -92,10 +92,7 @@ class GraphFile:
         return GraphFile(graph, truth_m, T_initial, frozenset(), cut(self.T_truth), cut(self.stamps_s))
 
     def with_unit_scale(self) -> "GraphFile":
-        """The same file with the translations of inter-robot closures reduced to length one and their scale free.
-
-        Covariances stay as they are in the file.
-        """
+        """The same file with the translations of inter-robot closures reduced to length one and their scale free."""
         closures = tuple(unit_length(c) if c.query.log != c.match.log else c for c in self.graph.closures)
         return replace(self, graph=replace(self.graph, closures=closures))
 
@@ -147,11 +144,12 @@ def _isotropic_all(covariances: Float | None, planar: bool) -> Float | None:
 
 
 def unit_length(closure: LoopClosure) -> LoopClosure:
-    """A closure whose translation has length one and whose scale is free; a zero translation stays."""
+    """A closure whose translation has length one and whose scale is free, its covariance in that unit; zero stays."""
     T = np.array(closure.T_query_match_unscaled)
-    length_m = float(np.linalg.norm(T[:3, 3]))
-    T[:3, 3] /= length_m if length_m > 0 else 1.0
-    return replace(closure, T_query_match_unscaled=T, metric=False, scale_initial=None)
+    length_m = float(np.linalg.norm(T[:3, 3])) or 1.0
+    T[:3, 3] /= length_m
+    covariance = None if closure.covariance is None else in_units(closure.covariance, length_m)
+    return replace(closure, T_query_match_unscaled=T, covariance=covariance, metric=False, scale_initial=None)
 
 
 def log_of(key: int) -> LogId:

@@ -24,7 +24,7 @@ from flocc_agent.core.pose_graph import (
     LoopClosure,
     OptimisationFailed,
 )
-from flocc_agent.geometry import inverse
+from flocc_agent.geometry import in_units, inverse
 from flocc_launch.graph_files import GraphFile, read_graph_file, write_g2o
 from flocc_launch.graph_files.graph_file import GraphFileError, ate_m, first_poses_at, unmeasured_steps
 from flocc_protocol.errors import FloccError
@@ -258,7 +258,8 @@ def _write(out: Path, result: Mapping[str, Any], solution: GraphSolution, file: 
 
 
 def _scaled(closure: LoopClosure, scale: float | None) -> LoopClosure:
-    """A closure with its estimated scale put into its translation."""
-    T = np.array(closure.T_query_match_unscaled)
-    T[:3, 3] *= scale or 1.0
-    return replace(closure, T_query_match_unscaled=T, metric=True)
+    """A closure with its estimated scale put into its translation and covariance."""
+    T, metres = np.array(closure.T_query_match_unscaled), scale or 1.0
+    T[:3, 3] *= metres
+    covariance = None if closure.covariance is None else in_units(closure.covariance, 1.0 / metres)
+    return replace(closure, T_query_match_unscaled=T, covariance=covariance, metric=True)

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from flocc_agent.config import BackendConfig
 from flocc_agent.runtime.kept_for_maps import BACK_END_FACT, CAMERA_FACT, FRONT_END_FACT, MAP_FACT, UsedMap
-from flocc_agent.runtime.map_folder import BadMap, LensModel, MapFrontEnd
+from flocc_agent.runtime.map_folder import MANIFEST, BadMap, LensModel, MapFrontEnd
 from flocc_agent.runtime.record_tables import COLUMNS, is_sound
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
@@ -83,6 +83,8 @@ def store_folders(where: Path) -> list[Path]:
     """
     found = [folder for folder in (where, where / "store") if (folder / "robot.sqlite").is_file()]
     found += [path.parent for path in sorted(where.glob("robots/*/store/robot.sqlite"))]
+    if not found and (where / MANIFEST).is_file():
+        raise BadMap(f"{where}: is a map already")
     if not found:
         raise BadMap(f"{where}: holds no robot's store (robots/*/store of a run, or the folder of an agent)")
     return found

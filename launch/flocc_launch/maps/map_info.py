@@ -5,6 +5,8 @@ import numpy as np
 from flocc_agent.geometry import symmetric
 from flocc_agent.runtime.map_folder import LensModel, MapFolder, MapManifest
 
+CONTRADICTED_SHOWN = 10
+
 
 def map_lines(opened: MapFolder) -> list[tuple[str, str]]:
     """Names and values, for `flocc map info`.
@@ -33,7 +35,16 @@ def manifest_lines(manifest: MapManifest) -> list[tuple[str, str]]:
         ("made by", f"flocc {manifest.made_by}{f', swarm {manifest.swarm}' if manifest.swarm else ''}"),
         *((f"log {entry.log}", f"{entry.keyframes} keyframes, {_lens(entry.camera)}") for entry in manifest.logs),
         *((f"left out {log}", reason) for log, reason in manifest.left_out.items()),
+        *contradicted_lines(manifest),
     ]
+
+
+def contradicted_lines(manifest: MapManifest) -> list[tuple[str, str]]:
+    """Keyframes that several logs contradict, those of the most logs first."""
+    most = sorted(manifest.contradicted.items(), key=lambda each: (-len(each[1]), each[0]))
+    lines = [(f"contradicted {keyframe}", f"by {', '.join(logs)}") for keyframe, logs in most[:CONTRADICTED_SHOWN]]
+    more = len(most) - len(lines)
+    return lines + ([("contradicted", f"{more} keyframes more, in map.json")] if more else [])
 
 
 def _lens(camera: LensModel | None) -> str:

@@ -43,7 +43,7 @@ def prune_map(folder: Path, out: Path, place_m: float, place_deg: float) -> MapM
     opened.check_whole()
     kept = set(kept_keyframes(opened, place_m, np.radians(place_deg)))
     manifest = opened.manifest
-    solved = SolvedMap(opened.saved(), opened.covariances(), {})
+    solved = SolvedMap(opened.saved(), opened.covariances(), {}, contradicted=opened.manifest.contradicted)
     content = MapContent(
         name=manifest.name,
         logs=opened.records,

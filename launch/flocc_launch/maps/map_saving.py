@@ -73,7 +73,7 @@ def copy_map(opened: MapFolder, out: Path) -> MapManifest:
     content = MapContent(
         name=manifest.name,
         logs=opened.records,
-        solved=SolvedMap(opened.saved(), opened.covariances(), {}),
+        solved=SolvedMap(opened.saved(), opened.covariances(), {}, contradicted=opened.manifest.contradicted),
         front_end=manifest.front_end,
         optics=optics_of(opened),
         latents=latents_of(opened),

@@ -83,6 +83,8 @@ def check_target(out: Path, *others: Path) -> None:
         if out.resolve() == other.resolve():
             raise BadMap(f"{out}: is the map that was given; the new one needs another folder (--out)")
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not _is_left_over(out))):
+        if out.is_dir() and not (out / MANIFEST).exists():
+            raise BadMap(f"{out}: holds something else than a map; choose another --out")
         read_manifest(out)
 
 
@@ -124,6 +126,7 @@ def _write(out: Path, content: MapContent) -> MapManifest:
         pruned=content.pruned,
         closures=len(saved.closures),
         left_out={str(log): reason for log, reason in content.solved.left_out.items()},
+        contradicted=dict(content.solved.contradicted),
         records=records,
         solution=solution,
         latent_file=latent_file,

@@ -34,6 +34,8 @@ Progress = Callable[[int, int], None]
 PAIR_SIDE_PX = 400
 VIEW_SIDE_PX = 170
 JPEG_QUALITY = 68
+PICTURE_MIN_PX = 16
+"""What is lower or narrower is a code for synthetic perception, which nobody wants to look at."""
 SAME_STAMP_S = 1e-3
 LINES_MAX = 60
 """Lines that are drawn of the matches that agree, and of those that do not; more of them hide the pictures."""
@@ -134,6 +136,8 @@ class Shelf:
         recording = self._recording(keyframe.log.robot)
         frame = None if recording is None else frame_at(recording, float(track.stamps_s[keyframe.index]))
         if recording is None or frame is None:
+            return None
+        if min(recording.camera.width, recording.camera.height) < PICTURE_MIN_PX:
             return None
         try:
             return recording.load_image(frame)

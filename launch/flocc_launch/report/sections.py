@@ -38,6 +38,8 @@ def tiles(report: RunReport) -> str:
     """The figures that matter most; errors only where something of the truth is known."""
     known = report.has_truth()
     during = (number(report.iate_m, "m"), f"mean ATE during the run; F1 of closures {number(report.if1)}")
+    if report.iate_m is None:
+        during = (number(report.if1), "F1 of closures")
     shown = [
         (seconds(report.merged_after_s), "until one map" if report.merged_after_s else "not merged into one map"),
         *((ate_tile(report),) if known else ()),
@@ -183,14 +185,19 @@ def errors_part(report: RunReport, errors: str) -> str:
             ]
         )
     rows.append(["all, jointly", number(report.ate_joint_odometry_m), number(report.ate_joint_m), "", ""])
-    rows.append(["during the run", number(report.iate_odometry_m), number(report.iate_m), "", ""])
+    if report.iate_m is not None:
+        rows.append(["during the run", number(report.iate_odometry_m), number(report.iate_m), "", ""])
     heads = ["", "ATE before#", "after, m#", "RPE before#", "after, m#"]
     note = (
         "Per robot: each trajectory aligned on its own. Jointly: odometry stands at its true first poses "
         f"({number(report.ate_joint_odometry_aligned_m, 'm')} after one alignment for all), the corrected "
-        "trajectories after one alignment for all robots together. During the run: the joint error of what was "
-        f"believed after each of the {count_of(report.iate_moments)} rounds that found one map, on average."
+        "trajectories after one alignment for all robots together."
     )
+    if report.iate_m is not None:
+        note += (
+            " During the run: the joint error of what was believed after each of the "
+            f"{count_of(report.iate_moments)} rounds that found one map, on average."
+        )
     left = element(
         "figure",
         element("h3", "Error of each keyframe"),

@@ -50,11 +50,13 @@ def error_lines(report: RunReport) -> list[str]:
             f"joint ATE     {number(report.ate_joint_m, 'm')}{of_the_dead(report)}; odometry at its true starts "
             f"{number(report.ate_joint_odometry_m, 'm')}, aligned {number(report.ate_joint_odometry_aligned_m, 'm')}"
         )
-    if report.iate_m is not None or report.if1 is not None:
-        lines.append(
-            f"during it     ATE {number(report.iate_m, 'm')}; odometry {number(report.iate_odometry_m, 'm')} "
-            f"(mean of {count_of(report.iate_moments)} rounds in one map); F1 of closures {number(report.if1)}"
-        )
+    during = [] if report.if1 is None else [f"F1 of closures {number(report.if1)}"]
+    if report.iate_m is not None:
+        rounds = f"mean of {count_of(report.iate_moments)} rounds in one map"
+        errors = f"ATE {number(report.iate_m, 'm')}; odometry {number(report.iate_odometry_m, 'm')}"
+        during.insert(0, f"{errors} ({rounds})")
+    if during:
+        lines.append(f"during it     {'; '.join(during)}")
     return lines
 
 

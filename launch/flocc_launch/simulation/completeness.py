@@ -28,6 +28,7 @@ MARGIN = 1e-4
 class Complete:
     """Every keyframe is recorded and solved; of each two logs, keyframes that look most alike are registered.
 
+    A robot that comes back looks no more for keyframes both of which were registered with one of the other's log.
     A pair is refused unseen only by a robot that holds refusals of pairs that were seen.
     """
 
@@ -41,7 +42,7 @@ class Complete:
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
         for effect in step.effects:
             if isinstance(effect, PersistRecord) and effect.log == step.station.log:
-                record = decoded(effect.data)[0]
+                record = decoded(effect.data)
                 if isinstance(record, KeyframeRecord):
                     self._recorded[life] += 1
                     self._describe(effect.data, record)
@@ -75,12 +76,15 @@ class Complete:
             log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
         }
         resolved = resolved_pairs(logs)
+        partnered = {(end, pair.other(end).log) for pair in resolved for end in (pair.low, pair.high)}
+        came_back = {station.log for station in group if station.life > 1}
         for one, other in combinations(known, 2):
             apart = one.robot != other.robot and (one in writers or other in writers)
             if not apart or max(logs[one].keyframes, logs[other].keyframes) < 2:
                 continue
             for pair in _alike((one, known[one]), (other, known[other]), threshold):
-                if pair not in resolved:
+                both = {(pair.low, pair.high.log), (pair.high, pair.low.log)} <= partnered
+                if pair not in resolved and not (both and came_back & {one, other}):
                     yield f"nobody registered {pair.low} {pair.high}, which look alike"
 
     def _described(self, copy: LogCopy) -> dict[int, NDArray[np.float32]]:

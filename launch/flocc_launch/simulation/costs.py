@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from flocc_agent.core.effects import Broadcast, Effect, FetchLatent, Register, Report, Unicast
 from flocc_agent.core.events import LatentFetched, LatentFetchFailed
+from flocc_agent.core.latents import BACKLOG_MAX
 from flocc_agent.core.reports import CandidateFound, NameTaken, NeighbourDown, NeighbourUp
 from flocc_launch.simulation.invariants import Step
 from flocc_launch.simulation.virtual_robot import Station
@@ -27,6 +28,8 @@ ELECTION_MAX = 60
 ASKED_MAX = 12
 """How often one robot asks for the same place of a log within a second."""
 SHARE_SIGMAS = 5.5
+HEARD_S = 3.0
+"""So long ago a robot may have said what others still know of it."""
 SHARED_MIN = 32
 """Of so many pairs between two robots of one class each registers about half: by a coin, within so many deviations."""
 
@@ -93,7 +96,7 @@ def _often(times_s: deque[float], now_s: float, window_s: float) -> int:
 
 @dataclass(slots=True)
 class Balanced:
-    """Work goes to stronger robots in range, and between equals each does about half.
+    """Work goes to stronger robots in range that have not more than enough, and between equals each does about half.
 
     Attributes:
         classes: Compute class by robot name.
@@ -102,6 +105,7 @@ class Balanced:
     classes: dict[str, int]
     _near_since_s: dict[tuple[str, int], dict[str, float]] = field(default_factory=lambda: defaultdict(dict))
     _known_since_s: dict[tuple[str, int, CandidatePair], float] = field(default_factory=dict)
+    _full_s: dict[str, float] = field(default_factory=dict)
     _shared: Counter[bool] = field(default_factory=Counter)
 
     def step(self, step: Step) -> Iterator[str]:
@@ -112,6 +116,8 @@ class Balanced:
         life = step.station.name, step.station.life
         for effect in step.effects:
             match effect:
+                case Broadcast(Heartbeat(load=load)) if load >= BACKLOG_MAX:
+                    self._full_s[step.station.name] = step.at_s
                 case Report(NeighbourUp(peer=peer)):
                     self._near_since_s[life][peer] = step.at_s
                 case Report(NeighbourDown(peer=peer) | NameTaken(peer=peer)):
@@ -127,7 +133,7 @@ class Balanced:
         near = {peer for peer, since_s in self._near_since_s[life].items() if since_s < known_s}
         own_class = station.compute_class
         stronger = sorted(peer for peer in near if self.classes.get(peer, 0) > own_class)
-        if stronger:
+        if stronger and not any(self._full_s.get(peer, float("-inf")) > known_s - HEARD_S for peer in stronger):
             yield f"{station.name} registers {pair.low} {pair.high}, though {stronger[0]} is stronger and near"
         other = pair.high.log if station.log == pair.low.log else pair.low.log
         if (

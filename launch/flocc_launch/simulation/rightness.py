@@ -61,7 +61,7 @@ class Right:
 
     def _recorded(self, step: Step, event: PairRegistered) -> Iterator[str]:
         own = (e for e in step.effects if isinstance(e, PersistRecord) and e.log == step.station.log)
-        for record in (decoded(effect.data)[0] for effect in own):
+        for record in (decoded(effect.data) for effect in own):
             if not isinstance(record, ClosureRecord | RejectionRecord):
                 continue
             if CandidatePair.of(record.query, record.match) != event.pair:

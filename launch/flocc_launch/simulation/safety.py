@@ -24,6 +24,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.log_copy import decoded
+from flocc_agent.core.loop_closing import registrar_of
 from flocc_agent.core.offers import FAR_TAKEOVERS, TAKEOVER_S
 from flocc_agent.core.plausibility import UNTIED
 from flocc_agent.core.pose_graph import map_frame
@@ -74,11 +75,11 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], ho
         ),
         Invariant("one frame", lacking=liveness.in_other_frames),
         Invariant("nothing lost", step=Published().step, lacking=liveness.not_everywhere),
-        Invariant("believed", step=doubted_in_error if honest else None, wants=frozenset({Report})),
+        Invariant("believed", step=doubted_in_error if honest else None, wants=frozenset({Report, Optimise})),
         Invariant("bounded", step=Bounded().step),
         Invariant("reported", step=Doubles().step, wants=sent | told),
         Invariant("cheap", step=Cheap().step, wants=sent | told | {LatentFetched, LatentFetchFailed}),
-        Invariant("balanced", step=Balanced(classes).step, wants=told),
+        Invariant("balanced", step=Balanced(classes).step, wants=told | {Broadcast}),
         Invariant(
             "complete",
             step=complete.step,
@@ -95,8 +96,13 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], ho
 
 
 def doubted_in_error(step: Step) -> Iterator[str]:
-    """An honest leader whose correction is called a lie; one that is waited for is none."""
+    """An honest leader whose correction is called a lie, or believed after an own solution only.
+
+    One that is waited for is none.
+    """
     for effect in step.effects:
+        if isinstance(effect, Optimise) and effect.term.counter == 0:
+            yield f"{step.station.name} believes its own solution only"
         if isinstance(effect, Report) and isinstance(effect.fact, PeerRefused):
             reason = effect.fact.reason
             if reason.startswith(UNTRUE) and not reason.endswith(UNTIED):
@@ -171,9 +177,9 @@ class Once:
     """Each pair is registered by one robot, and again only where that could not be known.
 
     A second registration is excused where the first robot died, or where robots were apart: the one that registers
-    took the pair over while the owner in charge, or the first robot, was out of its hearing; and two robots of one name
-    get what one of them is offered. It never is where the robot holds a record of the pair already, unless that refused
-    it unseen.
+    took the pair over while the owner in charge, or the first robot, was out of its or an owner's hearing; and two
+    robots of one name get what one of them is offered. It never is where the robot holds a record of the pair already,
+    unless that refused it unseen.
 
     Attributes:
         separated: At times robots cannot hear each other.
@@ -186,7 +192,7 @@ class Once:
     again: int = 0
     _begun: dict[CandidatePair, list[_Registered]] = field(default_factory=lambda: defaultdict(list))
     _records: dict[CandidatePair, set[tuple[LogId, int, bytes]]] = field(default_factory=lambda: defaultdict(set))
-    _changed_s: dict[tuple[str, str], float] = field(default_factory=dict)
+    _heard: dict[tuple[str, str], tuple[bool, float]] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
         """A second registration of a pair without an excuse."""
@@ -195,12 +201,12 @@ class Once:
                 case PersistRecord(log, number, data):
                     self._note_record(log, number, data)
                 case Report(NeighbourUp() | NeighbourDown() as changed):
-                    self._changed_s[step.station.name, changed.peer] = step.at_s
+                    self._heard[step.station.name, changed.peer] = isinstance(changed, NeighbourUp), step.at_s
                 case Register(pair):
                     yield from self._registers(step, pair)
 
     def _note_record(self, log: LogId, number: int, data: bytes) -> None:
-        record = decoded(data)[0]
+        record = decoded(data)
         unseen = isinstance(record, RejectionRecord) and record.reason == UNLIKELY
         if isinstance(record, ClosureRecord | RejectionRecord) and not unseen:
             self._records[CandidatePair.of(record.query, record.match)].add((log, number, data))
@@ -228,13 +234,21 @@ class Once:
             return False
         if earlier.by.log.robot == again.station.log.robot:
             return True
-        involved = sorted({earlier.by.log.robot, again.station.log.robot, pair.low.log.robot, pair.high.log.robot})
-        return any(self._apart(one, other, again) for one in involved for other in involved if one != other)
+        owners = {pair.low.log.robot, pair.high.log.robot}
+        takers, charged = owners | {again.station.log.robot}, {registrar_of(pair).robot, earlier.by.log.robot}
+        if any(self._hears(one, other) is False for one in takers for other in charged - {one}):
+            return True
+        involved = takers | charged
+        return any(self._changed_lately(one, other, again) for one in involved for other in involved - {one})
 
-    def _apart(self, one: str, other: str, step: Step) -> bool:
-        """Whether a robot did not hear another one lately, as far as pairs are taken over for that."""
-        changed_s = self._changed_s.get((one, other))
-        return changed_s is None or step.at_s - changed_s <= APART_S
+    def _hears(self, one: str, other: str) -> bool | None:
+        """Whether a robot hears another one; None: it never did."""
+        return self._heard.get((one, other), (None, 0.0))[0]
+
+    def _changed_lately(self, one: str, other: str, step: Step) -> bool:
+        """Whether a robot never heard another one, or lost or found it so lately that pairs are taken over for it."""
+        heard = self._heard.get((one, other))
+        return heard is None or step.at_s - heard[1] <= APART_S
 
 
 @dataclass(slots=True)

@@ -5,16 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.agent.backend.plain_team import plain_team
 
 from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.optimiser import optimise
+from flocc_agent.backend.pair_closures import measured
 from flocc_agent.config import BackendConfig, Formulation
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, pose, so3_exp
-from flocc_lab.graph_family.family_spec import Lengths, drawn
-from flocc_lab.graph_family.graphs import Member, made
+from flocc_lab.graph_family.family_spec import Lengths
+from flocc_lab.graph_family.graphs import Member
 from flocc_lab.graph_family.methods import settings
 from flocc_lab.graph_family.single_false import outcome
+from flocc_lab.graph_family.team_walks import TeamSpec, team_graph
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -22,25 +25,8 @@ FIRST, SECOND = LogId("r00"), LogId("r01")
 
 
 def two_robots(lengths: Lengths = Lengths.METRIC, noise_factor: float = 1.0, robots: int = 2) -> Member:
-    spec = replace(
-        drawn(8),
-        keyframes=(120,) * robots,
-        scale_off=(1.0,) * robots,
-        lengths=lengths,
-        closures=60,
-        odometry=(0.002, 0.02),
-        closure=(0.01, 0.05),
-        odometry_factor=noise_factor,
-        closure_factor=noise_factor,
-        heavy_tails=False,
-        outliers=0.0,
-        groups=0,
-        weak=False,
-        opposite=False,
-        parallel=False,
-        planar=True,
-    )
-    return made(spec)
+    noise = {"odometry_factor": noise_factor, "closure_factor": noise_factor}
+    return plain_team(8, (120,) * robots, lengths=lengths, **noise)
 
 
 def said(member: Member, query: KeyframeId, match: KeyframeId, error: Float) -> LoopClosure:
@@ -157,3 +143,29 @@ def test_measurements_that_count_as_given_are_not_held() -> None:
     member = two_robots()
     false = said(member, KeyframeId(FIRST, 60), KeyframeId(SECOND, 60), MOVED)
     assert held(member, false, config=settings(formulation=Formulation.BASE)) == {}
+
+
+def test_directions_of_robots_far_from_each_other_are_not_taken_for_exact_ones() -> None:
+    """Twenty metres apart, a direction that is known to half a degree says little of metres."""
+    team = team_graph(TeamSpec(seed=1, robots=3, poses=60)).without_lengths()
+    assert held_closures(team.graph.trajectories, dict(enumerate(team.graph.closures)), settings()) == {}
+
+
+def test_a_false_direction_between_robots_far_from_each_other_is_held() -> None:
+    team = team_graph(TeamSpec(seed=1, robots=3, poses=60)).without_lengths()
+    closures = dict(enumerate(team.graph.closures))
+    k, right = next((k, c) for k, c in closures.items() if c.query.log != c.match.log)
+    closures[k] = replace(right, T_query_match_unscaled=right.T_query_match_unscaled @ TURNED)
+    assert list(held_closures(team.graph.trajectories, closures, settings())) == [k]
+
+
+def test_the_variance_of_a_direction_grows_with_the_square_of_its_length() -> None:
+    closure = LoopClosure(
+        KeyframeId(FIRST, 0), KeyframeId(SECOND, 0), pose(np.eye(3), np.array([1.0, 0.0, 0.0])),
+        covariance=np.diag([1e-4] * 3 + [4e-4] * 3),
+    )  # fmt: skip
+    metric = replace(closure, metric=True)
+    found = measured([0, 1], {0: closure, 1: metric}, settings()).with_lengths(np.array([20.0, 20.0]))
+    np.testing.assert_allclose(found.length_m, [20.0, 1.0])
+    np.testing.assert_allclose(found.translation, [0.02**2 * 20.0**2, 0.02**2])
+    np.testing.assert_allclose(found.translation_at(np.array([10.0, 10.0])), [0.02**2 * 30.0**2, 0.02**2])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flocc_agent.backend import chains, optimiser
+from flocc_agent.backend import chains
 from flocc_agent.backend.chains import CHAIN_EDGES_MAX, chains_of, kept_numbers
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation
@@ -64,7 +64,7 @@ def test_a_round_goes_on_from_the_one_before_it() -> None:
 
 def test_chains_that_are_bent_too_far_are_solved_with_all_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = graph_of().graph
-    monkeypatch.setattr(optimiser, "STRAIN_RATIO_MAX", -1.0)
+    monkeypatch.setattr(chains, "STRAIN_RATIO_MAX", -1.0)
     resolved = solved(graph)
     monkeypatch.setattr(chains, "CHAINED_POSES_MIN", 10**9)
     assert worst_m(resolved, solved(graph)) < 1e-3
@@ -77,7 +77,7 @@ def test_the_size_of_a_map_whose_scales_are_only_ratios_is_that_of_all_keyframes
     ratios = dict(zip(sorted(generated.trajectories), (0.9, 1.0, 1.1), strict=True))
     longer = {log: stretched(Trajectory(t.T_odom_keyframe), ratios[log]) for log, t in generated.trajectories.items()}
     graph = PoseGraph(longer, generated.closures)
-    monkeypatch.setattr(optimiser, "STRAIN_RATIO_MAX", -1.0)
+    monkeypatch.setattr(chains, "STRAIN_RATIO_MAX", -1.0)
     resolved = solved(graph)
     assert all(scale.is_applied and not scale.is_metric for scale in resolved.components[0].odometry_scales.values())
     monkeypatch.setattr(chains, "CHAINED_POSES_MIN", 10**9)

@@ -26,7 +26,7 @@ SMALL = (4, 9, 12, 13)
 def objective_of(drawn: Member, solver: Solver) -> tuple[Objective, State]:
     config = BackendConfig(solver=solver, weight_by_probability=False)
     closures = dict(enumerate(drawn.graph.closures))
-    T, _ = initial_poses(drawn.graph.trajectories, closures, config.steepness, None)
+    T = initial_poses(drawn.graph.trajectories, closures, config.steepness, None).T_map_keyframe
     problem = build(drawn.graph.trajectories, closures, config)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     state = state_of(np.concatenate([T[log] for log in problem.logs]), problem.clusters)

@@ -72,6 +72,42 @@ def test_jacobians_of_a_scale_that_divides_the_poses_are_the_numerical_derivativ
     np.testing.assert_allclose(analytic, measured, atol=2e-7 * max(1.0, float(np.abs(measured).max())))
 
 
+@pytest.mark.parametrize("turned_rad", [0.0, 0.3, 1.2, 0.5 * np.pi, 1.8, 2.8])
+@pytest.mark.parametrize("length_m", [0.05, 1.0, 20.0])
+def test_jacobians_of_a_direction_are_the_numerical_derivatives(turned_rad: float, length_m: float) -> None:
+    edges, state = direction(turned_rad, length_m)
+    at = residuals(edges, state)
+    jac = jacobians(edges, at)
+    analytic = np.hstack([jac.A_i[0], jac.A_j[0]])
+    measured = np.stack([numerical(edges, state, n)[:6] for n in range(12)], axis=1)
+    np.testing.assert_allclose(analytic, measured, atol=1e-6 * max(1.0, float(np.abs(measured).max())))
+
+
+def direction(turned_rad: float, length_m: float) -> tuple[Edges, State]:
+    """An edge of which the length is not known, and poses so far apart, so far off the measured direction."""
+    rng = np.random.default_rng(2)
+    edges, state = edge(rng, "random", 5.0, -1)
+    d = edges.d[0, 3:]
+    side = np.cross(d, rng.normal(size=3))
+    q = so3_exp(turned_rad * side / np.linalg.norm(side)) @ d / np.linalg.norm(d) * length_m
+    R_world_hat = rotations.matrices(state.q[:1])[0] @ rotations.matrices(edges.q_hat)[0]
+    t = np.array([state.t[0], state.t[0] + R_world_hat @ q])
+    return replace(edges, divides=np.array([True])), State(state.q, t, np.ones(1))
+
+
+def test_the_error_of_a_direction_is_its_angle_however_far_and_grows_up_to_half_a_turn() -> None:
+    def error(turned_rad: float, length_m: float) -> float:
+        edges, state = direction(turned_rad, length_m)
+        edges = replace(edges, sqrt_information=np.diag([0.0] * 3 + [1.0] * 3)[None], sigma=np.array([1e9]))
+        return float(np.sqrt(residuals(edges, state).squared()[0]) / np.linalg.norm(edges.d))
+
+    for turned_rad in (0.1, 1.0, 2.0, 3.0):
+        chord = 2.0 * np.sin(0.5 * turned_rad)
+        assert error(turned_rad, 100.0) == pytest.approx(chord, rel=1e-3)
+        assert error(turned_rad, 1000.0) == pytest.approx(chord, rel=1e-3)
+        assert error(turned_rad, 1e-3) < 2e-3, "poses that coincide have no direction"
+
+
 def test_a_held_scale_pulls_at_its_cluster_and_not_at_its_poses_scale() -> None:
     rng = np.random.default_rng(3)
     edges, state = edge(rng, "random", 0.3, 0, scale=0.5)

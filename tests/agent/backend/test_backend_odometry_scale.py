@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.agent.backend.plain_team import plain_team
 
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig, Formulation
 from flocc_agent.core.pose_graph import Component, GraphSolution, OptimisationFailed, PoseGraph, stretched
-from flocc_lab.graph_family.family_spec import Lengths, drawn
-from flocc_lab.graph_family.graphs import Member, made
+from flocc_lab.graph_family.family_spec import Lengths
+from flocc_lab.graph_family.graphs import Member
 from flocc_lab.graph_family.judge import judged
 from flocc_lab.graph_family.methods import answer_of, settings
 from flocc_lab.graph_family.team_walks import TeamSpec, team_graph
@@ -21,25 +22,7 @@ FIRST, SECOND = LogId("r00"), LogId("r01")
 
 def measured(lengths: Lengths, seed: int = 5, closures: int = 120) -> Member:
     """Three robots with true odometry and a few wrong closures."""
-    spec = replace(
-        drawn(seed),
-        keyframes=(120, 130, 110),
-        scale_off=(1.0, 1.0, 1.0),
-        lengths=lengths,
-        closures=closures,
-        odometry=(0.002, 0.02),
-        closure=(0.01, 0.05),
-        odometry_factor=1.0,
-        closure_factor=1.0,
-        heavy_tails=False,
-        outliers=0.1,
-        groups=0,
-        weak=False,
-        opposite=False,
-        parallel=False,
-        planar=True,
-    )
-    return made(spec)
+    return plain_team(seed, (120, 130, 110), lengths=lengths, closures=closures, outliers=0.1)
 
 
 def with_stretched(member: Member, ratios: Mapping[LogId, float]) -> Member:

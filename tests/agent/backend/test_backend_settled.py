@@ -1,4 +1,4 @@
-"""Rounds hold what the last whole one placed, and open it where new closures demand it."""
+"""Rounds rest on what the last whole one chose, move everything, and are whole where new closures demand it."""
 
 from dataclasses import replace
 
@@ -7,7 +7,6 @@ import pytest
 
 from flocc_agent.backend import settled
 from flocc_agent.backend.optimiser import optimise
-from flocc_agent.backend.settled import OPEN_KEYFRAMES
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import inverse, pose, se3_exp, so3_exp
@@ -56,24 +55,24 @@ def between_true(drawn: GeneratedGraph, i: int, j: int) -> np.ndarray:
     return np.asarray(inverse(drawn.T_world_keyframe[R00][i]) @ drawn.T_world_keyframe[R01][j])
 
 
-def test_what_is_new_is_solved_beside_what_is_settled(drawn: GeneratedGraph, first: GraphSolution) -> None:
+def test_a_round_that_rests_on_the_one_before_ends_where_a_whole_one_does(
+    drawn: GeneratedGraph, first: GraphSolution
+) -> None:
     graph = at(drawn, LATER)
     assert len(graph.closures) > len(first.closures)
     found, whole = solved(graph, first), solved(graph)
     assert found.whole is first
-    (component,), (of_whole,), (before,) = found.components, whole.components, first.components
+    (component,), (of_whole,) = found.components, whole.components
     for log, T in component.T_map_keyframe.items():
-        assert len(T) == LATER
-        held = WHOLE - OPEN_KEYFRAMES - 1
-        np.testing.assert_array_equal(T[:held], before.T_map_keyframe[log][:held])
         apart_m = np.linalg.norm(T[:, :3, 3] - of_whole.T_map_keyframe[log][:, :3, 3], axis=1)
-        assert apart_m.max() < 0.25
-        S, S_before = component.covariance_map_odom[log], before.covariance_map_odom[log]
+        assert len(T) == LATER
+        assert apart_m.max() < 0.005
+        S, S_whole = component.covariance_map_odom[log], of_whole.covariance_map_odom[log]
         assert S is not None
-        assert S_before is not None
-        assert np.all(np.linalg.eigvalsh(S - S_before) > -1e-12)
+        assert S_whole is not None
+        np.testing.assert_allclose(S, S_whole, rtol=0.05, atol=0.01 * np.abs(S_whole).max())
     assert [c.state for c in found.closures] == [c.state for c in whole.closures]
-    assert component.cost == pytest.approx(of_whole.cost, rel=0.05)
+    assert component.cost == pytest.approx(of_whole.cost, rel=1e-3)
 
 
 def test_one_false_closure_is_turned_away_and_a_second_beside_it_opens_the_map(
@@ -90,7 +89,7 @@ def test_one_false_closure_is_turned_away_and_a_second_beside_it_opens_the_map(
     assert again.whole is None
 
 
-def test_closures_that_agree_and_pull_at_the_settled_part_open_it(drawn: GeneratedGraph, first: GraphSolution) -> None:
+def test_closures_that_agree_and_pull_move_what_is_old(drawn: GeneratedGraph, first: GraphSolution) -> None:
     rng = np.random.default_rng(1)
     near = [(a, b) for a in range(100, 700, 30) for b in range(100, 700)
             if np.linalg.norm(between_true(drawn, a, b)[:3, 3]) < 6.0]  # fmt: skip
@@ -100,8 +99,20 @@ def test_closures_that_agree_and_pull_at_the_settled_part_open_it(drawn: Generat
         replace(closure(a, b, between_true(drawn, a, b) @ aside @ se3_exp(rng.normal(0.0, 0.01, 6))), covariance=S)
         for a, b in near[:: len(near) // 6][:6]
     ]
-    assert solved(at(drawn, LATER), first).whole is first
-    assert solved(at(drawn, LATER, *pulling), first).whole is None
+    graph = at(drawn, LATER, *pulling)
+    found, whole = solved(graph, first), solved(graph, replace(first, iterations=0))
+    assert found.whole is first
+    assert whole.whole is None
+    (component,), (of_whole,), (before,) = found.components, whole.components, first.components
+    moved_m, apart_m = (
+        max(
+            float(np.linalg.norm(component.T_map_keyframe[log][:700, :3, 3] - T[:700, :3, 3], axis=1).max())
+            for log, T in other.T_map_keyframe.items()
+        )
+        for other in (before, of_whole)
+    )
+    assert moved_m > 0.05
+    assert apart_m < 0.1 * moved_m
 
 
 def test_a_robot_that_one_closure_alone_joins_stays_apart(drawn: GeneratedGraph) -> None:

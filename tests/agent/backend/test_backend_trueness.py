@@ -1,39 +1,20 @@
 """Covariances grow where residuals say so: noise that is understated, and drift that keeps its direction."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from tests.agent.backend.plain_team import plain_team
 
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.trueness import window_variances
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_lab.bench.nees import asked, uncertainty
-from flocc_lab.graph_family.family_spec import Lengths, drawn
-from flocc_lab.graph_family.graphs import Member, made
+from flocc_lab.graph_family.graphs import Member
 from flocc_lab.graph_family.methods import settings
 
 
 def two_robots(noise_factor: float) -> Member:
-    spec = replace(
-        drawn(8),
-        keyframes=(120, 120),
-        scale_off=(1.0, 1.0),
-        lengths=Lengths.METRIC,
-        closures=60,
-        odometry=(0.004, 0.02),
-        closure=(0.01, 0.05),
-        odometry_factor=noise_factor,
-        closure_factor=noise_factor,
-        heavy_tails=False,
-        outliers=0.0,
-        groups=0,
-        weak=False,
-        opposite=False,
-        parallel=False,
-        planar=False,
-    )
-    return made(spec)
+    noise = {"odometry_factor": noise_factor, "closure_factor": noise_factor}
+    return plain_team(8, (120, 120), odometry=(0.004, 0.02), planar=False, **noise)
 
 
 def solved(member: Member) -> GraphSolution:

@@ -56,7 +56,7 @@ def test_ties_are_a_logs_newest_closures_and_no_record_is_read() -> None:
     assert known.assembly.ties(R1, 10) == [Tie(5, at(R1, 1), 0.0), Tie(0, at(R2, 1), 2.0)]
     assert known.assembly.ties(R1, 1) == [Tie(5, at(R1, 1), 0.0)]
     assert known.assembly.ties(R2, 10) == [Tie(3, at(R3, 2), 2.0), Tie(1, at(R1, 0), 2.0)]
-    assert known.assembly.ties(LogId("r9"), 10) == ()
+    assert known.assembly.ties(LogId("r9"), 10) == []
     assert known.assembly.joined(R1, R3)
 
 

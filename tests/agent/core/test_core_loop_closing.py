@@ -1,23 +1,27 @@
 """Candidates to registrations: each pair by one robot, taken over, rejected when its latents are lost."""
 
+from collections import Counter
 from typing import Any
 
+import pytest
 from tests.agent.core.virtual_time import Robots, answer, keyframe
 
+from flocc_agent.core import latents
 from flocc_agent.core.effects import Effect, Encode, FetchLatent, Register, Unicast
 from flocc_agent.core.events import (
+    LATENT_FALSE,
     LATENT_UNKNOWN,
     Event,
     KeyframeEncodingFailed,
     LatentFetchFailed,
     LatentMissing,
 )
-from flocc_agent.core.latents import RELAYS_MAX, RETRY_S, Latents, Peer, Reach
+from flocc_agent.core.latents import BACKLOG_MAX, RELAYS_MAX, RETRY_S, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, registrar_of
 from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
-from flocc_agent.core.reports import ClosureRejected
+from flocc_agent.core.reports import ClosureRejected, LatentFailed
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
 from flocc_protocol.records import RejectionRecord
@@ -307,15 +311,145 @@ def test_wishes_that_nobody_can_grant_do_not_keep_others_waiting() -> None:
     assert turns == set(needed)
 
 
+def test_a_holder_that_served_a_false_latent_is_asked_again_only_when_it_comes_back() -> None:
+    wanted, holds = keyframe("r3/1"), Peer(0, holds=(keyframe("r3/1"), keyframe("r3/2")))
+    around = reach(r2=holds.holds, r4=holds.holds)
+    around.on_false("r2", wanted)
+    around.update("r2", holds)
+    assert (around.holder(wanted), around.holder(keyframe("r3/2"))) == ("r4", "r2")
+    around.on_false("r4", wanted)
+    assert Latents(R1, PARAMETERS).wants([wanted], around, 0.0) == (wanted,)
+    around.remove("r2")
+    around.update("r2", holds)
+    assert around.holder(wanted) == "r2"
+
+
+def test_a_latent_is_asked_of_its_owner_whatever_it_served() -> None:
+    around = reach(r2=())
+    around.on_false("r2", keyframe("r2/1"))
+    assert around.holder(keyframe("r2/1")) == "r2"
+
+
 def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     latents = Latents(R1, PARAMETERS)
     for k in range(50):
-        latents.on_wants([keyframe(f"r3/{k}")], 0.0)
+        latents.on_wants([keyframe(f"r3/{k}")], float(k))
         latents.add(keyframe(f"r3/{k}"))
     assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - RELAYS_MAX, 50))
 
 
+def test_wishes_have_their_turns_although_some_are_granted_meanwhile() -> None:
+    latents, needed = Latents(R1, PARAMETERS), [keyframe(f"r3/{k}") for k in range(40)]
+    wished: set[KeyframeId] = set()
+    for turn in range(5):
+        wishes = latents.wants(needed[turn:], reach(r2=()), turn * WANTS_TURN_S)  # the first ones come, one a turn
+        assert not wished & set(wishes)
+        wished |= set(wishes)
+    assert wished == set(needed)
+
+
+def test_what_is_wished_for_still_is_wished_for_until_its_turn_is_over() -> None:
+    latents, needed = Latents(R1, PARAMETERS), [keyframe(f"r3/{k}") for k in range(20)]
+    first = latents.wants(needed, reach(r2=()), 0.0)
+    assert latents.wants(needed, reach(r2=()), 0.5, first[1:]) == (*first[1:], needed[8])
+
+
+def test_what_came_for_a_neighbour_is_held_however_many_others_are_wished_for() -> None:
+    latents, came = Latents(R1, PARAMETERS), keyframe("r3/0")
+    latents.on_wants([came], 0.0)
+    latents.add(came)
+    for k in range(1, 100):
+        latents.on_wants([keyframe(f"r3/{k}")], 0.0)
+    assert latents.holds() == (came,)
+    assert latents.sizes()["relayed"] == (RELAYS_MAX, RELAYS_MAX)
+    for k in range(1, 100):
+        latents.on_wants([keyframe(f"r3/{k}")], WANTS_TURN_S)
+    assert latents.holds() == ()
+
+
+def handed(machine: LoopClosing, now: float) -> list[CandidatePair]:
+    told = [effect.message for effect in machine.tick(now) if isinstance(effect, Unicast) and effect.to == "server"]
+    return [pair for message in told if isinstance(message, CandidateOffer) for pair in message.pairs]
+
+
+def test_a_stronger_robot_is_handed_its_share_of_what_it_has_room_for_the_most_similar_first() -> None:
+    machine, pairs = closing(), pairs_of(R1, 5)
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX - 4))
+    machine.on_peer("r2", Peer(0))
+    for k, pair in enumerate(pairs):
+        found(machine, pair, 0.5 + 0.1 * k)
+    assert handed(machine, 0.0) == [pairs[4], pairs[3]]
+    assert handed(machine, 0.3) == []
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX - 4))
+    assert handed(machine, 0.6) == [pairs[2], pairs[1]]
+    assert handed(machine, OFFER_PERIOD_S) == sorted([pairs[4], pairs[3]])
+
+
+def test_while_a_stronger_robot_has_more_than_enough_to_do_others_help() -> None:
+    machine, pairs = closing(), pairs_of(R1, 5)
+    for k in range(100):
+        machine.on_held(KeyframeId(R1, k))
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    machine.on_peer("r2", Peer(0))
+    for k, pair in enumerate(pairs):
+        found(machine, pair, 0.5 + 0.1 * k)
+    helped = PARAMETERS.registrations_max + PARAMETERS.fetches_max
+    effects = machine.tick(0.0)
+    assert offers(effects) == []
+    assert [effect.keyframe for effect in effects if isinstance(effect, FetchLatent)] == [keyframe("r2/1")]
+    assert machine.load == helped
+    machine.on_peer("server", Peer(9, load=0))
+    assert handed(machine, 0.5) == [pairs[1], pairs[0]]
+
+
+def test_what_nobody_in_range_can_give_is_left_to_the_stronger_robot() -> None:
+    machine = closing()
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    found(machine, pair_of(R1))
+    assert machine.tick(0.0) == []
+    assert machine.load == 0
+    assert len(machine.open_pairs()) == 1
+
+
+def test_a_robot_that_begins_hands_on_what_it_may_have_handed_on_before() -> None:
+    machine = closing(listens_until_s=1.0)
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    machine.on_peer("r2", Peer(0))
+    found(machine, pair_of(R1))
+    assert handed(machine, 1.0) == [pair_of(R1)]
+
+
+def test_pairs_that_a_stronger_robot_was_not_told_of_do_not_wait_for_it_when_it_is_gone() -> None:
+    machine = closing()
+    machine.on_peer("server", Peer(9, load=BACKLOG_MAX))
+    found(machine, pair_of(R1))
+    machine.tick(0.0)
+    machine.on_lost("server", 1.0)
+    machine.on_peer("r2", Peer(0))
+    assert [effect.keyframe for effect in machine.tick(1.0) if isinstance(effect, FetchLatent)] == [keyframe("r2/1")]
+
+
 # Whole robots
+
+
+def test_a_server_that_answers_nothing_does_not_keep_the_others_from_closing_loops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(latents, "BACKLOG_MAX", 2)
+    robots = Robots()
+    for name in ("r1", "r2"):
+        robots.add(name)
+    robots.add("server", compute_class=9)
+    robots.run(30.0)
+    robots.work = lambda robots, name, effect: (
+        None if name == "server" and isinstance(effect, Register) else answer(effect)
+    )
+    meet(robots, "r1", "r2", keyframes=16)
+    robots.run(30.0)
+    by = Counter(name for _, name, effect in robots.done if isinstance(effect, Register))
+    assert by["server"] == 1
+    assert by["r1"] + by["r2"] >= 8
+    assert len(registrations(robots)) == len(set(registrations(robots)))
 
 
 def test_every_pair_is_registered_once() -> None:
@@ -408,6 +542,23 @@ def test_a_lost_latent_is_known_to_robots_that_only_hear_the_owner_through_other
     assert {fact.reason for fact in robots.facts("r4", ClosureRejected)} == {"a latent was lost"}
     robots.run(60.0)
     assert all(core.closing.lost(robots.now_s) == () for core in robots.cores.values())
+
+
+def test_a_relay_that_serves_false_latents_keeps_no_closure_back() -> None:
+    def work(robots: Robots, name: str, effect: Effect) -> Event | None:
+        if isinstance(effect, FetchLatent) and effect.holder == "r2" and effect.keyframe.log.robot != "r2":
+            return LatentFetchFailed(effect.keyframe, effect.holder, LATENT_FALSE)
+        return answer(effect)
+
+    robots = Robots(work=work)
+    for name in ("r1", "r2", "r3", "r4"):
+        robots.add(name)
+    robots.separate("r1", "r4")
+    meet(robots, "r1", "r4")
+    robots.run(60.0)
+    assert robots.cores["r3"].assembly.closures == 4
+    false = [fact.keyframe for fact in robots.facts("r4", LatentFailed) if fact.holder == "r2"]
+    assert len(false) == len(set(false)) > 0
 
 
 def test_an_own_latent_that_the_store_evicted_rejects_its_pair() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from flocc_agent.core.log_copy import BLOCK_RECORDS, LogCopy
 from flocc_agent.core.parameters import PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import Found, PlaceRecognition, direction
+from flocc_agent.core.place_recognition import THINNED_AT_ONCE, Found, PlaceRecognition, direction
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import KeyframeRecord, encode_record
@@ -82,6 +82,35 @@ def test_every_keyframe_has_a_partner_in_each_other_log_where_anything_is_alike_
     first, second = (next(each for each in keyframes if each[0].log == log) for log in (OTHERS[0], OWN))
     assert recognition.on_keyframes([first]) == []
     assert [candidate.pair.other(OWN_FIRST) for _, candidate in recognition.on_keyframes([second])] == [first[0]]
+
+
+def test_rows_that_stand_for_others_are_few_unlike_and_found_by_their_keyframes() -> None:
+    """Many logs of which none is like itself: bounds fall until few enough stay, and what stays is where it belongs."""
+    rng = np.random.default_rng(5)
+    logs, held, count = [LogId(f"r{k}") for k in range(2, 8)], 1200, 900
+    keyframes = [(KeyframeId(log, k), Array.int8(rng.standard_normal(64))) for log in logs for k in range(count)]
+    arrays = dict(keyframes)
+    whole, parts = (
+        PlaceRecognition(OWN, PlaceRecognitionParameters(similarity_threshold=0.99), keyframes_held=held)
+        for _ in range(2)
+    )
+    whole.on_keyframes(keyframes)
+    for first in range(0, len(keyframes), 500):
+        parts.on_keyframes(keyframes[first : first + 500])
+    share = held // (len(logs) - 1)
+    for recognition in (whole, parts):
+        assert recognition.rows <= len(logs) * (2 * share + THINNED_AT_ONCE)
+        for log in logs:
+            kept = {k: around for k in range(count) if (around := recognition._around(KeyframeId(log, k), 0))}
+            assert set(range(count - share, count)) <= set(kept)
+            assert len(kept) <= 2 * share + THINNED_AT_ONCE
+            for k, (units, number) in kept.items():
+                unit = direction(arrays[KeyframeId(log, k)])
+                assert unit is not None
+                np.testing.assert_allclose(units[number], unit, atol=1e-6)
+            oldest = KeyframeId(log, min(kept))
+            found = recognition.on_keyframes([(OWN_FIRST, arrays[oldest])])
+            assert found[0][1].pair.other(OWN_FIRST) == oldest
 
 
 class Logs:

@@ -245,6 +245,16 @@ def test_a_pair_that_was_refused_unseen_is_fetched_once_a_closure_lies_beside_it
     assert fetched(machine.tick(9.0)) == [one.high]
 
 
+@pytest.mark.parametrize("seen", ["too few correspondences", "a latent was lost"])
+@pytest.mark.parametrize("unseen_first", [False, True])
+def test_a_pair_that_somebody_else_settled_is_not_taken_up_again(seen: str, unseen_first: bool) -> None:
+    machine, (one, *_) = closing_after_refusals(), of_own(1)
+    for reason in (UNLIKELY, seen) if unseen_first else (seen, UNLIKELY):
+        machine.on_rejection(one, reason, was_seen=reason == "too few correspondences")
+    machine.on_closure(CandidatePair(KeyframeId(R1, one.low.index + 1), one.high), 9.0)
+    assert machine.open_pairs() == []
+
+
 def test_a_pair_that_is_held_is_fetched_when_later_keyframes_agree() -> None:
     levels: dict[CandidatePair, float] = {}
     machine, (one, *_) = closing_after_refusals(levels), of_own(1)

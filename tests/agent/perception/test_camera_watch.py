@@ -360,3 +360,16 @@ def test_street_names_a_wrong_focal_length_within_20_keyframes(shared: Path, fac
     else:
         assert {doubt.doubt for doubt in told} == {"focal length"}
         assert told[-1].amount == pytest.approx(1.0 / factor, rel=0.06)
+
+
+@pytest.mark.data
+def test_noisy_poses_accuse_no_camera(shared: Path) -> None:
+    """Steps of 0.1 m by poses that are 1 to 2 cm off: the robot was told that its focal length is 1.29 times."""
+    from flocc_lab.bench.acceptance_rows import colour_sevenscenes
+    from flocc_lab.bench.watched_drives import drives_of
+
+    drive = drives_of("sevenscenes", colour_sevenscenes(shared / "data" / "sevenscenes"))
+    views = [view for robot in drive if robot.robot == "r2" for view in robot.views][:13]
+    perception, watch = build_perception(PerceptionConfig()), CameraWatch()
+    looks = [watch.look(perception, view.image(), view.T_odom_camera) for view in views]
+    assert [doubt for look in looks for doubt in look.doubts] == []

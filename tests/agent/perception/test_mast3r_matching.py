@@ -1,5 +1,6 @@
 """Reciprocal matching: the reference's matches, exactly."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,8 @@ from flocc_agent.perception.mast3r.reciprocal_matching import (  # noqa: E402
     MatchParameters,
     match_confidences,
     match_views,
-    matches_near_starts,
     reciprocal_matches,
     reciprocal_matches_both_ways,
-    symmetric_matches,
 )
 from flocc_agent.perception.mast3r.search import BlockIndex, nearest  # noqa: E402
 
@@ -29,26 +28,18 @@ def records() -> tuple[dict[str, Any], list[Any]]:
 
 @pytest.mark.golden
 def test_matches_equal_the_references_for_every_size_and_subsampling() -> None:
+    """The reference searched each in up to three ways; ours is one for all of them."""
     fields, cases = records()
+    ours = cache(lambda name, S: reciprocal_matches(fields[name]["A"], fields[name]["B"], S))
     checked = 0
     for case in cases:
         if "S" not in case:
             continue
-        found = reciprocal_matches(fields[case["name"]]["A"], fields[case["name"]]["B"], case["S"])
+        found = ours(case["name"], case["S"])
         assert np.array_equal(found.xy1, case["xy1"])
         assert np.array_equal(found.xy2, case["xy2"])
         checked += 1
     assert checked == 24
-
-
-@pytest.mark.golden
-def test_given_starts_within_a_tolerance_equal_the_references() -> None:
-    fields, cases = records()
-    for case in (case for case in cases if case["tag"] == "pixel_tol5"):
-        starts = torch.stack(case["init"], dim=1).numpy()
-        found = matches_near_starts(fields[case["name"]]["A"], fields[case["name"]]["B"], starts, 5.0)
-        assert np.array_equal(found.xy1, case["xy1"])
-        assert np.array_equal(found.xy2, case["xy2"])
 
 
 @pytest.mark.golden
@@ -60,17 +51,6 @@ def test_union_of_both_directions_and_its_confidences_equal_the_references() -> 
         assert np.array_equal(found.xy1, case["xy1"])
         assert np.array_equal(found.xy2, case["xy2"])
         assert np.array_equal(match_confidences(found, field["qa"], field["qb"]), case["conf"].numpy())
-
-
-@pytest.mark.golden
-def test_union_of_two_decodes_and_its_confidences_equal_the_references() -> None:
-    fields, cases = records()
-    for case in (case for case in cases if case["tag"] == "sym"):
-        field = fields[case["name"]]
-        found, confidences = symmetric_matches((field["A"], field["B"]), (case["f12"], case["f22"]), tuple(case["q"]))
-        assert np.array_equal(found.xy1, case["xy1"])
-        assert np.array_equal(found.xy2, case["xy2"])
-        assert np.allclose(confidences, case["conf"].numpy(), rtol=1e-6)
 
 
 DECODED = [("tiny_sq", 4), ("tiny_min", 4), ("tiny_portrait", 4), ("small_land", 8)]

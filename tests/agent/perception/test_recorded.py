@@ -48,6 +48,18 @@ def test_a_pair_is_found_in_both_directions_with_scale_or_without(tmp_path: Path
         assert there.scale_initial == back.scale_initial == known
 
 
+def test_a_covariance_is_in_the_unit_of_its_pose(tmp_path: Path) -> None:
+    covariance = np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0]) + 0.5 * (np.eye(6, k=3) + np.eye(6, k=-3))
+    told = entry("a/0", "b/1", covariance=covariance[np.triu_indices(6)].tolist())
+    for scale, unit_m in (("removed", 5.0), ("kept", 1.0)):
+        seen = perception(tmp_path, scale, pairs=[told])
+        found = seen.register(*(seen.encode(name_image(name)) for name in ("a/0", "b/1")), None)
+        assert isinstance(found, Registration)
+        assert found.covariance is not None
+        units = np.diag([1.0] * 3 + [unit_m] * 3)
+        np.testing.assert_allclose(units @ found.covariance @ units, covariance)
+
+
 def test_a_pair_that_was_not_recorded_is_no_registration(tmp_path: Path) -> None:
     seen = perception(tmp_path)
     a, b = (seen.encode(name_image(name)) for name in ("a/1", "b/1"))

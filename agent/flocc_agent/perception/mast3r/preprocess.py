@@ -5,14 +5,13 @@ input follows its official test code, or Swarm-SLAM's. Distortion is removed bef
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
-from PIL import ImageOps, UnidentifiedImageError
+from PIL import ImageOps
 
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.mast3r.sizes import PATCH_PX
@@ -161,18 +160,3 @@ def rgb_pixels(picture: Pillow.Image) -> Pixels:
         grey = np.clip(np.nan_to_num(values) * (255.0 / top), 0, 255).round().astype(np.uint8)
         return np.repeat(grey[:, :, None], 3, axis=2)
     return np.asarray(picture.convert("RGB"))
-
-
-def read_pixels(path: Path) -> Pixels:
-    """Read a picture file as (H, W, 3) uint8.
-
-    Raises:
-        BadImage: The file is missing, no picture, damaged or a decompression bomb.
-    """
-    try:
-        with Pillow.open(path) as picture:
-            if picture.width * picture.height > PIXELS_MAX:
-                raise BadImage(f"{path}: {picture.width}x{picture.height} pixels are more than {PIXELS_MAX}")
-            return rgb_pixels(picture)
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError, Pillow.DecompressionBombError) as error:
-        raise BadImage(f"{path}: cannot be read as a picture: {error}") from error

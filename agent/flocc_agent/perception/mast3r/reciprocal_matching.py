@@ -130,22 +130,6 @@ def reciprocal_matches(
     return Matches(_pixels(pairs[:, 0], desc_1.shape[1]), _pixels(pairs[:, 1], desc_2.shape[1]))
 
 
-def matches_near_starts(desc_1: Tensor, desc_2: Tensor, start_xy: Int, tolerance_px: float) -> Matches:
-    """Match given pixels of image 1 in one round, keeping those whose way back ends nearby.
-
-    Args:
-        desc_1: (H1, W1, D).
-        desc_2: (H2, W2, D).
-        start_xy: (Q, 2) column and row in image 1.
-        tolerance_px: The way back must end less than this from the start; the start is what is reported.
-    """
-    width = desc_1.shape[1]
-    start = torch.from_numpy(start_xy[:, 0] + width * start_xy[:, 1]).to(desc_1.device)
-    index_1, index_2, _ = reciprocal_indices(desc_1, desc_2, start, rounds=1)
-    distance = np.linalg.norm(_pixels(index_1, width) - start_xy, axis=1)
-    return Matches(start_xy, _pixels(index_2, desc_2.shape[1])).where(distance < tolerance_px)
-
-
 def united(first: Matches, second: Matches, widths: tuple[int, int]) -> Matches:
     """Union of two sets of matches, sorted by their pixels in images 1 and 2."""
     xy1, xy2 = np.concatenate([first.xy1, second.xy1]), np.concatenate([first.xy2, second.xy2])
@@ -192,32 +176,3 @@ def match_views(desc: tuple[Tensor, Tensor], confidence: tuple[Tensor, Tensor], 
     if parameters.confidence_min > 0:
         matches = matches.where(match_confidences(matches, *confidence) >= parameters.confidence_min)
     return matches
-
-
-def symmetric_matches(
-    first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], confidences: tuple[Tensor, ...], subsample: int = 8
-) -> tuple[Matches, Float32]:
-    """Union of the matches of two decodes, (1, 2) and (2, 1), each searched both ways.
-
-    Args:
-        first: (H, W, D) descriptors of images 1 and 2 from the decode (1, 2).
-        second: The same from the decode (2, 1), image 1 first.
-        confidences: (H, W) descriptor confidences of each decode's views 1 and 2; the second's view 1 is image 2.
-        subsample: Distance of the seeds, pixels.
-
-    Returns:
-        The matches and for each the geometric mean of its two confidences, from the decode that found it first.
-    """
-    found, values = [], []
-    for k, desc in enumerate((first, second)):
-        matches = reciprocal_matches_both_ways(desc[0], desc[1], subsample)
-        of_1, of_2 = confidences[:2] if k == 0 else (confidences[3], confidences[2])
-        at_1 = of_1[matches.xy1[:, 1], matches.xy1[:, 0]]
-        at_2 = of_2[matches.xy2[:, 1], matches.xy2[:, 0]]
-        found.append(matches)
-        values.append((at_1 * at_2).sqrt().float().cpu().numpy())
-    xy = [np.concatenate([getattr(matches, side) for matches in found]) for side in ("xy1", "xy2")]
-    widths = (first[0].shape[1], first[1].shape[1])
-    linear = np.stack([xy[0][:, 0] + widths[0] * xy[0][:, 1], xy[1][:, 0] + widths[1] * xy[1][:, 1]], axis=1)
-    _, kept = np.unique(linear, axis=0, return_index=True)
-    return Matches(xy[0][kept], xy[1][kept]), np.concatenate(values)[kept]

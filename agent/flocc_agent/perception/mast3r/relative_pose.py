@@ -109,17 +109,6 @@ def weiszfeld_focal(pts3d: NDArray[np.floating], principal_px: tuple[float, floa
     return focal if np.isfinite(focal) and focal > 0 else None
 
 
-def median_focal(pts3d: NDArray[np.floating], principal_px: tuple[float, float]) -> float:
-    """Focal length that a pointmap implies, as the median over pixels of both coordinates; pixels."""
-    height, width = pts3d.shape[:2]
-    v, u = np.mgrid[:height, :width]
-    x, y, z = np.moveaxis(np.asarray(pts3d, np.float64), -1, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        votes = np.concatenate([((u - principal_px[0]) * z / x).ravel(), ((v - principal_px[1]) * z / y).ravel()])
-    finite = np.sort(votes[~np.isnan(votes)])
-    return float(finite[(len(finite) - 1) // 2])  # the lower of two middle values, as the reference
-
-
 def _normalised(pts3d: NDArray[np.floating]) -> Float:
     """(N, 2) x/z and y/z, zero where they are not finite."""
     points = np.asarray(pts3d, np.float64).reshape(-1, 3)
@@ -224,24 +213,3 @@ def pose_covariance(points: Float, uv: Float, K: Float, T_2_1: Float) -> Float |
     squares = float((reprojection_errors_px(points, uv, K, T_2_1) ** 2).sum())
     variance = max(squares / max(len(J) - DEGREES_OF_FREEDOM, 1), SIGMA_MIN_PX**2)
     return np.asarray(variance * np.linalg.inv(information))
-
-
-def weighted_similarity(source: Float, target: Float, weights: Float) -> tuple[float, Float, Float]:
-    """Similarity between two pointmaps of one picture, weighted by confidence (Umeyama 1991).
-
-    Args:
-        source: (N, 3).
-        target: (N, 3).
-        weights: (N,) not negative, not all zero.
-
-    Returns:
-        Scale, rotation (3, 3) and translation (3,), with `target ~ scale * R @ source + t`.
-    """
-    w = weights / weights.sum()
-    mean_source, mean_target = w @ source, w @ target
-    centred_source, centred_target = source - mean_source, target - mean_target
-    U, singular_values, Vt = np.linalg.svd((centred_target * w[:, None]).T @ centred_source)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = U @ np.diag(signs) @ Vt
-    scale = float(singular_values @ signs / (w @ (centred_source**2).sum(axis=1)))
-    return scale, R, np.asarray(mean_target - scale * R @ mean_source)

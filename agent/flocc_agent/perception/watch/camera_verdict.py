@@ -42,6 +42,10 @@ DISAGREEMENT_MAX = 4.0
 """An explanation that leaves more than this explains nothing: pictures or odometry are too bad to say."""
 AGREEING_SHARE_MIN = 0.65
 """Share of the pairs that must prefer an explanation to none."""
+NOISY_DISAGREEMENT = 2.0
+GAIN_MIN_SIGMAS = 2.0
+"""Where even the best explanation leaves more than the first, the mean gain of a pair must exceed its own uncertainty
+by the second: pictures or odometry are several times as bad as assumed, and chance gains as much as a fault costs."""
 FOCAL_ERROR_MIN_RATIO = 0.05
 MIXED_ANGLE_MIN_RAD = float(np.radians(30.0))
 """Between directions of motion, at the median: less may be few or badly spread matches; other axes give far more."""
@@ -184,10 +188,18 @@ def evidence(before: Float, after: Float) -> float:
     return len(before) * (trimmed(before) - left) / (left + DISAGREEMENT_FLOOR)
 
 
+def gain_sigmas(before: Float, after: Float) -> float:
+    """The mean gain of a pair over the standard error of that mean: a paired test, which scales with the noise."""
+    gains = before - after
+    return float(gains.mean() / max(float(gains.std(ddof=1)) / np.sqrt(len(gains)), 1e-9))
+
+
 def _named(found: _Explanation, nothing: _Explanation) -> CameraVerdict | None:
     """The verdict, where it is large enough to matter and most pairs agree with it."""
     X = np.eye(3) if found.X is None else found.X
     if found.fault is None or float(np.mean(found.left < nothing.left)) < AGREEING_SHARE_MIN:
+        return None
+    if trimmed(found.left) > NOISY_DISAGREEMENT and gain_sigmas(nothing.left, found.left) < GAIN_MIN_SIGMAS:
         return None
     focal_is_off = abs(found.focal_factor - 1.0) >= FOCAL_ERROR_MIN_RATIO
     mount_is_off = angle_rad(X) >= MOUNT_ERROR_MIN_RAD

@@ -147,10 +147,13 @@ def camera_of(message: Any) -> CameraModel:
     """
     K, D = (message.k, message.d) if "k" in message.__dataclass_fields__ else (message.K, message.D)
     size, place = _region(message)
+    if abs(K[1]) > SKEW_RATIO_MAX * abs(K[0]):
+        raise ValueError(f"K has a skew of {K[1]:g} pixels, which flocc does not read")
     focal = _cropped((float(K[0]), float(K[4]), float(K[2]), float(K[5])), place)
     return with_distortion(str(message.distortion_model) or None, [float(value) for value in D], size, focal)
 
 
+SKEW_RATIO_MAX = 1e-3
 Place = tuple[int, int, int, int]
 
 

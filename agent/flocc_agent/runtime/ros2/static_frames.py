@@ -16,6 +16,8 @@ Float = NDArray[np.float64]
 
 FRAMES_MAX = 4096
 DEPTH_MAX = 64
+STILL_MAX = 1e-4
+"""By how much a transform that stays as it is may differ from an earlier one: metres, and parts of a rotation."""
 POSITION_MAX_M = COORDINATE_MAX / 4
 """So that a camera on such a body is still within what may be sent."""
 
@@ -25,6 +27,7 @@ class StaticFrames:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Float]] = {}
+        self._moved: set[str] = set()
 
     def add(self, message: Any) -> None:
         """Take in a TFMessage of /tf_static; one that is bad does not take the others with it.
@@ -45,7 +48,11 @@ class StaticFrames:
         child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
         if child not in self._parents and len(self._parents) >= FRAMES_MAX:
             raise BadMessage(f"/tf_static has more than {FRAMES_MAX} frames")
-        self._parents[child] = (parent, pose_of_transform(stamped.transform, f"/tf_static: {parent} to {child}"))
+        T_parent_child = pose_of_transform(stamped.transform, f"/tf_static: {parent} to {child}")
+        before = self._parents.get(child)
+        if before is not None and (before[0] != parent or np.abs(before[1] - T_parent_child).max() > STILL_MAX):
+            self._moved.add(child)
+        self._parents[child] = (parent, T_parent_child)
 
     def with_others(self, transforms: Sequence[Any]) -> "StaticFrames":
         """These frames and those of other TransformStamped messages, which do not move either; its own count first.
@@ -59,10 +66,9 @@ class StaticFrames:
         both._parents.update(self._parents)
         return both
 
-    def parent(self, frame: str) -> str | None:
-        """The frame that carries another one, or None."""
-        found = self._parents.get(frame)
-        return None if found is None else found[0]
+    def moved_between(self, a: str, b: str) -> str | None:
+        """A frame of the chain between two that was given more than one place, or None."""
+        return min(self._moved & (set(self._ancestors(a)) ^ set(self._ancestors(b))), default=None)
 
     def between(self, a: str, b: str) -> Float | None:
         """`T_a_b`, or None where no chain of static transforms connects the two."""

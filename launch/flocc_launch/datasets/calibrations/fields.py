@@ -339,6 +339,11 @@ def _coefficients(keys: Keys, kind: LensKind | None, name: str | None) -> list[f
     """Distortion coefficients in the order of their model: as a list, or as keys k1, k2, p1 and so on."""
     given = keys.take(*COEFFICIENTS)
     listed = None if given is None else [] if given == "none" else flat_numbers(given, "distortion")
+    if name is None and isinstance(given, list) and [len(row) for row in given if isinstance(row, list)] == [1] * 4:
+        raise ValueError(
+            "four coefficients in a column are what OpenCV's fisheye calibration gives: add distortion_model, "
+            "equidistant or plumb_bob"
+        )
     names = ("k1", "k2", "k3", "k4") if kind is LensKind.EQUIDISTANT else RADIAL
     single = {key: keys.number(key, f"Camera.{key}") for key in RADIAL}
     present = [key for key, value in single.items() if value is not None]

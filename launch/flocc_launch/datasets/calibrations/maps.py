@@ -401,6 +401,9 @@ FORMS: tuple[Form, ...] = (
 
 REFUSED_MAPS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], str], ...] = (
     ("a Meshroom or OpenMVG scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
+    ("VINS' settings that do not know where the camera sits (estimate_extrinsic: 2)",
+     lambda d: d.get("estimate_extrinsic") == 2 and "extrinsicRotation" not in d and "body_T_cam0" not in d,
+     "write body_T_cam0 of what VINS found, or take estimate_extrinsic out where the camera is the body"),
     ("a Kalibr target", lambda d: "target_type" in d, "give the camchain file that Kalibr writes"),
     ("Kalibr's IMU file", lambda d: "accelerometer_noise_density" in d and "fx" not in d and "intrinsics" not in d,
      "give the camchain file that Kalibr writes"),

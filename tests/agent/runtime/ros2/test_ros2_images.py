@@ -157,6 +157,7 @@ def test_a_third_radial_coefficient_is_taken_out_of_the_image() -> None:
         ({"D": (0.1,) * 8}, "'plumb_bob' has 0 or 4 or 5 coefficients, but there are 8"),
         ({"k": (0.0,) * 9}, "focal lengths positive"),
         ({"k": (float("nan"),) * 9}, "must be finite"),
+        ({"k": (5.0, 0.5, 4.0, 0.0, 6.0, 3.0, 0.0, 0.0, 1.0)}, "K has a skew of 0.5 pixels"),
     ],
 )
 def test_intrinsics_that_cannot_be_used_are_refused(changes: dict[str, Any], said: str) -> None:
