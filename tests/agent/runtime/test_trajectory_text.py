@@ -166,9 +166,7 @@ REFUSED = {
     "kitti.txt": ("1 0 0 1 0 1 0 2 0 0 1 3\n" * 3, "kitti.txt: holds 3 matrices without stamps"),
     "eigen.txt": (
         "".join(
-            row(
-                s, math.cos(a), math.sin(a), 0, 0, -math.sin(a), math.cos(a), 0, 0, 0, 0, 1, 0, *t, 1, separator=" "
-            )
+            row(s, math.cos(a), math.sin(a), 0, 0, -math.sin(a), math.cos(a), 0, 0, 0, 0, 1, 0, *t, 1, separator=" ")
             for a, (s, t, _) in zip((0.05 * k + 0.3 for k in range(10)), rows(), strict=True)
         ),
         "eigen.txt:1: the matrices stand column by column",
