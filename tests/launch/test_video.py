@@ -41,6 +41,7 @@ def test_frames_get_the_stamps_of_the_video(video: Path, tmp_path: Path) -> None
     beside(video)
     found = info(video)
     assert (found.format, found.images, found.odometry_poses, found.faults) == ("video", FRAMES, 40, ())
+    assert found.to_s == pytest.approx((FRAMES - 1) / RATE_HZ)  # of the last frame, not the end of the video
     recording = Recording.open(convert(video, tmp_path / "out"))
     assert [frame.stamp_s for frame in recording.frames] == pytest.approx([0.1 * k for k in range(FRAMES)], abs=0.002)
     assert [frame.T_odom_body[0, 3] for frame in recording.frames] == pytest.approx(range(FRAMES), abs=0.03)

@@ -260,7 +260,7 @@ def _video_info(path: Path) -> Info:
         images=head.frames,
         posed=None if trajectory is None else posed_frames(trajectory, head),
         from_s=0.0,
-        to_s=head.frames / head.rate_hz if head.rate_hz > 0 else 0.0,
+        to_s=max(head.frames - 1, 0) / head.rate_hz if head.rate_hz > 0 else 0.0,
         camera=lens.camera if lens else None,
         odometry_poses=None if trajectory is None else len(trajectory),
         truth_poses=None,
