@@ -10,13 +10,22 @@ def verdict(report: RunReport) -> str:
     """Whether the maps merged, when, and what it did to the error."""
     if len(report.robots) == 1:
         return alone(report)
-    parts = (map_sentence(report), error_sentence(report), camera_sentence(report))
+    parts = (misplaced_sentence(report), map_sentence(report), error_sentence(report), camera_sentence(report))
     return " ".join(sentence for sentence in parts if sentence)
+
+
+def misplaced_sentence(report: RunReport) -> str:
+    """Whose place in a map is not to be believed, since the camera's axes are not those of its odometry."""
+    if not report.misplaced_cameras:
+        return ""
+    who = listed(list(report.misplaced_cameras))
+    verb = "is" if len(report.misplaced_cameras) == 1 else "are"
+    return f"{' '.join(report.misplaced_cameras.values())} Do not believe where {who} {verb} in a map with others."
 
 
 def camera_sentence(report: RunReport) -> str:
     """Whose camera is not what its configuration says."""
-    robots = report.doubted_cameras
+    robots = [robot for robot in report.doubted_cameras if robot not in report.misplaced_cameras]
     if not robots:
         return ""
     whose = listed([f"{robot}'s" for robot in robots])
