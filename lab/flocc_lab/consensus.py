@@ -10,12 +10,11 @@ dual variable biases. What is different is the penalty, and with it the form of 
   but by that neighbour (`force`, in the pose's own tangent, so that frames may turn). Both replace the target and the
   dual of ADMM: the receiver minimises `f(x) + force . d + penalty(x, T)` with d from T to x. At rest all d are zero and
   forces are opposite, whatever the penalty is; a message that is lost costs time only, the newest one counts.
-- The best penalty is what the neighbour's graph is like, seen from the shared poses (optimised Schwarz methods, Gander
-  2006): its Schur complement. It is told in short as the covariances of each shared pose in the one before (`spread`),
-  the tree whose marginals are right, and is given to the back end as between factors: free of gauge, 84 bytes a pose.
-- What a tree leaves out is anchored: each pose by a part `anchoring` of its closures' information. That part is
-  measured on what the neighbour says: where its poses moved by d and its forces by g, its stiffness along d is g . d
-  (a secant, as in the spectral penalties of Xu et al. 2017).
+- The penalty is the geometric mean of how stiff both robots hold the shared poses (`shared_stiffness`), told in short
+  after a few steps, in editions: both sides use the newest one that both have told. While they differ, time is lost,
+  not the place of rest.
+- What is heard replaces only a part of what was heard before (`RELAXATION`): the rest keeps its pull at the same poses.
+  One half is ADMM, a whole one need not come to rest.
 
 Unknown scales: a scale of its own is eliminated before anything else sees it (`edges`); those of clusters belong to
 one pair, and so are the owner's alone. Weights of closures are the owner's as well, and constants here: decided while
@@ -23,40 +22,38 @@ robots still move, they let go of all closures, because the forces that answered
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from flocc_agent.backend.descent import LENGTHS
 from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residuals, state_of, taken
-from flocc_agent.backend.problem import (
-    closure_edges,
-    concatenate,
-    initial_scale,
-    odometry_edges,
-    plain_edges,
-    sqrt_informations,
-)
+from flocc_agent.backend.problem import closure_edges, concatenate, initial_scale, odometry_edges
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph
-from flocc_agent.geometry import hats, inverse, poses_from_tq, quaternions
+from flocc_agent.geometry import inverse, poses_from_tq, quaternions
+from flocc_lab.shared_stiffness import SharedStiffness, geometric_mean, stiffness_of
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-SPREAD_TOLD = (0, 1, 4)
-"""After which steps a robot tells how its shared poses hang together: by then its graph has its shape."""
-ANCHORING_MIN, ANCHORING_START, ANCHORING_MAX = 0.02, 0.3, 1.0
-"""Parts of the closures' information: with less, dense graphs come apart; more holds long chains back."""
-SECANTS_FROM = 6
-"""From so many messages of a neighbour on their differences say how stiff it is; before, everything moves at once."""
-SECANT_POWER = 0.5
-APART_FACTOR = 4.0
-"""By how much anchors grow where both sides come apart again."""
+HEAD_BYTES, POSE_BYTES = 26, 52
+STIFFNESS_AFTER = (5, 12)
+"""After which steps a robot says how stiff it holds its shared poses: first by a guess of its other neighbours, then by
+what they said; dense graphs are at rest before the second."""
+RELAXATION = 0.8
+"""Of what is heard; at 0.9 smallGrid3D comes apart, at 0.5 chains take half as long again."""
+ANCHORING_FLOATING = 1e-3
+"""Part of the closures' information that holds a robot which nothing else holds, where its stiffness is asked for."""
+ANCHORING = 1e-4
+"""Part of it that both sides add to their penalty; with more, long chains bend slowly."""
+ANCHORING_UNKNOWN = 0.3
+"""Part of it that is the penalty while nothing is known of the neighbour's stiffness."""
 TETHER_RATIO = 1e-9
 """Of the mean stiffness, on every pose: a graph that floats has no unique step."""
 ALONE_STEPS_MAX = 20
@@ -70,21 +67,24 @@ class SharedPoses:
     Attributes:
         T: (S, 4, 4) where it has them, in the common frame.
         force: (S, 6) gradient there of all that it knows from elsewhere; rotation first, in the pose's own tangent.
-        spread: (S-1, 6, 6) covariance of each pose relative to the one before, or None: as told before.
+        known: Newest edition of the receiver's stiffness that it has; 0 for none.
+        edition: Of the stiffness that comes with it; 0 for none.
+        stiffness: How stiff it holds the shared poses by all but the receiver; None where the receiver has it.
     """
 
     T: Float
     force: Float
-    spread: Float | None = None
+    known: int = 0
+    edition: int = 0
+    stiffness: SharedStiffness | None = None
 
     def packed(self) -> bytes:
         """As it would travel: the first position in double, all else in single precision."""
         origin = self.T[0, :3, 3]
-        turned = quaternions(self.T[:, :3, :3])
-        rows = np.concatenate([self.T[:, :3, 3] - origin, turned, self.force], axis=1)
-        upper = np.triu_indices(6)
-        spread = np.zeros(0) if self.spread is None else self.spread[:, upper[0], upper[1]]
-        return origin.astype("<f8").tobytes() + rows.astype("<f4").tobytes() + spread.astype("<f4").tobytes()
+        rows = np.concatenate([self.T[:, :3, 3] - origin, quaternions(self.T[:, :3, :3]), self.force], axis=1)
+        stiffness = b"" if self.stiffness is None else self.stiffness.packed()
+        head = origin.astype("<f8").tobytes() + bytes((self.known, self.edition))
+        return head + rows.astype("<f4").tobytes() + stiffness
 
     @staticmethod
     def unpacked(payload: bytes, count: int) -> "SharedPoses":
@@ -93,24 +93,19 @@ class SharedPoses:
         Raises:
             ValueError: It has another length, is not finite, or holds a quaternion without direction.
         """
-        ends = (24, 24 + 52 * count, 24 + 52 * count + 84 * (count - 1))
-        if count < 1 or len(payload) not in ends[1:]:
+        end = HEAD_BYTES + POSE_BYTES * count
+        if count < 1 or len(payload) not in (end, end + SharedStiffness.size(count)):
             raise ValueError(f"{len(payload)} bytes are not {count} shared poses")
-        rows = np.frombuffer(payload[24 : ends[1]], "<f4").astype(float).reshape(count, 13)
+        rows = np.frombuffer(payload[HEAD_BYTES:end], "<f4").astype(float).reshape(count, 13)
         T = poses_from_tq(rows[:, :7])
         T[:, :3, 3] += np.frombuffer(payload[:24], "<f8")
-        spread = None
-        if len(payload) == ends[2]:
-            spread = np.zeros((count - 1, 6, 6))
-            upper = np.triu_indices(6)
-            spread[:, upper[0], upper[1]] = np.frombuffer(payload[ends[1] :], "<f4").reshape(count - 1, 21)
-            spread += np.swapaxes(np.triu(spread, 1), 1, 2)
-        told = SharedPoses(T, rows[:, 7:], spread)
+        stiffness = SharedStiffness.unpacked(payload[end:], count) if len(payload) > end else None
+        told = SharedPoses(T, rows[:, 7:], payload[24], payload[25], stiffness)
         told.check(count)
         return told
 
     def check(self, count: int) -> None:
-        """Refuse what is not finite, of another size, or no covariance.
+        """Refuse what is not finite, of another size, or no stiffness.
 
         Raises:
             ValueError: It is; the sentence says what.
@@ -119,12 +114,11 @@ class SharedPoses:
             raise ValueError(f"{len(self.T)} poses and {len(self.force)} forces are not {count} shared poses")
         if not (np.all(np.isfinite(self.T)) and np.all(np.isfinite(self.force))):
             raise ValueError("shared poses or forces are not finite")
-        if self.spread is None:
-            return
-        if self.spread.shape != (count - 1, 6, 6) or not np.all(np.isfinite(self.spread)):
-            raise ValueError(f"the spread is not that of {count} poses")
-        if count > 1 and np.linalg.eigvalsh(self.spread).min() <= 0:
-            raise ValueError("the spread of shared poses is not positive definite")
+        editions = len(STIFFNESS_AFTER)
+        if max(self.known, self.edition) > editions or (self.edition > 0) != (self.stiffness is not None):
+            raise ValueError(f"edition {self.edition} of the stiffness of shared poses is not one of {editions}")
+        if self.stiffness is not None:
+            self.stiffness.check(count)
 
 
 @dataclass(slots=True, eq=False)
@@ -132,24 +126,59 @@ class PairedRobot:
     """What a robot knows of one with which it shares poses.
 
     Attributes:
+        lower: Whether the robot itself is the lower of both.
         index: (S,) the shared poses among its own and its copies.
-        stiffness: (S, 6, 6) information of the closures at each, diagonal.
-        heard: What the neighbour said last; None before.
-        spread: What it said last of that.
-        anchoring: Part of the closures' information by which each pose is anchored.
-        messages: How often it was heard.
-        apart: How far its poses were from one's own, in the anchors' measure.
-        priors: The penalty, as edges.
+        closures: (S, 6, 6) information of the closures at each, diagonal.
+        penalty: (6S, 6S) information by which they are held to T.
+        T: (S, 4, 4) where the neighbour said that it has them; None before it was heard.
+        force: (6S,) what it asks for there besides the penalty.
+        ours: Own stiffness by edition.
+        theirs: The neighbour's by edition.
+        known: Newest own edition that the neighbour has.
     """
 
+    lower: bool
     index: Int
-    stiffness: Float
-    heard: SharedPoses | None = None
-    spread: Float | None = None
-    anchoring: float = ANCHORING_START
-    messages: int = 0
-    apart: float = np.inf
-    priors: Edges | None = None
+    closures: Float
+    penalty: Float
+    T: Float | None = None
+    force: Float = field(default_factory=lambda: np.zeros(0))
+    ours: dict[int, SharedStiffness] = field(default_factory=dict)
+    theirs: dict[int, SharedStiffness] = field(default_factory=dict)
+    known: int = 0
+
+    def pull(self, T: Float) -> Float:
+        """Gradient (6S,) where the shared poses are at `T`."""
+        return self.force + self.penalty @ self._apart(T)
+
+    def merit(self, T: Float) -> float:
+        """What `pull` is the gradient of."""
+        apart = self._apart(T)
+        return float(self.force @ apart + 0.5 * apart @ self.penalty @ apart)
+
+    def hear(self, told: SharedPoses) -> None:
+        """Take a part of what the neighbour said in the place of what it said before."""
+        force = told.force.ravel()
+        if self.T is not None:
+            force = RELAXATION * force + (1.0 - RELAXATION) * self.pull(told.T)
+        self.T, self.force, self.known = told.T, force, max(self.known, told.known)
+        if told.stiffness is not None:
+            self.theirs[told.edition] = told.stiffness
+
+    def stiffen(self) -> None:
+        """Choose the penalty by what is known of one or both stiffnesses."""
+        common = max(self.ours.keys() & self.theirs.keys(), default=None)
+        if common is not None:
+            both = (self.ours[common], self.theirs[common])
+            stiffness = geometric_mean(*(both if self.lower else both[::-1]))
+        else:
+            stiffness = next(iter((self.theirs or self.ours).values()))
+        self.penalty = stiffness.matrix() + ANCHORING * block_diag(*self.closures)
+
+    def _apart(self, T: Float) -> Float:
+        """Tangents (6S,) from where the neighbour has the shared poses to `T`."""
+        assert self.T is not None
+        return _differences(self.T, T).ravel()
 
 
 @dataclass(slots=True, eq=False)
@@ -159,7 +188,7 @@ class ConsensusPart:
     Attributes:
         log: The robot.
         config: Formulation and noise model.
-        own: Number of its own keyframes; copies of others' come after them, then the origin of the common frame.
+        own: Number of its own keyframes; copies of others' come after them.
         edges: Odometry, then the closures that it owns.
         closures: Rows of the closures in `edges`.
         neighbours: By their log.
@@ -184,109 +213,85 @@ class ConsensusPart:
 
     def step(self) -> None:
         """One Gauss-Newton step, shortened where it leads up, down the own cost and what neighbours ask for."""
-        held = self._edges()
-        weights = np.ones(len(held))
-        weights[: len(self.edges)] = self.weights
-        at = residuals(held, self.state, hold=False)
-        H, gradient = self._normal(held, at, weights)
-        gradient = gradient + self._forces()
+        H, gradient = self._normal()
+        T = self.state.poses()
+        for neighbour in self._heard():
+            np.add.at(gradient, _rows(neighbour), neighbour.pull(T[neighbour.index]))
         delta = -_factor(H).solve(gradient)
         if np.all(np.isfinite(delta)):
-            self.state = self._shortened(held, weights, delta, self._merit(held, weights, self.state))
+            self.state = self._shortened(delta, self._merit(self.state))
         self.steps += 1
+        if self.steps in STIFFNESS_AFTER:
+            edition = STIFFNESS_AFTER.index(self.steps) + 1
+            told = {other: self._stiffness(other) for other in self.neighbours}
+            for other, stiffness in told.items():
+                self.neighbours[other].ours[edition] = stiffness
+                self.neighbours[other].stiffen()
 
     def tell(self, other: LogId) -> SharedPoses:
         """What a neighbour hears after this step."""
         neighbour = self.neighbours[other]
-        spread = self.spread(other) if self.steps - 1 in SPREAD_TOLD else None
-        return SharedPoses(self.state.poses()[neighbour.index], self._force(neighbour), spread)
+        T = self.state.poses()[neighbour.index]
+        force = np.zeros((len(T), 6)) if neighbour.T is None else -neighbour.pull(T).reshape(-1, 6)
+        newest = max(neighbour.ours, default=0)
+        edition = newest if newest > neighbour.known else 0
+        return SharedPoses(T, force, max(neighbour.theirs, default=0), edition, neighbour.ours.get(edition))
 
     def hear(self, other: LogId, told: SharedPoses) -> None:
-        """Take what a neighbour said in the place of what it said before.
+        """Take what a neighbour said.
 
         Raises:
             ValueError: It cannot be; nothing has changed.
         """
         neighbour = self.neighbours[other]
         told.check(len(neighbour.index))
-        if told.spread is not None:
-            neighbour.spread = told.spread
-        apart = _squares(neighbour, told.T, self.state.poses()[neighbour.index])
-        if apart > neighbour.apart:
-            neighbour.anchoring = min(ANCHORING_MAX, APART_FACTOR * neighbour.anchoring)
-        elif neighbour.heard is not None and neighbour.messages >= SECANTS_FROM:
-            neighbour.anchoring = _measured_anchoring(neighbour, neighbour.heard, told)
-        neighbour.apart = apart
-        neighbour.heard, neighbour.messages = told, neighbour.messages + 1
-        neighbour.priors = _priors(neighbour, told, len(self.state.q) - 1)
+        neighbour.hear(told)
+        if told.stiffness is not None:
+            neighbour.stiffen()
 
-    def spread(self, other: LogId) -> Float:
-        """Covariance (S-1, 6, 6) of each shared pose relative to the one before, by all but that neighbour."""
-        index = self.neighbours[other].index
-        held = self._edges(without=other)
-        weights = np.ones(len(held))
-        weights[: len(self.edges)] = self.weights
-        H, _ = self._normal(held, residuals(held, self.state, hold=False), weights)
-        rows = (6 * index[:, None] + np.arange(6)).ravel()
+    def _heard(self) -> list[PairedRobot]:
+        return [neighbour for neighbour in self.neighbours.values() if neighbour.T is not None]
+
+    def _stiffness(self, other: LogId) -> SharedStiffness:
+        """How stiff the shared poses are by all but that neighbour."""
+        neighbour = self.neighbours[other]
+        rows = _rows(neighbour)
+        H, _ = self._normal(without=neighbour)
+        floating = ANCHORING_FLOATING * np.einsum("sbb->sb", neighbour.closures).ravel()
+        H = csc_array(H + coo_array((floating, (rows, rows)), shape=H.shape))
         units = np.zeros((H.shape[0], len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
-        covariance = _factor(H).solve(units)[rows]
-        Ad = _relative_adjoints(self.state.poses()[index])
-        spread = np.empty((len(index) - 1, 6, 6))
-        for k, back in enumerate(Ad):
-            block = covariance[6 * k : 6 * k + 12, 6 * k : 6 * k + 12]
-            difference = np.hstack([-back, np.eye(6)])
-            spread[k] = difference @ block @ difference.T
-        return 0.5 * (spread + np.swapaxes(spread, 1, 2))
+        return stiffness_of(_factor(H).solve(units)[rows], self.state.poses()[neighbour.index])
 
-    def _edges(self, without: LogId | None = None) -> Edges:
-        """The own edges, then the penalties of the neighbours."""
-        told = [n.priors for log, n in self.neighbours.items() if log != without and n.priors is not None]
-        return concatenate([self.edges, *told])
-
-    def _forces(self) -> Float:
-        """Gradient of what neighbours say besides penalties."""
-        forces = np.zeros((len(self.state.q) - 1, 6))
-        for neighbour in self.neighbours.values():
-            if neighbour.heard is not None:
-                np.add.at(forces, neighbour.index, neighbour.heard.force)
-        return np.concatenate([forces.ravel(), np.zeros(len(self.state.scale))])
-
-    def _force(self, neighbour: PairedRobot) -> Float:
-        """Gradient (S, 6) of everything but by this neighbour: at rest the opposite of what is by it."""
-        if neighbour.heard is None or neighbour.priors is None:
-            return np.zeros((len(neighbour.index), 6))
-        at = residuals(neighbour.priors, self.state)
-        by_pose = _pose_gradient(neighbour.priors, at, np.ones(len(neighbour.priors)), len(self.state.q))
-        return -(by_pose[neighbour.index] + neighbour.heard.force)
-
-    def _merit(self, held: Edges, weights: Float, state: State) -> float:
-        at = residuals(held, state, hold=False)
+    def _merit(self, state: State) -> float:
+        at = residuals(self.edges, state, hold=False)
         prior = np.sum(((state.scale - 1.0) / self.config.scale_prior_unknown_sigma_ratio) ** 2)
-        cost = 0.5 * (float(weights @ at.squared()) + float(prior))
         T = state.poses()
-        for neighbour in self.neighbours.values():
-            if neighbour.heard is not None:
-                cost += float(np.sum(neighbour.heard.force * _differences(neighbour.heard.T, T[neighbour.index])))
-        return cost
+        told = sum(neighbour.merit(T[neighbour.index]) for neighbour in self._heard())
+        return 0.5 * (float(self.weights @ at.squared()) + float(prior)) + told
 
-    def _shortened(self, held: Edges, weights: Float, delta: Float, before: float) -> State:
+    def _shortened(self, delta: Float, before: float) -> State:
         """The first shortened step that does not lead up, or the least bad of them."""
-        split = 6 * (len(self.state.q) - 1)
-        delta = np.concatenate([delta[:split], np.zeros(6), delta[split:]])
         best, best_cost = self.state, np.inf
         for length in LENGTHS:
             there = self.state.retract(length * delta)
-            cost = self._merit(held, weights, there)
+            cost = self._merit(there)
             if cost < best_cost:
                 best, best_cost = there, cost
             if cost <= before + 1e-12 * abs(before):
                 break
         return best
 
-    def _normal(self, held: Edges, at: Residuals, weights: Float) -> tuple[csc_array, Float]:
-        """Normal equations of all poses but the origin, then of cluster scales."""
-        return _normal_equations(held, at, weights, self.state, self.config.scale_prior_unknown_sigma_ratio)
+    def _normal(self, without: PairedRobot | None = None) -> tuple[csc_array, Float]:
+        """Normal equations of all poses, then of cluster scales, with penalties but for what neighbours ask for."""
+        at = residuals(self.edges, self.state, hold=False)
+        sigma = self.config.scale_prior_unknown_sigma_ratio
+        H, gradient = _normal_equations(self.edges, at, self.weights, self.state, sigma)
+        for neighbour in self._heard():
+            if neighbour is not without:
+                block, rows = coo_array(neighbour.penalty), _rows(neighbour)
+                H = H + coo_array((block.data, (rows[block.row], rows[block.col])), shape=H.shape)
+        return csc_array(H), gradient
 
 
 def shared_poses(graph: PoseGraph, log: LogId) -> dict[LogId, list[KeyframeId]]:
@@ -321,11 +326,12 @@ def part_of(graph: PoseGraph, log: LogId, config: BackendConfig, T: Float) -> Co
     odometry = odometry_edges(trajectory, 0, config)
     rows = slice(len(odometry), len(odometry) + len(owned))
     state = state_of(_with_copies(T, owned, at, scale, len(copies)), clusters)
-    stiffness = _stiffness_by_keyframe(graph.closures, config)
-    neighbours = {
-        other: PairedRobot(np.array([at[k] for k in keyframes]), np.array([stiffness[k] for k in keyframes]))
-        for other, keyframes in shared_poses(graph, log).items()
-    }
+    informations = _information_by_keyframe(graph.closures, config)
+    neighbours = {}
+    for other, keyframes in shared_poses(graph, log).items():
+        information = np.array([informations[k] for k in keyframes])
+        unknown = ANCHORING_UNKNOWN * block_diag(*information)
+        neighbours[other] = PairedRobot(log < other, np.array([at[k] for k in keyframes]), information, unknown)
     whole = concatenate([odometry, edges])
     return ConsensusPart(log, config, len(trajectory), whole, rows, neighbours, state, np.ones(len(whole)))
 
@@ -339,21 +345,21 @@ def solved_alone(part: ConsensusPart) -> Float:
         edges=taken(part.edges, own),
         closures=closures,
         neighbours={},
-        state=state_of(np.concatenate([part.T, np.eye(4)[None]]), len(part.state.scale)),
+        state=state_of(part.T, len(part.state.scale)),
         weights=np.ones(len(own)),
     )
     cost = np.inf
     for _ in range(ALONE_STEPS_MAX):
         alone.step()
-        before, cost = cost, alone._merit(alone.edges, alone.weights, alone.state)
+        before, cost = cost, alone._merit(alone.state)
         if before - cost <= ALONE_TOLERANCE_RATIO * cost:
             break
     return alone.T
 
 
 def _with_copies(T: Float, owned: list[LoopClosure], at: Mapping[KeyframeId, int], scale: Float, count: int) -> Float:
-    """Own poses, copies of others' where the first closure sees them, and the origin."""
-    poses = np.concatenate([T, np.tile(np.eye(4), (count + 1, 1, 1))])
+    """Own poses, then copies of others' where the first closure sees them."""
+    poses = np.concatenate([T, np.tile(np.eye(4), (count, 1, 1))])
     seen = np.arange(len(poses)) < len(T)
     for closure, metres in zip(owned, scale.tolist(), strict=True):
         T_query_match = np.array(closure.T_query_match_unscaled, dtype=float)
@@ -366,7 +372,7 @@ def _with_copies(T: Float, owned: list[LoopClosure], at: Mapping[KeyframeId, int
     return poses
 
 
-def _stiffness_by_keyframe(closures: Sequence[LoopClosure], config: BackendConfig) -> dict[KeyframeId, Float]:
+def _information_by_keyframe(closures: Sequence[LoopClosure], config: BackendConfig) -> dict[KeyframeId, Float]:
     """Isotropic information (6, 6) of the closures between robots at each keyframe of a higher robot."""
     between = [c for c in closures if c.query.log != c.match.log]
     zero = {end.log: 0 for c in between for end in (c.query, c.match)}
@@ -387,45 +393,9 @@ def _differences(T: Float, there: Float) -> Float:
     return np.concatenate([2.0 * quaternions(D[:, :3, :3])[:, 1:], D[:, :3, 3]], axis=1)
 
 
-def _relative_adjoints(T: Float) -> Float:
-    """Adjoints (S-1, 6, 6) that take a pose's tangent to that of the next pose."""
-    back = inverse(T[1:]) @ T[:-1]
-    out = np.zeros((len(back), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = back[:, :3, :3]
-    out[:, 3:, :3] = hats(back[:, :3, 3]) @ back[:, :3, :3]
-    return out
-
-
-def _priors(neighbour: PairedRobot, told: SharedPoses, origin: int) -> Edges:
-    """The penalty around what was told: between factors by the spread, and anchors."""
-    index, T = neighbour.index, told.T
-    anchors = plain_edges(np.full(len(index), origin), index, T, np.sqrt(neighbour.anchoring) * _anchors(neighbour))
-    if neighbour.spread is None or len(index) < 2:
-        return anchors
-    relative = inverse(T[:-1]) @ T[1:]
-    return concatenate([plain_edges(index[:-1], index[1:], relative, sqrt_informations(neighbour.spread)), anchors])
-
-
-def _anchors(neighbour: PairedRobot) -> Float:
-    """Square roots (S, 6, 6) of the information by which each shared pose is anchored, at an anchoring of 1."""
-    return np.sqrt(neighbour.stiffness)
-
-
-def _squares(neighbour: PairedRobot, T: Float, there: Float) -> float:
-    """Squared distance between shared poses in two places, weighed by the anchors."""
-    return float(np.sum((_anchors(neighbour) @ _differences(T, there)[:, :, None]) ** 2))
-
-
-def _measured_anchoring(neighbour: PairedRobot, before: SharedPoses, told: SharedPoses) -> float:
-    """How much of the anchors the neighbour's own stiffness comes to, along the way that it has just moved."""
-    d = _differences(before.T, told.T)
-    work = float(np.sum(d * (told.force - before.force)))
-    if neighbour.spread is not None and len(d) > 1:
-        stretched = d[1:] - np.einsum("kab,kb->ka", _relative_adjoints(told.T), d[:-1])
-        work -= float(np.sum(stretched * np.linalg.solve(neighbour.spread, stretched[..., None])[..., 0]))
-    whole = _squares(neighbour, before.T, told.T)
-    measured = min(max(work / whole, ANCHORING_MIN), ANCHORING_MAX) if whole > 0 else neighbour.anchoring
-    return float(neighbour.anchoring ** (1.0 - SECANT_POWER) * measured**SECANT_POWER)
+def _rows(neighbour: PairedRobot) -> Int:
+    """Rows (6S,) of the shared poses among a robot's variables."""
+    return (6 * neighbour.index[:, None] + np.arange(6)).ravel()
 
 
 def _pose_gradient(edges: Edges, at: Residuals, weights: Float, poses: int) -> Float:
@@ -440,38 +410,35 @@ def _pose_gradient(edges: Edges, at: Residuals, weights: Float, poses: int) -> F
 def _normal_equations(
     edges: Edges, at: Residuals, weights: Float, state: State, scale_sigma: float
 ) -> tuple[csc_array, Float]:
-    """Information matrix and gradient of poses without the last one, which is the origin, then cluster scales."""
-    jac, poses, clusters = jacobians(edges, at), len(state.q) - 1, len(state.scale)
+    """Information matrix and gradient of poses, then of cluster scales."""
+    jac, poses, clusters = jacobians(edges, at), len(state.q), len(state.scale)
     size = 6 * poses + clusters
     scaled = np.flatnonzero(edges.cluster >= 0)
     column = 6 * poses + edges.cluster[scaled]
     blocks = [(edges.i, jac.A_i), (edges.j, jac.A_j)]
-    parts = [_block(a, A, b, B, weights, poses) for a, A in blocks for b, B in blocks]
+    parts = [_block(a, A, b, B, weights) for a, A in blocks for b, B in blocks]
     slopes, w = jac.a_scale[scaled], weights[scaled]
     for ends, A in blocks:
-        cross = np.einsum("eab,ea,e->eb", A[scaled], slopes, w)
-        kept = ends[scaled] < poses
-        rows = (6 * ends[scaled][:, None] + np.arange(6))[kept].ravel()
-        columns = np.repeat(column[kept], 6)
-        parts += [(rows, columns, cross[kept].ravel()), (columns, rows, cross[kept].ravel())]
+        cross = np.einsum("eab,ea,e->eb", A[scaled], slopes, w).ravel()
+        rows, columns = (6 * ends[scaled][:, None] + np.arange(6)).ravel(), np.repeat(column, 6)
+        parts += [(rows, columns, cross), (columns, rows, cross)]
     diagonal = np.arange(6 * poses, size)
     parts.append((column, column, w * np.sum(slopes**2, axis=1)))
     parts.append((diagonal, diagonal, np.full(clusters, scale_sigma**-2.0)))
     rows, columns, values = (np.concatenate([part[k] for part in parts]) for k in range(3))
     by_scale = np.bincount(column - 6 * poses, w * np.sum(slopes * at.e[scaled], axis=1), clusters)
-    gradient = _pose_gradient(edges, at, weights, poses + 1)[:poses].ravel()
+    gradient = _pose_gradient(edges, at, weights, poses).ravel()
     prior = (state.scale - 1.0) / scale_sigma**2
     return csc_array(coo_array((values, (rows, columns)), shape=(size, size))), np.concatenate(
         [gradient, by_scale[:clusters] + prior]
     )
 
 
-def _block(a: Int, A: Float, b: Int, B: Float, weights: Float, poses: int) -> tuple[Int, Int, Float]:
-    """Rows, columns and values of `A^T W B`, without those of the origin."""
-    kept = (a < poses) & (b < poses)
-    values = np.swapaxes(A[kept], 1, 2) @ (weights[kept, None, None] * B[kept])
-    rows = np.repeat(6 * a[kept][:, None] + np.arange(6), 6, axis=1)
-    columns = np.tile(6 * b[kept][:, None] + np.arange(6), (1, 6))
+def _block(a: Int, A: Float, b: Int, B: Float, weights: Float) -> tuple[Int, Int, Float]:
+    """Rows, columns and values of `A^T W B`."""
+    values = np.swapaxes(A, 1, 2) @ (weights[:, None, None] * B)
+    rows = np.repeat(6 * a[:, None] + np.arange(6), 6, axis=1)
+    columns = np.tile(6 * b[:, None] + np.arange(6), (1, 6))
     return rows.ravel(), columns.ravel(), values.ravel()
 
 

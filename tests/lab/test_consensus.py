@@ -11,9 +11,20 @@ from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import build
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
+from flocc_agent.geometry import hats
 from flocc_lab.bench.consensus_sweeps import Sweeps
 from flocc_lab.bench.generated_graph import GeneratedGraph, Noise, generate
-from flocc_lab.consensus import ConsensusPart, SharedPoses, part_of, shared_poses, solved_alone
+from flocc_lab.consensus import (
+    HEAD_BYTES,
+    POSE_BYTES,
+    STIFFNESS_AFTER,
+    ConsensusPart,
+    SharedPoses,
+    part_of,
+    shared_poses,
+    solved_alone,
+)
+from flocc_lab.shared_stiffness import KNOTS_MAX, SharedStiffness, geometric_mean, stiffness_of
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_protocol.ids import LogId
 
@@ -97,7 +108,8 @@ def test_the_place_of_rest_does_not_depend_on_the_penalty() -> None:
     team = Sweeps(graph, settings)
     for part in team.parts.values():
         for neighbour in part.neighbours.values():
-            neighbour.stiffness = 3.0 * neighbour.stiffness
+            neighbour.closures = 1000.0 * neighbour.closures
+            neighbour.penalty = 3.0 * neighbour.penalty
     for _ in range(40):
         team.sweep()
     assert cost(graph, settings, team.T) == pytest.approx(
@@ -123,20 +135,42 @@ def test_shared_poses_are_the_higher_robots_at_closures_between_two() -> None:
 
 
 def told() -> SharedPoses:
-    graph = three_robots().graph
-    parts = Sweeps(graph, config()).parts
-    parts[A].step()
+    parts = Sweeps(three_robots().graph, config()).parts
+    for _ in range(STIFFNESS_AFTER[0]):
+        parts[A].step()
     return parts[A].tell(B)
 
 
 def test_what_is_told_is_read_again_in_single_precision() -> None:
     said = told()
-    assert said.spread is not None
+    assert said.stiffness is not None
+    assert (said.edition, said.known) == (1, 0)
     read = SharedPoses.unpacked(said.packed(), len(said.T))
-    assert read.spread is not None
+    assert read.stiffness is not None
+    assert (read.edition, read.known) == (1, 0)
     assert np.allclose(read.T, said.T, atol=1e-5)
-    assert np.allclose(read.spread, said.spread, rtol=1e-5, atol=1e-9)
-    assert len(said.packed()) == 24 + 52 * len(said.T) + 84 * (len(said.T) - 1)
+    assert np.allclose(read.stiffness.matrix(), said.stiffness.matrix(), rtol=1e-4, atol=1e-2)
+    assert len(said.packed()) == HEAD_BYTES + POSE_BYTES * len(said.T) + SharedStiffness.size(len(said.T))
+
+
+def test_stiffness_is_told_until_the_other_has_it() -> None:
+    parts = Sweeps(three_robots().graph, config()).parts
+    for _ in range(STIFFNESS_AFTER[0]):
+        parts[A].step()
+    for _ in range(2):
+        assert parts[A].tell(B).edition == 1
+    parts[B].hear(A, parts[A].tell(B))
+    parts[A].hear(B, parts[B].tell(A))
+    assert parts[A].tell(B).stiffness is None
+
+
+def test_both_sides_hold_the_same_penalty_once_both_have_told() -> None:
+    team = Sweeps(three_robots().graph, config())
+    for _ in range(STIFFNESS_AFTER[0] + 1):
+        team.sweep()
+    for log, part in team.parts.items():
+        for other, neighbour in part.neighbours.items():
+            assert np.allclose(neighbour.penalty, team.parts[other].neighbours[log].penalty, rtol=1e-4, atol=1e-2)
 
 
 def listener() -> ConsensusPart:
@@ -145,19 +179,22 @@ def listener() -> ConsensusPart:
 
 def test_what_cannot_be_is_refused_and_changes_nothing() -> None:
     said, part = told(), listener()
-    nan = np.full_like(said.force, np.nan)
-    assert said.spread is not None
+    assert said.stiffness is not None
+    knots = said.stiffness.knots
     for wrong in (
-        replace(said, force=nan),
+        replace(said, force=np.full_like(said.force, np.nan)),
         replace(said, T=np.full_like(said.T, np.inf)),
         replace(said, T=said.T[:-1], force=said.force[:-1]),
-        replace(said, spread=-said.spread),
-        replace(said, spread=said.spread[:-1]),
+        replace(said, stiffness=replace(said.stiffness, knots=-knots)),
+        replace(said, stiffness=replace(said.stiffness, knots=knots[:-6, :-6])),
+        replace(said, stiffness=None),
+        replace(said, edition=9),
+        replace(said, known=9),
     ):
-        with pytest.raises(ValueError, match=r"shared poses|spread"):
+        with pytest.raises(ValueError, match=r"shared poses|stiffness"):
             part.hear(A, wrong)
-    assert part.neighbours[A].heard is None
-    assert part.neighbours[A].spread is None
+    assert part.neighbours[A].T is None
+    assert part.neighbours[A].theirs == {}
 
 
 @pytest.mark.parametrize("cut", [1, 40, 84])
@@ -165,3 +202,37 @@ def test_a_message_that_broke_off_is_refused(cut: int) -> None:
     said = told()
     with pytest.raises(ValueError, match="are not"):
         SharedPoses.unpacked(said.packed()[:-cut], len(said.T))
+
+
+def test_a_mean_of_stiffnesses_is_the_geometric_one() -> None:
+    rng = np.random.default_rng(5)
+    T = np.asarray(three_robots().graph.trajectories[A].T_odom_keyframe, dtype=float)[: KNOTS_MAX + 4]
+    stiff, soft = (stiffness_of(k * np.eye(6 * len(T)), T) for k in (1.0, 100.0))
+    mean = geometric_mean(stiff, soft)
+    assert np.allclose(mean.matrix(), 0.1 * stiff.matrix())
+    root = rng.normal(size=(6 * len(T), 6 * len(T)))
+    drawn = stiffness_of(root @ root.T, T)
+    G, A_, B_ = geometric_mean(stiff, drawn).knots, stiff.knots, drawn.knots
+    G = G @ G.T
+    assert np.allclose(G @ np.linalg.inv(A_ @ A_.T) @ G, B_ @ B_.T, rtol=1e-6, atol=1e-9)
+
+
+def test_what_hangs_on_a_knot_keeps_its_covariance_relative_to_it() -> None:
+    T = np.asarray(three_robots().graph.trajectories[A].T_odom_keyframe, dtype=float)[: KNOTS_MAX + 4]
+    root = np.random.default_rng(6).normal(size=(6 * len(T), 6 * len(T)))
+    covariance = root @ root.T
+    whole = stiffness_of(covariance[: 6 * KNOTS_MAX, : 6 * KNOTS_MAX], T[:KNOTS_MAX])
+    assert np.allclose(np.linalg.inv(whole.matrix()), covariance[: 6 * KNOTS_MAX, : 6 * KNOTS_MAX], rtol=1e-6)
+    there = np.linalg.inv(stiffness_of(covariance, T).matrix())
+    others = [k for k in range(len(T)) if k not in np.round(np.linspace(0, len(T) - 1, KNOTS_MAX))]
+    for k in others:
+        q = min((0, k - 1), key=lambda n: abs(n - k))
+        back = np.zeros((6, 6))
+        D = np.linalg.inv(T[k]) @ T[q]
+        back[:3, :3] = back[3:, 3:] = D[:3, :3]
+        back[3:, :3] = hats(D[None, :3, 3])[0] @ D[:3, :3]
+        J = np.hstack([-back, np.eye(6)])
+        rows = np.r_[6 * q : 6 * q + 6, 6 * k : 6 * k + 6]
+        assert np.allclose(
+            J @ there[np.ix_(rows, rows)] @ J.T, J @ covariance[np.ix_(rows, rows)] @ J.T, rtol=1e-6, atol=1e-6
+        )

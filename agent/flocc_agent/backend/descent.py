@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from flocc_agent.backend.edges import Edges, Residuals, State, residuals, taken
+from flocc_agent.backend.edges import Edges, Residuals, State, directions, residuals, taken
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
 from flocc_agent.config import BackendConfig
 
@@ -142,9 +142,10 @@ def voted_cost(objective: Objective, state: State, votes: Float) -> float:
     A state is where all closures count once. There many that agree bend odometry as many do; to hold that against them
     while they count as few would let go of all of them.
     """
-    agreeing = objective.agreeing(state)
+    as_angles = bool(np.any(directions(objective.edges)))
+    agreeing = objective.agreeing(state, as_angles)
     if not np.all(votes[agreeing] == 1.0):
-        state = descend(objective, state, objective.weights(votes * agreeing), VOTED_STEPS_MAX).state
+        state = descend(objective, state, objective.weights(votes * agreeing), VOTED_STEPS_MAX, hold=as_angles).state
     return objective.truncated_cost(state, votes)
 
 

@@ -74,13 +74,13 @@ def lowest(objective: Objective, state: State) -> Solved:
 
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
-    """GNC by several schedules from one state; the lowest truncated cost wins."""
+    """GNC by several schedules from one state; the lowest truncated cost wins, each taken where it ended."""
     says = places.votes if places is not None else np.ones(len(objective.bounds()))
     found = [scheduled(objective, state, ratio) for ratio in START_RATIOS]
     if np.any(directions(objective.edges)):
         found = [as_angles(objective, solved) for solved in found]
         found.append(scheduled(objective, state, START_RATIOS[-1], hold=True))
-    solved = min(found, key=lambda solved: voted_cost(objective, solved.state, says))
+    solved = min(found, key=lambda solved: objective.truncated_cost(solved.state, says))
     return replaced(objective, solved, places) if places is not None else solved
 
 

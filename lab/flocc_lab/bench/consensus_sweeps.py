@@ -1,4 +1,4 @@
-"""Consensus of robots (`backend.consensus`) on graphs of one robot that are cut among several, beside the optimum.
+"""Consensus of robots (`flocc_lab.consensus`) on graphs of one robot that are cut among several, beside the optimum.
 
 `python -m flocc_lab.bench.consensus_sweeps FILE... [--robots 5] [--sweeps 60] [--loss 0.3] [--seed 1]` prints a row of
 Markdown for each g2o file. In a sweep each robot in turn does one step and tells each of its neighbours; a message is
@@ -76,7 +76,7 @@ class SweepsVerdict:
     """How a set went.
 
     Attributes:
-        shared: SharedPoses poses of all pairs.
+        shared: Poses that pairs share, of all pairs.
         above: Cost over the optimum, less one, after each sweep.
         bytes_at: Bytes told by then.
         cpu_s: Of all robots and sweeps.

@@ -53,7 +53,8 @@ def test_a_covariance_is_in_the_unit_of_its_pose(tmp_path: Path) -> None:
     told = entry("a/0", "b/1", covariance=covariance[np.triu_indices(6)].tolist())
     for scale, unit_m in (("removed", 5.0), ("kept", 1.0)):
         seen = perception(tmp_path, scale, pairs=[told])
-        found = seen.register(*(seen.encode(name_image(name)) for name in ("a/0", "b/1")), None)
+        a, b = (seen.encode(name_image(name)) for name in ("a/0", "b/1"))
+        found = seen.register(a, b, None)
         assert isinstance(found, Registration)
         assert found.covariance is not None
         units = np.diag([1.0] * 3 + [unit_m] * 3)

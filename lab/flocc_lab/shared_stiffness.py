@@ -1,0 +1,143 @@
+"""How stiff a robot's graph holds the poses that it shares with another, in few numbers, and the mean of two such.
+
+The penalty between two robots is best the geometric mean of how stiff either holds what they share (optimised Schwarz
+methods, Gander 2006: in each direction with stiffnesses `a` and `b`, an exchange leaves `((sqrt a - sqrt b) / (sqrt a +
+sqrt b))^2` of an error where the penalty is `sqrt(a b)`), and it must be the same on both sides: then the exchange is
+Peaceman and Rachford's splitting (1955), which comes to rest for whatever penalty. A whole Schur complement would take
+18 numbers a pair of poses; here the marginal of up to `KNOTS_MAX` of them is whole, and each other pose hangs on its
+nearest knot by the marginal between these two.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from flocc_agent.geometry import hats, inverse, poses_from_tq, quaternions
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+KNOTS_MAX = 16
+_LOWER_6 = np.tril_indices(6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedStiffness:
+    """Information of poses that two robots share, by all that one of them knows but by the other.
+
+    Attributes:
+        knots: (6M, 6M) lower Cholesky factor of the information of the knots, in the poses' own tangents, rotation
+            first (single precision keeps what a factor says definite, not what its square does).
+        ties: (S-M, 6, 6) likewise of each other pose relative to its nearest knot, in the pose's own tangent.
+        tied: (S-M, 7) where that pose was, seen from its knot; translation, then quaternion `w x y z`.
+    """
+
+    knots: Float
+    ties: Float
+    tied: Float
+
+    def packed(self) -> bytes:
+        """As it would travel, in single precision."""
+        ties = self.ties[:, _LOWER_6[0], _LOWER_6[1]]
+        rows = [self.knots[np.tril_indices(len(self.knots))], ties.ravel(), self.tied.ravel()]
+        return np.concatenate(rows).astype("<f4").tobytes()
+
+    @staticmethod
+    def size(count: int) -> int:
+        """Bytes of so many poses, packed."""
+        knots = min(count, KNOTS_MAX)
+        return 4 * (3 * knots * (6 * knots + 1) + 28 * (count - knots))
+
+    @staticmethod
+    def unpacked(payload: bytes, count: int) -> "SharedStiffness":
+        """Read what `packed` wrote of so many poses; `payload` has the right length."""
+        values = np.frombuffer(payload, "<f4").astype(float)
+        M = min(count, KNOTS_MAX)
+        knots, ties = np.zeros((6 * M, 6 * M)), np.zeros((count - M, 6, 6))
+        whole, end = 3 * M * (6 * M + 1), len(values) - 7 * (count - M)
+        knots[np.tril_indices(6 * M)] = values[:whole]
+        ties[:, _LOWER_6[0], _LOWER_6[1]] = values[whole:end].reshape(-1, 21)
+        return SharedStiffness(knots, ties, values[end:].reshape(-1, 7))
+
+    def check(self, count: int) -> None:
+        """Refuse what is of another size, not finite or not positive definite.
+
+        Raises:
+            ValueError: It is; the sentence says what.
+        """
+        M = min(count, KNOTS_MAX)
+        if (self.knots.shape, len(self.ties), len(self.tied)) != ((6 * M, 6 * M), count - M, count - M):
+            raise ValueError(f"the stiffness is not that of {count} poses")
+        diagonals = np.concatenate([np.diagonal(self.knots), np.einsum("kaa->ka", self.ties).ravel()])
+        finite = all(np.all(np.isfinite(part)) for part in (self.knots, self.ties, self.tied))
+        if not finite or not np.all(diagonals > 0) or not np.all(np.linalg.norm(self.tied[:, 3:], axis=1) > 0.5):
+            raise ValueError("the stiffness of shared poses is not positive definite")
+
+    def matrix(self) -> Float:
+        """Information (6S, 6S) of all of them; mostly zero where S is large."""
+        count = len(self.knots) // 6 + len(self.ties)
+        knots, others, nearest = _knots(count)
+        information = np.zeros((6 * count, 6 * count))
+        rows = _rows(knots)
+        information[np.ix_(rows, rows)] = self.knots @ self.knots.T
+        for k, q, L, difference in zip(others, nearest, self.ties, _differences(self.tied), strict=True):
+            both = _rows(np.array([q, k]))
+            information[np.ix_(both, both)] += difference.T @ L @ L.T @ difference
+        return information
+
+
+def stiffness_of(covariance: Float, T: Float) -> SharedStiffness:
+    """In short what the covariance (6S, 6S) of poses at `T` (S, 4, 4) says."""
+    knots, others, nearest = _knots(len(T))
+    rows = _rows(knots)
+    T_knot_pose = inverse(T[nearest]) @ T[others]
+    tied = np.concatenate([T_knot_pose[:, :3, 3], quaternions(T_knot_pose[:, :3, :3])], axis=1)
+    ties = np.empty((len(others), 6, 6))
+    for n, (k, q, difference) in enumerate(zip(others, nearest, _differences(tied), strict=True)):
+        both = _rows(np.array([q, k]))
+        ties[n] = _information_factor(difference @ covariance[np.ix_(both, both)] @ difference.T)
+    return SharedStiffness(_information_factor(covariance[np.ix_(rows, rows)]), ties, tied)
+
+
+def geometric_mean(lower: SharedStiffness, higher: SharedStiffness) -> SharedStiffness:
+    """Of two robots' stiffnesses of the same poses, part by part; poses are tied where the lower one has them."""
+    ties = [_mean_factor(a, b) for a, b in zip(lower.ties, higher.ties, strict=True)]
+    knots = _mean_factor(lower.knots, higher.knots)
+    return SharedStiffness(knots, np.array(ties).reshape(lower.ties.shape), lower.tied)
+
+
+def _differences(tied: Float) -> Float:
+    """Jacobians (K, 6, 12) of a pose relative to its knot by the tangents of both, rotation first."""
+    back = inverse(poses_from_tq(tied))
+    out = np.zeros((len(back), 6, 12))
+    out[:, :3, :3] = out[:, 3:, 3:6] = -back[:, :3, :3]
+    out[:, 3:, :3] = -hats(back[:, :3, 3]) @ back[:, :3, :3]
+    out[:, :, 6:] = np.eye(6)
+    return out
+
+
+def _knots(count: int) -> tuple[Int, Int, Int]:
+    """Which of so many poses are knots, which are not, and the nearest knot of each of those."""
+    knots = np.round(np.linspace(0, count - 1, min(count, KNOTS_MAX))).astype(np.int64)
+    others = np.setdiff1d(np.arange(count), knots)
+    nearest = knots[np.argmin(np.abs(others[:, None] - knots), axis=1)] if len(others) else others
+    return knots, others, nearest
+
+
+def _rows(poses: Int) -> Int:
+    return (6 * poses[:, None] + np.arange(6)).ravel()
+
+
+def _information_factor(covariance: Float) -> Float:
+    """Lower Cholesky factor of the inverse of a covariance."""
+    backwards = np.linalg.cholesky(0.5 * (covariance + covariance.T)[::-1, ::-1])
+    return np.ascontiguousarray(solve_triangular(backwards, np.eye(len(backwards)), lower=True).T[::-1, ::-1])
+
+
+def _mean_factor(L: Float, M: Float) -> Float:
+    """Lower Cholesky factor of the geometric mean of `L L^T` and `M M^T` (Pusz and Woronowicz 1975)."""
+    U, roots, _ = np.linalg.svd(solve_triangular(L, M, lower=True))
+    R = np.linalg.qr((L @ U * np.sqrt(roots)).T, mode="r")
+    return np.ascontiguousarray((np.sign(np.diagonal(R))[:, None] * R).T)
