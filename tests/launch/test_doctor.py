@@ -305,14 +305,17 @@ def test_no_map_is_ok_that_a_robot_with_its_camera_upside_down_is_part_of(tmp_pa
     assert "T_body_camera" in findings[0].advice
     assert not [line for line in finding_lines(findings) if line.startswith("ok")]
     said = verdict(build(load(folder)))
-    assert said.startswith(f"{begins} in a map with others. ")
+    assert said.startswith(f"{begins}. All two robots found one common map")
     assert "Look at" not in said
 
 
 def test_a_camera_that_was_kept_out_is_why_maps_did_not_merge(tmp_path: Path) -> None:
-    findings = diagnose(upside_down("map/r1", "map/r2").write(tmp_path / "run"))
+    folder = upside_down("map/r1", "map/r2").write(tmp_path / "run")
+    findings = diagnose(folder)
     assert [(finding.cause, finding.severity) for finding in findings] == [("camera-turned", Severity.BLOCKS)]
     assert findings[0].sentence.endswith("kept out of closures.")
+    begins = "r2's camera is turned by 179.9 degrees against its odometry."
+    assert verdict(build(load(folder))).startswith(f"{begins} The robots did not merge")
 
 
 def test_a_robot_that_left_no_result_is_judged_by_the_events(tmp_path: Path) -> None:

@@ -15,12 +15,16 @@ def verdict(report: RunReport) -> str:
 
 
 def misplaced_sentence(report: RunReport) -> str:
-    """Whose place in a map is not to be believed, since the camera's axes are not those of its odometry."""
-    if not report.misplaced_cameras:
-        return ""
-    who = listed(list(report.misplaced_cameras))
-    verb = "is" if len(report.misplaced_cameras) == 1 else "are"
-    return f"{' '.join(report.misplaced_cameras.values())} Do not believe where {who} {verb} in a map with others."
+    """Whose camera's axes are not those of its odometry, and whose place among others is so not to be believed."""
+    frames = [robot.map_frame for robot in report.robot_details]
+    among_others = [
+        robot.robot
+        for robot in report.robot_details
+        if robot.robot in report.misplaced_cameras and robot.map_frame and frames.count(robot.map_frame) > 1
+    ]
+    verb = "is" if len(among_others) == 1 else "are"
+    doubt = [f"Do not believe where {listed(among_others)} {verb}."] if among_others else []
+    return " ".join([*report.misplaced_cameras.values(), *doubt])
 
 
 def camera_sentence(report: RunReport) -> str:
