@@ -11,8 +11,9 @@ from pydantic import BaseModel
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.core.reports import WITHHELD
 from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
-from flocc_launch.doctor import Finding, Severity, diagnose
+from flocc_launch.doctor import Finding, Severity, diagnose, finding_lines
 from flocc_launch.report.build import build
 from flocc_launch.report.verdict import verdict
 from flocc_launch.runs.loaded_run import load
@@ -284,6 +285,37 @@ def test_a_camera_that_does_not_fit_is_named_with_its_latest_figure(tmp_path: Pa
     assert report.doubted_cameras == ["r1", "r2"]
     assert verdict(report).endswith("Look at r1's and r2's cameras: their pictures and odometry do not fit.")
     assert any("1.50 times" in warning for warning in report.warnings)
+
+
+def upside_down(*frames: str) -> Story:
+    """A run whose second robot told that its camera hangs upside down, after some closures."""
+    story = corrections_lost()
+    story.frames.update(zip(("r1", "r2"), frames, strict=True))
+    story.say(15.0, "r2", "encoding_failed", keyframe="r2/9", reason=WITHHELD)
+    fields = {"doubt": "mounting", "amount": 179.9, "where": "180 degrees about z (forward)", "pairs": 5}
+    return story.say(4.0, "r2", "camera_doubted", **fields, withheld=True)
+
+
+def test_no_map_is_ok_that_a_robot_with_its_camera_upside_down_is_part_of(tmp_path: Path) -> None:
+    folder = upside_down("map/r1", "map/r1").write(tmp_path / "run")
+    findings = diagnose(folder)
+    assert [finding.cause for finding in findings] == ["merged-doubtfully", "camera-turned"]
+    begins = "r2's camera is turned by 179.9 degrees against its odometry. Do not believe where r2 is"
+    assert findings[0].sentence == f"{begins}. All 2 robots are in map/r1."
+    assert "T_body_camera" in findings[0].advice
+    assert not [line for line in finding_lines(findings) if line.startswith("ok")]
+    said = verdict(build(load(folder)))
+    assert said.startswith(f"{begins}. All two robots found one common map")
+    assert "Look at" not in said
+
+
+def test_a_camera_that_was_kept_out_is_why_maps_did_not_merge(tmp_path: Path) -> None:
+    folder = upside_down("map/r1", "map/r2").write(tmp_path / "run")
+    findings = diagnose(folder)
+    assert [(finding.cause, finding.severity) for finding in findings] == [("camera-turned", Severity.BLOCKS)]
+    assert findings[0].sentence.endswith("kept out of closures.")
+    begins = "r2's camera is turned by 179.9 degrees against its odometry."
+    assert verdict(build(load(folder))).startswith(f"{begins} The robots did not merge")
 
 
 def test_a_robot_that_left_no_result_is_judged_by_the_events(tmp_path: Path) -> None:

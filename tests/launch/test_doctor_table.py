@@ -113,8 +113,8 @@ def warning(*texts: str) -> Story:
     return merged().say(14.0, "r1", "optimised", term=1, round=3, **parts)
 
 
-def doubting(doubt: str, amount: float, where: str = "") -> Callable[[], Story]:
-    fields = {"doubt": doubt, "amount": amount, "where": where, "pairs": 12}
+def doubting(doubt: str, amount: float, where: str = "", withheld: bool = False) -> Callable[[], Story]:
+    fields = {"doubt": doubt, "amount": amount, "where": where, "pairs": 12, "withheld": withheld}
     return lambda: merged().say(14.0, "r2", "camera_doubted", **fields)
 
 
@@ -130,6 +130,7 @@ STORIES: dict[str, Callable[[], Story]] = {
     "frozen-pictures": doubting("frozen", 10),
     "camera": doubting("of a later version", 2.0),
     "merged": merged,
+    "merged-doubtfully": doubting("mounting", 179.9, "180 degrees about z (forward)", withheld=True),
     "unknown": lambda: corrections_lost().say(
         13.1, "r2", "correction", term=1, round=2, map_frame="map/r2", T_map_odom=[0.0] * 3 + [0.0, 0.0, 0.0, 1.0]
     ),

@@ -80,6 +80,10 @@ class EncodingFailed:
     reason: str
 
 
+WITHHELD = "the camera's axes are not those of its odometry, so closures would misplace the robot"
+"""Why such a camera's keyframes are not encoded."""
+
+
 @fact("camera_doubted")
 class CameraDoubted:
     """A robot's own pictures contradict its odometry, its calibration, or each other.
@@ -91,12 +95,14 @@ class CameraDoubted:
             number of frozen pictures; 1 elsewhere.
         where: An overlay's place in the picture, or the turn about the camera's axes; else empty.
         pairs: Of consecutive keyframes that say so.
+        withheld: Whether the robot offers no keyframe for closures as long as its pictures say so.
     """
 
     doubt: str
     amount: float
     where: str
     pairs: int
+    withheld: bool = False
 
 
 @fact("candidate")

@@ -9,10 +9,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from flocc_agent.runtime.facts import AgentDied
+from flocc_launch.doctor.cameras import finding_of, kept_out
 from flocc_launch.doctor.finding import Finding, Severity
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.merge_evidence import named
 from flocc_launch.doctor.steps import STEPS
+from flocc_launch.runs.camera_doubts import DoubtSentence
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.timeline import ends
@@ -42,8 +44,19 @@ def merging(loaded: LoadedRun) -> list[Finding]:
     if len(groups) == 1 and loaded.tracks[groups[0][0]].map_frame is not None:
         frame = loaded.tracks[groups[0][0]].map_frame
         sentence = f"All {len(groups[0])} robots{living(loaded, groups[0])} are in {frame}."
+        misplaced = kept_out(loaded, groups[0])
+        if misplaced:
+            return [merged_doubtfully(sentence, misplaced)]
         return [Finding("merged", Severity.GOOD, sentence, robots=groups[0])]
     return [furthest(loaded, first, second) for k, first in enumerate(groups) for second in groups[k + 1 :]]
+
+
+def merged_doubtfully(sentence: str, misplaced: Sequence[DoubtSentence]) -> Finding:
+    """One map, with robots in it whose cameras' axes are not their odometry's: closures from before that was known."""
+    who = tuple(sorted({doubt.robot for doubt in misplaced}))
+    why = " ".join(doubt.headline for doubt in misplaced)
+    doubtful = f"{why} Do not believe where {named(who)} {'is' if len(who) == 1 else 'are'}. {sentence}"
+    return Finding("merged-doubtfully", Severity.HINDERS, doubtful, misplaced[0].advice, who)
 
 
 def living(loaded: LoadedRun, group: Sequence[str]) -> str:
@@ -71,6 +84,9 @@ def furthest(loaded: LoadedRun, first: Iterable[str], second: Iterable[str]) -> 
 
 def stop(loaded: LoadedRun, a: str, b: str) -> tuple[int, Finding]:
     """The first step that failed between two robots, with its number."""
+    misplaced = kept_out(loaded, (a, b))
+    if misplaced:
+        return -1, finding_of(misplaced[0], Severity.BLOCKS)
     for number_of, step in enumerate(STEPS):
         found = step(loaded, a, b)
         if found is not None:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from flocc_agent.core.reports import EncodingFailed, FrontEndsDiffer, NameTaken, RoundSolved
+from flocc_agent.core.reports import WITHHELD, EncodingFailed, FrontEndsDiffer, NameTaken, RoundSolved
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.cameras import doubted_cameras
@@ -117,10 +117,11 @@ def look_weak(loaded: LoadedRun) -> bool:
 
 
 def encoding_failures(loaded: LoadedRun) -> list[Finding]:
-    """Keyframes without descriptor or latent."""
+    """Keyframes without descriptor or latent, but for those that were kept out: of these the camera's finding tells."""
     found: dict[str, list[Reported[EncodingFailed]]] = {}
     for event in of_kind(loaded.events, EncodingFailed):
-        found.setdefault(event.robot, []).append(event)
+        if event.fact.reason != WITHHELD:
+            found.setdefault(event.robot, []).append(event)
     return [
         Finding(
             "encoding-failed",

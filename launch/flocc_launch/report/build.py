@@ -101,6 +101,7 @@ def build(loaded: LoadedRun) -> RunReport:
         robot_details=robots,
         deaths_unasked=deaths_unasked(loaded.events),
         doubted_cameras=sorted({doubt.robot for doubt in camera_doubts(loaded.events) if doubt.matters}),
+        misplaced_cameras={d.robot: d.headline for d in camera_doubts(loaded.events) if d.withheld},
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})

@@ -207,6 +207,8 @@ class RunReport(Record):
     """Robots whose agents died without a fault of the scenario or an operator's order, once for each death."""
     doubted_cameras: list[str] = Field(default_factory=list)
     """Robots whose pictures contradict their odometry or calibration, or are frozen; the warnings say how."""
+    misplaced_cameras: dict[str, str] = Field(default_factory=dict)
+    """Those of them whose camera's axes are not their odometry's -> how, in a sentence; kept out of closures."""
     warnings: list[str]
 
     def has_truth(self) -> bool:

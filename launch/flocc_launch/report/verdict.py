@@ -10,13 +10,26 @@ def verdict(report: RunReport) -> str:
     """Whether the maps merged, when, and what it did to the error."""
     if len(report.robots) == 1:
         return alone(report)
-    parts = (map_sentence(report), error_sentence(report), camera_sentence(report))
+    parts = (misplaced_sentence(report), map_sentence(report), error_sentence(report), camera_sentence(report))
     return " ".join(sentence for sentence in parts if sentence)
+
+
+def misplaced_sentence(report: RunReport) -> str:
+    """Whose camera's axes are not those of its odometry, and whose place among others is so not to be believed."""
+    frames = [robot.map_frame for robot in report.robot_details]
+    among_others = [
+        robot.robot
+        for robot in report.robot_details
+        if robot.robot in report.misplaced_cameras and robot.map_frame and frames.count(robot.map_frame) > 1
+    ]
+    verb = "is" if len(among_others) == 1 else "are"
+    doubt = [f"Do not believe where {listed(among_others)} {verb}."] if among_others else []
+    return " ".join([*report.misplaced_cameras.values(), *doubt])
 
 
 def camera_sentence(report: RunReport) -> str:
     """Whose camera is not what its configuration says."""
-    robots = report.doubted_cameras
+    robots = [robot for robot in report.doubted_cameras if robot not in report.misplaced_cameras]
     if not robots:
         return ""
     whose = listed([f"{robot}'s" for robot in robots])

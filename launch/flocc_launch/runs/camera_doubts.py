@@ -15,6 +15,7 @@ AXES = (
     "The axes seem to be another convention's: T_body_camera is missing, or odometry is of the body (x forward, z up) "
     "where the camera's is meant (z forward), or the camera hangs upside down."
 )
+KEPT_OUT = "As long as its pictures say so its keyframes are kept out of closures."
 ADVICE = {
     "focal length": (
         "Calibrate at the size in which the pictures arrive, or multiply fx and fy by that; a zoom, a crop or a "
@@ -45,12 +46,19 @@ class DoubtSentence:
         doubt: As in `CameraDoubted`.
         sentence: What was found.
         advice: What to change.
+        withheld: As in `CameraDoubted`.
     """
 
     robot: str
     doubt: str
     sentence: str
     advice: str
+    withheld: bool
+
+    @property
+    def headline(self) -> str:
+        """The first clause of the sentence: robot, and figure."""
+        return f"{self.sentence.partition(': ')[0].partition('. ')[0].rstrip('.')}."
 
     @property
     def matters(self) -> bool:
@@ -62,7 +70,7 @@ def camera_doubts(events: Iterable[Reported[Fact]]) -> list[DoubtSentence]:
     """Every robot's doubts, by name."""
     latest = {(told.robot, told.fact.doubt): told.fact for told in of_kind(events, CameraDoubted)}
     return [
-        DoubtSentence(robot, doubt, _sentence(robot, fact), _advice(fact))
+        DoubtSentence(robot, doubt, _sentence(robot, fact), _advice(fact), fact.withheld)
         for (robot, doubt), fact in sorted(latest.items())
     ]
 
@@ -82,7 +90,8 @@ def _sentence(robot: str, fact: CameraDoubted) -> str:
         "overlay": f"{share} of {robot}'s pictures ({fact.where}) move with the camera: {_guess(fact)}.",
         "frozen": f"{fact.amount:.0f} or more pictures of {robot} are ones that it took before, though it had moved.",
     }
-    return sentences.get(fact.doubt, f"{robot}'s camera: {fact.doubt} {fact.amount:g} {fact.where}".rstrip() + ".")
+    said = sentences.get(fact.doubt, f"{robot}'s camera: {fact.doubt} {fact.amount:g} {fact.where}".rstrip() + ".")
+    return f"{said} {KEPT_OUT}" if fact.withheld else said
 
 
 def _guess(fact: CameraDoubted) -> str:

@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-CACHE_FORM = b"3"
+CACHE_FORM = b"4"
 """Changes with what a file of the cache holds."""
 
 
@@ -104,14 +104,18 @@ class CachedWatch:
 def _packed_look(looked: KeyframeLook) -> list[Any]:
     d = looked.descriptor
     descriptor = None if d is None else [d.dtype, list(d.shape), d.data, d.scale]
-    return [descriptor, looked.latent, looked.fault, [[d.doubt, d.amount, d.where, d.pairs] for d in looked.doubts]]
+    doubts = [[d.doubt, d.amount, d.where, d.pairs, d.withheld] for d in looked.doubts]
+    return [descriptor, looked.latent, looked.fault, doubts]
 
 
 def _looked(packed: list[Any]) -> KeyframeLook:
     descriptor, latent, fault, doubts = packed
     array = None if descriptor is None else Array(descriptor[0], tuple(descriptor[1]), *descriptor[2:])
-    told = (CameraDoubted(doubt=doubt, amount=amount, where=where, pairs=n) for doubt, amount, where, n in doubts)
-    return KeyframeLook(array, latent, fault, tuple(told))
+    told = tuple(
+        CameraDoubted(doubt=doubt, amount=amount, where=where, pairs=n, withheld=withheld)
+        for doubt, amount, where, n, withheld in doubts
+    )
+    return KeyframeLook(array, latent, fault, told)
 
 
 def _code_hash() -> bytes:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from tests.agent.perception.classical_scenes import camera_at, seen_from, wall
 
 from flocc_agent.config import ClassicalConfig, PerceptionConfig
-from flocc_agent.core.interfaces import Camera, Image, OdometryPair
+from flocc_agent.core.interfaces import Camera, Image, OdometryPair, Perception
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
-from flocc_agent.core.reports import CameraDoubted
+from flocc_agent.core.reports import WITHHELD, CameraDoubted
 from flocc_agent.geometry import angle_rad, inverse, pose, so3_exp
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.perception.classical.encoder import encode_features
@@ -26,6 +27,7 @@ from flocc_agent.perception.watch.camera_watch import CameraWatch
 from flocc_agent.perception.watch.overlay import OverlayFinder, place_of
 from flocc_agent.perception.watch.seen_motion import Flow, flow_of, moves_with_the_scene
 from flocc_lab.bench.overlays import overlay
+from flocc_protocol.arrays import Array
 
 Float = NDArray[np.float64]
 
@@ -149,6 +151,79 @@ def test_mirrored_pictures_are_named() -> None:
 
 def test_a_robot_that_only_drives_straight_shows_no_focal_length() -> None:
     assert camera_verdict(flows(np.random.default_rng(5), factor=0.5, turn_rad=0.001)) is None
+
+
+# Whose closures would misplace it
+
+
+class Told:
+    """A perception whose registrar tells the flows of a drive in turn."""
+
+    def __init__(self, pairs: list[WatchedPair]) -> None:
+        self.registrar = self
+        self._flows = [pair.flow for pair in pairs]
+
+    def describe(self, image: Image) -> Array:
+        return Array.of(np.zeros(2, np.float32))
+
+    def encode(self, image: Image) -> bytes:
+        return b"latent"
+
+    def flow(self, before: bytes, now: bytes, T_odom_before: Float, T_odom_now: Float) -> Flow | None:
+        return self._flows.pop(0)
+
+
+def offered(pairs: list[WatchedPair]) -> tuple[list[bool], list[CameraDoubted]]:
+    """Whether each keyframe of a drive is offered for closures, and what is told."""
+    perception, watch, rng = Told(pairs), CameraWatch(), np.random.default_rng(0)
+    looks = [
+        watch.look(
+            cast(Perception, perception),
+            image_of(rng.integers(0, 256, (240, 320), dtype=np.uint8)),
+            pose(np.eye(3), np.array([k, 0.0, 0.0])),
+        )
+        for k in range(len(pairs) + 1)
+    ]
+    assert {look.fault for look in looks} <= {"", WITHHELD}
+    assert all((look.latent is None) == (look.descriptor is None) == bool(look.fault) for look in looks)
+    return [look.latent is not None for look in looks], [doubt for look in looks for doubt in look.doubts]
+
+
+def turned(rng: np.random.Generator, degrees: float, count: int = 20, turn_rad: float = 0.1) -> list[WatchedPair]:
+    T = pose(so3_exp(np.radians(degrees) * np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    return flows(rng, count, turn_rad=turn_rad, odometry=turned_by(T))
+
+
+@pytest.mark.parametrize("degrees", [75.0, 90.0, 179.9])
+def test_a_camera_of_other_axes_is_kept_out_of_closures_from_when_it_is_known(degrees: float) -> None:
+    is_offered, doubts = offered(turned(np.random.default_rng(21), degrees))
+    assert is_offered == [True] * 5 + [False] * 16
+    assert [(doubt.doubt, doubt.withheld) for doubt in doubts] == [("mounting", True)]
+    assert doubts[0].amount == pytest.approx(degrees, abs=2.0)
+
+
+def test_mirrored_pictures_are_kept_out_of_closures() -> None:
+    is_offered, doubts = offered(flows(np.random.default_rng(22), mirrored=True))
+    assert not any(is_offered[12:])
+    assert ("mirrored", True) in {(doubt.doubt, doubt.withheld) for doubt in doubts}
+
+
+@pytest.mark.parametrize("seed", range(23, 25))
+def test_a_camera_that_fits_or_is_a_bit_off_is_offered_always(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for pairs in (flows(rng), turned(rng, 6.0), turned(rng, 40.0), flows(rng, factor=0.6)):
+        is_offered, doubts = offered(pairs)
+        assert all(is_offered)
+        assert not any(doubt.withheld for doubt in doubts)
+
+
+def test_a_straight_way_proves_nothing_and_a_mended_camera_is_offered_again() -> None:
+    rng = np.random.default_rng(27)
+    straight, _ = offered([*turned(rng, 180.0), *turned(rng, 180.0, 60, turn_rad=0.001)])
+    assert not any(straight[8:])
+    mended, _ = offered([*turned(rng, 180.0, 8), *flows(rng, 30)])
+    assert not any(mended[7:12])
+    assert all(mended[20:])
 
 
 # What moves with the camera

@@ -50,6 +50,8 @@ FOCAL_ERROR_MIN_RATIO = 0.05
 MIXED_ANGLE_MIN_RAD = float(np.radians(30.0))
 """Between directions of motion, at the median: less may be few or badly spread matches; other axes give far more."""
 MOUNT_ERROR_MIN_RAD = float(np.radians(2.5))
+AXES_ERROR_MIN_RAD = float(np.radians(60.0))
+"""A mounting off by so much is no screw that came loose: the axes are another convention's, or upside down."""
 
 
 class CameraFault(Enum):
@@ -78,6 +80,12 @@ class CameraVerdict:
     focal_factor: float
     X: Float
     pairs: int
+
+    @property
+    def places_wrongly(self) -> bool:
+        """Whether closures of this camera put the robot where it is not: its axes are others than odometry's."""
+        turned = self.fault in (CameraFault.MOUNTING, CameraFault.BOTH) and angle_rad(self.X) >= AXES_ERROR_MIN_RAD
+        return turned or self.fault is CameraFault.MIRRORED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,12 +146,18 @@ class CameraTrial:
         return costs(self.motions(STEP**k), X)
 
 
+def shows_camera(pairs: Sequence[WatchedPair]) -> bool:
+    """Whether these pairs are enough, and turn enough by odometry, for a verdict."""
+    turns_rad = [angle_rad(between(pair.flow.T_odom_before, pair.flow.T_odom_now)[:3, :3]) for pair in pairs]
+    return len(pairs) >= PAIRS_MIN and sum(turn_rad > TURN_MIN_RAD for turn_rad in turns_rad) >= TURNS_MIN
+
+
 def camera_verdict(pairs: Sequence[WatchedPair]) -> CameraVerdict | None:
     """Say what is wrong with the camera that saw these pairs; None where nothing is, or nothing can be said."""
+    if not shows_camera(pairs):
+        return None
     trial = CameraTrial(pairs)
     motions = trial.motions()
-    if len(pairs) < PAIRS_MIN or int((np.linalg.norm(motions.turn_odom, axis=1) > TURN_MIN_RAD).sum()) < TURNS_MIN:
-        return None
     nothing = _Explanation(None, costs(motions, np.eye(3)))
     tried = [nothing, trial.focal_length(np.eye(3)), _turned(CameraFault.MOUNTING, motions)]
     found = _simplest(tried)

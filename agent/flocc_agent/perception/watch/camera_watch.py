@@ -3,7 +3,8 @@
 Three looks. Is the picture one that was seen before? Then it is not encoded: it would be a place where the robot is
 not. Does part of it stay while the robot turns? Then features and place descriptor leave that part out from now on. Do
 motions between consecutive keyframes agree with odometry's? The first ones are all looked at, later ones now and then,
-since a camera can be knocked, or zoomed, on the way.
+since a camera can be knocked, or zoomed, on the way. As long as they say that its axes are others than odometry's, its
+keyframes carry odometry only: closures with them would put the robot where it is not.
 """
 
 from collections import deque
@@ -15,9 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Image, KeyframeLook, Perception
-from flocc_agent.core.reports import CameraDoubted
+from flocc_agent.core.reports import WITHHELD, CameraDoubted
 from flocc_agent.geometry import so3_log
-from flocc_agent.perception.watch.camera_verdict import CameraFault, CameraVerdict, WatchedPair, camera_verdict
+from flocc_agent.perception.watch.camera_verdict import (
+    CameraFault,
+    CameraVerdict,
+    WatchedPair,
+    camera_verdict,
+    shows_camera,
+)
 from flocc_agent.perception.watch.overlay import OverlayFinder, place_of
 from flocc_agent.perception.watch.seen_motion import Flow
 from flocc_agent.stages import stage
@@ -67,6 +74,7 @@ class CameraWatch:
         self._seen = 0
         self._repeats = 0
         self._told: list[CameraDoubted] = []
+        self._withheld = False
 
     def look(self, perception: Perception, image: Image, T_odom_camera: Float) -> KeyframeLook:
         """Describe and encode the next keyframe's image as far as it shows the scene, and tell what is odd about it.
@@ -92,6 +100,8 @@ class CameraWatch:
         if isinstance(perception.registrar, SeesFlow):
             with stage("watch"):
                 doubts += self._motion(perception.registrar, latent, T_odom_camera)
+        if self._withheld:
+            return KeyframeLook(None, None, WITHHELD, tuple(doubts))
         return KeyframeLook(descriptor, latent, "", tuple(doubts))
 
     def _look_at(self, image: Image, T_odom_camera: Float) -> bool:
@@ -139,12 +149,16 @@ class CameraWatch:
         self._pairs.append(WatchedPair(flow))
         count = len(self._pairs)
         is_time = count in JUDGED_AT if self._seen <= PAIRS_MAX else self._seen % EVERY_LATER**2 == 0
-        verdict = camera_verdict(tuple(self._pairs)) if is_time else None
+        if not is_time or not shows_camera(self._pairs):
+            return []
+        verdict = camera_verdict(self._pairs)
+        self._withheld = verdict is not None and verdict.places_wrongly
         return [] if verdict is None else self._judged(verdict)
 
     def _judged(self, verdict: CameraVerdict) -> list[CameraDoubted]:
         doubt = _doubt_of(verdict)
-        known = next((told for told in reversed(self._told) if told.doubt == doubt.doubt), None)
+        kind = doubt.doubt, doubt.withheld
+        known = next((told for told in reversed(self._told) if (told.doubt, told.withheld) == kind), None)
         is_focal = verdict.fault is CameraFault.FOCAL_LENGTH
         if known is not None and not (is_focal and abs(known.amount / doubt.amount - 1.0) > FOCAL_STEP_RATIO):
             return []
@@ -163,7 +177,13 @@ def _doubt_of(verdict: CameraVerdict) -> CameraDoubted:
     is_turned = verdict.fault in (CameraFault.MOUNTING, CameraFault.BOTH)
     amount = float(np.linalg.norm(turn_deg)) if verdict.fault is CameraFault.MOUNTING else verdict.focal_factor
     where = _about(turn_deg) if is_turned else ""
-    return CameraDoubted(doubt=verdict.fault.value, amount=round(amount, 3), where=where, pairs=verdict.pairs)
+    return CameraDoubted(
+        doubt=verdict.fault.value,
+        amount=round(amount, 3),
+        where=where,
+        pairs=verdict.pairs,
+        withheld=verdict.places_wrongly,
+    )
 
 
 def _about(turn_deg: Float) -> str:
