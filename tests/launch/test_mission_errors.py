@@ -253,4 +253,4 @@ def test_without_ground_truth_both_are_unknown(tmp_path: Path) -> None:
     folder = synthetic_run.write(tmp_path / "run", Synthetic(with_truth=False))
     report = finish(folder)
     assert (report.iate_m, report.iate_odometry_m, report.iate_moments, report.if1) == (None, None, 0, None)
-    assert "during it     ATE –; odometry – (mean of 0 rounds in one map); F1 of closures –" in evaluate(folder.path)
+    assert "during it" not in evaluate(folder.path)
