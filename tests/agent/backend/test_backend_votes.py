@@ -8,7 +8,7 @@ import pytest
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.placing import spanning
 from flocc_agent.backend.votes import votes
-from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, PoseGraph
+from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, pose, so3_exp
 from flocc_lab.graph_family.family_campaign import verdict_of
 from flocc_lab.graph_family.family_spec import Lengths, drawn
@@ -75,3 +75,12 @@ def test_many_right_closures_are_not_let_go_of_for_the_odometry_that_they_bend()
     found = optimise(PoseGraph(trajectories, closures), settings())
     assert isinstance(found, GraphSolution)
     assert [component.logs for component in found.components] == [tuple(sorted(logs))]
+
+
+def test_a_place_that_leaves_hardly_a_closure_is_none() -> None:
+    drawn_member = member(2593)
+    found = optimise(drawn_member.graph, settings())
+    assert isinstance(found, GraphSolution)
+    used = np.array([closure.state is ClosureState.USED for closure in found.closures])
+    assert np.count_nonzero(used & drawn_member.is_right) > 45
+    assert not np.any(used & ~drawn_member.is_right)
