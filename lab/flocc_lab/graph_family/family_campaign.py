@@ -65,7 +65,7 @@ HEAD = (
 
 
 def table(verdicts: Sequence[GraphVerdict]) -> str:
-    """A row per method, as Markdown. Ratios are ATE over the oracle's, without groups of wrong closures."""
+    """A row per method, as Markdown. Ratios are ATE over the oracle's, of those without groups where there are any."""
     names = list(dict.fromkeys(v.method for v in verdicts))
     return "\n".join(
         [HEAD, "|---" * 13 + "|", *(_row(name, [v for v in verdicts if v.method == name]) for name in names)]
@@ -73,9 +73,9 @@ def table(verdicts: Sequence[GraphVerdict]) -> str:
 
 
 def _row(name: str, of_method: Sequence[GraphVerdict]) -> str:
-    plain = [v for v in of_method if not v.groups] or list(of_method)
+    plain = [v for v in of_method if not v.groups]
     grouped = [v for v in of_method if v.groups]
-    ratios = np.array([v.ratio for v in plain])
+    ratios = np.array([v.ratio for v in plain or grouped])
     unsaid = sum(v.worse_than_odometry and not v.warned for v in of_method)
     lost = sum(v.right_lost for v in of_method) / max(sum(v.right for v in of_method), 1)
     return (
