@@ -251,4 +251,4 @@ def test_strangers_cannot_grow_a_robot_without_bound(monkeypatch: pytest.MonkeyP
         robot.tick(now)
         held.append(items_held(robot))
     assert max(held[150:]) < 1.1 * max(held[:150])
-    assert max(held) < 1000
+    assert max(held) < 1100
