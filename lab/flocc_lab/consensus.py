@@ -36,7 +36,7 @@ from flocc_agent.backend.problem import closure_edges, concatenate, initial_scal
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, poses_from_tq, quaternions
-from flocc_lab.shared_stiffness import SharedStiffness, geometric_mean, stiffness_of
+from flocc_lab.shared_stiffness import SharedStiffness, geometric_mean, rows_of, stiffness_of
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -190,7 +190,6 @@ class ConsensusPart:
         config: Formulation and noise model.
         own: Number of its own keyframes; copies of others' come after them.
         edges: Odometry, then the closures that it owns.
-        closures: Rows of the closures in `edges`.
         neighbours: By their log.
         state: Where it stands.
         weights: (E,) of the own edges, in [0, 1].
@@ -200,7 +199,6 @@ class ConsensusPart:
     config: BackendConfig
     own: int
     edges: Edges
-    closures: slice
     neighbours: dict[LogId, PairedRobot]
     state: State
     weights: Float
@@ -216,7 +214,7 @@ class ConsensusPart:
         H, gradient = self._normal()
         T = self.state.poses()
         for neighbour in self._heard():
-            np.add.at(gradient, _rows(neighbour), neighbour.pull(T[neighbour.index]))
+            np.add.at(gradient, rows_of(neighbour.index), neighbour.pull(T[neighbour.index]))
         delta = -_factor(H).solve(gradient)
         if np.all(np.isfinite(delta)):
             self.state = self._shortened(delta, self._merit(self.state))
@@ -255,7 +253,7 @@ class ConsensusPart:
     def _stiffness(self, other: LogId) -> SharedStiffness:
         """How stiff the shared poses are by all but that neighbour."""
         neighbour = self.neighbours[other]
-        rows = _rows(neighbour)
+        rows = rows_of(neighbour.index)
         H, _ = self._normal(without=neighbour)
         floating = ANCHORING_FLOATING * np.einsum("sbb->sb", neighbour.closures).ravel()
         H = csc_array(H + coo_array((floating, (rows, rows)), shape=H.shape))
@@ -289,7 +287,7 @@ class ConsensusPart:
         H, gradient = _normal_equations(self.edges, at, self.weights, self.state, sigma)
         for neighbour in self._heard():
             if neighbour is not without:
-                block, rows = coo_array(neighbour.penalty), _rows(neighbour)
+                block, rows = coo_array(neighbour.penalty), rows_of(neighbour.index)
                 H = H + coo_array((block.data, (rows[block.row], rows[block.col])), shape=H.shape)
         return csc_array(H), gradient
 
@@ -324,7 +322,6 @@ def part_of(graph: PoseGraph, log: LogId, config: BackendConfig, T: Float) -> Co
         ends = np.array([(at[c.query], at[c.match]) for c in owned])
         edges = replace(edges, i=ends[:, 0], j=ends[:, 1])
     odometry = odometry_edges(trajectory, 0, config)
-    rows = slice(len(odometry), len(odometry) + len(owned))
     state = state_of(_with_copies(T, owned, at, scale, len(copies)), clusters)
     informations = _information_by_keyframe(graph.closures, config)
     neighbours = {}
@@ -333,17 +330,15 @@ def part_of(graph: PoseGraph, log: LogId, config: BackendConfig, T: Float) -> Co
         unknown = ANCHORING_UNKNOWN * block_diag(*information)
         neighbours[other] = PairedRobot(log < other, np.array([at[k] for k in keyframes]), information, unknown)
     whole = concatenate([odometry, edges])
-    return ConsensusPart(log, config, len(trajectory), whole, rows, neighbours, state, np.ones(len(whole)))
+    return ConsensusPart(log, config, len(trajectory), whole, neighbours, state, np.ones(len(whole)))
 
 
 def solved_alone(part: ConsensusPart) -> Float:
     """Poses (N, 4, 4) of a robot by its odometry and the closures within it; nothing else is known yet."""
     own = np.flatnonzero((part.edges.i < part.own) & (part.edges.j < part.own))
-    closures = slice(int(np.searchsorted(own, part.closures.start)), len(own))
     alone = replace(
         part,
         edges=taken(part.edges, own),
-        closures=closures,
         neighbours={},
         state=state_of(part.T, len(part.state.scale)),
         weights=np.ones(len(own)),
@@ -393,11 +388,6 @@ def _differences(T: Float, there: Float) -> Float:
     return np.concatenate([2.0 * quaternions(D[:, :3, :3])[:, 1:], D[:, :3, 3]], axis=1)
 
 
-def _rows(neighbour: PairedRobot) -> Int:
-    """Rows (6S,) of the shared poses among a robot's variables."""
-    return (6 * neighbour.index[:, None] + np.arange(6)).ravel()
-
-
 def _pose_gradient(edges: Edges, at: Residuals, weights: Float, poses: int) -> Float:
     """Gradient (poses, 6) of half the weighted squares."""
     jac, out = jacobians(edges, at), np.zeros((poses, 6))
@@ -420,7 +410,7 @@ def _normal_equations(
     slopes, w = jac.a_scale[scaled], weights[scaled]
     for ends, A in blocks:
         cross = np.einsum("eab,ea,e->eb", A[scaled], slopes, w).ravel()
-        rows, columns = (6 * ends[scaled][:, None] + np.arange(6)).ravel(), np.repeat(column, 6)
+        rows, columns = rows_of(ends[scaled]), np.repeat(column, 6)
         parts += [(rows, columns, cross), (columns, rows, cross)]
     diagonal = np.arange(6 * poses, size)
     parts.append((column, column, w * np.sum(slopes**2, axis=1)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from flocc_agent.geometry import hats, inverse, poses_from_tq, quaternions
+from flocc_agent.geometry import adjoints, inverse, poses_from_tq, quaternions
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -80,10 +80,10 @@ class SharedStiffness:
         count = len(self.knots) // 6 + len(self.ties)
         knots, others, nearest = _knots(count)
         information = np.zeros((6 * count, 6 * count))
-        rows = _rows(knots)
+        rows = rows_of(knots)
         information[np.ix_(rows, rows)] = self.knots @ self.knots.T
-        for k, q, L, difference in zip(others, nearest, self.ties, _differences(self.tied), strict=True):
-            both = _rows(np.array([q, k]))
+        for k, q, L, difference in zip(others, nearest, self.ties, _tie_jacobians(self.tied), strict=True):
+            both = rows_of(np.array([q, k]))
             information[np.ix_(both, both)] += difference.T @ L @ L.T @ difference
         return information
 
@@ -91,12 +91,12 @@ class SharedStiffness:
 def stiffness_of(covariance: Float, T: Float) -> SharedStiffness:
     """In short what the covariance (6S, 6S) of poses at `T` (S, 4, 4) says."""
     knots, others, nearest = _knots(len(T))
-    rows = _rows(knots)
+    rows = rows_of(knots)
     T_knot_pose = inverse(T[nearest]) @ T[others]
     tied = np.concatenate([T_knot_pose[:, :3, 3], quaternions(T_knot_pose[:, :3, :3])], axis=1)
     ties = np.empty((len(others), 6, 6))
-    for n, (k, q, difference) in enumerate(zip(others, nearest, _differences(tied), strict=True)):
-        both = _rows(np.array([q, k]))
+    for n, (k, q, difference) in enumerate(zip(others, nearest, _tie_jacobians(tied), strict=True)):
+        both = rows_of(np.array([q, k]))
         ties[n] = _information_factor(difference @ covariance[np.ix_(both, both)] @ difference.T)
     return SharedStiffness(_information_factor(covariance[np.ix_(rows, rows)]), ties, tied)
 
@@ -108,14 +108,10 @@ def geometric_mean(lower: SharedStiffness, higher: SharedStiffness) -> SharedSti
     return SharedStiffness(knots, np.array(ties).reshape(lower.ties.shape), lower.tied)
 
 
-def _differences(tied: Float) -> Float:
+def _tie_jacobians(tied: Float) -> Float:
     """Jacobians (K, 6, 12) of a pose relative to its knot by the tangents of both, rotation first."""
-    back = inverse(poses_from_tq(tied))
-    out = np.zeros((len(back), 6, 12))
-    out[:, :3, :3] = out[:, 3:, 3:6] = -back[:, :3, :3]
-    out[:, 3:, :3] = -hats(back[:, :3, 3]) @ back[:, :3, :3]
-    out[:, :, 6:] = np.eye(6)
-    return out
+    back = adjoints(inverse(poses_from_tq(tied)))
+    return np.concatenate([-back, np.broadcast_to(np.eye(6), back.shape)], axis=2)
 
 
 def _knots(count: int) -> tuple[Int, Int, Int]:
@@ -126,7 +122,8 @@ def _knots(count: int) -> tuple[Int, Int, Int]:
     return knots, others, nearest
 
 
-def _rows(poses: Int) -> Int:
+def rows_of(poses: Int) -> Int:
+    """Rows (6S,) of poses among variables of six numbers each."""
     return (6 * poses[:, None] + np.arange(6)).ravel()
 
 

@@ -22,9 +22,8 @@ DAMPING_FACTOR = 10.0
 LENGTHS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Parts of a step that are tried before it is damped: they cost residuals, damping costs a linear system and holds back
 the softest motions most, which are those that long chains need."""
-
-
 VOTED_STEPS_MAX = 3
+"""Linear systems that are solved to compare states by votes: they stand near their optimum."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +57,11 @@ class Objective:
     linear: LinearSolver
     config: BackendConfig
     held: Bool | None = None
+
+    @property
+    def has_directions(self) -> bool:
+        """Whether closures without a unit are among the edges: `hold` tells those by their angles."""
+        return bool(np.any(directions(self.edges)))
 
     def cost(self, state: State, weights: Float, hold: bool) -> float:
         """Sum of half squared residuals, weighted, with the priors of cluster scales."""
@@ -142,10 +146,10 @@ def voted_cost(objective: Objective, state: State, votes: Float) -> float:
     A state is where all closures count once. There many that agree bend odometry as many do; to hold that against them
     while they count as few would let go of all of them.
     """
-    as_angles = bool(np.any(directions(objective.edges)))
-    agreeing = objective.agreeing(state, as_angles)
+    hold = objective.has_directions
+    agreeing = objective.agreeing(state, hold)
     if not np.all(votes[agreeing] == 1.0):
-        state = descend(objective, state, objective.weights(votes * agreeing), VOTED_STEPS_MAX, hold=as_angles).state
+        state = descend(objective, state, objective.weights(votes * agreeing), VOTED_STEPS_MAX, hold).state
     return objective.truncated_cost(state, votes)
 
 

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from flocc_agent.backend.alarms import held_closures
 from flocc_agent.backend.chains import Chains, chains_of, is_explained
 from flocc_agent.backend.descent import Solved, descend
-from flocc_agent.backend.edges import directions
 from flocc_agent.backend.initial import Aligned, extended, lengths_at
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import SavedLog
@@ -223,10 +222,10 @@ def _grown(trajectories: Mapping[LogId, Trajectory], component: Component) -> di
 def _agreed(began: Posed, wanted: Bool, is_new: Bool, closures: Sequence[LoopClosure]) -> Solved | None:
     """Solve with wanted closures, less the new ones that disagree alone; None where more than that is wrong."""
     objective, state, taken = began.objective, began.start, wanted
-    as_angles = bool(np.any(directions(objective.edges)))
+    hold = objective.has_directions
     for _ in range(2):
-        solved = descend(objective, state, objective.weights(taken.astype(float)), hold=as_angles)
-        agree = objective.closure_residuals(solved.state, as_angles) <= objective.bounds()
+        solved = descend(objective, state, objective.weights(taken.astype(float)), hold=hold)
+        agree = objective.closure_residuals(solved.state, hold) <= objective.bounds()
         wrong = np.flatnonzero(agree != taken)
         if len(wrong) == 0:
             return solved if solved.converged else None

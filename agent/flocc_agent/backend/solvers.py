@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.backend.averaging import averaged
 from flocc_agent.backend.descent import Objective, Solved, descend, voted_cost
-from flocc_agent.backend.edges import State, directions, residuals
+from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.graduated import graduated
 from flocc_agent.backend.placing import NEARLY_RATIO, Places
 from flocc_agent.config import Solver
@@ -75,9 +75,9 @@ def lowest(objective: Objective, state: State) -> Solved:
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
     """GNC by several schedules from one state; the lowest truncated cost wins, each taken where it ended."""
-    says = places.votes if places is not None else np.ones(len(objective.bounds()))
+    says = places.votes if places is not None else 1.0
     found = [scheduled(objective, state, ratio) for ratio in START_RATIOS]
-    if np.any(directions(objective.edges)):
+    if objective.has_directions:
         found = [as_angles(objective, solved) for solved in found]
         found.append(scheduled(objective, state, START_RATIOS[-1], hold=True))
     solved = min(found, key=lambda solved: objective.truncated_cost(solved.state, says))
@@ -90,18 +90,14 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     Votes make it cheap to let go of closures that stand close together: where odometry is stated too exact, a place
     that leaves hardly any may cost less than all that bend it (drawn seeds 2088, 2593).
     """
-
-    def votes_of(solved: Solved) -> float:
-        return float(places.votes[solved.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN].sum())
-
     cost = voted_cost(objective, solved.state, places.votes)
     for _ in range(PLACEMENTS_MAX):
-        chosen = solved.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN
-        better = None
+        chosen, better = accepted(objective, solved), None
+        votes_min = NEARLY_RATIO * places.votes[chosen].sum()
         for placement in places.proposals(solved.state, chosen):
             moved = descend(objective, placement.state, objective.weights(placement.chosen.astype(float)), 5)
             there = selected(objective, moved.state, moved.iterations)
-            if votes_of(there) < NEARLY_RATIO * votes_of(solved):
+            if places.votes[accepted(objective, there)].sum() < votes_min:
                 continue
             if (lower := voted_cost(objective, there.state, places.votes)) < cost:
                 better, cost = there, lower
@@ -112,6 +108,11 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     return solved
 
 
+def accepted(objective: Objective, solved: Solved) -> Bool:
+    """Which closures (L,) are used."""
+    return np.asarray(solved.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN)
+
+
 def scheduled(objective: Objective, state: State, start_ratio: float, hold: bool = False) -> Solved:
     """GNC, then plain inliers."""
     stages = graduated(objective, state, start_ratio, hold)
@@ -120,7 +121,7 @@ def scheduled(objective: Objective, state: State, start_ratio: float, hold: bool
 
 def held(objective: Objective, solved: Solved) -> Solved:
     """Move to the optimum whose scales all stay above their bound."""
-    if np.any(directions(objective.edges)):
+    if objective.has_directions:
         return as_angles(objective, solved)
     at = residuals(objective.edges, solved.state)
     if not np.any(at.held & (solved.weights > 0.0)):
@@ -135,7 +136,7 @@ def as_angles(objective: Objective, solved: Solved) -> Solved:
     iterations = solved.iterations + final.iterations
     if objective.config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
         return Solved(final.state, final.weights, final.cost, iterations, final.converged)
-    if np.array_equal(objective.agreeing(final.state, True), final.weights[objective.closures] >= ACCEPTED_WEIGHT_MIN):
+    if np.array_equal(objective.agreeing(final.state, True), accepted(objective, final)):
         return Solved(final.state, final.weights, final.cost, iterations, final.converged)
     return selected(objective, final.state, iterations, hold=True)
 

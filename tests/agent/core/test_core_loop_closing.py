@@ -432,18 +432,26 @@ def test_pairs_that_a_stronger_robot_was_not_told_of_do_not_wait_for_it_when_it_
 # Whole robots
 
 
-def test_a_server_that_answers_nothing_does_not_keep_the_others_from_closing_loops(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(latents, "BACKLOG_MAX", 2)
+def two_and_a_server() -> Robots:
     robots = Robots()
     for name in ("r1", "r2"):
         robots.add(name)
     robots.add("server", compute_class=9)
+    return robots
+
+
+def all_but_the_server(_: Robots, name: str, effect: Effect) -> Event | None:
+    """The server registers nothing."""
+    return None if name == "server" and isinstance(effect, Register) else answer(effect)
+
+
+def test_a_server_that_answers_nothing_does_not_keep_the_others_from_closing_loops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(latents, "BACKLOG_MAX", 2)
+    robots = two_and_a_server()
     robots.run(30.0)
-    robots.work = lambda robots, name, effect: (
-        None if name == "server" and isinstance(effect, Register) else answer(effect)
-    )
+    robots.work = all_but_the_server
     meet(robots, "r1", "r2", keyframes=16)
     robots.run(30.0)
     by = Counter(name for _, name, effect in robots.done if isinstance(effect, Register))
@@ -464,10 +472,7 @@ def test_every_pair_is_registered_once() -> None:
 
 
 def test_a_server_without_a_camera_registers_for_the_others() -> None:
-    robots = Robots()
-    for name in ("r1", "r2"):
-        robots.add(name)
-    robots.add("server", compute_class=9)
+    robots = two_and_a_server()
     robots.run(3.0)
     meet(robots, "r1", "r2")
     robots.run(30.0)
@@ -477,14 +482,9 @@ def test_a_server_without_a_camera_registers_for_the_others() -> None:
 
 
 def test_pairs_of_a_server_that_dies_are_taken_over() -> None:
-    robots = Robots()
-    for name in ("r1", "r2"):
-        robots.add(name)
-    robots.add("server", compute_class=9)
+    robots = two_and_a_server()
     robots.run(3.0)
-    robots.work = lambda robots, name, effect: (
-        None if name == "server" and isinstance(effect, Register) else answer(effect)
-    )
+    robots.work = all_but_the_server
     meet(robots, "r1", "r2")
     robots.run(4.0)
     robots.kill("server")
