@@ -19,7 +19,8 @@ from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.saved_map import SavedMap
-from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq, symmetric
+from flocc_agent.core.spared import AGREE_LENGTHS, AGREE_RATIO, AGREE_STEPS, Foretold
+from flocc_agent.geometry import between, inverse, pose7, pose_from_tq, poses_from_tq, symmetric
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
@@ -114,6 +115,12 @@ class _Odometry:
     def pose(self, index: int) -> Float:
         """`T_odom_keyframe` (4, 4)."""
         return pose_from_tq(self._row(index))
+
+    def seen_from(self, index: int, others: Sequence[int]) -> Float:
+        """Poses (1 + K, 4, 4) in the frame of one keyframe, of the one before it or after it, and of K others."""
+        before = index - 1 if index else min(1, len(self) - 1)
+        T = poses_from_tq(np.array([self._row(each) for each in (index, before, *others)]))
+        return between(T[:1], T[1:])
 
     def stamp_s(self, index: int) -> float:
         """When a keyframe was taken."""
@@ -229,6 +236,37 @@ class GraphAssembly:
         """The newest closures of a log; their records are not read."""
         return self._ends.ties(log, ties_max)
 
+    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
+        """Closures with a length between the same stretches as a pair, as far as all keyframes are known."""
+        if not self._known(pair.low) or not self._known(pair.high):
+            return []
+        low, high = pair.low.log, pair.high.log
+        ends = self._ends.beside(pair.low, pair.high, reach)
+        found = (CandidatePair(KeyframeId(low, i), KeyframeId(high, j)) for i, j in ends)
+        return [closure for closure in found if self._known(closure.low) and self._known(closure.high)]
+
+    def tied(self, keyframe: KeyframeId, reach: int) -> float:
+        """Closures for each keyframe of a stretch, with whatever other keyframes."""
+        if not self._known(keyframe):
+            return 0.0
+        first, end = max(keyframe.index - reach, 0), min(keyframe.index + reach + 1, len(self._odometry[keyframe.log]))
+        return self._ends.tied(keyframe, reach) / (end - first)
+
+    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:
+        """What closures beside a pair say of it, by odometry from their keyframes to the pair's."""
+        read = (self._record_at(*self._closures[closure]) for closure in closures)
+        records = [record for record in read if isinstance(record, ClosureRecord)]
+        T = poses_from_tq(np.array([record.T_query_match_unscaled for record in records]).reshape(-1, 7))
+        T[:, :3, 3] *= np.array([record.scale_initial or 0.0 for record in records])[:, None]
+        back = [record.query == closure.high for record, closure in zip(records, closures, strict=True)]
+        T[back] = inverse(T[back])
+        low = self._odometry[pair.low.log].seen_from(pair.low.index, [closure.low.index for closure in closures])
+        high = self._odometry[pair.high.log].seen_from(pair.high.index, [closure.high.index for closure in closures])
+        lengths_m, low_m, high_m = (np.linalg.norm(each[:, :3, 3], axis=1) for each in (T, low[1:], high[1:]))
+        steps_m = (float(np.linalg.norm(low[0, :3, 3])) + float(np.linalg.norm(high[0, :3, 3]))) / 2
+        may_m = AGREE_LENGTHS * lengths_m + AGREE_RATIO * (low_m + high_m) + AGREE_STEPS * steps_m
+        return Foretold(low[1:] @ T @ inverse(high[1:]), may_m)
+
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """What else was measured at a log's keyframes, or of them."""
         return self._measured.of(log, self._odometry, self._known)
@@ -240,9 +278,7 @@ class GraphAssembly:
         """
         if not self._reads_all and log in self._odometry and other in self._odometry:
             return True
-        links = self._ends.links()
-        measured = self._measured.factors(self._odometry, self._known)
-        links += [(factor.query.log, factor.match.log) for factor in measured]
+        links = self._ends.links() + self._measured.links(self._odometry, self._known)
         if self._saved is not None:
             links += [(self._saved.anchor, each) for each in self._saved.logs]
         ends = {end for link in links for end in link}

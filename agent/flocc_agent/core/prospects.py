@@ -13,10 +13,9 @@ import zlib
 from bisect import bisect_left, insort
 from collections.abc import Callable
 from enum import Enum
-from itertools import product
 
+from flocc_agent.core.pair_set import PairTable
 from flocc_agent.core.pulls import remember
-from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
 
 UNLIKELY = "pairs that agree better were refused"
@@ -57,8 +56,8 @@ class Prospects:
         self._fresh: dict[CandidatePair, bool] = {}
         self._judged: dict[CandidatePair, Judged] = {}
         self._order: list[Judged] = []
-        self._closures: dict[CandidatePair, None] = {}
-        self._unlikely: dict[CandidatePair, None] = {}
+        self._closures: PairTable[bool] = PairTable(UNLIKELY_MAX)
+        self._unlikely: PairTable[bool] = PairTable(UNLIKELY_MAX)
         self._held_since_s: dict[CandidatePair, float] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -66,8 +65,8 @@ class Prospects:
         return {
             "agreements": (len(self._found), UNLIKELY_MAX),
             "judged": (len(self._fresh) + len(self._judged), 2 * JUDGED_MAX),
-            "closures beside": (len(self._closures), UNLIKELY_MAX),
-            "unlikely": (len(self._unlikely), UNLIKELY_MAX),
+            "closures beside": self._closures.size(),
+            "unlikely": self._unlikely.size(),
             "held": (len(self._held_since_s), UNLIKELY_MAX),
         }
 
@@ -84,20 +83,20 @@ class Prospects:
             remember(self._fresh, pair, is_closure, JUDGED_MAX)
         if not is_closure:
             return []
-        remember(self._closures, pair, None, UNLIKELY_MAX)
-        again = [other for other in beside(pair) if other in self._unlikely] if self._unlikely else []
+        self._closures.put(pair, True)
+        again = sorted(other for other in self._unlikely.beside(pair, BESIDE) if other != pair)
         for other in again:
-            del self._unlikely[other]
+            self._unlikely.pop(other)
         return again
 
     def on_unlikely(self, pair: CandidatePair, was_resolved: bool = False) -> None:
         """A pair was refused unseen; another record of it may say more."""
         if pair in self._unlikely or not was_resolved:
-            remember(self._unlikely, pair, None, UNLIKELY_MAX)
+            self._unlikely.put(pair, True)
 
     def on_settled(self, pair: CandidatePair) -> None:
         """A record says more of a pair than that it was refused unseen."""
-        self._unlikely.pop(pair, None)
+        self._unlikely.pop(pair)
 
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record says what became of a pair."""
@@ -133,7 +132,7 @@ class Prospects:
         better = self._order[first : first + REFUSED_MIN]
         if len(better) < REFUSED_MIN or any(is_closure for _, _, is_closure in better):
             return False
-        return not any(other in self._closures for other in beside(pair))
+        return not any(other != pair for other in self._closures.beside(pair, BESIDE))
 
     def _learn(self) -> None:
         """Put pairs that were judged meanwhile into their order; only now is everything of their surroundings here."""
@@ -155,15 +154,3 @@ class Prospects:
 def is_probe(pair: CandidatePair) -> bool:
     """Whether a pair is registered however unlikely it is; by other bits than those that say which owner does it."""
     return (zlib.crc32(f"{pair.low} {pair.high}".encode()) >> 8) % PROBED_EVERY == 0
-
-
-def beside(pair: CandidatePair) -> list[CandidatePair]:
-    """Pairs of keyframes up to `BESIDE` before or after a pair's."""
-    steps = range(-BESIDE, BESIDE + 1)
-    low, high = pair.low, pair.high
-    ends = (
-        (KeyframeId(low.log, low.index + i), KeyframeId(high.log, high.index + j))
-        for i, j in product(steps, steps)
-        if (i, j) != (0, 0) and low.index + i >= 0 and high.index + j >= 0
-    )
-    return [CandidatePair(one, other) for one, other in ends if one < other]
