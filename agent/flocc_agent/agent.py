@@ -509,7 +509,7 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
+        merging = evidence_of(driver.robot, self.config.core, driver.solved).model_dump(mode="json")
         status = self.status().model_dump(mode="json")
         return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
 
@@ -586,8 +586,8 @@ class Agent:
 
     def _state(self) -> tuple[AgentStatus, tuple[str, ...]]:
         """What a robot monitor is told: the status, and what the last own solution warned of."""
-        solution = self._started.last_solution
-        return self.status(), () if solution is None else solution.warnings
+        solved = self._started.solved
+        return self.status(), () if solved is None else tuple(solved.warnings)
 
     def _begin_anew(self) -> None:
         """End this journey: who runs the agent starts it again, and it begins another log."""
