@@ -12,9 +12,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-from flocc_agent.core import assembly, closure_table, election, judgement, log_copy, loop_closing, plausibility, robot
+from flocc_agent.core import assembly, closure_rows, election, judgement, log_copy, loop_closing, plausibility, robot
 from flocc_agent.core.assembly import GraphAssembly
-from flocc_agent.core.closure_table import ClosureTable
+from flocc_agent.core.closure_rows import ClosureTable
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.correction_evidence import CorrectionEvidence
 from flocc_agent.core.corrections import Corrections
@@ -78,7 +78,7 @@ def small_pieces() -> Iterator[None]:
             (robot, "BLOCK_RECORDS"),
             (assembly, "POSES_OF_A_PIECE"),
             (robot, "POSES_OF_A_PIECE"),
-            (closure_table, "ROWS_OF_A_PIECE"),
+            (closure_rows, "ROWS_OF_A_PIECE"),
             (robot, "ROWS_OF_A_PIECE"),
         ):
             stack.enter_context(patch.object(owner, name, 4))

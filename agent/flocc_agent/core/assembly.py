@@ -13,7 +13,7 @@ from struct import Struct
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_table import ClosureTable, Tie
+from flocc_agent.core.closure_rows import ClosureTable, Tie
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
@@ -209,7 +209,8 @@ class GraphAssembly:
         """The pose graph of everything known; closures whose keyframes are not here yet are left out."""
         trajectories = {log: self._trajectory(log) for log in sorted(self._odometry)}
         measured = self._measured.factors(self._odometry, self._known)
-        closures = self._closures.closures(self._known, lambda log: len(trajectories.get(log, ())))
+        unread = {KeyframeId(log, index) for log, odometry in self._odometry.items() for index in odometry.unread}
+        closures = self._closures.closures(lambda log: len(trajectories.get(log, ())), unread)
         return PoseGraph(trajectories, tuple(closures), measured=measured, saved=self._saved)
 
     def _trajectory(self, log: LogId) -> Trajectory:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
-from flocc_agent.core.closure_table import ROWS_OF_A_PIECE
+from flocc_agent.core.closure_rows import ROWS_OF_A_PIECE
 from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections

@@ -6,7 +6,7 @@ old ones leave memory; 12 bytes of its pair and 4 for each of its logs remain.
 
 import math
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from struct import Struct
 from typing import NamedTuple
 
@@ -22,7 +22,6 @@ from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import UPPER_TRIANGLE, ClosureRecord
 
 Rows = NDArray[np.void]
-Known = Callable[[KeyframeId], bool]
 
 ROWS_OF_A_PIECE = 64
 """Closures that leave memory together: some 17 kB."""
@@ -127,18 +126,19 @@ class ClosureTable:
         """Pairs of logs with closures between them, or within one."""
         return sorted(self._of_pair)
 
-    def closures(self, known: Known, counts: Callable[[LogId], int]) -> list[LoopClosure]:
+    def closures(self, counts: Callable[[LogId], int], unread: Set[KeyframeId]) -> list[LoopClosure]:
         """Those of which both keyframes are known, in the order of their pairs.
 
         Args:
-            known: Whether a keyframe is.
-            counts: From which number on no keyframe of a log is.
+            counts: From which number on no keyframe of a log is known.
+            unread: Keyframes before that of which nothing is known.
         """
         chosen = self._in_order(counts)
         if not len(chosen):
             return []
         rows = np.frombuffer(self._rows.all(), dtype=ROW)[chosen]
-        return [closure for closure in self._built(rows) if known(closure.query) and known(closure.match)]
+        built = list(self._built(rows))
+        return [c for c in built if c.query not in unread and c.match not in unread] if unread else built
 
     def _in_order(self, counts: Callable[[LogId], int]) -> NDArray[np.intp]:
         """Rows of pairs whose keyframes are below the counts of their logs, in the order of the pairs."""

@@ -5,7 +5,7 @@ import pytest
 
 from flocc_agent.core import measured_records
 from flocc_agent.core.assembly import GraphAssembly
-from flocc_agent.core.closure_table import Tie
+from flocc_agent.core.closure_rows import Tie
 from flocc_agent.core.factors import Tracks, factor_of
 from flocc_agent.core.gossip import NewRecord
 from flocc_protocol.arrays import Array
