@@ -1,7 +1,7 @@
 """What the doctor says."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 
@@ -51,3 +51,14 @@ def blocked(cause: str, sentence: str, advice: str, *robots: str) -> Finding:
 def good(cause: str, sentence: str) -> Finding:
     """A finding that all is well."""
     return Finding(cause, Severity.GOOD, sentence)
+
+
+def together(findings: Iterable[Finding]) -> list[Finding]:
+    """Findings with equal sentences become one, as severe as the first."""
+    found: dict[tuple[str, str], Finding] = {}
+    for finding in findings:
+        key = (finding.cause, finding.sentence)
+        known = found.get(key)
+        robots = finding.robots if known is None else tuple(sorted({*known.robots, *finding.robots}))
+        found[key] = replace(known or finding, robots=robots)
+    return list(found.values())
