@@ -488,7 +488,8 @@ class Agent:
         """What looks at this robot's images."""
         from flocc_agent.perception.watch.camera_watch import CameraWatch
 
-        return CameraWatch(None if self._recording is None else self._recording.hidden)
+        hidden = None if self._recording is None else self._recording.hidden
+        return CameraWatch(hidden, self.config.perception.odometry_up)
 
     @property
     def _method(self) -> str | None:
