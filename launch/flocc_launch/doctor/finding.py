@@ -56,7 +56,10 @@ def good(cause: str, sentence: str) -> Finding:
 
 
 def kept_apart(emulated: str | None, advice: str) -> str:
-    """What to do where robots do not hear each other: advice on the network, unless an emulated radio explains it."""
+    """What to do where robots do not hear each other: advice on the network, after what is emulated of the radio."""
     if emulated is None:
         return advice
-    return f"The emulated radio explains it ({emulated}): change [radio], or what the scenario's faults do to it."
+    return (
+        f"The emulated radio may be why ({emulated}): change [radio], or what the scenario's faults do to it. "
+        f"If it is not: {advice[0].lower()}{advice[1:]}"
+    )
