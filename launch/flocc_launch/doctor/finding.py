@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 
+ONE_WAY_ADVICE = "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power."
+
 
 class Severity(Enum):
     """How much a finding matters."""
@@ -62,3 +64,13 @@ def together(findings: Iterable[Finding]) -> list[Finding]:
         robots = finding.robots if known is None else tuple(sorted({*known.robots, *finding.robots}))
         found[key] = replace(known or finding, robots=robots)
     return list(found.values())
+
+
+def kept_apart(emulated: str | None, advice: str) -> str:
+    """What to do where robots do not hear each other: advice on the network, after what is emulated of the radio."""
+    if emulated is None:
+        return advice
+    return (
+        f"The emulated radio may be why ({emulated}): change [radio], or what the scenario's faults do to it. "
+        f"If it is not: {advice[0].lower()}{advice[1:]}"
+    )

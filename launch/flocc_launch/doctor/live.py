@@ -5,7 +5,14 @@ from dataclasses import replace
 
 from flocc_launch.dashboard.status_table import NO_ANSWER, RobotStatus
 from flocc_launch.doctor.cameras import doubts_told, finding_of, findings_of, merged_doubtfully
-from flocc_launch.doctor.finding import Finding, Severity, blocked, together
+from flocc_launch.doctor.finding import (
+    ONE_WAY_ADVICE,
+    Finding,
+    Severity,
+    blocked,
+    kept_apart,
+    together,
+)
 from flocc_launch.doctor.live_steps import apart, is_server
 from flocc_launch.doctor.merge_evidence import named
 
@@ -80,7 +87,10 @@ def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:
         blocked(
             "no-peer",
             f"{named(alone)} hear{'s' * (len(alone) == 1)} no other robot.",
-            "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            kept_apart(
+                emulated_of(rows),
+                "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            ),
             *alone,
         )
     ]
@@ -93,7 +103,7 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         blocked(
             "one-way-link",
             f"{a} hears {b}, but {b} does not hear {a}.",
-            "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power.",
+            kept_apart(emulated_of(rows), ONE_WAY_ADVICE),
             a,
             b,
         )
@@ -101,6 +111,11 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         for b in sorted(hears[a])
         if b in hears and a not in hears[b]
     ]
+
+
+def emulated_of(rows: Sequence[RobotStatus]) -> str | None:
+    """What of the radio is emulated, as the first robot says that has any of it emulated."""
+    return next((row.emulated for row in rows if row.emulated is not None), None)
 
 
 def without_keyframes(rows: Sequence[RobotStatus]) -> list[Finding]:
