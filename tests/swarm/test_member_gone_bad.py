@@ -1,7 +1,8 @@
 """A member of a swarm with keys goes bad, live: it drives counters, contradicts everybody's logs and lies as a leader.
 
-The three attacks come together, with its own certificate and signing key. What the others say to each other, hold and
-deliver must stay, and when it is gone nothing of it may remain.
+It fills the room for logs of its name, floods others with badly signed records in every member's name, and asks for
+records in others' names. All attacks come together, with its own certificate and signing key. What the others say to
+each other, hold and deliver must stay, and when it is gone nothing of it may remain.
 """
 
 import asyncio

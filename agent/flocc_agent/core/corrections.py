@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.claims import CorrectionClaim
 from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer, may_hold
@@ -234,6 +235,12 @@ class Corrections:
         if message.knots is None or self._has_knots(message) or self.doubts.knows(message.version):
             return False
         return message.log == self._own or self._follows_all or self._requests.waits(message.log, now)
+
+    def claim(self, message: LogCorrection, now: float) -> CorrectionClaim | None:
+        """What `refused` would check of a correction that is news; None where it would not come to that."""
+        if not self.is_news(message, now) or (message.log not in self._newest and not self._is_room(message.log)):
+            return None
+        return CorrectionClaim(message.term.leader, encode_correction(message), message.signature)
 
     def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Refuse a newer correction for which there is no room, or which its leader did not make."""

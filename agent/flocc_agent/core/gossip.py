@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple, Protocol
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.claims import RecordClaim
 from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.log_copy import LogCopy, decoded
@@ -238,6 +239,19 @@ class Gossip:
         if gap or left_out:
             effects += self._pulls.ask_on(sender.robot, now, left_out)
         return new, effects
+
+    def claims(self, batch: RecordBatch) -> list[RecordClaim]:
+        """Records of a batch whose signatures `on_records` would check: those that could be taken in."""
+        copy = self.logs.get(batch.log)
+        known = [] if copy is None else copy.encoded[batch.first : batch.first + len(batch.records)]
+        if batch.log != self._own:
+            is_gap = batch.first > self._held(batch.log)
+            if is_gap or self._no_room(batch.log) is not None:
+                return []
+            if copy is not None and not copy.agrees(batch.first, batch.checksum_before, batch.records):
+                return []
+        new = [k for k, data in enumerate(batch.records) if k >= len(known) or known[k] != data]
+        return [RecordClaim(batch.log, batch.first + k, batch.records[k]) for k in new]
 
     def _on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
         peer = sender.robot

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
+from flocc_agent.core.claims import Claim
 from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
@@ -246,6 +247,23 @@ class Robot:
         if self.in_map is None:
             return effects
         return effects + self.in_map.told(effects, self.gossip.logs[self.log].keyframes, now)
+
+    def claims(self, envelope: Envelope, now: float) -> list[Claim]:
+        """What of a message its sealer will be asked for, as far as this robot knows now; nothing changes."""
+        peer, message = envelope.sender.robot, envelope.message
+        if peer == self.log.robot:
+            return []
+        match message:
+            case Records(batches):
+                heard = [batch for batch in batches if not self._muted.is_muted(peer, batch.log.robot, now)]
+                return [claim for batch in heard for claim in self.gossip.claims(batch)]
+            case CorrectionBatch(corrections):
+                heard_of = [c for c in corrections if not self._muted.is_muted(peer, c.term.leader.robot, now)]
+                trusted = [c for c in heard_of if not self._is_distrusted(c.term.leader, now)]
+                found = [self.corrections.claim(correction, now) for correction in trusted]
+                return [claim for claim in found if claim is not None]
+            case _:
+                return []
 
     def deadline(self) -> float:
         """When `tick` is due next, in seconds of the driver's clock."""
