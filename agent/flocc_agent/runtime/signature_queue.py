@@ -20,7 +20,9 @@ WAITING_MAX = 256
 CHECKS_PER_S, CHECKS_BURST = 1000.0, 2000.0
 """Of what one peer sends: some 0.1 to 0.2 s of CPU a second; answers bring 750 keyframes a second at most."""
 TURN_CLAIMS = 256
-"""A turn takes in no further message once it has so many to check: some 40 ms."""
+"""A turn takes in no further peer's messages once it has so many to check: some 40 ms."""
+TURN_MESSAGES = 32
+"""Of one peer in one turn."""
 
 
 @dataclass(slots=True)
@@ -119,6 +121,13 @@ class SignatureQueue:
             if not peer.waiting or peer.due_s() > now or sum(map(len, found)) >= TURN_CLAIMS:
                 continue
             self._peers[name] = self._peers.pop(name)  # behind those whose turn this was not
+            found += self._taken(peer, now)
+        return found
+
+    def _taken(self, peer: _Signer, now: float) -> list[list[Claim]]:
+        """Messages of one peer up to the first that claims something: what the next ones claim depends on it."""
+        found: list[list[Claim]] = []
+        while peer.waiting and not any(found) and len(found) < TURN_MESSAGES:
             self._turn.append(peer.waiting.popleft())
             found.append(self._claims_of(self._turn[-1], now))
         return found
