@@ -287,6 +287,13 @@ class Corrections:
         if applied is not None and self._own not in self._newest:
             self._keep(applied)
 
+    def forget_log(self, log: LogId) -> None:
+        """A log is held no more, and neither is where it lies."""
+        if self._newest.pop(log, None) is not None:
+            self._announcer.remove(log)
+        self._whole.pop(log, None)
+        self._wanted.pop(log, None)
+
     def _placed(self, own: LogCorrection) -> Placed:
         """A correction of the own log and what is known of the other logs."""
         others = {log: known for log in self._newest if log != self._own and (known := self.of(log)) is not None}

@@ -17,6 +17,7 @@ from flocc_agent.core.corrected import CorrectedLog, Correction, Corrector
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
+    DropLog,
     Effect,
     Encode,
     FetchLatent,
@@ -338,7 +339,7 @@ class Driver:
             match effect:
                 case PersistRecord(log=log) if log != self.robot.log:
                     self._disk.put(effect)
-                case PersistRecord() | PersistTerm() | PersistCorrection():
+                case PersistRecord() | PersistTerm() | PersistCorrection() | DropLog():
                     kept.append(effect)
                 case Report(fact):
                     self._tell(fact)
