@@ -509,9 +509,13 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution)
+        if self._radio is not None:
+            merging = merging.model_copy(update={"emulated": self._radio.parameters.emulated()})
         status = self.status().model_dump(mode="json")
-        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
+        return json.dumps(
+            {**status, "compute_class": self.config.compute_class, **merging.model_dump(mode="json")}
+        ).encode()
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""

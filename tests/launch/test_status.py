@@ -104,6 +104,18 @@ def test_the_doctor_of_a_running_swarm_names_the_cause(rows: list[RobotStatus], 
     assert [finding.cause for finding in diagnose_live(rows)] == causes
 
 
+@pytest.mark.parametrize(
+    "rows", [[row("r1"), row("r2")], [row("r1", "r2"), row("r2")]], ids=["no-peer", "one-way-link"]
+)
+def test_an_emulated_radio_is_no_firewall(rows: list[RobotStatus]) -> None:
+    """Under `--range` or `--loss` advice on networks would send people the wrong way."""
+    real = diagnose_live(rows)[1]
+    assert "emulated" not in real.advice
+    emulated = diagnose_live([each.model_copy(update={"emulated": "a range of 12 m"}) for each in rows])[1]
+    assert emulated.cause == real.cause
+    assert emulated.advice.startswith("The emulated radio explains it (a range of 12 m): change [radio]")
+
+
 def test_the_figures_of_a_running_swarm_stand_in_the_sentence() -> None:
     (similar,) = diagnose_live(apart(best_similarities={"r2": 0.41}))
     assert "the best similarity so far is 0.41, below the threshold of 0.5" in similar.sentence

@@ -129,6 +129,7 @@ class MergeStatus(BaseModel):
         match_ratio_threshold: R_thr.
         pairs: By two robots.
         solver: Of the last own solution, None where it made none.
+        emulated: What of its radio is emulated, in words; None where messages come as the network brings them.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -138,3 +139,4 @@ class MergeStatus(BaseModel):
     match_ratio_threshold: float | None = None
     pairs: list[PairStatus] = []
     solver: SolverStatus | None = None
+    emulated: str | None = None

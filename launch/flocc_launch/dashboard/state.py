@@ -108,10 +108,17 @@ class SwarmState:
         self.optimised: Reported[RoundSolved] | None = None
         self.t = 0.0
 
-    def apply(self, event: Reported[Fact]) -> None:
-        """Take one event; those of one robot come in order."""
+    def apply(self, event: Reported[Fact], by_itself: bool = True) -> None:
+        """Take one event; those of one robot come in order.
+
+        Args:
+            event: What happened.
+            by_itself: Whether the robot said or did it. A leader's correction also comes for robots that are gone.
+        """
         robot = self.robots.setdefault(event.robot, RobotState())
-        self.t, robot.last_s = max(self.t, event.t), event.t
+        self.t = max(self.t, event.t)
+        if by_itself:
+            robot.last_s = event.t
         apply_to(robot, event.fact)
         if isinstance(event.fact, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
             self.closures[event.fact.query, event.fact.match] = event.fact.probability

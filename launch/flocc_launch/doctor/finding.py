@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
+ONE_WAY_ADVICE = "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power."
+
 
 class Severity(Enum):
     """How much a finding matters."""
@@ -51,3 +53,10 @@ def blocked(cause: str, sentence: str, advice: str, *robots: str) -> Finding:
 def good(cause: str, sentence: str) -> Finding:
     """A finding that all is well."""
     return Finding(cause, Severity.GOOD, sentence)
+
+
+def kept_apart(emulated: str | None, advice: str) -> str:
+    """What to do where robots do not hear each other: advice on the network, unless an emulated radio explains it."""
+    if emulated is None:
+        return advice
+    return f"The emulated radio explains it ({emulated}): change [radio], or what the scenario's faults do to it."

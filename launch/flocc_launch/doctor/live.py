@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from flocc_launch.dashboard.status_table import NO_ANSWER, RobotStatus
-from flocc_launch.doctor.finding import Finding, Severity, blocked
+from flocc_launch.doctor.finding import ONE_WAY_ADVICE, Finding, Severity, blocked, kept_apart
 from flocc_launch.doctor.live_steps import apart, is_server
 from flocc_launch.doctor.merge_evidence import named
 
@@ -74,7 +74,10 @@ def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:
         blocked(
             "no-peer",
             f"{named(alone)} hear{'s' * (len(alone) == 1)} no other robot.",
-            "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            kept_apart(
+                emulated_of(rows),
+                "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            ),
             *alone,
         )
     ]
@@ -87,7 +90,7 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         blocked(
             "one-way-link",
             f"{a} hears {b}, but {b} does not hear {a}.",
-            "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power.",
+            kept_apart(emulated_of(rows), ONE_WAY_ADVICE),
             a,
             b,
         )
@@ -95,6 +98,11 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         for b in sorted(hears[a])
         if b in hears and a not in hears[b]
     ]
+
+
+def emulated_of(rows: Sequence[RobotStatus]) -> str | None:
+    """What of the radio is emulated, as the first robot says that has any of it emulated."""
+    return next((row.emulated for row in rows if row.emulated is not None), None)
 
 
 def without_keyframes(rows: Sequence[RobotStatus]) -> list[Finding]:
