@@ -478,7 +478,7 @@ class Agent:
             self._store,
             transport,
             self._clock_s,
-            names_latents=sealer is not None,
+            sealer=sealer,
         )
         return Driver(
             core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
