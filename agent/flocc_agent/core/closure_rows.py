@@ -126,6 +126,10 @@ class ClosureTable:
         """Pairs of logs with closures between them, or within one."""
         return sorted(self._of_pair)
 
+    def logs(self) -> set[LogId]:
+        """Logs that closures are of, or stand in."""
+        return set(self._logs)
+
     def closures(self, counts: Callable[[LogId], int], unread: Set[KeyframeId]) -> list[LoopClosure]:
         """Those of which both keyframes are known, in the order of their pairs.
 
