@@ -13,9 +13,11 @@ import zlib
 from bisect import bisect_left, insort
 from collections.abc import Callable
 from enum import Enum
+from itertools import product
 
-from flocc_agent.core.pair_set import PairTable
+from flocc_agent.core.known_sets import PairSet, PairTable
 from flocc_agent.core.pulls import remember
+from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
 
 UNLIKELY = "pairs that agree better were refused"
@@ -56,7 +58,7 @@ class Prospects:
         self._fresh: dict[CandidatePair, bool] = {}
         self._judged: dict[CandidatePair, Judged] = {}
         self._order: list[Judged] = []
-        self._closures: PairTable[bool] = PairTable(UNLIKELY_MAX)
+        self._closures = PairSet()
         self._unlikely: PairTable[bool] = PairTable(UNLIKELY_MAX)
         self._held_since_s: dict[CandidatePair, float] = {}
 
@@ -65,7 +67,6 @@ class Prospects:
         return {
             "agreements": (len(self._found), UNLIKELY_MAX),
             "judged": (len(self._fresh) + len(self._judged), 2 * JUDGED_MAX),
-            "closures beside": self._closures.size(),
             "unlikely": self._unlikely.size(),
             "held": (len(self._held_since_s), UNLIKELY_MAX),
         }
@@ -83,7 +84,7 @@ class Prospects:
             remember(self._fresh, pair, is_closure, JUDGED_MAX)
         if not is_closure:
             return []
-        self._closures.put(pair, True)
+        self._closures.add(pair)
         again = sorted(other for other in self._unlikely.beside(pair, BESIDE) if other != pair)
         for other in again:
             self._unlikely.pop(other)
@@ -132,7 +133,7 @@ class Prospects:
         better = self._order[first : first + REFUSED_MIN]
         if len(better) < REFUSED_MIN or any(is_closure for _, _, is_closure in better):
             return False
-        return not any(other != pair for other in self._closures.beside(pair, BESIDE))
+        return not any(other in self._closures for other in beside(pair))
 
     def _learn(self) -> None:
         """Put pairs that were judged meanwhile into their order; only now is everything of their surroundings here."""
@@ -154,3 +155,15 @@ class Prospects:
 def is_probe(pair: CandidatePair) -> bool:
     """Whether a pair is registered however unlikely it is; by other bits than those that say which owner does it."""
     return (zlib.crc32(f"{pair.low} {pair.high}".encode()) >> 8) % PROBED_EVERY == 0
+
+
+def beside(pair: CandidatePair) -> list[CandidatePair]:
+    """Pairs of keyframes up to `BESIDE` before or after a pair's."""
+    steps = range(-BESIDE, BESIDE + 1)
+    low, high = pair.low, pair.high
+    ends = (
+        (KeyframeId(low.log, low.index + i), KeyframeId(high.log, high.index + j))
+        for i, j in product(steps, steps)
+        if (i, j) != (0, 0) and low.index + i >= 0 and high.index + j >= 0
+    )
+    return [CandidatePair(one, other) for one, other in ends if one < other]

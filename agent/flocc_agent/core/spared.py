@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.pair_set import PairTable
+from flocc_agent.core.known_sets import PairTable
 from flocc_agent.core.pulls import remember
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
@@ -64,7 +64,7 @@ class HeldClosures(Protocol):
         """Those that have a length between two stretches, as far as their keyframes are known."""
         ...
 
-    def tied(self, keyframe: KeyframeId, reach: int) -> float:
+    def density(self, keyframe: KeyframeId, reach: int) -> float:
         """Closures for each keyframe of a stretch, with whatever other keyframes."""
         ...
 
@@ -80,7 +80,7 @@ class NoClosures:
         """None."""
         return []
 
-    def tied(self, keyframe: KeyframeId, reach: int) -> float:  # noqa: ARG002
+    def density(self, keyframe: KeyframeId, reach: int) -> float:  # noqa: ARG002
         """None."""
         return 0.0
 
@@ -118,7 +118,7 @@ class Spared:
         beside = self._held.beside(pair, STRETCH)
         if len(beside) < self._enough or self._weak.get(pair) == len(beside):
             return False
-        if min(self._held.tied(pair.low, STRETCH), self._held.tied(pair.high, STRETCH)) < TIED_MIN:
+        if min(self._held.density(pair.low, STRETCH), self._held.density(pair.high, STRETCH)) < TIED_MIN:
             return False
         agreeing = agreeing_of(self._held.foretold(pair, beside))
         if agreeing - CONTRADICTED * (len(beside) - agreeing) >= self._enough:

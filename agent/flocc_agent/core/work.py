@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from flocc_agent.core.pair_set import is_beside
+from flocc_agent.core.known_sets import is_beside
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.spared import STRETCH
 from flocc_protocol.codec import Pose7

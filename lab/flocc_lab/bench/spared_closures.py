@@ -134,7 +134,7 @@ def of_scenario(name: str, scenario: Scenario) -> dict[str, Any]:
         leader = next(s.core for s in swarm.running() if s.core and s.core.election.leading)
         closures.append(leader.assembly.closures)
         found.append(leader_ate_m(swarm, leader.assembly.graph()))
-    return _row(name, *closures, found)
+    return _row(name, closures[0], closures[1], found)
 
 
 def walk_scenario(seed: int) -> Scenario:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.effects import PersistRecord, Report
 from flocc_agent.core.events import KeyframeCaptured
+from flocc_agent.core.known_sets import is_beside
 from flocc_agent.core.log_copy import LogCopy, decoded
-from flocc_agent.core.pair_set import is_beside
 from flocc_agent.core.prospects import REFUSED_MIN, UNLIKELY
 from flocc_agent.core.reports import ClosureRejected
 from flocc_agent.core.spared import STRETCH, TOLD
