@@ -673,3 +673,55 @@ def test_a_matrix_that_is_not_finite_is_not_taken_for_two(tmp_path: Path) -> Non
     (tmp_path / "transforms.json").write_text(json.dumps(table))
     with pytest.raises(FloccError, match=r"a\.png: the pose has a number that is not finite"):
         read_source(tmp_path)
+
+
+CHAIN = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [30.0, 30.0, 16.0, 12.0]
+  resolution: [32, 24]
+  timeshift_cam_imu: 0.125
+"""
+
+
+@pytest.mark.parametrize("clock", ["of the body", "of the pictures", "by order"])
+def test_kalibrs_time_shift_is_added_to_pictures_where_poses_are_of_the_bodys_clock(tmp_path: Path, clock: str) -> None:
+    path = write_plain(tmp_path / "p")
+    (path / "camera.toml").unlink()
+    (path / "camera.yaml").write_text(CHAIN)
+    stamps_s = np.arange(99.5, 104.0, 0.05) + 0.01
+    if clock == "of the body":
+        poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+        poses[:, 0, 3] = stamps_s
+        write_tum(path / "groundtruth.tum", Trajectory(stamps_s, poses))
+    elif clock == "by order":
+        for k, file in enumerate(sorted((path / "images").iterdir())):
+            file.rename(path / "images" / f"{k:04d}.png")
+    found = read_source(path)
+    told = [note for note in found.notes if "timeshift_cam_imu is +0.125 s (t_imu = t_cam + shift)" in note]
+    assert len(told) == 1
+    shifted = clock == "of the body"
+    assert found.images[1][0] == pytest.approx(100.625 if shifted else 100.5)
+    assert ("was not added" in told[0]) is not shifted
+    convert(path, tmp_path / "out")
+    back = Recording.open(tmp_path / "out")
+    assert back.frames[1].stamp_s == pytest.approx(100.625 if shifted else 100.5)
+    if shifted:
+        assert back.frames[1].T_odom_body[0, 3] == pytest.approx(100.625 - stamps_s[0], abs=1e-6)
+
+
+def test_a_mask_is_straightened_with_its_pictures(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    (path / "camera.toml").write_text(
+        "[camera]\nwidth = 32\nheight = 24\nfx = 14.0\nfy = 14.0\ncx = 15.5\ncy = 11.5\nmodel = 'equidistant'\n"
+        "distortion = [0.01, 0.0, 0.0, 0.0]\n"
+    )
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[:6] = 0
+    cv2.imwrite(str(path / "mask.png"), mask)
+    back = Recording.open(convert(path, tmp_path / "out"))
+    assert back.hidden is not None
+    assert back.hidden.shape == (back.camera.height, back.camera.width)
+    assert back.hidden[0].any()
+    assert not back.hidden[-1].any()

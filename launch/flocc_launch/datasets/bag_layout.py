@@ -25,6 +25,8 @@ Float = NDArray[np.float64]
 
 TRANSFORMS_READ_MAX = 2000
 FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
+BODY_FRAMES = r"base(_?(link|footprint|frame|stabilized))?|body(_?(link|frame))?|chassis(_?link)?|trunk|robot"
+"""What the frame of a whole robot is called; an IMU is one of its parts, and whose pose is told stays open."""
 PARTS_OF_NAMES, LETTERS_OR_DIGITS = r"[a-z0-9]+", r"[a-z]+|\d+"
 WANTED_POSES = re.compile(
     r"plan|goal|setpoint|target|waypoint|initial_?pose|desired|reference|command|cmd", re.IGNORECASE
@@ -394,6 +396,11 @@ class Layout:
                 f"{self.bag.path}: no chain of static transforms leads from {body}, which {robot.poses} moves, to "
                 f"{camera or 'none'}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
             )
+        if beside is not None and (T_root_camera := self._on_root(robot, frames, camera)) is not None:
+            return T_root_camera, (
+                f"{self.bag.path}: {robot.poses} does not say which frame it moves; {frames.static.root(camera)} is "
+                "taken, on which the camera sits: name a camera file with T_body_camera (--camera) if not"
+            )
         if beside is not None:
             raise DatasetError(
                 f"{self.bag.path}: the camera ({camera}) sits on {beside}, but {robot.poses} does not say which frame "
@@ -403,6 +410,16 @@ class Layout:
             f"{self.bag.path}: nothing says where the camera ({camera or 'no frame'}) sits on the body "
             f"({body or 'no frame'}); they are taken as one: name a camera file with T_body_camera (--camera) if not"
         )
+
+    def _on_root(self, robot: RobotTopics, frames: Frames, camera: str) -> Float | None:
+        """The camera in the body that carries it by static transforms; None where it has no body's name.
+
+        Poses of a topic that names a camera may be the camera's.
+        """
+        root = frames.static.root(camera)
+        is_body = re.fullmatch(BODY_FRAMES, root.rsplit("/", 1)[-1].lower()) is not None
+        names_camera = robot.poses is not None and re.search(r"cam|optical|lens|eye", robot.poses.topic.name.lower())
+        return frames.static.between(root, camera) if is_body and not names_camera else None
 
     def _between_on_tf(self, frames: Frames, body: str, camera: str) -> Float | None:
         """`T_body_camera` where transforms that stay as they are stand on /tf, as ROS 1 repeats them; None without any.

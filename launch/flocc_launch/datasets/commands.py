@@ -12,6 +12,7 @@ import numpy as np
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.recording import MASK, read_mask
+from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
@@ -151,11 +152,10 @@ def _unused(source: Source) -> list[str]:
 
 def _mask_faults(source: Source) -> list[str]:
     """Why a folder's mask cannot be used."""
-    camera = None if source.lens is None else source.lens.camera.agent_camera()
     try:
-        if camera is not None:
-            read_mask(source.path / MASK, camera)
-    except FloccError as error:
+        if source.lens is not None:
+            read_mask(source.path / MASK, Straightener(source.lens.camera, source.lens.view_rad))
+    except (FloccError, ValueError) as error:
         return [str(error)]
     return []
 
@@ -526,4 +526,6 @@ def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None,
     lens, changed = source.lens, ""
     if lens is not None and (lens.camera.agent_camera() is None or source.levels != FULL):
         changed = f" of {lens.camera} view={lens.view_rad} {source.levels}"
+    if lens is not None and lens.time_shift_s:
+        changed += f" shift={lens.time_shift_s}"
     return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}{changed}"

@@ -10,6 +10,7 @@ import numpy as np
 from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.trajectory import NEAR_S, Trajectory
 from flocc_launch.datasets.bag_reader import is_bag
+from flocc_launch.datasets.camera_clock import of_pictures, told
 from flocc_launch.datasets.folders import (
     read_euroc,
     read_kitti,
@@ -187,14 +188,30 @@ def read_source(
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
     source = _read(path, name, form)
+    lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
+    source = _of_body_clock(replace(source, lens=lens))
     if time_offset_s:
         odometry, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
         source = replace(source, odometry=odometry, truth=truth)
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None and time_offset_s is not None:
             check_times(source, trajectory)
-    lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
-    return _usable(replace(source, lens=lens))
+    return _usable(source)
+
+
+def _of_body_clock(source: Source) -> Source:
+    """The source with stamps of the body's clock, where the calibration says how far the camera's is off."""
+    shift_s = source.lens.time_shift_s if source.lens else 0.0
+    if shift_s == 0.0:
+        return source
+    stamps_s = [stamp_s for stamp_s, _ in source.images]
+    trajectories = [each for each in (source.odometry, source.truth) if each is not None]
+    of_camera = source.is_posed_by_image or any(of_pictures(each.stamps_s.tolist(), stamps_s) for each in trajectories)
+    notes = (*source.notes, f"{source.path}: {told(shift_s, not of_camera)}")
+    if of_camera:
+        return replace(source, notes=notes)
+    images = tuple((stamp_s + shift_s, file) for stamp_s, file in source.images)
+    return replace(source, images=images, notes=notes)
 
 
 def _usable(source: Source) -> Source:

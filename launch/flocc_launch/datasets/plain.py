@@ -44,12 +44,16 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     images, faults, how = _named_images(path) if listing is None else (*listed_images(listing), "")
     stamps_s = [stamp_s for stamp_s, _ in images] if images else None
     odometry, truth, notes = trajectories_beside(path, form, stamps_s)
+    by_order = images is None
     if images is None:
         images, faults = _stamped_by_order(path, odometry or truth)
     read_how = (f"{path}: the names of the images say their stamps as {how}",) if how in UNUSUAL else ()
     lens = camera_file(path, images)
     notes = (*read_how, *notes)
-    return Source(path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+    return Source(
+        path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes,
+        is_posed_by_image=by_order,
+    )  # fmt: skip
 
 
 def trajectories_beside(
