@@ -224,6 +224,36 @@ def test_a_camera_files_time_shift_moves_a_bags_pictures(tmp_path: Path, caplog:
     assert "timeshift_cam_imu is +0.05 s (t_imu = t_cam + shift), and was added" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("topic", "named"), [("/thermal/image_raw", False), ("/boson/image_raw", False), ("/cam/image_raw", True)]
+)
+def test_a_thermal_cameras_16uc1_is_grey(tmp_path: Path, topic: str, named: bool) -> None:
+    script = BagScript(False)
+    for k in range(6):
+        pixels = np.linspace(3000, 9000, 32 * 24).reshape(24, 32).astype(np.uint16)
+        script.raw(topic, ZERO_NS + k * 10**8, pixels, "16UC1")
+        script.camera_info(f"{topic.rpartition('/')[0]}/camera_info", ZERO_NS + k * 10**8)
+        script.odometry("/odom", ZERO_NS + k * 10**8, 0.1 * k)
+    bag = script.write(tmp_path / "run", "mcap")
+    if named:
+        with pytest.raises(DatasetError, match=r"hold depth, no pictures: .* --image-topic if it is of a thermal"):
+            convert(bag, tmp_path / "unnamed")
+    found = Recording.open(convert(bag, tmp_path / "out", image_topic=topic if named else None))
+    assert len(found.frames) == 6
+    shown = found.load_image(found.frames[0]).pixels
+    assert shown[0, 0, 0] < shown[-1, -1, 0]
+
+
+def test_a_depth_topic_is_no_picture_even_where_it_is_named(tmp_path: Path) -> None:
+    script = BagScript(False)
+    for k in range(6):
+        script.raw("/depth/image_raw", ZERO_NS + k * 10**8, np.full((24, 32), 900, np.uint16), "16UC1")
+        script.camera_info("/depth/camera_info", ZERO_NS + k * 10**8)
+        script.odometry("/odom", ZERO_NS + k * 10**8, 0.1 * k)
+    with pytest.raises(DatasetError, match="how depth is published"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out", image_topic="/depth/image_raw")
+
+
 def test_a_mounting_that_static_transforms_give_twice_is_refused(tmp_path: Path) -> None:
     script = mounted(walking(False))
     script.transform("/tf_static", ZERO_NS + 9 * S, ("housing", "camera"), (0.0, 0.1, 0.0), FORWARD)

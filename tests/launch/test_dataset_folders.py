@@ -725,3 +725,60 @@ def test_a_mask_is_straightened_with_its_pictures(tmp_path: Path) -> None:
     assert back.hidden.shape == (back.camera.height, back.camera.width)
     assert back.hidden[0].any()
     assert not back.hidden[-1].any()
+
+
+def phone_folder(path: Path, images: str, trajectory: str, names: str = "IMG_{:04d}.png") -> Path:
+    for k in range(6):
+        write_image(path / images / names.format(k), 10 * k)
+    write_tum(path / trajectory, Trajectory(100.0 + 0.5 * np.arange(6), moving(6)))
+    write_camera(path / "camera.toml", CAMERA, np.eye(4))
+    return path
+
+
+@pytest.mark.parametrize("images", ["DCIM/Camera", "DCIM/100ANDRO", "photos", "Pictures", "Frames", "RGB"])
+def test_folders_as_a_phone_copies_them_are_plain_ones(tmp_path: Path, images: str) -> None:
+    found = read_source(phone_folder(tmp_path / "p", images, "odometry.tum"))
+    assert [stamp_s for stamp_s, _ in found.images] == [100.0, 100.5, 101.0, 101.5, 102.0, 102.5]
+    assert found.odometry is not None
+
+
+@pytest.mark.parametrize("name", ["arcore_poses.txt", "ARKit_poses.txt", "ARposes.txt"])
+def test_a_phones_axes_are_said_or_asked_for(tmp_path: Path, name: str) -> None:
+    path = phone_folder(tmp_path / "p", "DCIM/Camera", name)
+    with pytest.raises(DatasetError, match=r"y points up and z backwards; write T_body_camera = \[\[1, 0, 0, 0\]"):
+        read_source(path)
+    write_camera(path / "camera.toml", CAMERA, np.diag([1.0, -1.0, -1.0, 1.0]))
+    assert read_source(path).odometry is not None
+
+
+@pytest.mark.parametrize(
+    "form", ["{s:.6f}", "{ns}", "{k:05d} {s:.6f} 0.02", "{s:.6f},{k}.png", "{k}.png {s:.6f}", "{k},{ns}"]
+)
+@pytest.mark.parametrize("name", ["times.txt", "timestamps.txt"])
+def test_images_that_only_count_take_the_stamps_of_times(tmp_path: Path, form: str, name: str) -> None:
+    path = phone_folder(tmp_path / "p", "images", "odometry.tum", "{}.png")
+    zero_s = 1_700_000_000
+    lines = [form.format(k=k, s=zero_s + 0.2 * k, ns=zero_s * 10**9 + k * 2 * 10**8) for k in range(6)]
+    (path / name).write_text("\n".join(lines) + "\n")
+    stamps_s = zero_s + 0.05 * np.arange(30)
+    write_tum(path / "odometry.tum", Trajectory(stamps_s, np.tile(np.eye(4), (30, 1, 1))))
+    found = read_source(path)
+    assert [stamp_s for stamp_s, _ in found.images] == pytest.approx([zero_s + 0.2 * k for k in range(6)], abs=1e-6)
+    assert any(f"{name} gives them" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (["0.1", "0.2"], "has 2 stamps, but .* has 6 images"),
+        (["0", "1", "2", "3", "4", "5"], "stamps can be seconds"),
+        (["0.5", "0.4", "0.6", "0.7", "0.8", "0.9"], "time goes backwards"),
+        ([f"{7 * k} {0.2 * k}" for k in range(6)], "its lines must be stamps"),
+        (["a", "b", "c", "d", "e", "f"], "stamps"),
+    ],
+)
+def test_times_that_are_none_are_refused(tmp_path: Path, lines: list[str], said: str) -> None:
+    path = phone_folder(tmp_path / "p", "images", "odometry.tum", "{}.png")
+    (path / "times.txt").write_text("\n".join(lines) + "\n")
+    with pytest.raises(DatasetError, match=said):
+        read_source(path)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, STILL_MAX, StaticFrames, pose_of_transform
 from flocc_agent.runtime.ros2.types import BadMessage
-from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
+from flocc_launch.datasets.bag_messages import CAMERA_TYPE, DEPTH_NAME, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.source import DatasetError
 
@@ -32,6 +32,8 @@ WANTED_POSES = re.compile(
     r"plan|goal|setpoint|target|waypoint|initial_?pose|desired|reference|command|cmd", re.IGNORECASE
 )
 """Leaves of topics that say where a robot is to be, not where it is."""
+THERMAL = re.compile(r"therm|flir|boson|lepton|lwir|infrared|hadron|optris|seek|tau2", re.IGNORECASE)
+"""In the names of topics of thermal cameras, which publish grey of 16 bits as 16UC1."""
 TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk", "gps", "gnss", "amcl")
 """In the names of topics that say where a robot is in a map, not how it moved."""
 
@@ -239,7 +241,10 @@ class Layout:
             return named(self.bag, IMAGE_TYPES, name)
         kept = [topic for topic in images if not self._is_depth(topic)]
         if images and not kept:
-            raise DatasetError(f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}")
+            raise DatasetError(
+                f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}; name one "
+                "of 16UC1 with --image-topic if it is of a thermal camera"
+            )
         by_base: dict[str, BagTopic] = {}
         for topic in kept:
             base = topic.name.removesuffix("/compressed")
@@ -255,7 +260,9 @@ class Layout:
         if leaf in ("compressedDepth", "theora"):
             return True
         head = self.head(topic)
-        return head is not None and head.coding.split(";")[0].strip() in ("16UC1", "32FC1")
+        coding = "" if head is None else head.coding.split(";")[0].strip()
+        is_thermal = THERMAL.search(topic.name) is not None and DEPTH_NAME.search(topic.name) is None
+        return coding == "32FC1" or (coding == "16UC1" and not is_thermal)
 
     def info_of(self, image: BagTopic) -> BagTopic | None:
         """The CameraInfo of an image topic: of its namespace, else of its frame, else the only one; None where unclear.
