@@ -1,4 +1,4 @@
-"""Pictures are held against the trajectory: an order of quaternions that they contradict is refused, both readings told."""
+"""Pictures are held against the trajectory: an order of quaternions that they contradict is refused."""
 
 import os
 from dataclasses import replace

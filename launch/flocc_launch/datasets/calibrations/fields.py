@@ -86,7 +86,7 @@ HARMLESS = re.compile(
     r"depthscale|depthfactor|thdepth|thfarpoints|aabbscale|applied(transform|scale)|perviewreprojectionerrors|imagepoints|"
     r"extrinsicparameters|gridpoints|flagvalue|flags|fixprincipalpoint|ttracking|tlr|left.*|right.*|camera2.*|tcncnm1|"
     r"perviewerrors|stddevintrinsics|stddevextrinsics|intrinsicsstd|camoverlaps|rotationrate|t\d\d|posestd|calibaccel.*|"
-    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile)$"
+    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile|mindist(ance)?|maxcnt|fthreshold|posegraphsavepath|visualizecamerasize)$"
 )
 """Plain names of keys that look as if they mattered and do not: of other sensors or rectified images."""
 
