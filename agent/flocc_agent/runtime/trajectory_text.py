@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
-from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of, contradiction
+from flocc_agent.runtime.columns import (
+    UNITS_S,
+    Columns,
+    HeaderError,
+    begins_with_stamp,
+    columns_of,
+    contradiction,
+)
 from flocc_agent.runtime.dated_rows import dated
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, oddity, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
@@ -139,16 +146,19 @@ def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns |
         return None
     if form is not None:
         return _named_form(form, table.path)
-    for line, header in reversed(table.headers):
+    for line, header in table.headers:
         if (fault := contradiction(header)) is not None:
             raise RecordingError(f"{table.path}:{line}: {fault}; {WAY_OUT}")
+    for line, header in reversed(table.headers):
         try:
             found = columns_of(header, count)
         except HeaderError as error:
             raise RecordingError(f"{table.path}:{line}: {error}; {WAY_OUT}") from None
         if found is not None:
             return found
-        if len(words := header.split(",")) >= 7 and not any(is_number(word.strip()) for word in words):
+        words = header.split(",") if "," in header else header.split()
+        words = words if "," in header or (len(words) == count and begins_with_stamp(header)) else []
+        if len(words) >= 7 and not any(is_number(word.strip()) for word in words):
             raise RecordingError(f"{table.path}:{line}: the header is not understood ({header[:80]}); {WAY_OUT}")
     return _by_numbers(table, count) if otherwise is None else _named_form(otherwise, table.path)
 

@@ -204,7 +204,7 @@ def chosen_pairs(
     images: Sequence[tuple[float, Path]], trajectory: Trajectory
 ) -> list[tuple[tuple[float, Path], tuple[float, Path]]]:
     """At most `PAIRS_MAX` pairs, of which the second has turned enough against the first."""
-    chosen = []
+    chosen: list[tuple[tuple[float, Path], tuple[float, Path]]] = []
     for start in np.unique(np.linspace(0, len(images) - 1, 2 * PAIRS_MAX).astype(int)):
         T_before = trajectory.at(images[start][0])
         if T_before is None:
@@ -217,8 +217,8 @@ def chosen_pairs(
             if turn_rad >= TURN_WANTED_RAD:
                 chosen.append((images[start], now))
                 break
-    keep = np.unique(np.linspace(0, len(chosen) - 1, min(len(chosen), PAIRS_MAX)).astype(int)) if chosen else []
-    return [chosen[k] for k in keep]
+    kept = np.unique(np.linspace(0, len(chosen) - 1, min(len(chosen), PAIRS_MAX)).astype(int))
+    return [chosen[k] for k in kept]
 
 
 def _image(file: Path, source: Source, straightener: Straightener) -> Image | None:
