@@ -337,7 +337,17 @@ def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], t
     if columns.nanoseconds is not None:
         values[:, 0] += values[:, -1] * 1e-9
     note = f"{table.path}: {len(damaged)} of {len(table.rows)} rows were left out, the first at line "
-    return values, np.array(lines), (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
+    told = (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
+    return values, np.array(lines), (*told, *_moved(table, columns))
+
+
+def _moved(table: Table, columns: Columns) -> tuple[str, ...]:
+    """Which frame the poses move, where a column says it: the camera's mounting must be on that."""
+    index = next((index for name, index in columns.labels if "child_frame" in name), None)
+    moved = {fields[index] for _, fields in table.rows[:200] if index is not None and len(fields) > index} - {""}
+    return (
+        (f"{table.path}: poses are of {min(moved)}: the camera's mounting (T_body_camera) is on that",) if moved else ()
+    )
 
 
 def _refuse_mixed(table: Table, columns: Columns) -> None:

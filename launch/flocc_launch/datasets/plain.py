@@ -43,7 +43,7 @@ def is_plain(path: Path) -> bool:
     """Whether a folder holds images of its own: in `images/`, in a list, or beside a trajectory."""
     if (path / "images").is_dir() or (path / "images.txt").exists():
         return True
-    return path.is_dir() and (bool(image_files(path)) or _image_folder(path) != path) and _has_trajectory(path)
+    return path.is_dir() and (bool(image_files(path)) or _image_folder(path) != path) and has_trajectory(path)
 
 
 def read_plain(path: Path, form: str | None = None) -> Source:
@@ -108,7 +108,8 @@ def taken_file(path: Path, stems: tuple[str, ...]) -> Path | None:
     return next(iter(_trajectory_files(path, stems)), None)
 
 
-def _has_trajectory(path: Path) -> bool:
+def has_trajectory(path: Path) -> bool:
+    """Whether a trajectory of one of the plain names stands in a folder."""
     return any(_trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
 
 
