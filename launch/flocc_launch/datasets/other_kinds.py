@@ -52,7 +52,7 @@ FOLDERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
      "write COLMAP's text form of it: File, Export, Export Cameras"),
     ("Bundler's reconstruction", ("bundle.out",),
      "write COLMAP's text form of it"),
-    ("ScanNet++", ("dslr", "iphone"),
+    ("a scene of ScanNet of 2023", ("dslr", "iphone"),
      "put one of its nerfstudio/transforms.json beside its images"),
     ("TartanAir V2", ("pose_lcam_front.txt",),
      "make groundtruth.tum of pose_lcam_front.txt, which is in NED axes, beside the images"),
