@@ -200,6 +200,13 @@ class Store:
         self._others_bytes += len(record.data)
         return True
 
+    def drop_log(self, log: LogId) -> None:
+        """Keep nothing of another robot's log any more."""
+        assert log != self.identity.log
+        with self._lock:
+            self._records.write("DELETE FROM records WHERE log = ?", [(str(log),)])
+            self._measure()
+
     def records(self, log: LogId, first: int = 0) -> list[StoredRecord]:
         """Give a log's records from a number on, in order; in others' logs numbers may be missing."""
         rows = self._records.read("SELECT number, data FROM records WHERE log = ? AND number >= ?", (str(log), first))

@@ -18,6 +18,7 @@ from flocc_agent.core.reports import (
     LeaderFollowed,
     LeaderLost,
     LogForked,
+    LogGivenUp,
     NameTaken,
     NeighbourDown,
     NeighbourUp,
@@ -213,7 +214,16 @@ class Telemetry:
         return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = (CameraDoubted, FrontEndsDiffer, PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_WARNINGS = (
+    CameraDoubted,
+    FrontEndsDiffer,
+    PeerRefused,
+    NameTaken,
+    LogForked,
+    LogGivenUp,
+    LatentLost,
+    RoundFailed,
+)
 _INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 

@@ -73,6 +73,11 @@ class Disk:
         else:
             self._waiting[log] = self._waiting.get(log, 0) + 1
 
+    def drop_log(self, log: LogId) -> None:
+        """Keep nothing of another robot's log any more."""
+        self.records.pop(log, None)
+        self._waiting.pop(log, None)
+
     def put_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
         """Keep a latent; the oldest make room."""
         self.latent_bytes += len(latent) - len(self.latents.pop(keyframe, b""))
