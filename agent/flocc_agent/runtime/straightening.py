@@ -41,7 +41,7 @@ class Straightener:
             return pixels
         if self._map is None:
             self._map = self._pixel_map()
-        return np.asarray(cv2.remap(pixels, *self._map, cv2.INTER_CUBIC))
+        return np.asarray(cv2.remap(pixels, *self._map, cv2.INTER_LINEAR))
 
     def _pixel_map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Where each pixel of what `apply` gives is found in a picture as it was taken."""

@@ -87,7 +87,7 @@ def write_wide(source_path: Path, out: Path, kind: LensKind) -> Path:
     for stamp_s, file in source.images:
         pixels = cv2.imdecode(np.frombuffer(read_bytes(file), np.uint8), cv2.IMREAD_COLOR)
         assert pixels is not None
-        wide = cv2.remap(pixels, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_CONSTANT)
+        wide = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
         cv2.imwrite(str(out / "images" / f"{stamp_s:.6f}.jpg"), wide, [cv2.IMWRITE_JPEG_QUALITY, 97])
     (out / "camera.yaml").write_text(kalibr(Rig(model, source.lens.T_body_camera)), encoding="utf-8")
     for name, trajectory in (("odometry", source.odometry), ("groundtruth", source.truth)):
