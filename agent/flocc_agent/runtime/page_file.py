@@ -23,6 +23,7 @@ class PageFile:
         self._folder = folder
         self._file: IO[bytes] | None = None
         self._bytes = 0
+        self._free: dict[int, list[int]] = {}
         self._is_full = False
 
     @property
@@ -31,7 +32,7 @@ class PageFile:
 
     @property
     def size_bytes(self) -> int:
-        """What was put so far."""
+        """How long the file is."""
         return self._bytes
 
     def put(self, piece: bytes) -> int | None:
@@ -39,7 +40,8 @@ class PageFile:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(buffering=0, dir=self._folder)  # noqa: SIM115
-            written, place = 0, self._bytes
+            free = self._free.get(len(piece))
+            written, place = 0, free[-1] if free else self._bytes
             while written < len(piece):
                 written += os.pwrite(self._file.fileno(), piece[written:], place + written)
         except OSError as error:
@@ -47,9 +49,16 @@ class PageFile:
                 logger.warning("old records stay in memory: %s", error)
             self._is_full = True
             return None
-        self._bytes += len(piece)
+        if free:
+            free.pop()
+        else:
+            self._bytes += len(piece)
         self._is_full = False
         return place
+
+    def free(self, place: int, size_bytes: int) -> None:
+        """Let the next piece of this size take the room of one that is needed no more."""
+        self._free.setdefault(size_bytes, []).append(place)
 
     def get(self, place: int, size_bytes: int) -> bytes:
         """A piece again.
