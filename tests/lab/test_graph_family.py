@@ -13,7 +13,7 @@ from flocc_lab.graph_family.judge import judged
 from flocc_lab.graph_family.methods import NoAnswer, flocc, oracle, settings
 
 TEN = (3, 4, 7, 9, 13, 19, 20, 29, 31, 35)
-"""The first ten with fewer than five hundred keyframes, but 27, which takes as long as they; `make campaign` has all."""
+"""The first ten with fewer than five hundred keyframes, but slow 27; `make campaign` has all."""
 
 
 def test_specs_lie_within_the_stated_ranges_and_use_them() -> None:
