@@ -461,7 +461,7 @@ class Agent:
             sealer,
             distributed,
             None if sealer is None else sealer.compute_classes,
-            PageFile(config.folder),
+            PageFile(config.folder, config.store.record_bytes_max),
         )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
