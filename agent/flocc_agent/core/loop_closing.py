@@ -133,6 +133,8 @@ class LoopClosing:
     def on_offer(self, offer: CandidateOffer, now: float) -> None:
         """Pairs that another robot found and that this one is to register."""
         for pair in offer.pairs:
+            if pair in self._spared and not self._spared.is_told(pair):
+                self._spared.remove(pair)  # keyframes without closures came since, so that its stretch is weak now
             if offer.transferred and not (pair in self._resolved or pair in self._work or pair in self._spared):
                 self._offers.remove(pair)
                 self._undecided.pop(pair, None)
