@@ -33,6 +33,7 @@ import numpy as np
 from flocc_agent.core.effects import (
     Broadcast,
     Deliver,
+    DropLog,
     Effect,
     Encode,
     FetchLatent,
@@ -56,6 +57,7 @@ from flocc_agent.core.reports import (
     LeaderFollowed,
     LeaderLost,
     LogForked,
+    LogGivenUp,
     NameTaken,
     NeighbourDown,
     NeighbourRestarted,
@@ -100,6 +102,10 @@ class PlaceEyes:
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration:  # noqa: ARG002
         """Both cameras stood at one place."""
         return Registration(np.eye(4), 100, 100, 1.0)
+
+    def without(self, latent: bytes, hidden: object) -> bytes:  # noqa: ARG002
+        """Nothing moves with the camera."""
+        return latent
 
 
 def played(text: str) -> str:
@@ -216,7 +222,7 @@ def _told(effect: Effect) -> str | None:
             return f"optimises in {term} round {number}"
         case Report(fact):
             return _reported(fact)
-        case Unicast() | IterateBlock() | PersistRecord() | PersistTerm() | PersistCorrection():
+        case Unicast() | IterateBlock() | PersistRecord() | PersistTerm() | PersistCorrection() | DropLog():
             return None
         case _:
             assert_never(effect)
@@ -235,6 +241,8 @@ def _reported(fact: Fact) -> str | None:
             return f"{name_of(fact)} {fact.peer}: {fact.reason}"
         case LatentLost() | LatentFailed():
             return f"{name_of(fact)} {fact.keyframe}"
+        case LogGivenUp():
+            return f"{name_of(fact)} {fact.log}"
         case SolutionIgnored():
             return f"ignores a solution of {fact.term} round {fact.round}"
     return None

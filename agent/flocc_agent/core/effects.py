@@ -118,6 +118,13 @@ class PersistRecord(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class DropLog:
+    """Keep nothing more of another robot's log."""
+
+    log: LogId
+
+
+@dataclass(frozen=True, slots=True)
 class PersistTerm:
     """Remember the highest term counter that this robot claimed."""
 
@@ -156,5 +163,6 @@ Effect = (
     | PersistRecord
     | PersistTerm
     | PersistCorrection
+    | DropLog
     | Report
 )

@@ -18,9 +18,9 @@ from collections.abc import Iterable, Iterator
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
 from flocc_agent.core.front_ends import FrontEnds
+from flocc_agent.core.known_sets import PairSet
 from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.offers import Offers, Recipient
-from flocc_agent.core.pair_set import PairSet
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
@@ -147,6 +147,18 @@ class LoopClosing:
             self._work.remove(pair)
             self._offers.remove(pair)
             self._chosen, self._changed = None, True
+
+    def forget(self, log: LogId) -> None:
+        """A log is held no more: its pairs wait for nothing."""
+        for pair in self.open_pairs():
+            if log in (pair.low.log, pair.high.log):
+                self.on_resolved(pair)
+                self._resolved.discard(pair)
+        self.latents.names.forget(log)
+
+    def is_written(self, log: LogId) -> bool:
+        """Whether the writer of a log is in range."""
+        return self._reach.writes(log)
 
     def on_closure(self, pair: CandidatePair, now: float) -> None:
         """A record of this pair is in a log, and it is a closure; what was refused unseen beside it has a chance."""
