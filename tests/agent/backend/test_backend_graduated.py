@@ -108,14 +108,8 @@ def test_only_a_solution_that_explains_the_closures_ends_the_search(
 ) -> None:
     """Where none is turned away no other schedule can explain more; where some are, all schedules run."""
     spec = drawn(SMALL[0])
-    as_stated = {
-        "closure_factor": 1.0,
-        "odometry_factor": 1.0,
-        "heavy_tails": False,
-        "groups": 0,
-        "lengths": Lengths.METRIC,
-    }
-    true = replace(spec, outliers=0.3 * with_wrong_ones, scale_off=(1.0,) * spec.robots, **as_stated)
+    plain = replace(spec, outliers=0.3 * with_wrong_ones, groups=0, lengths=Lengths.METRIC, heavy_tails=False)
+    true = replace(plain, scale_off=(1.0,) * spec.robots, closure_factor=1.0, odometry_factor=1.0)
     objective, state = objective_of(made(true), Solver.GNC_TLS)
     ratios: list[float] = []
 
