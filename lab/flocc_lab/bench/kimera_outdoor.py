@@ -38,7 +38,7 @@ HEAD = "| | closures used | objective, truncated at 99 % | at 99.99 % | CPU s |\
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class OutdoorAnswer:
     """What one solver made of the graph: poses by log, closures used, CPU seconds."""
 
     name: str
@@ -70,7 +70,7 @@ def _measurements(path: Path) -> Iterable[Measurement]:
             yield Measurement(first, second, pose(R_from_q_wxyz(q), t), np.diag(variances))
 
 
-def ours(graph: PoseGraph, config: BackendConfig) -> Row:
+def ours(graph: PoseGraph, config: BackendConfig) -> OutdoorAnswer:
     """The default back end."""
     began = time.process_time()
     solution = optimise(graph, config)
@@ -78,10 +78,10 @@ def ours(graph: PoseGraph, config: BackendConfig) -> Row:
     if not isinstance(solution, GraphSolution) or len(solution.components) != 1:
         sys.exit("the back end did not bring all robots into one frame")
     used = sum(c.state.value == "used" for c in solution.closures)
-    return Row("flocc", dict(solution.components[0].T_map_keyframe), used, cpu_s)
+    return OutdoorAnswer("flocc", dict(solution.components[0].T_map_keyframe), used, cpu_s)
 
 
-def gtsam_gnc(graph: PoseGraph, config: BackendConfig) -> Row:
+def gtsam_gnc(graph: PoseGraph, config: BackendConfig) -> OutdoorAnswer:
     """GTSAM's GNC from the poses that the back end begins with; only its optimiser is timed."""
     closures = dict(enumerate(graph.closures))
     T_start = initial_poses(graph.trajectories, closures, config.steepness, None).T_map_keyframe
@@ -91,7 +91,7 @@ def gtsam_gnc(graph: PoseGraph, config: BackendConfig) -> Row:
     found, weights = gnc_with(factors, values, [*range(problem.closure_rows.start), factors.size() - 1])
     cpu_s = time.process_time() - began
     used = int(np.count_nonzero(weights[problem.closure_rows] > 0.5))
-    return Row("GTSAM's `GncLMOptimizer`", problem.by_log(_poses(found, problem)), used, cpu_s)
+    return OutdoorAnswer("GTSAM's `GncLMOptimizer`", problem.by_log(_poses(found, problem)), used, cpu_s)
 
 
 def _poses(values: gtsam.Values, problem: Problem) -> Float:
