@@ -103,6 +103,10 @@ class PlaceEyes:
         """Both cameras stood at one place."""
         return Registration(np.eye(4), 100, 100, 1.0)
 
+    def without(self, latent: bytes, hidden: object) -> bytes:  # noqa: ARG002
+        """Nothing moves with the camera."""
+        return latent
+
 
 def played(text: str) -> str:
     """Play a trace from its beginning; the same text with what really happened."""

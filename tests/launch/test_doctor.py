@@ -233,7 +233,7 @@ def test_robots_that_an_emulated_radio_keeps_apart_are_not_sent_to_the_network(t
     story.radio = {"range_m": 12.0, "partitions": [{"groups": [["r1"], ["r2"]], "from_s": 3.0, "to_s": None}]}
     (finding,) = blocking(story.write(tmp_path / "emulated"))
     assert finding.cause == cause
-    assert "The emulated radio explains it (a range of 12 m, partitions)" in finding.advice
+    assert "The emulated radio may be why (a range of 12 m, partitions)" in finding.advice
     story.radio = {"of a later version": 1}
     (finding,) = blocking(story.write(tmp_path / "later"))
     assert "emulated" not in finding.advice

@@ -1,11 +1,18 @@
 """The sections of the perception back-ends, and which of them is used."""
 
+import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from flocc_agent.config.section import Section, inner
+
+
+def _is_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not all(map(math.isfinite, value)) or not any(value):
+        raise ValueError("a direction is three finite numbers, not all of them 0")
+    return value
 
 
 class ClassicalConfig(Section):
@@ -95,7 +102,7 @@ class Mast3rConfig(Section):
     """Number format of a sent latent; int8 (per channel) halves it to 0.8 MB."""
     place_input: Literal["native", "shorter-side", "swarm-slam"] = inner("swarm-slam")
     """What CosPlace sees: the picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
-    subsample_px: int = Field(8, ge=1, le=64)
+    subsample_px: int = inner(8, ge=1, le=64)
     """Distance of the matcher's seeds; 16 is four times faster with a quarter of the matches; equal on all robots."""
     calibrated: bool = True
     """Use the camera's calibration; false estimates focal lengths from the pointmaps, with a second decode."""
@@ -116,6 +123,9 @@ class PerceptionConfig(Section):
     brings."""
     options: dict[str, Any] = Field(default_factory=dict)
     """What an installed package's perception is to know; flocc hands it on as it is."""
+    odometry_up: Annotated[tuple[float, float, float], AfterValidator(_is_direction)] | None = None
+    """Direction against gravity in the odometry frame where odometry keeps roll and pitch, as a VIO does: [0, 0, 1] by
+    ROS's convention. The classical and the learned front end then register with gravity; none: it is not known."""
     classical: ClassicalConfig = ClassicalConfig()
     learned: LearnedConfig = LearnedConfig()
     synthetic: SyntheticConfig = SyntheticConfig()

@@ -9,9 +9,10 @@ import hashlib
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.claims import Claim
@@ -37,6 +38,7 @@ from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, FetchProblem, Transport
 from flocc_agent.runtime.workers import Workers, WorkFailed
+from flocc_protocol.ids import KeyframeId
 
 IMAGES_MAX = 8
 
@@ -126,9 +128,50 @@ async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEnco
     looked = result.value
     if looked.descriptor is None or looked.latent is None:
         return KeyframeEncodingFailed(effect.keyframe, looked.fault, looked.doubts)
+    if looked.hidden is not None and tools.sealer is None:
+        await asyncio.to_thread(hide_in_earlier, effect.keyframe, looked.hidden, tools.perception.without, tools.store)
     await asyncio.to_thread(tools.store.put_latent, effect.keyframe, looked.latent)
     sha256 = await asyncio.to_thread(_sent_forms, looked.latent, tools.perception) if tools.sealer is not None else b""
     return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts, sha256)
+
+
+class KeepsLatents(Protocol):
+    """What keeps latents by keyframe."""
+
+    def latent(self, keyframe: KeyframeId, /) -> bytes | None:
+        """Give a latent, None where there is none."""
+        ...
+
+    def replace_latent(self, keyframe: KeyframeId, latent: bytes, /) -> None:
+        """Keep another latent in the place of one that is there."""
+        ...
+
+
+EARLIER_MAX = 64
+"""Keyframes whose latents lose what turns out to move with the camera: it is found among the first few, mostly."""
+
+
+def hide_in_earlier(
+    keyframe: KeyframeId,
+    hidden: NDArray[np.bool_],
+    without: Callable[[bytes, NDArray[np.bool_]], bytes],
+    store: KeepsLatents,
+) -> None:
+    """Take what moves with the camera out of the latents that were encoded before it was known.
+
+    Where a robot's log says what its latents are, they stay: another one would be refused as false.
+
+    Args:
+        keyframe: With which it became known.
+        hidden: (H, W) of the camera's picture.
+        without: Takes what is hidden out of a latent.
+        store: Where they are.
+    """
+    for index in range(max(0, keyframe.index - EARLIER_MAX), keyframe.index):
+        earlier = KeyframeId(keyframe.log, index)
+        latent = store.latent(earlier)
+        if latent is not None:
+            store.replace_latent(earlier, without(latent, hidden))
 
 
 def _sent_forms(latent: bytes, perception: Perception) -> bytes:

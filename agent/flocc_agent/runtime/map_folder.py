@@ -355,7 +355,11 @@ class MapFolder:
         """
         try:
             poses = self.poses()
-            return SavedMap(tuple(poses), self.closed(), poses, self.used_closures(), is_fixed)
+            weights = {
+                KeyframeId.parse(keyframe): 1.0 / (1 + len(logs))
+                for keyframe, logs in self.manifest.contradicted.items()
+            }
+            return SavedMap(tuple(poses), self.closed(), poses, self.used_closures(), is_fixed, weights)
         except (KeyError, IndexError, ValueError) as error:
             raise BadMap(f"{self.path / self.manifest.solution.name}: does not fit the map: {error}") from error
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.reports import (
+    CameraDoubted,
     CandidateFound,
     ClosureAccepted,
     ClosureRejected,
@@ -51,6 +52,7 @@ class RobotState:
     corrected_m: dict[int, Float] = field(default_factory=dict)
     incarnation: int = 0
     candidates: int = 0
+    camera: dict[str, CameraDoubted] = field(default_factory=dict)
     accepted: int = 0
     rejected: int = 0
     sent: Mapping[str, int] = field(default_factory=dict)
@@ -189,6 +191,8 @@ def apply_to(robot: RobotState, fact: Fact) -> None:
             robot.loss, robot.queues = fact.loss, fact.queues
         case AccountKept():
             robot.sent_to, robot.received_from = totals(fact.sent_to), totals(fact.received_from)
+        case CameraDoubted():
+            robot.camera[fact.doubt] = fact
         case AgentDied():
             robot.end, robot.leader, robot.neighbours = "died", None, set()
         case AgentStopped():
@@ -226,6 +230,7 @@ def robot_view(name: str, robot: RobotState, now_s: float | None, server: bool) 
         map_frame=robot.map_frame,
         keyframes=len(robot.positions_odom_m),
         candidates=robot.candidates,
+        camera=list(robot.camera.values()),
         accepted=robot.accepted,
         rejected=robot.rejected,
         sent=dict(sorted(robot.sent.items())),

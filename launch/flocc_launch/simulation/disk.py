@@ -86,6 +86,11 @@ class Disk:
             oldest = next(iter(self.latents))
             self.latent_bytes -= len(self.latents.pop(oldest))
 
+    def replace_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
+        """Keep another latent in the place of one that is there."""
+        self.latent_bytes += len(latent) - len(self.latents[keyframe])
+        self.latents[keyframe] = latent
+
     def latent(self, keyframe: KeyframeId) -> bytes | None:
         """A latent of its own, or of the map."""
         data = self.latents.get(keyframe)

@@ -30,7 +30,7 @@ from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, ev
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
 from flocc_agent.perception.multiview.three_view import three_view
-from flocc_agent.perception.multiview.two_view import TwoView, two_view
+from flocc_agent.perception.multiview.two_view import TwoView, tilt_of, two_view
 from flocc_agent.perception.multiview.view_parameters import Geometry, Indices, LocalFeatures, Matched
 from flocc_agent.perception.watch.seen_motion import STAYS_MAX_PX, Flow, flow_of, moves_with_the_scene
 from flocc_agent.stages import stage
@@ -53,6 +53,10 @@ Result = Registration | RegistrationFailed
 AMONG_PX = 40.0
 AMONG_MIN = 3
 """A feature with so many that move with the camera within that many pixels moves with it, too."""
+SHARED_STAY_MIN = 30
+"""So many matches that stay at their pixel are one overlay on both cameras; 256 pairs of five places had 10 at most."""
+SHARED_AMONG_PX = 60.0
+"""What changes on such an overlay is looked for farther around: neither robot's own pictures have shown it yet."""
 NOTHING = np.zeros(0, np.intp)
 
 
@@ -91,7 +95,7 @@ class PairRegistrar(Generic[F]):
         self._match = match
         self._geometry = geometry
         self._acceptance = acceptance
-        self._own_pairs: OrderedDict[str, OwnPair] = OrderedDict()
+        self._own_pairs: OrderedDict[tuple[str, int, int], OwnPair] = OrderedDict()
         self._lock = threading.Lock()
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Result:
@@ -118,13 +122,13 @@ class PairRegistrar(Generic[F]):
         with stage("decode"):
             query_features, match_features = self._read(query), self._read(match)
         with stage("match"):
-            own = self._own_pair(query_features, odometry)
+            own = self._own_pair(query, query_features, odometry)
             loop_pair = self._loop_pair(query_features, match_features, own.hidden[0])
         with stage("pose"):
             result = self._posed(query_features, loop_pair, own.pair, odometry)
         if isinstance(result, RegistrationFailed):
             return result, None
-        evidence = evidence_of(result)
+        evidence = evidence_of(result, tilt_of(query_features, match_features, self._geometry))
         rule = self._acceptance
         if odometry is not None and (always or (rule is not None and rule.needs_neighbour(evidence))):
             with stage("match"):
@@ -185,17 +189,18 @@ class PairRegistrar(Generic[F]):
             return RegistrationFailed(RegistrationFailure.DEGENERATE, reason, *counts)
         return registration(loop_pair.refined, 0, counts, None)
 
-    def _own_pair(self, query: F, odometry: OdometryPair | None) -> OwnPair:
-        """Verify the odometry pair, or look it up."""
+    def _own_pair(self, latent: bytes, query: F, odometry: OdometryPair | None) -> OwnPair:
+        """Verify the odometry pair, or look it up; a latent may have lost features since."""
         if odometry is None:
             return OwnPair()
+        key = odometry.key, hash(latent), hash(odometry.latent)
         with self._lock:
-            known = self._own_pairs.get(odometry.key)
+            known = self._own_pairs.get(key)
         if known is not None:
             return known
         own = self._verified(query, self._read(odometry.latent), odometry.T_neighbour_query)
         with self._lock:
-            self._own_pairs[odometry.key] = own
+            self._own_pairs[key] = own
             while len(self._own_pairs) > ODOMETRY_PAIRS_MAX:
                 self._own_pairs.popitem(last=False)
         return own
@@ -220,20 +225,27 @@ class PairRegistrar(Generic[F]):
         return OwnPair(two_view(query, neighbour, scene, self._geometry, prior), hidden)
 
 
-def features_among(features: LocalFeatures, those: Indices) -> Indices:
+def features_among(features: LocalFeatures, those: Indices, radius_px: float = AMONG_PX) -> Indices:
     """All features that have several of those close by: what changes on an overlay lies among what does not."""
     if len(those) < AMONG_MIN:
         return those
     points = features.points * np.float32(features.focal_px)
     squares = (points**2).sum(axis=1)
     distances = squares[:, None] - 2.0 * points @ points[those].T + squares[those]
-    return np.union1d(those, np.flatnonzero((distances < AMONG_PX**2).sum(axis=1) >= AMONG_MIN))
+    return np.union1d(those, np.flatnonzero((distances < radius_px**2).sum(axis=1) >= AMONG_MIN))
 
 
 def without_overlay(first: LocalFeatures, second: LocalFeatures, matched: Matched) -> Matched:
-    """Matches that do not stay at their pixel: what does, in pictures from two places, is on both cameras' lenses."""
+    """Matches that do not stay at their pixel: what does, in pictures from two places, is on both cameras' lenses.
+
+    Where many do, both show one thing, such as a burnt-in clock, and what lies among them goes as well.
+    """
     moved = first.points[matched[0]] - second.points[matched[1]]
     moves = np.linalg.norm(moved, axis=1) * first.focal_px > STAYS_MAX_PX
+    stay = matched[0][~moves], matched[1][~moves]
+    if len(stay[0]) >= SHARED_STAY_MIN:
+        for features, of_pair, staying in zip((first, second), matched, stay, strict=True):
+            moves &= ~np.isin(of_pair, features_among(features, staying, SHARED_AMONG_PX))
     return matched[0][moves], matched[1][moves]
 
 
