@@ -3,9 +3,10 @@
 import pytest
 
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
-from flocc_launch.simulation.campaign import Campaign, SeedOutcome, campaign, prepared, shrink
+from flocc_launch.simulation.campaign import Campaign, SeedOutcome, campaign, prepared, run_checked, shrink
 from flocc_launch.simulation.coverage import table
 from flocc_launch.simulation.generator import FAMILIES, FAULTS_END_S, calm_s, drawn_scenario
+from flocc_launch.simulation.hardships import CLOCK_STEP_MAX_S, Hardship, HardshipKind, drawn_hardships
 from flocc_launch.simulation.invariants import Violation
 
 
@@ -63,6 +64,19 @@ def test_a_campaign_tells_which_messages_arrived_during_which_faults() -> None:
     assert any(row.startswith("heartbeat") for row in rows)
     cell = {"message": "heartbeat", "fault": "mute", "count": coverage["heartbeat", "mute"]}
     assert cell in found.as_json()["coverage"]  # type: ignore[operator]
+
+
+def test_clocks_step_by_up_to_two_hours_in_a_tenth_of_the_seeds() -> None:
+    drawn = [each for seed in range(500) for each in drawn_hardships(seed, ["r1", "r2"], FAULTS_END_S)]
+    steps_s = [each.number for each in drawn if each.kind is HardshipKind.CLOCK]
+    assert 30 < len(steps_s) < 70
+    assert min(steps_s) < 60
+    assert CLOCK_STEP_MAX_S / 2 < max(steps_s) <= CLOCK_STEP_MAX_S
+
+
+def test_a_robot_whose_clock_stepped_registers_no_pair_again() -> None:
+    step = Hardship(HardshipKind.CLOCK, "r3", 10.866, 27.024, 439)
+    assert run_checked(drawn_scenario(99600047), [step]).violations == ()
 
 
 def test_a_large_family_has_20_robots_and_ten_minutes_with_faults_to_their_end() -> None:

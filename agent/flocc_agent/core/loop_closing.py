@@ -34,6 +34,8 @@ from flocc_protocol.messages import CandidateOffer, CandidatePair
 
 REGISTRATION_TIMEOUT_S = 120.0
 """A registration that gave no answer for this long is tried again; networks on a CPU need much of it."""
+ASLEEP_S = 10.0
+"""A robot that was not woken for so long slept, and so did its workers: registrations have so much more time."""
 UNLIKELY_AT_ONCE_MAX = 16
 """Pairs that are refused unseen in one step: each is a record, and a burst of them would hold up others."""
 
@@ -94,6 +96,7 @@ class LoopClosing:
         self._turn = -1
         self._changed = True
         self._due_s = float("inf")
+        self._ticked_s = float("inf")
 
     @property
     def load(self) -> int:
@@ -308,6 +311,9 @@ class LoopClosing:
 
     def tick(self, now: float) -> list[Effect]:
         """Do whatever can be done now: offers, fetches, registrations."""
+        if now - self._ticked_s > ASLEEP_S:
+            self._work.wait_longer(now - self._ticked_s)
+        self._ticked_s = now
         if not self._changed and now < self._due_s:
             return []
         self._give_up(now)

@@ -205,6 +205,11 @@ class WorkTable:
         """Registrations that gave no answer in time."""
         return [pair for pair in self._registering if self._until_s(pair) <= now]
 
+    def wait_longer(self, by_s: float) -> None:
+        """Registrations under way may take so much longer."""
+        for pair in self._registering:
+            self._by_pair[pair].registering_until_s = self._until_s(pair) + by_s
+
     def due_s(self) -> float:
         """When a registration is given up."""
         return min(map(self._until_s, self._registering), default=float("inf"))

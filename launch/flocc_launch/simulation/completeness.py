@@ -1,7 +1,7 @@
 """Complete: nothing that should be found, registered or solved is left out."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -81,8 +81,9 @@ class Complete:
         known = {
             log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
         }
-        resolved = resolved_pairs(logs)
-        told = closures_by_logs(logs)
+        copies = _all_copies(swarm, group)
+        resolved = resolved_pairs(copies)
+        told = closures_by_logs(copies)
         partnered = {(end, pair.other(end).log) for pair in resolved for end in (pair.low, pair.high)}
         came_back = {station.log for station in group if station.life > 1}
         for one, other in combinations(known, 2):
@@ -123,16 +124,26 @@ def _alike(one: Described, other: Described, threshold: float) -> Iterator[Candi
             yield CandidatePair.of(KeyframeId(low, lefts[i]), KeyframeId(high, rights[j]))
 
 
-def resolved_pairs(logs: dict[LogId, LogCopy]) -> set[CandidatePair]:
+def _all_copies(swarm: Swarm, group: list[Station]) -> list[LogCopy]:
+    """Of each log the copy of one robot; of those of which two versions were seen the copies of all."""
+    return [
+        copy
+        for station in group
+        for log, copy in core(station).gossip.logs.items()
+        if station is group[0] or log in swarm.forked
+    ]
+
+
+def resolved_pairs(logs: Iterable[LogCopy]) -> set[CandidatePair]:
     """Pairs of which some log has a record."""
-    records = (record for copy in logs.values() for record in copy.other_records())
+    records = (record for copy in logs for record in copy.other_records())
     return {CandidatePair.of(r.query, r.match) for r in records if isinstance(r, ClosureRecord | RejectionRecord)}
 
 
-def closures_by_logs(logs: dict[LogId, LogCopy]) -> dict[tuple[LogId, LogId], set[CandidatePair]]:
+def closures_by_logs(logs: Iterable[LogCopy]) -> dict[tuple[LogId, LogId], set[CandidatePair]]:
     """Closures by the two logs that they join."""
     found: dict[tuple[LogId, LogId], set[CandidatePair]] = defaultdict(set)
-    for record in (record for copy in logs.values() for record in copy.other_records()):
+    for record in (record for copy in logs for record in copy.other_records()):
         if isinstance(record, ClosureRecord):
             pair = CandidatePair.of(record.query, record.match)
             found[pair.low.log, pair.high.log].add(pair)
@@ -147,7 +158,7 @@ def _closures_beside(closures: dict[tuple[LogId, LogId], set[CandidatePair]], pa
 
 def _spared_too_early(station: Station, pair: CandidatePair) -> Iterator[str]:
     held = core(station)
-    beside, enough = _closures_beside(closures_by_logs(held.gossip.logs), pair), held.closures_enough
+    beside, enough = _closures_beside(closures_by_logs(held.gossip.logs.values()), pair), held.closures_enough
     if not enough or beside < enough:
         yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
 

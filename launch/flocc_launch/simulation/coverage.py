@@ -17,7 +17,7 @@ AFTERMATH_S = 10.0
 PEACE = "peace"
 LASTING = (FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.LOSS, FaultKind.MUTE, FaultKind.SLOW)
 HEALED = (FaultKind.PARTITION, FaultKind.BLACKOUT)
-POINTS = (HardshipKind.OLDER, HardshipKind.FLIPPED, HardshipKind.TORN)
+POINTS = (HardshipKind.OLDER, HardshipKind.FLIPPED, HardshipKind.TORN, HardshipKind.CLOCK)
 
 Coverage = Mapping[tuple[str, str], int]
 """(message kind, what was wrong) -> messages that arrived."""

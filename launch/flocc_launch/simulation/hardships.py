@@ -4,6 +4,7 @@ They are drawn by the seed as the faults are, and end with them. Of a disk that 
 robots can know: the robot then ends its log and begins another one, as `flocc agent` does.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -16,7 +17,8 @@ from flocc_launch.simulation.swarm import Swarm
 HARDSHIPS_MAX = 2
 RATIO = 0.5
 """Share of the seeds that have some."""
-TWIN_RATIO, LIAR_RATIO = 0.15, 0.1
+TWIN_RATIO, LIAR_RATIO, CLOCK_RATIO = 0.15, 0.1, 0.1
+CLOCK_STEP_MAX_S = 7200
 
 
 class HardshipKind(StrEnum):
@@ -29,6 +31,7 @@ class HardshipKind(StrEnum):
     TORN = "power cut"
     TWIN = "second robot of its name"
     LIAR = "a leader that lies"
+    CLOCK = "a clock that steps"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +43,7 @@ class Hardship:
         robot: To whom.
         from_s: When it begins; an older copy is made then.
         to_s: When it ends; an older copy takes the disk's place then.
-        number: Which record, or how slow in milliseconds.
+        number: Which record, how slow in milliseconds, or by how many seconds a clock steps.
     """
 
     kind: HardshipKind
@@ -62,11 +65,17 @@ def drawn_hardships(seed: int, names: Sequence[str], end_s: float) -> tuple[Hard
     if rng.uniform() < LIAR_RATIO:
         from_s, to_s = _times(rng, end_s)
         drawn.append(Hardship(HardshipKind.LIAR, str(rng.choice(names)), from_s, to_s))
+    rng = np.random.default_rng([seed, 6])
+    if rng.uniform() < CLOCK_RATIO:
+        from_s, to_s = _times(rng, end_s)
+        step_s = round(math.exp(rng.uniform(0.0, math.log(CLOCK_STEP_MAX_S))))
+        drawn.append(Hardship(HardshipKind.CLOCK, str(rng.choice(names)), from_s, to_s, step_s))
     return tuple(sorted(drawn, key=lambda hardship: hardship.from_s))
 
 
 def _drawn(rng: np.random.Generator, names: Sequence[str], end_s: float) -> Hardship:
-    kinds = [kind for kind in HardshipKind if kind not in (HardshipKind.TWIN, HardshipKind.LIAR)]
+    apart = (HardshipKind.TWIN, HardshipKind.LIAR, HardshipKind.CLOCK)
+    kinds = [kind for kind in HardshipKind if kind not in apart]
     kind = kinds[int(rng.integers(len(kinds)))]
     from_s, to_s = _times(rng, end_s)
     return Hardship(kind, str(rng.choice(names)), from_s, to_s, int(rng.integers(20, 600)))
@@ -108,5 +117,7 @@ def _enter(swarm: Swarm, hardship: Hardship) -> None:
         case HardshipKind.LIAR:
             swarm.agenda.at(hardship.from_s, lambda: setattr(station, "lies", True))
             at(hardship.to_s, "mend")
+        case HardshipKind.CLOCK:
+            swarm.agenda.at(hardship.to_s, lambda: station.step_clock(float(hardship.number)))
         case _:
             assert_never(hardship.kind)

@@ -217,6 +217,13 @@ class Station:
 
         self._agenda.at(time_s, happen)
 
+    def step_clock(self, by_s: float) -> None:
+        """The robot's clock shows a later time from now on: its computer slept."""
+        self.clock = replace(self.clock, offset_s=self.clock.offset_s + by_s)
+        self._due_s = float("inf")
+        self._tick_s = self._agenda.now_s
+        self._agenda.at(self._agenda.now_s, self._tick)
+
     def _tick(self) -> None:
         """Wake up; deadlines that moved on since are waited for again."""
         self._tick_s = self._due_s = float("inf")

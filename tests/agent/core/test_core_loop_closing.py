@@ -229,7 +229,18 @@ def test_a_registration_without_an_answer_is_tried_again() -> None:
     hold_all(machine, pair)
     machine.tick(0.0)
     assert machine.deadline() == REGISTRATION_TIMEOUT_S
+    for second in range(5, int(REGISTRATION_TIMEOUT_S), 5):
+        assert machine.tick(float(second)) == []
     assert [type(e) for e in machine.tick(REGISTRATION_TIMEOUT_S)] == [Register]
+
+
+def test_a_robot_that_slept_waits_for_the_registrations_that_slept_with_it() -> None:
+    machine, pair = closing(), pair_of(R1)
+    found(machine, pair)
+    hold_all(machine, pair)
+    machine.tick(0.0)
+    assert machine.tick(5.0 + 3600.0) == []
+    assert machine.deadline() == REGISTRATION_TIMEOUT_S + 3605.0
 
 
 def test_the_least_similar_candidates_are_dropped_beyond_the_maximum() -> None:
