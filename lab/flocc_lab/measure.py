@@ -15,6 +15,7 @@ import resource
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
@@ -50,9 +51,12 @@ def gossip(dimension: int = 512) -> dict[str, Any]:
     return {"keyframes": keyframes, "bytes_per_keyframe_and_neighbour": round(received / keyframes / neighbours, 1)}
 
 
-def scale(robots: int, minutes: float, area_m: float = 120.0) -> dict[str, Any]:
+def scale(robots: int, minutes: float, area_m: float = 120.0, closures_enough: int | None = None) -> dict[str, Any]:
     """A large swarm in a town, radio range 25 m: CPU time of the simulation on one core, bytes by kind, memory."""
     scenario = _scenario(robots=robots, area_m=area_m, length_m=42.0 * minutes, range_m=25.0, distance_m=2.0)
+    if closures_enough is not None:
+        closing = replace(scenario.core.loop_closing, closures_enough=closures_enough)
+        scenario = scenario.model_copy(update={"core": replace(scenario.core, loop_closing=closing)})
     began_s = time.process_time()
     playbacks = playbacks_of(scenario, {})
     drawn_s = time.process_time()
@@ -140,6 +144,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--area-m", type=float, default=120.0)
+    parser.add_argument("--closures-enough", type=int, help="agreeing closures of two stretches; 0: register all pairs")
     parser.add_argument("--seeds", type=int, default=200)
     given = parser.parse_args()
     match given.what:
@@ -150,7 +155,7 @@ def main() -> None:
         case "twice":
             measured = twice(given.seeds)
         case _:
-            measured = scale(given.robots, given.minutes, given.area_m)
+            measured = scale(given.robots, given.minutes, given.area_m, given.closures_enough)
     sys.stdout.write(json.dumps({**measured, "command": " ".join(sys.argv[1:])}) + "\n")
 
 

@@ -73,7 +73,7 @@ def _run(robots: int, minutes: float, held: int) -> dict[str, Any]:
         "closures": len(graph.closures),
         "descriptors_held_most": max(core.recognition.rows for core in cores),
         "cpu_quarters_s": quarters,
-        "ate_m": _ate_m(swarm, graph),
+        "ate_m": leader_ate_m(swarm, graph),
         "ends": _ends(swarm, graph),
         "old": _old(swarm, graph),
     }
@@ -132,7 +132,7 @@ def _recall(old: list[Ends], found: list[Ends]) -> float:
     return again / max(len(old), 1)
 
 
-def _ate_m(swarm: Swarm, graph: PoseGraph) -> float:
+def leader_ate_m(swarm: Swarm, graph: PoseGraph) -> float:
     """Joint error of one solve over a graph, of its largest component."""
     solution = optimise(graph, BackendConfig())
     assert isinstance(solution, GraphSolution)

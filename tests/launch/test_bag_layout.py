@@ -68,11 +68,11 @@ def test_odometry_may_be_transforms_alone(tmp_path: Path) -> None:
         convert(bag, tmp_path / "other", odometry_topic="/tf:odom.base")
 
 
-def team() -> BagScript:
-    """Two robots with cameras, intrinsics and odometry under their namespaces."""
+def team(frames: tuple[str, str] | None = None) -> BagScript:
+    """Two robots with cameras, intrinsics and odometry under their namespaces; frames of image and odometry."""
     script = BagScript(False)
     for number, name in enumerate(("Alpha", "bob_2")):
-        script.frame, script.child = f"{name}/camera", f"{name}/camera"
+        script.frame, script.child = frames or (f"{name}/camera", f"{name}/camera")
         script.camera_info(f"/{name}/cam/camera_info", ZERO_NS)
         for k in range(4):
             script.odometry(f"/{name}/odom", ZERO_NS + k * S, float(10 * number + k))
@@ -80,6 +80,11 @@ def team() -> BagScript:
             script.raw(f"/{name}/depth/image", ZERO_NS + k * S, np.zeros((4, 4), np.uint16), "16UC1")
     script.messages.sort(key=lambda message: message[2])
     return script
+
+
+def test_what_is_so_for_all_robots_of_a_bag_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    convert(team(("camera", "body")).write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert re.findall(r"nothing says where the camera .* if not(.*)", caplog.text) == [" (so for 2 robots)"]
 
 
 def test_a_bag_of_two_robots_becomes_two_recordings(tmp_path: Path) -> None:
@@ -185,15 +190,73 @@ def test_images_of_one_robot_do_not_get_the_odometry_of_another(
 
 
 def test_a_body_that_odometry_does_not_name_is_found_on_tf_or_refused(tmp_path: Path) -> None:
-    script = mounted(robot_of(BagScript(False), "/cam/image_raw", "/odom", 0.0, ("camera", "")))
+    script = mounted(robot_of(BagScript(False), "/cam/image_raw", "/odom", 0.0, ("camera", "")), "imu")
     with pytest.raises(
         DatasetError, match=r"the camera \(camera\) sits on housing, but /odom does not say which frame"
     ):
         convert(script.write(tmp_path / "unnamed", "mcap"), tmp_path / "out")
-    for frame in ("odom", "body"):
+    for frame in ("odom", "imu"):
         script.transform("/tf", ZERO_NS, ("camera" if frame == "odom" else "odom", frame))
     bag = script.write(tmp_path / "run", "mcap")
     assert Recording.open(convert(bag, tmp_path / "found")).T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
+
+
+def test_poses_that_name_no_body_move_the_frame_on_which_the_camera_sits(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    script = robot_of(BagScript(False), "/cam/image_raw", "/vio/pose", 0.0, ("camera", ""))
+    script.transform("/tf_static", ZERO_NS, ("base_link", "mast"), (0.2, 0.0, 0.0))
+    script.transform("/tf_static", ZERO_NS, ("mast", "camera"), (0.0, 0.0, 0.3))
+    found = Recording.open(convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out"))
+    assert found.T_body_camera[:3, 3] == pytest.approx([0.2, 0.0, 0.3])
+    assert "/vio/pose does not say which frame it moves; base_link is taken" in caplog.text
+
+
+def test_a_camera_files_time_shift_moves_a_bags_pictures(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    script = BagScript(False)
+    for k in range(8):
+        script.compressed("/cam/image_raw", ZERO_NS + k * 10**8, 20 * k)
+        script.camera_info("/cam/camera_info", ZERO_NS + k * 10**8)
+        script.odometry("/odom", ZERO_NS + k * 10**8 + 10**6, 0.1 * k)
+    chain = tmp_path / "camchain.yaml"
+    chain.write_text(
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [31, 31, 16, 12]\n  resolution: [32, 24]\n"
+        "  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n  timeshift_cam_imu: 0.05\n"
+    )
+    bag = script.write(tmp_path / "run", "mcap")
+    found = Recording.open(convert(bag, tmp_path / "out", camera=chain))
+    assert found.frames[1].stamp_s == pytest.approx(ZERO_NS * 1e-9 + 0.15, abs=1e-6)
+    assert "timeshift_cam_imu is +0.05 s (t_imu = t_cam + shift), and was added" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("topic", "named"), [("/thermal/image_raw", False), ("/boson/image_raw", False), ("/cam/image_raw", True)]
+)
+def test_a_thermal_cameras_16uc1_is_grey(tmp_path: Path, topic: str, named: bool) -> None:
+    script = BagScript(False)
+    for k in range(6):
+        pixels = np.linspace(3000, 9000, 32 * 24).reshape(24, 32).astype(np.uint16)
+        script.raw(topic, ZERO_NS + k * 10**8, pixels, "16UC1")
+        script.camera_info(f"{topic.rpartition('/')[0]}/camera_info", ZERO_NS + k * 10**8)
+        script.odometry("/odom", ZERO_NS + k * 10**8, 0.1 * k)
+    bag = script.write(tmp_path / "run", "mcap")
+    if named:
+        with pytest.raises(DatasetError, match=r"hold depth, no pictures: .* --image-topic if it is of a thermal"):
+            convert(bag, tmp_path / "unnamed")
+    found = Recording.open(convert(bag, tmp_path / "out", image_topic=topic if named else None))
+    assert len(found.frames) == 6
+    shown = found.load_image(found.frames[0]).pixels
+    assert shown[0, 0, 0] < shown[-1, -1, 0]
+
+
+def test_a_depth_topic_is_no_picture_even_where_it_is_named(tmp_path: Path) -> None:
+    script = BagScript(False)
+    for k in range(6):
+        script.raw("/depth/image_raw", ZERO_NS + k * 10**8, np.full((24, 32), 900, np.uint16), "16UC1")
+        script.camera_info("/depth/camera_info", ZERO_NS + k * 10**8)
+        script.odometry("/odom", ZERO_NS + k * 10**8, 0.1 * k)
+    with pytest.raises(DatasetError, match="how depth is published"):
+        convert(script.write(tmp_path / "run", "mcap"), tmp_path / "out", image_topic="/depth/image_raw")
 
 
 def test_a_mounting_that_static_transforms_give_twice_is_refused(tmp_path: Path) -> None:

@@ -673,3 +673,112 @@ def test_a_matrix_that_is_not_finite_is_not_taken_for_two(tmp_path: Path) -> Non
     (tmp_path / "transforms.json").write_text(json.dumps(table))
     with pytest.raises(FloccError, match=r"a\.png: the pose has a number that is not finite"):
         read_source(tmp_path)
+
+
+CHAIN = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [30.0, 30.0, 16.0, 12.0]
+  resolution: [32, 24]
+  timeshift_cam_imu: 0.125
+"""
+
+
+@pytest.mark.parametrize("clock", ["of the body", "of the pictures", "by order"])
+def test_kalibrs_time_shift_is_added_to_pictures_where_poses_are_of_the_bodys_clock(tmp_path: Path, clock: str) -> None:
+    path = write_plain(tmp_path / "p")
+    (path / "camera.toml").unlink()
+    (path / "camera.yaml").write_text(CHAIN)
+    stamps_s = np.arange(99.5, 104.0, 0.05) + 0.01
+    if clock == "of the body":
+        poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
+        poses[:, 0, 3] = stamps_s
+        write_tum(path / "groundtruth.tum", Trajectory(stamps_s, poses))
+    elif clock == "by order":
+        for k, file in enumerate(sorted((path / "images").iterdir())):
+            file.rename(path / "images" / f"{k:04d}.png")
+    found = read_source(path)
+    told = [note for note in found.notes if "timeshift_cam_imu is +0.125 s (t_imu = t_cam + shift)" in note]
+    assert len(told) == 1
+    shifted = clock == "of the body"
+    assert found.images[1][0] == pytest.approx(100.625 if shifted else 100.5)
+    assert ("was not added" in told[0]) is not shifted
+    convert(path, tmp_path / "out")
+    back = Recording.open(tmp_path / "out")
+    assert back.frames[1].stamp_s == pytest.approx(100.625 if shifted else 100.5)
+    if shifted:
+        assert back.frames[1].T_odom_body[0, 3] == pytest.approx(100.625 - stamps_s[0], abs=1e-6)
+
+
+def test_a_mask_is_straightened_with_its_pictures(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    (path / "camera.toml").write_text(
+        "[camera]\nwidth = 32\nheight = 24\nfx = 14.0\nfy = 14.0\ncx = 15.5\ncy = 11.5\nmodel = 'equidistant'\n"
+        "distortion = [0.01, 0.0, 0.0, 0.0]\n"
+    )
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[:6] = 0
+    cv2.imwrite(str(path / "mask.png"), mask)
+    back = Recording.open(convert(path, tmp_path / "out"))
+    assert back.hidden is not None
+    assert back.hidden.shape == (back.camera.height, back.camera.width)
+    assert back.hidden[0].any()
+    assert not back.hidden[-1].any()
+
+
+def phone_folder(path: Path, images: str, trajectory: str, names: str = "IMG_{:04d}.png") -> Path:
+    for k in range(6):
+        write_image(path / images / names.format(k), 10 * k)
+    write_tum(path / trajectory, Trajectory(np.linspace(100.0, 102.5, 6), moving(6)))
+    write_camera(path / "camera.toml", CAMERA, np.eye(4))
+    return path
+
+
+@pytest.mark.parametrize("images", ["DCIM/Camera", "DCIM/100ANDRO", "photos", "Pictures", "Frames", "RGB"])
+def test_folders_as_a_phone_copies_them_are_plain_ones(tmp_path: Path, images: str) -> None:
+    found = read_source(phone_folder(tmp_path / "p", images, "odometry.tum"))
+    assert [stamp_s for stamp_s, _ in found.images] == [100.0, 100.5, 101.0, 101.5, 102.0, 102.5]
+    assert found.odometry is not None
+
+
+@pytest.mark.parametrize("name", ["arcore_poses.txt", "ARKit_poses.txt", "ARposes.txt"])
+def test_a_phones_axes_are_said_or_asked_for(tmp_path: Path, name: str) -> None:
+    path = phone_folder(tmp_path / "p", "DCIM/Camera", name)
+    with pytest.raises(DatasetError, match=r"y points up and z backwards; write T_body_camera = \[\[1, 0, 0, 0\]"):
+        read_source(path)
+    write_camera(path / "camera.toml", CAMERA, np.diag([1.0, -1.0, -1.0, 1.0]))
+    assert read_source(path).odometry is not None
+
+
+@pytest.mark.parametrize(
+    "form", ["{s:.6f}", "{ns}", "{k:05d} {s:.6f} 0.02", "{s:.6f},{k}.png", "{k}.png {s:.6f}", "{k},{ns}"]
+)
+@pytest.mark.parametrize("name", ["times.txt", "timestamps.txt"])
+def test_images_that_only_count_take_the_stamps_of_times(tmp_path: Path, form: str, name: str) -> None:
+    path = phone_folder(tmp_path / "p", "images", "odometry.tum", "{}.png")
+    zero_s = 1_700_000_000
+    lines = [form.format(k=k, s=zero_s + 0.2 * k, ns=zero_s * 10**9 + k * 2 * 10**8) for k in range(6)]
+    (path / name).write_text("\n".join(lines) + "\n")
+    stamps_s = np.linspace(zero_s, zero_s + 1.45, 30)
+    write_tum(path / "odometry.tum", Trajectory(stamps_s, np.tile(np.eye(4), (30, 1, 1))))
+    found = read_source(path)
+    assert [stamp_s for stamp_s, _ in found.images] == pytest.approx([zero_s + 0.2 * k for k in range(6)], abs=1e-6)
+    assert any(f"{name} gives them" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (["0.1", "0.2"], "has 2 stamps, but .* has 6 images"),
+        (["0", "1", "2", "3", "4", "5"], "stamps can be seconds"),
+        (["0.5", "0.4", "0.6", "0.7", "0.8", "0.9"], "time goes backwards"),
+        ([f"{7 * k} {0.2 * k}" for k in range(6)], "its lines must be stamps"),
+        (["a", "b", "c", "d", "e", "f"], "stamps"),
+    ],
+)
+def test_times_that_are_none_are_refused(tmp_path: Path, lines: list[str], said: str) -> None:
+    path = phone_folder(tmp_path / "p", "images", "odometry.tum", "{}.png")
+    (path / "times.txt").write_text("\n".join(lines) + "\n")
+    with pytest.raises(DatasetError, match=said):
+        read_source(path)

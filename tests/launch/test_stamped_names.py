@@ -127,3 +127,23 @@ def test_names_that_hold_one_camera_or_words_like_it_are_read() -> None:
     for form in ("{}_left", "cam0_{}", "leftover_{}_camera12345"):
         names = [form.format(1_700_000_000_100 + 100 * k) for k in range(3)]
         assert stamps_of_names(names, "folder")[0] == pytest.approx([1_700_000_000.1 + 0.1 * k for k in range(3)])
+
+
+def test_a_date_that_is_the_same_in_all_names_says_nothing() -> None:
+    names = [f"n015-2018-07-24-11-22-45+0800__CAM_FRONT__{1532402927612460 + k * 500000}" for k in range(4)]
+    found, how = stamps_of_names(names, "images")
+    assert found == pytest.approx([1532402927.61246 + 0.5 * k for k in range(4)])
+    assert how == "microseconds"
+    counted = [f"IMG_20231114_221320_00_{k:03d}" for k in range(4)]
+    assert stamps_of_names(counted, "images")[0] is None
+
+
+def test_a_screenshots_date_is_read() -> None:
+    names = [f"Screenshot 2023-11-14 at 10.13.2{k} PM" for k in range(3)]
+    assert stamps_of_names(names, "images")[0] == [1700000000.0, 1700000001.0, 1700000002.0]
+
+
+def test_colour_and_infrared_in_one_folder_are_two_cameras() -> None:
+    names = [f"{1700000000 + 0.5 * k:.2f}_{'rgb' if k % 2 else 'ir'}" for k in range(6)]
+    with pytest.raises(DatasetError, match=r"names are of several cameras \(ir, rgb\)"):
+        stamps_of_names(names, "images")

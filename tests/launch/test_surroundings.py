@@ -34,7 +34,7 @@ from flocc_launch.datasets import writer
 from flocc_launch.doctor.installation import surroundings
 from flocc_launch.setup import cache
 from flocc_launch.setup.cache import CacheError, cache_folder
-from flocc_launch.setup.world_faults import sentence_of
+from flocc_launch.setup.world_faults import sentence_of, speak_utf8
 from flocc_launch.swarm import agent_process
 from flocc_launch.swarm.agent_process import LOOK_PERIOD_S, RETRY_S, Lines
 from flocc_protocol.errors import FloccError
@@ -379,3 +379,14 @@ def test_a_text_is_no_checkpoint(
     (tmp_path / "agent.toml").write_text('robot = "r1"\n')
     assert run(monkeypatch, "weights", "check", str(tmp_path / "agent.toml")) == 2
     assert "is truncated, damaged or no torch checkpoint" in capsys.readouterr().err
+
+
+def test_a_python_that_cannot_be_started_anew_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "ascii")
+    monkeypatch.setattr(os, "execv", denied)
+    monkeypatch.setenv("PYTHONUTF8", "0")
+    if not sys.flags.utf8_mode:
+        speak_utf8()

@@ -34,6 +34,7 @@ from flocc_agent.core.pulls import Pulls
 from flocc_agent.core.reports import LogForked
 from flocc_agent.core.robot import Robot
 from flocc_agent.core.rounds import Rounds
+from flocc_agent.core.spared import Spared
 from flocc_agent.geometry import inverse, pose, pose7, pose_from_tq
 from flocc_launch.simulation.campaign import run_seed
 from flocc_protocol.arrays import Array
@@ -326,6 +327,10 @@ def _takes_all_for_refused(original: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, pair, **_: original(self, pair, is_closure=False)
 
 
+def _has_enough_with_two(original: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, held, _: original(self, held, 2)
+
+
 def _lets_nothing_go(_: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, owner, number: self._warm.append((owner, number))
 
@@ -402,6 +407,9 @@ MUTANTS = (
     Mutant("all pairs are unlikely", Prospects, "_is_unlikely", always(True)),
     Mutant("unlikely pairs wait for ever", Prospects, "of", always(Prospect.HELD)),
     Mutant("what was judged is taken for refused", Prospects, "on_judged", _takes_all_for_refused),
+    # spared pairs
+    Mutant("all pairs tell nothing new", Spared, "is_told", always(True)),
+    Mutant("two closures are enough", Spared, "__init__", _has_enough_with_two),
     # logs in pieces
     Mutant("a block gives its next record", _Block, "record", _gives_the_next_record, in_pieces=True),
     Mutant(

@@ -24,7 +24,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-CHAINED_POSES_MIN = 2000
+CHAINED_POSES_MIN = 300
 """Smaller components are solved as they are: they take no time."""
 KEPT_RATIO_MAX = 0.7
 """Where more of the keyframes than this would stay, nothing is gained."""

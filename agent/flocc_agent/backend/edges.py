@@ -19,11 +19,12 @@ Where nothing is known of a closure's unit its uncertainty is known in that unit
 however long. In metres such an edge costs less the nearer its poses are, and many of them shrink the map. At the end it
 is told by its angle theta instead, with `q = R_hat^T p` and u its whitened direction,
 
-    e_t = 2 sin(theta / 2) |L d| n |q| / sqrt(|q|^2 + NEAR_M^2) + (|q| / |d| - 1) / sigma * u,   n across u:
+    e_t = (2 sin(theta / 2) |L d| n + (|q| / |d| - 1) / sigma * u) |q| / sqrt(|q|^2 + NEAR_M^2),   n across u:
 
 the chord grows up to half a turn, so that there is a way back from the side, where a sine's slope is zero; poses that
-coincide have no direction, so that what is nearer than `NEAR_M` counts in metres; lengths have a wide prior. The search
-is made in metres at a length that is fitted to neighbours, where scales may pass through zero (`residuals`, `hold`).
+coincide have no direction, so that what is nearer than `NEAR_M` counts in metres, the wide prior on lengths, too: else
+its slope grows without bound there, and two poses that meet make the system singular. The search is made in metres at
+a length that is fitted to neighbours, where scales may pass through zero (`residuals`, `hold`).
 
 A scale is kept above `GAMMA_MIN`: an edge whose best scale lies below is held there, and pays for the distance to c.
 Updates are on the right: `R <- R Exp(omega)`, `t <- t + R v`; the tangent order is rotation, translation.
@@ -224,14 +225,16 @@ def _angles(edges: Edges, e0: Float) -> tuple[Float, Float]:
     room = np.maximum(1.0 + cosine, ROOM_MIN)
     length_m, d_m = np.maximum(np.linalg.norm(q, axis=1), TINY), np.linalg.norm(edges.d, axis=1)
     spread_m = np.sqrt(length_m**2 + NEAR_M**2)
-    chord = np.sqrt(2.0 / room) * length_m / spread_m
+    apart = length_m / spread_m
+    chord = np.sqrt(2.0 / room) * apart
     sine = (size * cosine)[:, None] * u - measured
-    prior = (length_m / d_m - 1.0) / edges.sigma
+    prior = (length_m / d_m - 1.0) / edges.sigma * apart
+    nearness_by_q = q * (NEAR_M / (length_m * spread_m))[:, None] ** 2
     e = np.einsum("eij,ej->ei", L[:, :, :3], e0[:, :3]) + chord[:, None] * sine + prior[:, None] * u
     u_by_q = (L[:, :, 3:] - u[:, :, None] * np.einsum("ei,eij->ej", u, L[:, :, 3:])[:, None, :]) / far[:, None, None]
     sideways = np.einsum("eij,ei->ej", u_by_q, measured)
-    by_length = q / (length_m * d_m * edges.sigma)[:, None] + chord[:, None] * sideways
-    by_chord = q * (NEAR_M / (length_m * spread_m))[:, None] ** 2 - (0.5 / (room * size))[:, None] * sideways
+    by_length = q / (spread_m * d_m * edges.sigma)[:, None] + prior[:, None] * nearness_by_q + chord[:, None] * sideways
+    by_chord = nearness_by_q - (0.5 / (room * size))[:, None] * sideways
     by_pose = L.copy()
     by_pose[:, :, 3:] = (chord * size * cosine + prior)[:, None, None] * u_by_q
     by_pose[:, :, 3:] += u[:, :, None] * by_length[:, None, :]

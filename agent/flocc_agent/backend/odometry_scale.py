@@ -19,7 +19,7 @@ from flocc_agent.backend.edges import State, residuals
 from flocc_agent.backend.linear import SingularSystem
 from flocc_agent.backend.mapped import SavedLog
 from flocc_agent.backend.posing import Posed
-from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, solve, solve_once
+from flocc_agent.backend.solvers import ACCEPTED_WEIGHT_MIN, continued, explains, solve, solve_once
 from flocc_agent.config import Formulation, Solver
 from flocc_agent.core.pose_graph import Component, GraphSolution, OdometryScale, is_landmark
 from flocc_protocol.ids import LogId
@@ -159,12 +159,11 @@ def scalable(posed: Posed) -> list[LogId]:
 
 
 def is_worth_another(found: SolvedWithScales) -> bool:
-    """Whether closures were rejected that a scale may explain, in a round that chose its closures anew."""
+    """Whether more closures than by chance were rejected, in a round that chose them anew: a scale may explain them."""
     config, posed = found.posed.objective.config, found.posed
-    chosen = found.solved.weights[posed.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
     robust = config.solver in (Solver.GNC_TLS, Solver.GNC_GM) and config.formulation is not Formulation.BASE
     few = posed.problem.poses <= ASKED_POSES_MAX
-    return robust and few and not posed.is_confirmed(found.solved) and not bool(np.all(chosen))
+    return robust and few and not posed.is_confirmed(found.solved) and not explains(posed.objective, found.solved)
 
 
 def settled(posed: Posed, solved: Solved) -> SolvedWithScales:

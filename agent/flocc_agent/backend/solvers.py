@@ -4,6 +4,9 @@ On the way a closure's scale may pass through zero, which is what keeps the sear
 at its bound (`edges.GAMMA_MIN`) and the rest moves to the constrained optimum.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +27,13 @@ EXPLAINED_RATIO = 100.0
 """LM looks for a better start where its first cost is so many times its degrees of freedom."""
 START_RATIOS = (1e-4, 1e-6)
 PLACEMENTS_MAX = 10
+SEARCH_TOLERANCE_RATIO = 1e-5
+"""Candidates are compared where a step lowers their cost by less than this part; only the best one goes on from there,
+as far as is configured."""
+AWAY_RATIO_MAX = 1e-3
+"""Ten times the part of right closures outside of their bounds, by chance: of fewer than a thousand none is away."""
+SAME_RATIO = 1e-3
+"""Two schedules that use the same closures, at costs that differ by less than this part, ended in one place."""
 
 
 def solve(objective: Objective, state: State, trusted: Bool | None = None, places: Places | None = None) -> Solved:
@@ -41,15 +51,34 @@ def solve(objective: Objective, state: State, trusted: Bool | None = None, place
     elif solver in (Solver.HUBER, Solver.CAUCHY):
         solved = reweighted(objective, state)
     else:
-        solved = (confirmed(objective, state, trusted) if trusted is not None else None) or best(
-            objective, state, places
+        solved = (confirmed(objective, state, trusted) if trusted is not None else None) or to_rest(
+            objective, best(searching(objective), state, places)
         )
     return held(objective, solved)
 
 
 def solve_once(objective: Objective, state: State, places: Places) -> Solved:
     """GNC by its most careful schedule alone."""
-    return held(objective, replaced(objective, scheduled(objective, state, START_RATIOS[-1]), places))
+    search = searching(objective)
+    solved = scheduled(search, state, START_RATIOS[-1])
+    if not explains(search, solved):
+        solved = replaced(search, solved, places)
+    return held(objective, to_rest(objective, solved))
+
+
+def searching(objective: Objective) -> Objective:
+    """The objective with the tolerance of searches, where a finer one is configured."""
+    config = objective.config
+    if config.relative_tolerance >= SEARCH_TOLERANCE_RATIO:
+        return objective
+    return replace(objective, config=config.model_copy(update={"relative_tolerance": SEARCH_TOLERANCE_RATIO}))
+
+
+def to_rest(objective: Objective, solved: Solved) -> Solved:
+    """Go on from where a search ended, as far as is configured; `held` does so where there are directions."""
+    if objective.config.relative_tolerance >= SEARCH_TOLERANCE_RATIO or objective.has_directions:
+        return solved
+    return selected(objective, solved.state, solved.iterations)
 
 
 def continued(objective: Objective, state: State) -> Solved:
@@ -76,12 +105,34 @@ def lowest(objective: Objective, state: State) -> Solved:
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
     """GNC by several schedules from one state; the lowest truncated cost wins, each taken where it ended."""
     says = places.votes if places is not None else 1.0
-    found = [scheduled(objective, state, ratio) for ratio in START_RATIOS]
+    found = [scheduled(objective, state, START_RATIOS[0])]
+    if not explains(objective, found[0]):
+        found += [scheduled(objective, state, ratio) for ratio in START_RATIOS[1:]]
+    found = different(objective, found)
     if objective.has_directions:
         found = [as_angles(objective, solved) for solved in found]
         found.append(scheduled(objective, state, START_RATIOS[-1], hold=True))
     solved = min(found, key=lambda solved: objective.truncated_cost(solved.state, says))
-    return replaced(objective, solved, places) if places is not None else solved
+    if places is None or explains(objective, solved):
+        return solved
+    return replaced(objective, solved, places)
+
+
+def explains(objective: Objective, solved: Solved) -> bool:
+    """Whether a solution turns away hardly more closures than chance does: no other one can explain more of them."""
+    used = accepted(objective, solved)
+    return bool(np.count_nonzero(~used) <= AWAY_RATIO_MAX * len(used))
+
+
+def different(objective: Objective, found: Sequence[Solved]) -> list[Solved]:
+    """Those of the solutions that ended in places of their own, the first of each."""
+    kept: list[Solved] = []
+    for solved in found:
+        chosen, cost = accepted(objective, solved), objective.truncated_cost(solved.state)
+        alike = [other for other in kept if np.array_equal(accepted(objective, other), chosen)]
+        if not any(abs(objective.truncated_cost(other.state) - cost) <= SAME_RATIO * cost for other in alike):
+            kept.append(solved)
+    return kept
 
 
 def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:

@@ -20,9 +20,11 @@ from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.pose_graph import MeasuredFactor, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.saved_map import SavedMap
-from flocc_agent.geometry import between, pose7, pose_from_tq, poses_from_tq
+from flocc_agent.core.spared import AGREE_LENGTHS, AGREE_RATIO, AGREE_STEPS, Foretold
+from flocc_agent.geometry import between, inverse, pose7, pose_from_tq, poses_from_tq
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import (
     ClosureRecord,
     KeyframeRecord,
@@ -78,6 +80,13 @@ class _Odometry:
     def pose(self, index: int) -> Float:
         """`T_odom_keyframe` (4, 4)."""
         return pose_from_tq(np.frombuffer(self._poses.row(index)))
+
+    def seen_from(self, index: int, others: Sequence[int]) -> Float:
+        """Poses (1 + K, 4, 4) in the frame of one keyframe, of the one before it or after it, and of K others."""
+        before = index - 1 if index else min(1, len(self) - 1)
+        rows = b"".join(self._poses.row(each) for each in (index, before, *others))
+        T = poses_from_tq(np.frombuffer(rows).reshape(-1, 7))
+        return between(T[:1], T[1:])
 
     def stamp_s(self, index: int) -> float:
         """When a keyframe was taken."""
@@ -199,6 +208,30 @@ class GraphAssembly:
         for keyframe in [keyframe for keyframe in self._odometry_pairs if keyframe.log == log]:
             del self._odometry_pairs[keyframe]
 
+    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
+        """Closures with a length between the same stretches as a pair, as far as all keyframes are known."""
+        if not self._known(pair.low) or not self._known(pair.high):
+            return []
+        found = self._closures.beside(pair, reach)
+        return [closure for closure in found if self._known(closure.low) and self._known(closure.high)]
+
+    def density(self, keyframe: KeyframeId, reach: int) -> float:
+        """Closures for each keyframe of a stretch, with whatever other keyframes."""
+        if not self._known(keyframe):
+            return 0.0
+        first, end = max(keyframe.index - reach, 0), min(keyframe.index + reach + 1, len(self._odometry[keyframe.log]))
+        return self._closures.ends(keyframe.log, first, end) / (end - first)
+
+    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:
+        """What closures beside a pair say of it, by odometry from their keyframes to the pair's."""
+        T = self._closures.poses(closures)
+        low = self._odometry[pair.low.log].seen_from(pair.low.index, [closure.low.index for closure in closures])
+        high = self._odometry[pair.high.log].seen_from(pair.high.index, [closure.high.index for closure in closures])
+        lengths_m, low_m, high_m = (np.linalg.norm(each[:, :3, 3], axis=1) for each in (T, low[1:], high[1:]))
+        steps_m = (float(np.linalg.norm(low[0, :3, 3])) + float(np.linalg.norm(high[0, :3, 3]))) / 2
+        may_m = AGREE_LENGTHS * lengths_m + AGREE_RATIO * (low_m + high_m) + AGREE_STEPS * steps_m
+        return Foretold(low[1:] @ T @ inverse(high[1:]), may_m)
+
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """What else was measured at a log's keyframes, or of them."""
         return self._measured.of(log, self._odometry, self._known)
@@ -210,9 +243,7 @@ class GraphAssembly:
         """
         if not self._reads_all and log in self._odometry and other in self._odometry:
             return True
-        links = self._closures.links()
-        measured = self._measured.factors(self._odometry, self._known)
-        links += [(factor.query.log, factor.match.log) for factor in measured]
+        links = self._closures.links() + self._measured.links(self._odometry, self._known)
         if self._saved is not None:
             links += [(self._saved.anchor, each) for each in self._saved.logs]
         ends = {end for link in links for end in link}

@@ -6,6 +6,7 @@ old ones leave memory; 12 bytes of its pair and 4 for each of its logs remain.
 
 import math
 from array import array
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence, Set
 from struct import Struct
 from typing import NamedTuple
@@ -16,11 +17,12 @@ from numpy.typing import NDArray
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.known_sets import pair_number, place_of
 from flocc_agent.core.pose_graph import LoopClosure
-from flocc_agent.geometry import poses_from_tq, symmetric
+from flocc_agent.geometry import inverse, poses_from_tq, symmetric
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import UPPER_TRIANGLE, ClosureRecord
 
+Float = NDArray[np.float64]
 Rows = NDArray[np.void]
 
 ROWS_OF_A_PIECE = 64
@@ -46,6 +48,7 @@ PACKED = Struct(f"<8I7ddd{UPPER_TRIANGLE}d")
 WHERE = Struct("<8I3d")
 """Of a row: what comes before the rotation."""
 SCALE_AT = ROW.fields["scale"][1] if ROW.fields is not None else 0
+COUNT_MAX = 2**16 - 1
 NO_COVARIANCE = (0.0,) * UPPER_TRIANGLE
 
 
@@ -80,6 +83,8 @@ class ClosureTable:
         """Numbers of the pairs of two logs, and their rows."""
         self._of_log: dict[LogId, array[int]] = {}
         """Rows of a log, in the order in which they became known."""
+        self._ends: dict[LogId, array[int]] = {}
+        """How many closures each keyframe of a log has."""
         self._count = 0
 
     def __len__(self) -> int:
@@ -109,6 +114,8 @@ class ClosureTable:
             numbers.insert(at, packed)
             rows.insert(at, len(self._rows))
             self._count += 1
+            for end in (pair.low, pair.high):
+                self._count_end(end)
         for each in set(key):
             of_log = self._of_log.get(each)
             if of_log is None:
@@ -121,6 +128,48 @@ class ClosureTable:
         """The newest ones of a log, the newest first."""
         rows = self._of_log.get(log)
         return [] if rows is None else [self._tie(log, row) for row in rows[-ties_max:][::-1]]
+
+    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
+        """Closures with a length whose keyframes are at most so many from a pair's, at both ends."""
+        of_pair = self._of_pair.get((pair.low.log, pair.high.log))
+        if of_pair is None:
+            return []
+        numbers, rows = of_pair
+        found: list[CandidatePair] = []
+        for k in range(bisect_left(numbers, max(pair.low.index - reach, 0) * (INDEX_MAX + 1)), len(numbers)):
+            low, high = divmod(numbers[k], INDEX_MAX + 1)
+            if low > pair.low.index + reach:
+                break
+            if abs(high - pair.high.index) <= reach and self._tie(pair.low.log, rows[k]).length_m > 0.0:
+                found.append(CandidatePair(KeyframeId(pair.low.log, low), KeyframeId(pair.high.log, high)))
+        return found
+
+    def ends(self, log: LogId, first: int, end: int) -> int:
+        """Closures at keyframes of a log, from one to before another, whatever log is at their other end."""
+        counts = self._ends.get(log)
+        return 0 if counts is None else sum(counts[first:end])
+
+    def poses(self, closures: Sequence[CandidatePair]) -> Float:
+        """What closures say, T_low_high (K, 4, 4) in metres by their first scale; without one no translation."""
+        rows = np.frombuffer(b"".join(self._rows.row(self._row(closure)) for closure in closures), dtype=ROW)
+        T = poses_from_tq(rows["T"])
+        T[:, :3, 3] *= rows["scale"][:, None]
+        queries = [KeyframeId(self._logs[row["query_log"]], int(row["query"])) for row in rows]
+        back = [query != closure.low for query, closure in zip(queries, closures, strict=True)]
+        T[back] = inverse(T[back])
+        return T
+
+    def _row(self, pair: CandidatePair) -> int:
+        numbers, rows = self._of_pair[pair.low.log, pair.high.log]
+        return rows[place_of(numbers, pair_number(pair))[0]]
+
+    def _count_end(self, keyframe: KeyframeId) -> None:
+        counts = self._ends.get(keyframe.log)
+        if counts is None:
+            counts = self._ends[keyframe.log] = array("H")
+        if keyframe.index >= len(counts):
+            counts.extend([0] * (keyframe.index + 1 - len(counts)))
+        counts[keyframe.index] = min(counts[keyframe.index] + 1, COUNT_MAX)
 
     def links(self) -> list[tuple[LogId, LogId]]:
         """Pairs of logs with closures between them, or within one."""

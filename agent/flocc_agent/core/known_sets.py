@@ -1,11 +1,13 @@
 """Sets that grow with the mission, in few bytes: of keyframes, and of pairs of them.
 
 A set is whole numbers in their order, an array for each log or pair of logs: 4 bytes a keyframe and 8 a pair, where
-objects take some 200 and 300.
+objects take some 200 and 300. A table of pairs is bounded, and finds those of the same stretches of two ways.
 """
 
 from array import array
 from bisect import bisect_left
+from collections.abc import Iterator
+from typing import Generic, TypeVar
 
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
@@ -67,6 +69,57 @@ class KeyframeSet:
     def discard(self, keyframe: KeyframeId) -> None:
         """Leave a keyframe out, where it is there."""
         _take_out(self._of_log.get(keyframe.log), keyframe.index)
+
+
+Value = TypeVar("Value")
+
+
+class PairTable(Generic[Value]):
+    """Pairs with a value each; beyond a maximum the oldest is forgotten."""
+
+    def __init__(self, pairs_max: int) -> None:
+        """Start without any, for at most so many."""
+        self._pairs_max = pairs_max
+        self._values: dict[CandidatePair, Value] = {}
+        self._of_logs: dict[tuple[LogId, LogId], dict[CandidatePair, None]] = {}
+
+    def __contains__(self, pair: CandidatePair) -> bool:
+        return pair in self._values
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def size(self) -> tuple[int, int]:
+        """How many there are, and at most."""
+        return len(self._values), self._pairs_max
+
+    def put(self, pair: CandidatePair, value: Value) -> None:
+        """Take a pair in; one that is there keeps its place."""
+        self._values[pair] = value
+        self._of_logs.setdefault((pair.low.log, pair.high.log), {})[pair] = None
+        if len(self._values) > self._pairs_max:
+            self.pop(next(iter(self._values)))
+
+    def pop(self, pair: CandidatePair) -> Value | None:
+        """Leave a pair out; its value, None where it was not there."""
+        value = self._values.pop(pair, None)
+        if value is not None:
+            logs = pair.low.log, pair.high.log
+            del self._of_logs[logs][pair]
+            if not self._of_logs[logs]:
+                del self._of_logs[logs]
+        return value
+
+    def beside(self, pair: CandidatePair, reach: int) -> Iterator[CandidatePair]:
+        """Pairs of the same logs whose keyframes are at most so many from a pair's, at both ends."""
+        of_logs = self._of_logs.get((pair.low.log, pair.high.log), ())
+        return (other for other in of_logs if is_beside(pair, other, reach))
+
+
+def is_beside(pair: CandidatePair, other: CandidatePair, reach: int) -> bool:
+    """Whether two pairs of the same two logs are of the same stretches."""
+    low, high = abs(pair.low.index - other.low.index), abs(pair.high.index - other.high.index)
+    return low <= reach and high <= reach
 
 
 def _put(numbers: "array[int]", number: int) -> None:

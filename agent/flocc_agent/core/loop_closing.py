@@ -5,6 +5,7 @@ work is halved between them. A robot that has a neighbour of a higher compute cl
 found a pair that is another's to register tells it so until the record shows. When the other is out of range for
 `TAKEOVER_S`, the finder registers the pair itself, if need be with latents that relays bring. A pair whose latent
 exists no more is rejected, by a record like any other; so is one that is hardly worth its latent (`prospects.py`).
+One that tells nothing new is left where it is, without a record (`spared.py`).
 A robot that comes back does not know what it handed over before: it listens who is there before it decides about any
 pair.
 
@@ -26,6 +27,7 @@ from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.reports import CandidateFound
+from flocc_agent.core.spared import HeldClosures, NoClosures, Spared
 from flocc_agent.core.work import OdometryPairOf, WorkTable
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair
@@ -56,6 +58,7 @@ class LoopClosing:
         closed: frozenset[LogId] = frozenset(),
         listens_until_s: float = float("-inf"),
         agreement: Agreement = lambda _: None,
+        held: HeldClosures | None = None,
     ) -> None:
         """Start without pairs.
 
@@ -68,6 +71,7 @@ class LoopClosing:
             closed: Logs that nobody writes any more, and whose latents are here.
             listens_until_s: Pairs wait undecided until then.
             agreement: How well the surroundings of a pair agree.
+            held: Closures that are known; None: no pair is spared because of them.
         """
         self.latents = Latents(own, parameters)
         self.dropped = 0
@@ -82,6 +86,8 @@ class LoopClosing:
         self._front_ends = FrontEnds()
         self._prospects = Prospects(agreement)
         self._unlikely: list[CandidatePair] = []
+        self._spared = Spared(held or NoClosures(), parameters.closures_enough)
+        self._told: list[CandidatePair] = []
         self._chosen: list[CandidatePair] | None = None
         self._resolved = PairSet()
         self._undecided: dict[CandidatePair, Candidate] = {}
@@ -110,6 +116,7 @@ class LoopClosing:
             "undecided": (len(self._undecided), candidates_max),
             **self.latents.sizes(),
             **self._prospects.sizes(),
+            **self._spared.sizes(),
         }
 
     # Pairs
@@ -129,10 +136,11 @@ class LoopClosing:
     def on_offer(self, offer: CandidateOffer, now: float) -> None:
         """Pairs that another robot found and that this one is to register."""
         for pair in offer.pairs:
-            if offer.transferred and pair not in self._resolved and pair not in self._work:
+            if offer.transferred and not (pair in self._resolved or pair in self._work or pair in self._spared):
                 self._offers.remove(pair)
                 self._undecided.pop(pair, None)
-                self._add(Candidate(pair, 0.0))
+                if not self._spares(Candidate(pair, 0.0)):
+                    self._add(Candidate(pair, 0.0))
             elif self._owner(pair) == self._own and not self._knows(pair):
                 self._assign(Candidate(pair, 0.0), now)
 
@@ -145,6 +153,7 @@ class LoopClosing:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
         self._prospects.on_resolved(pair)
+        self._spared.remove(pair)
         self._undecided.pop(pair, None)
         if pair in self._work or pair in self._offers:
             self._work.remove(pair)
@@ -175,6 +184,9 @@ class LoopClosing:
             self._resolved.discard(other)
             if self._owner(other) == self._own:
                 self._assign(Candidate(other, 0.0), now)
+        self._spare_beside(pair)
+        for other, similarity in self._spared.on_closure(pair):
+            self._assign(Candidate(other, similarity), now)
 
     def on_rejection(self, pair: CandidatePair, reason: str, was_seen: bool = True) -> bool:
         """A record of this pair is in a log, and it is none; whether its logs' front ends turned out to differ.
@@ -306,8 +318,9 @@ class LoopClosing:
         if self._undecided and self._listens_until_s <= now:
             self._decide(now)
         for candidate in self._offers.taken_over(self._reach, now):
-            self._hand_on_or_add(candidate, now)
-        effects = self._offers.tell(self._reach, now)
+            if not self._spares(candidate):
+                self._hand_on_or_add(candidate, now)
+        effects = self._offers.tell(self._reach, now, self._spares)
         self._take_back()
         if self.latents.free() > 0:
             effects += self.latents.fetch(self._worth_fetching(now), self._reach, now)
@@ -327,10 +340,31 @@ class LoopClosing:
         unlikely, self._unlikely = self._unlikely, []
         return unlikely
 
+    def take_told(self) -> list[CandidatePair]:
+        """Pairs that are spared because closures beside them tell what they would, each given once."""
+        told, self._told = self._told, []
+        return told
+
     # Assignment
 
     def _knows(self, pair: CandidatePair) -> bool:
-        return pair in self._resolved or pair in self._work or pair in self._offers or pair in self._undecided
+        known = pair in self._resolved or pair in self._work or pair in self._offers or pair in self._undecided
+        return known or pair in self._spared
+
+    def _spares(self, candidate: Candidate) -> bool:
+        """Whether a pair tells nothing new; then nobody waits for it."""
+        if not self._spared.is_told(candidate.pair):
+            return False
+        self._spared.add(candidate.pair, candidate.similarity)
+        self._told.append(candidate.pair)
+        return True
+
+    def _spare_beside(self, closure: CandidatePair) -> None:
+        """Spare pairs beside a new closure that nobody began to register here."""
+        for similarity, pair in self._work.beside(closure):
+            if self._spares(Candidate(pair, -similarity)):
+                self._work.remove(pair)
+                self._chosen, self._changed = None, True
 
     def _concerns(self, pair: CandidatePair) -> bool:
         """Whether a pair is of this robot's keyframes, or registered here."""
@@ -346,6 +380,8 @@ class LoopClosing:
         if now < self._listens_until_s:
             remember(self._undecided, candidate.pair, candidate, self._parameters.candidates_max)
             self._changed = True
+            return
+        if self._spares(candidate):
             return
         owner = self._owner(candidate.pair)
         if owner != self._own and self._own in (candidate.pair.low.log, candidate.pair.high.log):
@@ -365,7 +401,7 @@ class LoopClosing:
         """While a stronger robot has more than enough to do, a robot that has nothing to do helps."""
         for _ in range(self.load, self._parameters.registrations_max + self._parameters.fetches_max):
             candidate = self._offers.take_back(self._reach)
-            if candidate is not None:
+            if candidate is not None and not self._spares(candidate):
                 self._add(candidate)
 
     def _owner(self, pair: CandidatePair) -> LogId:

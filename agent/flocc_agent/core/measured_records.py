@@ -36,6 +36,7 @@ class MeasuredRecords:
         self._made: dict[LogId, dict[Place, MeasuredFactor]] = {}
         self._waiting: dict[str, dict[Place, float]] = {}
         self._edges: dict[LogId, dict[int, Float]] = {}
+        self._links: set[tuple[LogId, LogId]] = set()
 
     def add(self, new: NewRecord, record: MeasurementRecord) -> tuple[KeyframeId, ...]:
         """Take in a record, which is the new one's, and give the keyframes that it speaks of."""
@@ -62,16 +63,24 @@ class MeasuredRecords:
 
     def factors(self, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> tuple[MeasuredFactor, ...]:
         """All factors whose keyframes are here, by log and number."""
-        for robot in list(self._unmade):
-            self._make_all(robot, tracks, known)
+        self._make_everything(tracks, known)
         made = {place: factor for of_log in self._made.values() for place, factor in of_log.items()}
         return tuple(made[place] for place in sorted(made))
+
+    def links(self, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> list[tuple[LogId, LogId]]:
+        """Pairs of logs, or of a log and a landmark, that factors join; sorted."""
+        self._make_everything(tracks, known)
+        return sorted(self._links)
 
     def of(self, log: LogId, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> tuple[MeasuredFactor, ...]:
         """Those factors at a log's keyframes, or of them."""
         self._make_all(log.robot, tracks, known)
         made = self._made.get(log, {})
         return tuple(made[place] for place in sorted(made))
+
+    def _make_everything(self, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> None:
+        for robot in [robot for robot, unmade in self._unmade.items() if unmade]:
+            self._make_all(robot, tracks, known)
 
     def _make_all(self, robot: str, tracks: Tracks, known: Callable[[KeyframeId], bool]) -> None:
         """Make what can be made of the records that name a robot."""
@@ -96,6 +105,7 @@ class MeasuredRecords:
             return False
         for log in {made.query.log, made.match.log}:
             self._made.setdefault(log, {})[place] = made
+        self._links.add((made.query.log, made.match.log))
         return True
 
     def edge_covariances(self, log: LogId, keyframes: int) -> Float | None:

@@ -5,7 +5,7 @@ handed no more pairs than it can begin with soon; of those that wait for that th
 """
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from flocc_agent.core.effects import Effect, Unicast
@@ -155,14 +155,24 @@ class Offers:
         """When something is to be said or taken over."""
         return min((group.due_s for group in self._groups.values()), default=float("inf"))
 
-    def tell(self, reach: Reach, now: float) -> list[Effect]:
-        """Tell robots in range what is theirs to register."""
+    def tell(self, reach: Reach, now: float, spares: Callable[[Candidate], bool] = lambda _: False) -> list[Effect]:
+        """Tell robots in range what is theirs to register.
+
+        Args:
+            reach: Robots in range.
+            now: The time.
+            spares: Whether a pair is not to be registered any more; asked before it is told.
+        """
         effects: list[Effect] = []
         for recipient in sorted(self._groups, key=lambda recipient: (recipient.robot, recipient.log is not None)):
             group = self._groups[recipient]
             if group.due_s > now or not recipient.is_in(reach):
                 continue
-            pairs = [pair for pair in sorted(group.offers) if group.offers[pair].is_due(now)]
+            due = [pair for pair in sorted(group.offers) if group.offers[pair].is_due(now)]
+            needless = {pair for pair in due if spares(group.offers[pair].candidate)}
+            for pair in needless:
+                self.remove(pair)
+            pairs = [pair for pair in due if pair not in needless]
             pairs = [*pairs, *_handed(recipient, group, reach)][:OFFERS_MAX]
             for pair in pairs:
                 group.offers[pair].next_s, group.offers[pair].told = now + OFFER_PERIOD_S, True

@@ -128,11 +128,14 @@ class LoopClosingParameters:
     """Pairs registered at one time; more than workers only fills their queue."""
     candidates_max: int = _inner(4000)
     """Open candidates; the least similar ones are dropped beyond this."""
+    closures_enough: int = _inner(3)
+    """Of the same stretches of two ways no more pairs are registered once so many closures agree; 0: all are."""
 
     def __post_init__(self) -> None:
         _require(self.match_ratio_threshold >= 0, "match_ratio_threshold must not be negative")
         _require(self.fetches_max >= 1, "fetches_max must be at least 1")
         _require(self.registrations_max >= 1, "registrations_max must be at least 1")
+        _require(self.closures_enough >= 0, "closures_enough must not be negative")
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from enum import Enum
 from itertools import product
 
-from flocc_agent.core.known_sets import PairSet
+from flocc_agent.core.known_sets import PairSet, PairTable
 from flocc_agent.core.pulls import remember
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
@@ -59,7 +59,7 @@ class Prospects:
         self._judged: dict[CandidatePair, Judged] = {}
         self._order: list[Judged] = []
         self._closures = PairSet()
-        self._unlikely: dict[CandidatePair, None] = {}
+        self._unlikely: PairTable[bool] = PairTable(UNLIKELY_MAX)
         self._held_since_s: dict[CandidatePair, float] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -67,7 +67,7 @@ class Prospects:
         return {
             "agreements": (len(self._found), UNLIKELY_MAX),
             "judged": (len(self._fresh) + len(self._judged), 2 * JUDGED_MAX),
-            "unlikely": (len(self._unlikely), UNLIKELY_MAX),
+            "unlikely": self._unlikely.size(),
             "held": (len(self._held_since_s), UNLIKELY_MAX),
         }
 
@@ -85,19 +85,19 @@ class Prospects:
         if not is_closure:
             return []
         self._closures.add(pair)
-        again = [other for other in beside(pair) if other in self._unlikely] if self._unlikely else []
+        again = sorted(other for other in self._unlikely.beside(pair, BESIDE) if other != pair)
         for other in again:
-            del self._unlikely[other]
+            self._unlikely.pop(other)
         return again
 
     def on_unlikely(self, pair: CandidatePair, was_resolved: bool = False) -> None:
         """A pair was refused unseen; another record of it may say more."""
         if pair in self._unlikely or not was_resolved:
-            remember(self._unlikely, pair, None, UNLIKELY_MAX)
+            self._unlikely.put(pair, True)
 
     def on_settled(self, pair: CandidatePair) -> None:
         """A record says more of a pair than that it was refused unseen."""
-        self._unlikely.pop(pair, None)
+        self._unlikely.pop(pair)
 
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record says what became of a pair."""

@@ -59,6 +59,7 @@ from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.prospects import UNLIKELY
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
+    ClosureRejected,
     EncodingFailed,
     FrontEndsDiffer,
     KeyframeTaken,
@@ -72,6 +73,7 @@ from flocc_agent.core.reports import (
 )
 from flocc_agent.core.rounds import Rounds, solution_report
 from flocc_agent.core.saved_map import SavedMap
+from flocc_agent.core.spared import TOLD
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
@@ -209,6 +211,7 @@ class Robot:
             closed,
             listens_until_s,
             self.recognition.agreement,
+            self.assembly,
         )
         self.closing.latents.names.record_at = self._record_at
         self.in_map = None if restored.saved is None else InMap(restored.saved, now)
@@ -287,6 +290,11 @@ class Robot:
     def keyframes_given(self) -> int:
         """Own keyframes that were captured, recorded or not: the next one's number."""
         return self.gossip.logs[self.log].keyframes + len(self._pending)
+
+    @property
+    def closures_enough(self) -> int:
+        """Agreeing closures of two stretches beside which no more pairs are registered; 0: all are."""
+        return self._parameters.loop_closing.closures_enough
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Every queue, table and cache: how much is in it, and its maximum."""
@@ -761,6 +769,8 @@ class Robot:
         for pair in self.closing.take_unlikely():
             record = RejectionRecord(pair.low, pair.high, UNLIKELY, 0, 0)
             effects += [*self._append(record, now), Report(told(record, self.log))]
+        for pair in self.closing.take_told():
+            effects.append(Report(ClosureRejected(query=pair.low, match=pair.high, by=self.log.robot, reason=TOLD)))
         for keyframe in self.closing.own_lost():
             if self._has(keyframe):
                 pairs = self.closing.on_latent_lost(keyframe, now)

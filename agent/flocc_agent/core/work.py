@@ -10,7 +10,9 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field
 
+from flocc_agent.core.known_sets import is_beside
 from flocc_agent.core.place_recognition import Candidate
+from flocc_agent.core.spared import STRETCH
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
@@ -138,6 +140,16 @@ class WorkTable:
     def using(self, keyframe: KeyframeId) -> list[CandidatePair]:
         """Pairs that need a latent, the most similar first."""
         return [order[1] for order in sorted(self._by_pair[pair].order for pair in self._users.get(keyframe, ()))]
+
+    def beside(self, closure: CandidatePair) -> list[Order]:
+        """Pairs of the same stretches as a closure that are not under way."""
+        found: set[CandidatePair] = set()
+        first, last = max(closure.low.index - STRETCH, 0), closure.low.index + STRETCH
+        for index in range(first, last + 1):
+            found.update(self._users.get(KeyframeId(closure.low.log, index), ()))
+        logs = closure.low.log, closure.high.log
+        near = (pair for pair in found if (pair.low.log, pair.high.log) == logs and is_beside(closure, pair, STRETCH))
+        return sorted(self._by_pair[pair].order for pair in near if pair not in self._registering)
 
     def on_keyframe(self, log: LogId) -> bool:
         """A log grew: its keyframes may have got the neighbour that they lacked. Whether one did."""

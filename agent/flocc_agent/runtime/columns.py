@@ -44,6 +44,11 @@ _REVERSED_WORDS = re.compile(
 )
 """The same in a comment, whose words mean less: `T_body_world`, `world to camera`."""
 _JPL = re.compile(r"(?:^|_)jpl(?:_|$)")
+_LEFT_HANDED = re.compile(r"(?:^|_)(?:left_?handed|unity(?:3d)?)(?:_|$)")
+_STEPS = re.compile(
+    r"(?:^|_)(?:(?:relative|incremental|delta|frame_to_frame)_(?:pose|transform|motion|odometry)s?)(?:_|$)"
+)
+_OPENGL = re.compile(r"(?:^|_)(?:open_?gl|z_backwards?|y_up)(?:_|$)")
 _LABEL = re.compile(
     r"(.*[._/])?(child_frame(_id)?|frame_id|(device|vehicle|sensor|marker|tag|body|object|track|map)(_?id)?"
     r"|robot(_id|_name)?|id)"
@@ -52,6 +57,10 @@ _LABEL = re.compile(
 _PX4 = ("timestamp_sample", "q_offset[")
 """What a header of PX4's logs has, as `ulog2csv` writes it: arrays x y z and w x y z, stamps in microseconds."""
 _OTHER_PARTS = ("cov", "twist", "veloc", "accel", "gyro", "bias", "sigma", "std", "error", "imu", "mag")
+
+
+REVERSED_MIN = 3
+"""Words of a line that say so; a name or two may mean something else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +93,16 @@ def contradiction(comment: str) -> str | None:
     words = re.sub(r"[^a-z0-9]+", "_", comment.lower())
     if (turned := _REVERSED_WORDS.search(words)) is not None:
         return f"the poses are said to be of the world in the body or camera ({turned[0].strip('_')}): invert them"
+    if sum(_is_reversed(word) for word in re.split(r"[\s,;]+", comment)) >= REVERSED_MIN:
+        return "the columns are said to be of the world in the body or camera: invert the poses"
     if _JPL.search(words):
         return "the quaternions are said to be JPL's, which turn the other way: write Hamilton's"
+    if _LEFT_HANDED.search(words):
+        return "the axes are said to be left-handed: write poses of right-handed ones"
+    if _STEPS.search(words):
+        return "the poses are said to be from one to the next: write them in one fixed frame"
+    if _OPENGL.search(words):
+        return "the axes are said to be OpenGL's (y up, z backwards): turn the poses, or give T_body_camera"
     return None
 
 
@@ -134,6 +151,12 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
     if len(metres) > 1:
         raise HeaderError("the header gives positions in several units")
     return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split, metres.pop(), labels)
+
+
+def begins_with_stamp(header: str) -> bool:
+    """Whether the first word of a line is what a column of stamps is called."""
+    names = _names(header)
+    return bool(names) and _role(names[0]) == "stamp"
 
 
 def _px4_named(header: str) -> str:

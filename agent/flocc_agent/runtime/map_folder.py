@@ -364,6 +364,12 @@ class MapFolder:
             raise BadMap(f"{self.path / self.manifest.solution.name}: does not fit the map: {error}") from error
 
 
+def longer_copy(one: tuple[bytes, ...], other: tuple[bytes, ...]) -> tuple[bytes, ...] | None:
+    """The longer of two copies of a log; None where neither is the other's beginning."""
+    both = min(len(one), len(other))
+    return max(one, other, key=len) if one[:both] == other[:both] else None
+
+
 def read_manifest(path: Path) -> MapManifest:
     """Read `map.json`.
 

@@ -4,7 +4,7 @@
     RECORDING/images/*.jpg|png
     RECORDING/odometry.tum      T_odom_body at the images' stamps or denser
     RECORDING/groundtruth.tum   T_world_body, optional
-    RECORDING/camera.toml       [camera] width height fx fy cx cy distortion T_body_camera
+    RECORDING/camera.toml       [camera] width height fx fy cx cy distortion T_body_camera, a model if no pinhole
     RECORDING/mask.png          black where pictures show what moves with the camera, optional
     RECORDING/measurements.jsonl  what else was measured, optional (`measurement_file`)
 
@@ -21,10 +21,14 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import ConfigError, read_toml
 from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.lenses import CameraModel, LensKind
+from flocc_agent.lenses.lens_names import READ, kind_of
+from flocc_agent.lenses.models import DISTORTION_COUNTS
 from flocc_agent.runtime.measurement_file import NAME as MEASUREMENTS
 from flocc_agent.runtime.measurement_file import NOTHING, RecordedMeasurements, read_measurements
 from flocc_agent.runtime.pictures import FULL, Levels, PictureError, good_pictures, read_picture
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, position_fault
+from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_tum
@@ -61,13 +65,14 @@ class Recording:
 
     Attributes:
         path: The folder.
-        camera: Intrinsics of every image.
+        camera: Intrinsics of every image, once it is straightened.
         T_body_camera: (4, 4) pose of the camera in the body, metres.
         frames: Images that odometry covers, in order of time; at least one.
         truth: Ground truth `T_world_body` where the recording has one.
         levels: How images of 16 bits are brought to 8.
         measurements: What else was measured.
         hidden: (H, W) pixels that move with the camera; None where the recording does not say.
+        straightener: Takes out of images what `camera` cannot say; None: they are taken as they are.
     """
 
     path: Path
@@ -78,6 +83,12 @@ class Recording:
     levels: Levels = FULL
     measurements: RecordedMeasurements = NOTHING
     hidden: NDArray[np.bool_] | None = None
+    straightener: Straightener | None = None
+
+    @property
+    def model(self) -> Camera | CameraModel:
+        """Intrinsics of the images as they are stored."""
+        return self.camera if self.straightener is None else self.straightener.model
 
     @classmethod
     def open(cls, path: Path | str) -> "Recording":
@@ -95,20 +106,22 @@ class Recording:
                 f"{path}: has no camera.toml, no recording in flocc's own form; `flocc dataset convert {path} OUT` "
                 "writes one of a data set or a bag"
             )
-        camera, T_body_camera = read_camera(path / "camera.toml")
+        model, T_body_camera = read_camera(path / "camera.toml")
+        straightener = _straightener(model, path / "camera.toml")
         frames = _frames(path, read_tum(path / "odometry.tum"))
         truth_path = path / "groundtruth.tum"
         truth = read_tum(truth_path) if truth_path.exists() else None
         try:
-            looked = good_pictures([frame.image_path for frame in frames], (camera.width, camera.height))
+            looked = good_pictures([frame.image_path for frame in frames], (model.width, model.height))
         except PictureError as error:
             raise RecordingError(f"{error}; the intrinsics are in {path / 'camera.toml'}") from error
         if looked.fault is not None:
             logger.warning("%s", looked.fault)
         good = tuple(frames[k] for k in looked.good)
         measurements = read_measurements(path / MEASUREMENTS, [frame.stamp_s for frame in good])
-        hidden = read_mask(path / MASK, camera)
-        return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements, hidden)
+        hidden = read_mask(path / MASK, straightener)
+        camera, needed = straightener.camera, straightener if straightener.is_needed else None
+        return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements, hidden, needed)
 
     def ground_truth(self, stamp_s: float) -> Float | None:
         """True (4, 4) pose `T_world_body` at a time, or None where there is none."""
@@ -122,16 +135,25 @@ class Recording:
         """
         try:
             encoded = frame.image_path.read_bytes()
-            pixels = read_picture(encoded, (self.camera.width, self.camera.height), self.levels)
+            pixels = read_picture(encoded, (self.model.width, self.model.height), self.levels)
         except OSError as error:
             raise RecordingError(f"{frame.image_path}: cannot be read: {error.strerror or error}") from error
         except PictureError as error:
             raise RecordingError(f"{frame.image_path}: {error}") from error
-        return Image(pixels, self.camera)
+        return Image(pixels if self.straightener is None else self.straightener.apply(pixels), self.camera)
 
 
-def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_] | None:
+def _straightener(model: CameraModel, path: Path) -> Straightener:
+    try:
+        return Straightener(model)
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def read_mask(path: Path, straightener: Straightener) -> NDArray[np.bool_] | None:
     """Read which pixels (H, W) move with the camera: the black ones; None where there is no such file.
+
+    It is of the images as they are stored, and straightened as they are.
 
     Raises:
         RecordingError: It cannot be read, is of another size than the images, or leaves nothing of them.
@@ -139,7 +161,8 @@ def read_mask(path: Path, camera: Camera) -> NDArray[np.bool_] | None:
     if not path.exists():
         return None
     try:
-        pixels = read_picture(path.read_bytes(), (camera.width, camera.height), FULL)
+        model = straightener.model
+        pixels = straightener.apply(read_picture(path.read_bytes(), (model.width, model.height), FULL))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except PictureError as error:
@@ -176,7 +199,7 @@ def read_image_list(path: Path) -> list[tuple[float, Path]]:
     return images
 
 
-def read_camera(path: Path) -> tuple[Camera, Float]:
+def read_camera(path: Path) -> tuple[CameraModel, Float]:
     """Read `camera.toml`: intrinsics, and `T_body_camera` (identity where it is missing).
 
     Raises:
@@ -231,24 +254,47 @@ def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:
     return frames
 
 
-def _camera(values: dict[str, object], path: Path) -> Camera:
+SHAPES = {
+    LensKind.FOV: ("omega",),
+    LensKind.OMNIDIRECTIONAL: ("xi",),
+    LensKind.DOUBLE_SPHERE: ("xi", "alpha"),
+    LensKind.EUCM: ("alpha", "beta"),
+}
+"""Keys of a wide lens's shape, in the order of `CameraModel.shape`."""
+
+
+def _camera(values: dict[str, object], path: Path) -> CameraModel:
     sizes = {key: _number(values, key, path) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     uneven = next((key for key in ("width", "height") if sizes[key] != np.round(sizes[key])), None)
     if uneven is not None:
         raise RecordingError(f"{path}: camera.{uneven} must be a whole number, not {sizes[uneven]}")
-    distortion = values.pop("distortion", [0.0, 0.0, 0.0, 0.0])
+    name = values.pop("model", "pinhole")
+    kind = kind_of(name) if isinstance(name, str) else None
+    if kind is None:
+        raise RecordingError(f"{path}: camera.model is {name!r}; flocc reads {READ}")
+    shape = tuple(_number(values, key, path) for key in SHAPES.get(kind, ()))
+    distortion = _distortion(values, kind, path)
     if values:
         raise RecordingError(f"{path}: the key 'camera.{next(iter(values))}' does not exist")
-    if not isinstance(distortion, list) or len(distortion) != 4:
-        raise RecordingError(f"{path}: camera.distortion must be [k1, k2, p1, p2]")
+    focal = (sizes["fx"], sizes["fy"], sizes["cx"], sizes["cy"])
     try:
-        k1, k2, p1, p2 = (float(value) for value in distortion)
-        return Camera(
-            int(sizes["width"]), int(sizes["height"]), sizes["fx"], sizes["fy"], sizes["cx"], sizes["cy"],
-            (k1, k2, p1, p2),
-        )  # fmt: skip
-    except (TypeError, ValueError) as error:
+        return CameraModel(int(sizes["width"]), int(sizes["height"]), *focal, distortion, kind, shape)
+    except ValueError as error:
         raise RecordingError(f"{path}: {error}") from error
+
+
+def _distortion(values: dict[str, object], kind: LensKind, path: Path) -> tuple[float, ...]:
+    """Coefficients in the order of `CameraModel.distortion`, none where a pinhole has no such key."""
+    counts = DISTORTION_COUNTS[kind]
+    distortion = values.pop("distortion", [] if 0 in counts else None)
+    is_list = isinstance(distortion, list) and all(
+        isinstance(k, int | float) and not isinstance(k, bool) for k in distortion
+    )
+    if not isinstance(distortion, list) or not is_list or len(distortion) not in counts:
+        order = "[k1, k2, k3, k4]" if kind is LensKind.EQUIDISTANT else "[k1, k2, p1, p2, ...] in OpenCV's order"
+        many = " or ".join(map(str, counts))
+        raise RecordingError(f"{path}: camera.distortion of the {kind} model must be {order}, {many} numbers")
+    return tuple(map(float, distortion))
 
 
 def _number(values: dict[str, object], key: str, path: Path) -> float:

@@ -19,7 +19,7 @@ class Straightener:
     """
 
     def __init__(self, model: CameraModel, view_rad: float | None = None) -> None:
-        """Prepare; the map of a wide lens is computed once, with the first picture.
+        """Prepare; the map is computed once, with the first picture.
 
         Args:
             model: How the pictures were taken.
@@ -39,8 +39,17 @@ class Straightener:
 
         if not self.is_needed:
             return pixels
-        if self.model.kind is LensKind.PINHOLE:
-            return np.asarray(cv2.undistort(pixels, self.model.K(), np.array(self.model.distortion)))
         if self._map is None:
-            self._map = pixel_map(self.model, self.camera)
+            self._map = self._pixel_map()
         return np.asarray(cv2.remap(pixels, *self._map, cv2.INTER_LINEAR))
+
+    def _pixel_map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where each pixel of what `apply` gives is found in a picture as it was taken."""
+        import cv2
+
+        model = self.model
+        if model.kind is not LensKind.PINHOLE:
+            return pixel_map(model, self.camera)
+        K, size = model.K(), (model.width, model.height)
+        x, y = cv2.initUndistortRectifyMap(K, np.array(model.distortion), np.eye(3), K, size, cv2.CV_32FC1)
+        return np.asarray(x, dtype=np.float32), np.asarray(y, dtype=np.float32)

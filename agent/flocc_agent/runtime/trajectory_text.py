@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import is_rigid, nearest_rotation, pose
-from flocc_agent.runtime.columns import UNITS_S, Columns, HeaderError, columns_of, contradiction
+from flocc_agent.runtime.columns import (
+    UNITS_S,
+    Columns,
+    HeaderError,
+    begins_with_stamp,
+    columns_of,
+    contradiction,
+)
 from flocc_agent.runtime.dated_rows import dated
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, oddity, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
@@ -39,6 +46,9 @@ FORMS = {
 """Names for `--trajectory-format`; any other value is itself a line that names the columns."""
 MATRIX_FORM = "kitti"
 DAMAGED_RATIO_MAX = 0.2
+JUMPS = "jump away from those on both sides"
+TOO_FAST = f"lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
+TOO_FAST_ASKED = ": is the length in metres, and the stamp in its unit?"
 POSITION_MAX_M = 1e8
 NUMBER_MAX = 1e20
 """More than nanoseconds since 1970."""
@@ -139,16 +149,19 @@ def _columns(table: Table, form: str | None, otherwise: str | None) -> Columns |
         return None
     if form is not None:
         return _named_form(form, table.path)
-    for line, header in reversed(table.headers):
+    for line, header in table.headers:
         if (fault := contradiction(header)) is not None:
             raise RecordingError(f"{table.path}:{line}: {fault}; {WAY_OUT}")
+    for line, header in reversed(table.headers):
         try:
             found = columns_of(header, count)
         except HeaderError as error:
             raise RecordingError(f"{table.path}:{line}: {error}; {WAY_OUT}") from None
         if found is not None:
             return found
-        if len(words := header.split(",")) >= 7 and not any(is_number(word.strip()) for word in words):
+        words = header.split(",") if "," in header else header.split()
+        words = words if "," in header or (len(words) == count and begins_with_stamp(header)) else []
+        if len(words) >= 7 and not any(is_number(word.strip()) for word in words):
             raise RecordingError(f"{table.path}:{line}: the header is not understood ({header[:80]}); {WAY_OUT}")
     return _by_numbers(table, count) if otherwise is None else _named_form(otherwise, table.path)
 
@@ -327,7 +340,17 @@ def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], t
     if columns.nanoseconds is not None:
         values[:, 0] += values[:, -1] * 1e-9
     note = f"{table.path}: {len(damaged)} of {len(table.rows)} rows were left out, the first at line "
-    return values, np.array(lines), (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
+    told = (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
+    return values, np.array(lines), (*told, *_moved(table, columns))
+
+
+def _moved(table: Table, columns: Columns) -> tuple[str, ...]:
+    """Which frame the poses move, where a column says it: the camera's mounting must be on that."""
+    index = next((index for name, index in columns.labels if "child_frame" in name), None)
+    moved = {fields[index] for _, fields in table.rows[:200] if index is not None and len(fields) > index} - {""}
+    return (
+        (f"{table.path}: poses are of {min(moved)}: the camera's mounting (T_body_camera) is on that",) if moved else ()
+    )
 
 
 def _refuse_mixed(table: Table, columns: Columns) -> None:
@@ -470,11 +493,11 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     stamps_s, T, lines = stamps_s[moved], T[moved], lines[moved]
     good = possible(stamps_s, T[:, :3, 3])
     if not np.all(good):
-        notes.append(_too_fast(path, lines[~good], len(lines)))
+        notes.append(_left_out(path, lines[~good], len(lines), TOO_FAST, TOO_FAST_ASKED))
     stamps_s, T, lines = stamps_s[good], T[good], lines[good]
     odd = spikes(T[:, :3, 3])
     if np.any(odd):
-        notes.append(_jumps(path, lines[odd], len(lines)))
+        notes.append(_left_out(path, lines[odd], len(lines), JUMPS))
     stamps_s, T, lines = stamps_s[~odd], T[~odd], lines[~odd]
     anew = breaks(stamps_s, T)
     if np.any(anew):
@@ -486,25 +509,13 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     return Trajectory(stamps_s, T), tuple(notes)
 
 
-def _jumps(path: Path, lines: NDArray[np.int64], count: int) -> str:
-    """Say how many single poses jump away from both sides.
+def _left_out(path: Path, lines: NDArray[np.int64], count: int, what: str, asked: str = "") -> str:
+    """Say how many poses are no use, and what is wrong with them.
 
     Raises:
-        RecordingError: They are too many.
+        RecordingError: They are too many; what is asked then stands behind.
     """
-    fault = f"{len(lines)} of {count} poses jump away from those on both sides"
+    fault = f"{path}:{lines[0]}: {len(lines)} of {count} poses {what}"
     if len(lines) > DAMAGED_RATIO_MAX * count:
-        raise RecordingError(f"{path}:{lines[0]}: {fault}")
-    return f"{path}:{lines[0]}: {fault} and were left out"
-
-
-def _too_fast(path: Path, lines: NDArray[np.int64], count: int) -> str:
-    """Say how many poses lie out of reach of the others.
-
-    Raises:
-        RecordingError: They are too many.
-    """
-    fault = f"{len(lines)} of {count} poses lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
-    if len(lines) > DAMAGED_RATIO_MAX * count:
-        raise RecordingError(f"{path}:{lines[0]}: {fault}: is the length in metres, and the stamp in its unit?")
-    return f"{path}:{lines[0]}: {fault} and were left out"
+        raise RecordingError(fault + asked)
+    return f"{fault} and were left out"

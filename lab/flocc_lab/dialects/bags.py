@@ -59,7 +59,7 @@ def drawn(rng: np.random.Generator) -> Draw:
     )  # fmt: skip
 
 
-class _Script:
+class BagScript:
     """Messages of one bag."""
 
     def __init__(self, draw: Draw) -> None:
@@ -75,16 +75,20 @@ class _Script:
         self.messages: list[tuple[int, str, str, Any]] = []
 
     def make(self, name: str, *values: Any) -> Any:
+        """A message or part of one, by its type's name."""
         return self.store.types[name](*values)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
+        """A header."""
         stamp = self.make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
         return self.make("std_msgs/msg/Header", *([0] if self.ros1 else []), stamp, frame)
 
     def add(self, bag_ns: int, topic: str, kind: str, message: Any) -> None:
+        """Take a message in."""
         self.messages.append((bag_ns, topic, kind, message))
 
     def transform(self, stamp_ns: int, edge: tuple[str, str], t: tuple[float, ...], q: tuple[float, ...]) -> Any:
+        """A TransformStamped from the first frame of the edge to the second."""
         moved = self.make(
             "geometry_msgs/msg/Transform",
             self.make("geometry_msgs/msg/Vector3", *t),
@@ -108,6 +112,7 @@ class _Script:
             self.pose(bag_ns + 1000, 0 if draw.clock == "zero" else bag_ns, root, body, offset_m + 0.2 * k)
 
     def camera(self, bag_ns: int, stamp_ns: int, topic: str, frame: str, k: int) -> None:
+        """A picture and its intrinsics."""
         header = self.header(stamp_ns, frame)
         region = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         K = np.array([30.0, 0, 16, 0, 31, 12, 0, 0, 1])
@@ -127,6 +132,7 @@ class _Script:
             self.add(bag_ns, f"{topic}/image_raw/compressed", kind, self.make(kind, header, "png", data))
 
     def pose(self, bag_ns: int, stamp_ns: int, root: str, body: str, x_m: float) -> None:
+        """Where a robot is, by a topic of the drawn type below `root`."""
         draw, q = self.draw, (0.0, 0.0, 0.0, 1.0)
         fixed = body.replace("base_link", "odom")
         if draw.poses in ("tf", "TransformStamped"):
@@ -183,7 +189,7 @@ class _Script:
 
 def judged(draw: Draw, rng: np.random.Generator, folder: Path) -> str | None:
     """Write and convert one bag; returns what is wrong with the recordings, or None."""
-    script = _Script(draw)
+    script = BagScript(draw)
     names = [""] if draw.robots == 1 else ["alpha", "bravo", "charlie"][: draw.robots]
     for number, name in enumerate(names):
         script.robot(name, 100.0 * number)

@@ -27,10 +27,12 @@ class Rig:
     Attributes:
         model: Intrinsics.
         T_body_camera: (4, 4) mounting, metres.
+        time_shift_s: What Kalibr calls `timeshift_cam_imu`.
     """
 
     model: CameraModel
     T_body_camera: Float
+    time_shift_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,7 @@ class WriterForm:
         mounting: Whether it says `T_body_camera`.
         sized: Whether it says the size of the images.
         sizes: Those that it can say; none means any.
+        shift: Whether it says the offset of the camera's clock.
     """
 
     name: str
@@ -54,6 +57,7 @@ class WriterForm:
     mounting: bool = False
     sized: bool = True
     sizes: tuple[tuple[int, int], ...] = ()
+    shift: bool = False
 
 
 def _list(values: Sequence[float] | Float) -> str:
@@ -111,10 +115,13 @@ def toml(rig: Rig) -> str:
     """Write flocc's camera.toml."""
     m = rig.model
     keys = "".join(f"{key} = {value!r}\n" for key, value in zip(("fx", "fy", "cx", "cy"), _focal(m), strict=True))
+    names = {F: ("omega",), MEI: ("xi",), D: ("xi", "alpha"), U: ("alpha", "beta")}.get(m.kind, ())
+    shape = "".join(f"{key} = {value!r}\n" for key, value in zip(names, m.shape, strict=True))
+    model = "" if m.kind is P else f"model = {str(m.kind)!r}\n"
     rows = ",".join(_list(row) for row in rig.T_body_camera)
+    distortion = f"distortion = {_list(m.distortion)}\n" if m.distortion else ""
     return (
-        f"[camera]\nwidth = {m.width}\nheight = {m.height}\n{keys}distortion = {_list(_radtan(m, 4))}\n"
-        f"T_body_camera = [{rows}]\n"
+        f"[camera]\nwidth = {m.width}\nheight = {m.height}\n{keys}{model}{shape}{distortion}T_body_camera = [{rows}]\n"
     )
 
 
@@ -142,7 +149,8 @@ def kalibr(rig: Rig) -> str:
         f"cam0:\n  T_cam_imu:\n{_rows(inverse(rig.T_body_camera))}  cam_overlaps: [1]\n  camera_model: {camera}\n"
         f"  distortion_coeffs: {_list(coefficients)}\n  distortion_model: {distortion}\n"
         f"  intrinsics: {_list(numbers)}\n"
-        f"  resolution: [{m.width}, {m.height}]\n  rostopic: /cam0/image_raw\n  timeshift_cam_imu: 0.002\n{second}"
+        f"  resolution: [{m.width}, {m.height}]\n  rostopic: /cam0/image_raw\n"
+        f"  timeshift_cam_imu: {rig.time_shift_s}\n{second}"
     )
 
 
@@ -604,9 +612,9 @@ def nested(rig: Rig) -> str:
 
 FORMS: dict[str, WriterForm] = {
     "flocc YAML": WriterForm("camera.yaml", flat, mounting=True),
-    "flocc TOML": WriterForm("camera.toml", toml, mounting=True),
+    "flocc TOML": WriterForm("camera.toml", toml, (P, E, F, MEI, D, U), (0, 4, 5, 8, 12, 14), True),
     "EuRoC, Kimera": WriterForm("sensor.yaml", euroc, (P, E), (4,), True),
-    "Kalibr": WriterForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True),
+    "Kalibr": WriterForm("camchain.yaml", kalibr, (P, E, F, MEI, D, U), mounting=True, shift=True),
     "OpenVINS": WriterForm("kalibr_imucam_chain.yaml", openvins, (P, E), (4,), True),
     "ROS camera_info": WriterForm("ost.yaml", camera_info, (P, E), (0, 4, 5, 8)),
     "ros2 topic echo": WriterForm("echo.yaml", topic_echo, (P, E), (0, 4, 5, 8)),

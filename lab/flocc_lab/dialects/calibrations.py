@@ -63,7 +63,8 @@ def drawn_rig(form: WriterForm, rng: np.random.Generator) -> Rig:
     distortion, shape = _drawn_lens(kind, form, rng)
     model = CameraModel(width, height, fx, fy, cx, cy, distortion, kind, shape)
     T = pose(so3_exp(rng.uniform(-2, 2, 3)), np.round(rng.uniform(-0.5, 0.5, 3), 4))
-    return Rig(model, T if form.mounting else np.eye(4))
+    shift_s = float(np.round(rng.uniform(-0.05, 0.05), 5)) if form.shift else 0.0
+    return Rig(model, T if form.mounting else np.eye(4), shift_s)
 
 
 def _drawn_lens(
@@ -188,6 +189,7 @@ def judged(name: str, fault: str | None, rng: np.random.Generator, folder: Path)
     except FloccError as error:
         return DialectVerdict(name, fault, "refused", str(error))
     same = _is_same(lens.camera, rig.model) and np.allclose(lens.T_body_camera, rig.T_body_camera, atol=1e-6)
+    same = same and lens.time_shift_s == rig.time_shift_s
     return DialectVerdict(name, fault, "right" if same else "wrong", f"{lens.camera} of {rig.model}\n{text}")
 
 

@@ -21,7 +21,11 @@ class FrontEnd(StrEnum):
 
 Source = Annotated[Path, typer.Argument(help="Folder or bag.")]
 Format = Annotated[
-    str | None, typer.Option("--format", help="tum, euroc, kitti, 7scenes or plain, where it is not recognised.")
+    str | None,
+    typer.Option(
+        "--format",
+        help="plain, tum, euroc, kitti, kitti-raw, 7scenes, colmap, transforms or replica, where it is not recognised.",
+    ),
 ]
 CameraFile = Annotated[Path | None, typer.Option(help="Intrinsics (TOML or YAML) for a data set that has none.")]
 TrajectoryFormat = Annotated[

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from flocc_launch.datasets.bag_messages import (
     CAMERA_TYPE,
     IMAGE_TYPES,
     POSE_TYPES,
+    header_ns,
     image_file,
     lens_of,
     sampled_levels,
@@ -26,6 +28,7 @@ from flocc_launch.datasets.bag_messages import (
 )
 from flocc_launch.datasets.bag_poses import PoseDecoder, TransformDecoder
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
+from flocc_launch.datasets.camera_clock import of_pictures, told
 from flocc_launch.datasets.intrinsics import believable, read_lens
 from flocc_launch.datasets.journeys import JourneyWatch
 from flocc_launch.datasets.names import robot_name
@@ -39,6 +42,8 @@ logger = logging.getLogger(__name__)
 CHECKPOINT_MESSAGES = 1000
 STRAY = "the stamp is zero, or more than a minute off that of the others"
 UNTURNED_MAX = 1000
+STAMPS_TRIED = 60
+"""Of the first pictures and poses, to see whether they are stamped alike."""
 DAMAGED_RATIO_MAX = 0.2
 """A topic of which more messages are damaged is refused."""
 HEADER_BYTES = 12
@@ -153,14 +158,15 @@ def _convert_robots(
             faults.append(error)
     if runs:
         _pass_over(layout.bag, runs, progress)
+    said: Counter[str] = Counter()
     for run in runs:
         try:
             run.judge()
+            said.update(run.notes)
         except DatasetError as error:
             faults.append(error)
-            continue
-        for note in run.notes:
-            logger.warning("%s", note)
+    for note, count in said.items():
+        logger.warning("%s%s", note, f" (so for {count} robots)" if count > 1 else "")
     for fault in faults[1:]:
         logger.warning("%s", fault)
     if faults:
@@ -200,7 +206,24 @@ def _conversion(layout: Layout, robot: RobotTopics, out: Path, options: BagOptio
     if robot.poses is not None and is_truth(robot.poses.topic):
         notes.append(f"{layout.bag.path}: odometry is {robot.poses}, by its name no odometry, but ground truth or GPS")
     notes += [clock.note] if clock.note else []
-    return _Conversion(layout.bag, robot, lens, options, clock, out, identity, notes=notes)
+    shift_ns = 0
+    if lens.time_shift_s:
+        is_added = not clock.is_bag and not _stamps_are_shared(layout.bag, robot)
+        shift_ns = round(lens.time_shift_s * 1e9) if is_added else 0
+        notes.append(f"{layout.bag.path}: {told(lens.time_shift_s, is_added)}")
+        identity += f" shift={shift_ns}"
+    return _Conversion(layout.bag, robot, lens, options, clock, out, identity, shift_ns=shift_ns, notes=notes)
+
+
+def _stamps_are_shared(bag: Bag, robot: RobotTopics) -> bool:
+    """Whether odometry stamps its poses as the pictures are stamped that it was made of."""
+    if robot.poses is None or robot.poses.edge is not None:
+        return False
+    images, poses = (
+        [header_ns(message) * 1e-9 for _, message in bag.firsts(topic.name, STAMPS_TRIED)]
+        for topic in (robot.image, robot.poses.topic)
+    )
+    return of_pictures(poses, images)
 
 
 def _lens(layout: Layout, robot: RobotTopics, options: BagOptions) -> tuple[Lens, list[str]]:
@@ -276,6 +299,7 @@ class _Conversion:
 
     Attributes:
         start_ns: Bag time of the first message to take, where an earlier attempt was cut short.
+        shift_ns: What is added to the stamps of pictures for those of the body's clock.
     """
 
     bag: Bag
@@ -286,6 +310,7 @@ class _Conversion:
     out: Path
     identity: str
     zero_ns: int = 0
+    shift_ns: int = 0
     images: Tally = field(default_factory=Tally)
     poses: Tally = field(default_factory=Tally)
     journey: int = 0
@@ -391,8 +416,8 @@ class _Conversion:
         if len(posed) == 1 and not self.clock.is_bag and self.clock.is_off(posed[0][0], bag_ns):
             self.poses.damage(STRAY)
             return
-        for header_ns, numbers in posed:
-            taken_ns = bag_ns if self.clock.is_bag else header_ns
+        for posed_ns, numbers in posed:
+            taken_ns = bag_ns if self.clock.is_bag else posed_ns
             for is_new, good_ns, good in self.watch.take(taken_ns, numbers):
                 if is_new:
                     self._begin_journey(good_ns, bag_ns)
@@ -436,6 +461,7 @@ class _Conversion:
             taken_ns = bag_ns if self.clock.is_bag else stamp_ns(message.header)
             if taken_ns == 0 or (not self.clock.is_bag and self.clock.is_off(taken_ns, bag_ns)):
                 raise DatasetError(STRAY)
+            taken_ns += self.shift_ns
             if self.options.from_zero and self.zero_ns == 0:
                 self.zero_ns = taken_ns
             stamp_s = (taken_ns - self.zero_ns) * 1e-9

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, STILL_MAX, StaticFrames, pose_of_transform
 from flocc_agent.runtime.ros2.types import BadMessage
-from flocc_launch.datasets.bag_messages import CAMERA_TYPE, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
+from flocc_launch.datasets.bag_messages import CAMERA_TYPE, DEPTH_NAME, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
 from flocc_launch.datasets.source import DatasetError
 
@@ -25,11 +25,15 @@ Float = NDArray[np.float64]
 
 TRANSFORMS_READ_MAX = 2000
 FIXED_FRAMES = ("odom", "odometry", "map", "world", "earth", "vio", "global")
+BODY_FRAMES = r"base(_?(link|footprint|frame|stabilized))?|body(_?(link|frame))?|chassis(_?link)?|trunk|robot"
+"""What the frame of a whole robot is called; an IMU is one of its parts, and whose pose is told stays open."""
 PARTS_OF_NAMES, LETTERS_OR_DIGITS = r"[a-z0-9]+", r"[a-z]+|\d+"
 WANTED_POSES = re.compile(
     r"plan|goal|setpoint|target|waypoint|initial_?pose|desired|reference|command|cmd", re.IGNORECASE
 )
 """Leaves of topics that say where a robot is to be, not where it is."""
+THERMAL = re.compile(r"therm|flir|boson|lepton|lwir|infrared|hadron|optris|seek|tau2", re.IGNORECASE)
+"""In the names of topics of thermal cameras, which publish grey of 16 bits as 16UC1."""
 TRUTH_WORDS = ("ground_truth", "groundtruth", "vicon", "mocap", "optitrack", "leica", "rtk", "gps", "gnss", "amcl")
 """In the names of topics that say where a robot is in a map, not how it moved."""
 
@@ -237,7 +241,10 @@ class Layout:
             return named(self.bag, IMAGE_TYPES, name)
         kept = [topic for topic in images if not self._is_depth(topic)]
         if images and not kept:
-            raise DatasetError(f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}")
+            raise DatasetError(
+                f"{self.bag.path}: the image topics hold depth, no pictures: {listed(images)}; name one "
+                "of 16UC1 with --image-topic if it is of a thermal camera"
+            )
         by_base: dict[str, BagTopic] = {}
         for topic in kept:
             base = topic.name.removesuffix("/compressed")
@@ -253,7 +260,9 @@ class Layout:
         if leaf in ("compressedDepth", "theora"):
             return True
         head = self.head(topic)
-        return head is not None and head.coding.split(";")[0].strip() in ("16UC1", "32FC1")
+        coding = "" if head is None else head.coding.split(";")[0].strip()
+        is_thermal = THERMAL.search(topic.name) is not None and DEPTH_NAME.search(topic.name) is None
+        return coding == "32FC1" or (coding == "16UC1" and not is_thermal)
 
     def info_of(self, image: BagTopic) -> BagTopic | None:
         """The CameraInfo of an image topic: of its namespace, else of its frame, else the only one; None where unclear.
@@ -394,6 +403,11 @@ class Layout:
                 f"{self.bag.path}: no chain of static transforms leads from {body}, which {robot.poses} moves, to "
                 f"{camera or 'none'}, the frame of {robot.image.name}; name a camera file with T_body_camera: --camera"
             )
+        if beside is not None and (T_root_camera := self._on_root(robot, frames, camera)) is not None:
+            return T_root_camera, (
+                f"{self.bag.path}: {robot.poses} does not say which frame it moves; {frames.static.root(camera)} is "
+                "taken, on which the camera sits: name a camera file with T_body_camera (--camera) if not"
+            )
         if beside is not None:
             raise DatasetError(
                 f"{self.bag.path}: the camera ({camera}) sits on {beside}, but {robot.poses} does not say which frame "
@@ -403,6 +417,16 @@ class Layout:
             f"{self.bag.path}: nothing says where the camera ({camera or 'no frame'}) sits on the body "
             f"({body or 'no frame'}); they are taken as one: name a camera file with T_body_camera (--camera) if not"
         )
+
+    def _on_root(self, robot: RobotTopics, frames: Frames, camera: str) -> Float | None:
+        """The camera in the body that carries it by static transforms; None where it has no body's name.
+
+        Poses of a topic that names a camera may be the camera's.
+        """
+        root = frames.static.root(camera)
+        is_body = re.fullmatch(BODY_FRAMES, root.rsplit("/", 1)[-1].lower()) is not None
+        names_camera = robot.poses is not None and re.search(r"cam|optical|lens|eye", robot.poses.topic.name.lower())
+        return frames.static.between(root, camera) if is_body and not names_camera else None
 
     def _between_on_tf(self, frames: Frames, body: str, camera: str) -> Float | None:
         """`T_body_camera` where transforms that stay as they are stand on /tf, as ROS 1 repeats them; None without any.

@@ -60,7 +60,7 @@ def image_file(message: Any, topic: BagTopic, jpeg: bool) -> tuple[bytes, str]:
                 f"topic {topic.name}: an image compressed as {message.format!r} cannot be read: {error}"
             ) from error
     try:
-        pixels = raw_pixels(message)
+        pixels = raw_pixels(message, is_picture=DEPTH_NAME.search(topic.name) is None)
     except ValueError as error:
         raise DatasetError(f"topic {topic.name}: {error}") from error
     if jpeg:
@@ -71,9 +71,11 @@ def image_file(message: Any, topic: BagTopic, jpeg: bool) -> tuple[bytes, str]:
 def sampled_levels(bag: Bag, topic: BagTopic) -> Levels:
     """How a topic's images of 16 bits are brought to 8, by a sample over the whole bag."""
     first = bag.first(topic.name)
-    if first is None or _deep_pixels(first[1]) is None:
+    is_picture = DEPTH_NAME.search(topic.name) is None
+    if first is None or _deep_pixels(first[1], is_picture) is None:
         return FULL
-    return levels_of(pixels for message in _spread(bag, topic) if (pixels := _deep_pixels(message)) is not None)
+    deep = (_deep_pixels(message, is_picture) for message in _spread(bag, topic))
+    return levels_of(pixels for pixels in deep if pixels is not None)
 
 
 def _spread(bag: Bag, topic: BagTopic) -> Iterator[Any]:
@@ -90,11 +92,11 @@ def _spread(bag: Bag, topic: BagTopic) -> Iterator[Any]:
             continue
 
 
-def _deep_pixels(message: Any) -> Any:
+def _deep_pixels(message: Any, is_picture: bool) -> Any:
     """Pixels of an image of 16 bits; None of others, and of what cannot be read."""
     try:
         compressed = hasattr(message, "format")
-        pixels = compressed_pixels(message) if compressed else raw_pixels(message)
+        pixels = compressed_pixels(message) if compressed else raw_pixels(message, is_picture)
     except ValueError:
         return None
     return pixels if pixels.dtype == np.uint16 else None
@@ -162,6 +164,8 @@ def checked_numbers(numbers: tuple[float, ...], topic: BagTopic) -> tuple[float,
     return x, y, z, qx / norm, qy / norm, qz / norm, qw / norm
 
 
+DEPTH_NAME = re.compile(r"depth|disparity|range|distance", re.IGNORECASE)
+"""In the names of topics whose values of 16 bits are no grey."""
 RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
 """In the names of topics of images that were undistorted, as image_proc and camera drivers publish them."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.pictures import FULL
 from flocc_agent.runtime.recording import MASK, read_mask
+from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.bag_convert import BagOptions, convert_bag
@@ -23,6 +24,7 @@ from flocc_launch.datasets.cut import cut
 from flocc_launch.datasets.detect import check_times, not_taken, read_source, team_folder
 from flocc_launch.datasets.drift import DriftKind, DriftSpec, drifted, fitted, kind_of, summary
 from flocc_launch.datasets.names import robot_names
+from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import (
@@ -129,7 +131,7 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         odometry_poses=len(source.odometry) if source.odometry else None,
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
-        faults=(*source.faults, *_missing(source), *_mask_faults(source)),
+        faults=(*source.faults, *_missing(source), *_mask_faults(source), *_seen(source, form is not None)),
         notes=(*source.notes, *_unused(source)),
         odometry_file=taken_file(path, ODOMETRY_STEMS) if source.odometry else None,
         truth_file=taken_file(path, TRUTH_STEMS) if source.truth else None,
@@ -151,11 +153,10 @@ def _unused(source: Source) -> list[str]:
 
 def _mask_faults(source: Source) -> list[str]:
     """Why a folder's mask cannot be used."""
-    camera = None if source.lens is None else source.lens.camera.agent_camera()
     try:
-        if camera is not None:
-            read_mask(source.path / MASK, camera)
-    except FloccError as error:
+        if source.lens is not None:
+            read_mask(source.path / MASK, Straightener(source.lens.camera, source.lens.view_rad))
+    except (FloccError, ValueError) as error:
         return [str(error)]
     return []
 
@@ -389,6 +390,7 @@ def convert(
         f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
     )
     own = None if odometry is None else _given_odometry(source, odometry, form, time_offset_s)
+    _see_pictures(source, own, form is not None)
     moved = own or _odometry(source, drift, np.random.default_rng([seed, 0]))
     _tell_uncovered(source, moved)
     write_source(source, out, moved, identity, progress)
@@ -447,6 +449,7 @@ def split(
     """
     source = _viewed(read_source(path, format_name, camera, form), view_deg)
     _tell(source)
+    _see_pictures(source, None, form is not None)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
     identity = _identity(f"split overlap_s={overlap_s}", path, source, drift or needed_drift(source, kind), seed)
@@ -494,6 +497,26 @@ def _tell(source: Source) -> None:
         logger.warning("%s", note)
 
 
+def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) -> None:
+    """Log what pictures contradict of the trajectory that is used.
+
+    Raises:
+        DatasetError: As `seen_faults`.
+    """
+    trajectory = given or source.odometry or source.truth
+    if trajectory is not None:
+        _tell(replace(source, notes=seen_faults(source, trajectory, is_settled)))
+
+
+def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
+    """The same in sentences, where nothing is converted."""
+    trajectory = source.odometry or source.truth
+    try:
+        return () if trajectory is None else seen_faults(source, trajectory, is_settled)
+    except DatasetError as error:
+        return (str(error),)
+
+
 def _given_odometry(source: Source, path: Path, form: str | None, time_offset_s: float) -> Trajectory:
     read, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
     given = read.later(time_offset_s)
@@ -526,4 +549,6 @@ def _identity(command: str, path: Path, source: Source, drift: DriftSpec | None,
     lens, changed = source.lens, ""
     if lens is not None and (lens.camera.agent_camera() is None or source.levels != FULL):
         changed = f" of {lens.camera} view={lens.view_rad} {source.levels}"
+    if lens is not None and lens.time_shift_s:
+        changed += f" shift={lens.time_shift_s}"
     return f"{command} {path.resolve()} format={source.format} drift={errors} seed={seed}{changed}"

@@ -1,5 +1,6 @@
 """Which data set a folder is, and the reader for it."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -10,6 +11,7 @@ import numpy as np
 from flocc_agent.runtime.columns import UNITS_S
 from flocc_agent.runtime.trajectory import NEAR_S, Trajectory
 from flocc_launch.datasets.bag_reader import is_bag
+from flocc_launch.datasets.camera_clock import of_pictures, told
 from flocc_launch.datasets.folders import (
     read_euroc,
     read_kitti,
@@ -21,7 +23,7 @@ from flocc_launch.datasets.kitti_raw import image_folder, read_kitti_raw
 from flocc_launch.datasets.names import robot_name
 from flocc_launch.datasets.other_kinds import kind_of_file, kind_of_folder, marked_kind
 from flocc_launch.datasets.pixels import size_of, usable_images
-from flocc_launch.datasets.plain import is_plain, read_plain
+from flocc_launch.datasets.plain import has_trajectory, is_plain, read_plain
 from flocc_launch.datasets.reconstructions import (
     colmap_folder,
     read_colmap,
@@ -36,6 +38,11 @@ CLOCKS_DIFFER = (
 )
 INSIDE_MAX = 200
 """Entries of a folder that is none of the known data sets that are looked at for what its owner may have meant."""
+UNREAD_SUFFIXES = (
+    ".heic", ".heif", ".avif", ".gif", ".jp2", ".j2k", ".jxl", ".exr", ".hdr", ".dng", ".cr2", ".cr3", ".nef", ".arw",
+    ".raf", ".orf", ".rw2", ".gpr", ".insp", ".raw",
+)  # fmt: skip
+"""Pictures that flocc does not read."""
 READERS: dict[str, Callable[[Path], Source]] = {
     "euroc": read_euroc,
     "kitti": read_kitti,
@@ -58,6 +65,9 @@ def detect_format(path: Path) -> str:
     if not path.exists():
         raise DatasetError(f"{path}: does not exist")
     known = _known_format(path)
+    marked = marked_kind(path) if known == "plain" and not has_trajectory(path) else None
+    if marked is not None:
+        raise DatasetError(f"{path}: {marked}")
     if known is not None:
         return known
     if is_bag(path):
@@ -187,14 +197,30 @@ def read_source(
     if name not in READERS:
         raise DatasetError(f"{path}: the format {name!r} is not known; there are {', '.join(READERS)}")
     source = _read(path, name, form)
+    lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
+    source = _of_body_clock(replace(source, lens=lens))
     if time_offset_s:
         odometry, truth = (t.later(time_offset_s) if t is not None else None for t in (source.odometry, source.truth))
         source = replace(source, odometry=odometry, truth=truth)
     for trajectory in (source.odometry, source.truth):
         if trajectory is not None and time_offset_s is not None:
             check_times(source, trajectory)
-    lens = source.lens if camera is None else read_lens(camera, size_of(source.images))
-    return _usable(replace(source, lens=lens))
+    return _usable(source)
+
+
+def _of_body_clock(source: Source) -> Source:
+    """The source with stamps of the body's clock, where the calibration says how far the camera's is off."""
+    shift_s = source.lens.time_shift_s if source.lens else 0.0
+    if shift_s == 0.0:
+        return source
+    stamps_s = [stamp_s for stamp_s, _ in source.images]
+    trajectories = [each for each in (source.odometry, source.truth) if each is not None]
+    of_camera = source.is_posed_by_image or any(of_pictures(each.stamps_s.tolist(), stamps_s) for each in trajectories)
+    notes = (*source.notes, f"{source.path}: {told(shift_s, not of_camera)}")
+    if of_camera:
+        return replace(source, notes=notes)
+    images = tuple((stamp_s + shift_s, file) for stamp_s, file in source.images)
+    return replace(source, images=images, notes=notes)
 
 
 def _usable(source: Source) -> Source:
@@ -202,8 +228,20 @@ def _usable(source: Source) -> Source:
     lens = source.lens
     size = None if lens is None else (lens.camera.width, lens.camera.height)
     images, notes, levels = usable_images(source.images, size)
-    told = (*source.notes, *(lens.notes if lens else ()), *notes)
+    told = (*source.notes, *(lens.notes if lens else ()), *notes, *_unread(source.images[0][1].parent))
     return replace(source, images=images, notes=told, levels=levels)
+
+
+def _unread(folder: Path) -> tuple[str, ...]:
+    """What of a folder of images is a picture of a kind that is not read, counted."""
+    try:
+        kinds = Counter(file.suffix.lower() for file in folder.iterdir())
+    except OSError:  # its files can be read, it cannot be listed
+        return ()
+    unread = ((suffix, count) for suffix, count in sorted(kinds.items()) if suffix in UNREAD_SUFFIXES)
+    return tuple(
+        f"{folder}: {count} {suffix} files were left out: flocc does not read them" for suffix, count in unread
+    )
 
 
 def _read(path: Path, name: str, form: str | None) -> Source:

@@ -137,7 +137,9 @@ def read_kitti(path: Path) -> Source:
     if lens is None and calibration.exists() and files:
         lens = rectified_lens(calibration, number, files[0])
     shown = some(images, folder)
-    return Source(path, "kitti", shown, lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes)
+    return Source(
+        path, "kitti", shown, lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes, is_posed_by_image=True
+    )
 
 
 def posed(stamps_s: list[float], poses: list[Float], file: Path) -> tuple[Trajectory, tuple[str, ...]]:
@@ -187,7 +189,17 @@ def read_sevenscenes(path: Path) -> Source:
         faults = (*faults, f"{path}: has {orphans} poses more than images")
     truth = Trajectory(np.array([stamp_s for stamp_s, _ in images]), np.array(poses))
     lens = camera_file(path, images) or _sevenscenes_lens(path, images[0][1])
-    return Source(path, "7scenes", tuple(images), lens, truth=truth, up_world=UP_CAMERA, faults=faults, notes=notes)
+    return Source(
+        path,
+        "7scenes",
+        tuple(images),
+        lens,
+        truth=truth,
+        up_world=UP_CAMERA,
+        faults=faults,
+        notes=notes,
+        is_posed_by_image=True,
+    )
 
 
 def _sevenscenes_pose(path: Path) -> Float:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.recording import read_camera
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_launch.datasets.calibrations.document import parsed_json, parsed_xml, parsed_yaml, read_text
@@ -53,8 +52,7 @@ def read_lens(path: Path, size: Size | None = None) -> Lens:
     """
     path, chosen = _file_and_camera(path)
     if path.suffix == ".toml":
-        camera, T_body_camera = read_camera(path)
-        return believable(Lens(CameraModel.of_camera(camera), T_body_camera), path)
+        return believable(Lens(*read_camera(path)), path)
     text = read_text(path)
     try:
         return believable(_lens(path, text, chosen, size), path)

@@ -94,6 +94,7 @@ class ImageWriter:
 
     Attributes:
         lens: Of the images in the recording.
+        straightener: What remaps them.
     """
 
     def __init__(self, lens: Lens, levels: Levels = FULL) -> None:
@@ -105,10 +106,10 @@ class ImageWriter:
         self._size = (lens.camera.width, lens.camera.height)
         self._levels = levels
         try:
-            self._straightener = Straightener(lens.camera, lens.view_rad)
+            self.straightener = Straightener(lens.camera, lens.view_rad)
         except ValueError as error:
             raise DatasetError(str(error)) from error
-        self.lens = Lens(CameraModel.of_camera(self._straightener.camera), lens.T_body_camera)
+        self.lens = Lens(CameraModel.of_camera(self.straightener.camera), lens.T_body_camera)
 
     def written(self, encoded: bytes, suffix: str | None = None) -> tuple[bytes, str]:
         """Bytes and suffix of an image in the recording.
@@ -123,9 +124,9 @@ class ImageWriter:
         head = head_of(encoded)
         if (fault := pictures.size_fault(head, self._size)) is not None:
             raise PictureError(fault)
-        if not self._straightener.is_needed and head.bits == 8:
+        if not self.straightener.is_needed and head.bits == 8:
             return encoded, suffix or SUFFIXES[head.format]
-        pixels = self._straightener.apply(pictures.decoded(encoded, self._size))
+        pixels = self.straightener.apply(pictures.decoded(encoded, self._size))
         if pixels.dtype == np.uint16:
             pixels = self._levels.eight_bits(pixels)
         return pnm(pixels) if head.bits > 8 and head.format == "PNM" else encoded_image(pixels, head.bits > 8)

@@ -3,23 +3,39 @@
 Names vary, so several are taken; what was looked for is said where nothing fits.
 """
 
+import re
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
+from flocc_agent.runtime.columns import UNITS_S
+from flocc_agent.runtime.stamp_units import are_counted, plausible_units
+from flocc_agent.runtime.text_tables import is_number, text_lines
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.files import camera_file, image_files, listed_images, some, unequal
-from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.source import DatasetError, Lens, Source
 from flocc_launch.datasets.stamped_names import stamps_of_names
 
 Stamped = tuple[tuple[float, Path], ...]
 
-ODOMETRY_STEMS = ("odometry", "trajectory", "poses", "vio")
+ODOMETRY_STEMS = (
+    "odometry", "trajectory", "poses", "vio", "odom", "camera_poses", "arcore_poses", "arkit_poses", "arcore", "arkit",
+    "arposes",
+)  # fmt: skip
 TRUTH_STEMS = ("groundtruth", "gt", "ground_truth")
 LISTINGS = ("images.txt", "rgb.txt")
-IMAGE_FOLDERS = ("images", "rgb", "image", "color", "cam0", "left")
+IMAGE_FOLDERS = (
+    "images", "rgb", "image", "color", "cam0", "left", "frames", "photos", "pictures", "img", "imgs", "dcim", "camera",
+)  # fmt: skip
+TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
+"""Stamps of images whose names only count, one a line, or behind the image's number or before or behind its name."""
+OF_PHONES = ("arcore", "arkit", "arposes")
+PHONE_AXES = "T_body_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
 TRAJECTORY_SUFFIXES = (".tum", ".txt", ".csv")
-UNUSUAL = ("dates, read as UTC", "seconds and their fraction")
+UNUSUAL = ("dates, read as UTC", "seconds and their fraction", *(f"{name} gives them" for name in TIMES))
 """Readings of names that a note tells."""
 
 
@@ -27,7 +43,7 @@ def is_plain(path: Path) -> bool:
     """Whether a folder holds images of its own: in `images/`, in a list, or beside a trajectory."""
     if (path / "images").is_dir() or (path / "images.txt").exists():
         return True
-    return path.is_dir() and (bool(image_files(path)) or _image_folder(path) != path) and _has_trajectory(path)
+    return path.is_dir() and (bool(image_files(path)) or _image_folder(path) != path) and has_trajectory(path)
 
 
 def read_plain(path: Path, form: str | None = None) -> Source:
@@ -44,12 +60,33 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     images, faults, how = _named_images(path) if listing is None else (*listed_images(listing), "")
     stamps_s = [stamp_s for stamp_s, _ in images] if images else None
     odometry, truth, notes = trajectories_beside(path, form, stamps_s)
+    by_order = images is None
     if images is None:
         images, faults = _stamped_by_order(path, odometry or truth)
     read_how = (f"{path}: the names of the images say their stamps as {how}",) if how in UNUSUAL else ()
     lens = camera_file(path, images)
+    _see_phone_axes(path, lens)
     notes = (*read_how, *notes)
-    return Source(path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes)
+    return Source(
+        path, "plain", images, lens, odometry=odometry, truth=truth, faults=faults, notes=notes,
+        is_posed_by_image=by_order,
+    )  # fmt: skip
+
+
+def _see_phone_axes(path: Path, lens: Lens | None) -> None:
+    """See that the axes of a phone's camera are said, which are those of OpenGL.
+
+    Raises:
+        DatasetError: The trajectory is ARCore's or ARKit's by its name, and the calibration says no mounting.
+    """
+    file = taken_file(path, ODOMETRY_STEMS)
+    if file is None or lens is None or not file.stem.lower().startswith(OF_PHONES):
+        return
+    if np.array_equal(lens.T_body_camera, np.eye(4)):
+        raise DatasetError(
+            f"{file}: poses of ARCore and ARKit are of a camera whose y points up and z backwards; write {PHONE_AXES} "
+            f"into the calibration, or call the file odometry{file.suffix} if it has other axes"
+        )
 
 
 def trajectories_beside(
@@ -71,7 +108,8 @@ def taken_file(path: Path, stems: tuple[str, ...]) -> Path | None:
     return next(iter(_trajectory_files(path, stems)), None)
 
 
-def _has_trajectory(path: Path) -> bool:
+def has_trajectory(path: Path) -> bool:
+    """Whether a trajectory of one of the plain names stands in a folder."""
     return any(_trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
 
 
@@ -94,11 +132,15 @@ def _first_trajectory(
 
 
 def _image_folder(path: Path) -> Path:
-    """Where the images are: in a folder of a usual name, or in the only folder inside of it (images/cam0)."""
-    folder = next((path / name for name in IMAGE_FOLDERS if (path / name).is_dir()), path)
+    """Where the images are: in a folder of a usual name, or in the only folder inside of it (images/cam0).
+
+    Capitals do not matter (`DCIM/Camera`, `RGB`); hidden folders (`DCIM/.thumbnails`) are none.
+    """
+    there = {entry.name.lower(): entry for entry in sorted(path.iterdir()) if entry.is_dir()} if path.is_dir() else {}
+    folder = next((there[name] for name in IMAGE_FOLDERS if name in there), path)
     if folder == path or image_files(folder):
         return folder
-    inside = [entry for entry in folder.iterdir() if entry.is_dir()]
+    inside = [entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
     return inside[0] if len(inside) == 1 else folder
 
 
@@ -107,6 +149,8 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
     folder = _image_folder(path)
     files = some(tuple(image_files(folder)), folder)
     stamps_s, how = stamps_of_names([file.stem for file in files], folder)
+    if stamps_s is None and (times := next((path / t for t in TIMES if (path / t).is_file()), None)) is not None:
+        stamps_s, how = stamps_of_times(times, files), f"{times.name} gives them"
     if stamps_s is None:
         return None, (), how
     pairs = sorted(zip(stamps_s, files, strict=True))
@@ -116,6 +160,49 @@ def _named_images(path: Path) -> tuple[Stamped | None, tuple[str, ...], str]:
             f"{twins[1]}: has the stamp of another image, {twins[0]:.6f} s; a folder holds the images of one camera"
         )
     return tuple(pairs), (), how
+
+
+def stamps_of_times(path: Path, files: Sequence[Path]) -> list[float]:
+    """Seconds of images whose names only count, by a file with a line for each.
+
+    A line is a stamp, or holds one beside the image's number or name; what is behind (an exposure) is not used.
+
+    Raises:
+        DatasetError: Lines are of another form, not as many as images, time goes backwards, or their unit is not clear.
+    """
+    rows = [re.split(r"[\s,;]+", text.strip(",; ")) for _, text in text_lines(path)]
+    if rows and not any(map(is_number, rows[0])):
+        rows = rows[1:]
+    if len(rows) != len(files):
+        raise DatasetError(
+            f"{path}: has {len(rows)} stamps, but {files[0].parent} has {len(files)} images; list them in images.txt "
+            "with lines 'stamp_s relative/path'"
+        )
+    names = [{file.name, _number(file.stem)} for file in files]
+    named = next((k for k in (0, 1) if _is_of_names([row[k : k + 1] for row in rows], names)), None)
+    column = 0 if named is None or len(rows[0]) == 1 else 1 - named
+    if not all(len(row) > column and is_number(row[column]) for row in rows) or (named is None and len(rows[0]) > 1):
+        raise DatasetError(f"{path}: its lines must be stamps, or stamps beside the numbers or names of the images")
+    stamps = np.array([float(row[column]) for row in rows])
+    units = plausible_units(stamps)
+    if len(units) != 1 or are_counted(stamps):
+        readings = " or ".join(units) or "no unit of time"
+        raise DatasetError(f"{path}: stamps can be {readings}; list the images in images.txt with seconds")
+    if np.any(np.diff(stamps) <= 0):
+        line = int(np.argmax(np.diff(stamps) <= 0)) + 2
+        raise DatasetError(f"{path}:{line}: time goes backwards or stands still")
+    per_s = round(1 / UNITS_S[units[0]])
+    return [float(row[column]) / per_s for row in rows]
+
+
+def _is_of_names(cells: Sequence[Sequence[str]], names: Sequence[set[str]]) -> bool:
+    """Whether a column holds the numbers or names of images; a counting column is one of each image's number."""
+    return all(cell and _number(cell[0].rpartition("/")[2]) in name for cell, name in zip(cells, names, strict=True))
+
+
+def _number(word: str) -> str:
+    """A number without leading zeros; any other word as it is."""
+    return str(int(word)) if word.isdecimal() else word
 
 
 def _stamped_by_order(path: Path, trajectory: Trajectory | None) -> tuple[Stamped, tuple[str, ...]]:

@@ -282,7 +282,7 @@ def _source(
     images = tuple(zip(stamped_s.tolist(), (found[key] for key in keys), strict=True))
     if calibration is not None:
         lens = read_lens(calibration, size_of(images))
-    return Source(path, name, images, lens, truth=truth, notes=tuple(notes))
+    return Source(path, name, images, lens, truth=truth, notes=tuple(notes), is_posed_by_image=True)
 
 
 def _seconds(given: list[Any], path: Path) -> list[float] | None:
@@ -329,4 +329,4 @@ def read_replica(path: Path) -> Source:
     lens = None if place is None else read_lens(place)
     told = f"{path}: images have no stamps; {REPLICA_RATE_HZ:g} a second were assumed"
     images = tuple(zip(stamps_s, files, strict=True))
-    return Source(path, "replica", images, lens, truth=truth, notes=(told, *notes))
+    return Source(path, "replica", images, lens, truth=truth, notes=(told, *notes), is_posed_by_image=True)

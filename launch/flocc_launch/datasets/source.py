@@ -26,6 +26,7 @@ class Lens:
         camera: Intrinsics.
         T_body_camera: (4, 4) pose of the camera in the body, metres.
         view_rad: Horizontal field of view of a wide lens's remapped images; None takes as much as there is.
+        time_shift_s: What is added to the stamps of its pictures for those of the body's clock.
         notes: What its file says that is not used, one sentence each.
     """
 
@@ -33,6 +34,7 @@ class Lens:
     T_body_camera: Float = field(default_factory=lambda: np.eye(4))
     view_rad: float | None = None
     notes: tuple[str, ...] = ()
+    time_shift_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +52,7 @@ class Source:
         faults: What is wrong with the rest, one sentence each; what is above is good.
         notes: What was left out, or concluded where nothing said it; one sentence each.
         levels: How images of 16 bits are brought to 8.
+        is_posed_by_image: Whether each image has a pose of its own, and stamps are only numbers of both.
     """
 
     path: Path
@@ -62,3 +65,4 @@ class Source:
     faults: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     levels: Levels = FULL
+    is_posed_by_image: bool = False

@@ -24,10 +24,12 @@ FRACTIONS_S = {3: 1e-3, 6: 1e-6, 9: 1e-9}
 WAY_OUT = "list the images in images.txt with lines 'stamp_s relative/path'"
 
 _DATE = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])[-_.T ]{0,3}"
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])(?:[-_.T ]{0,3}| at )"
     r"([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d|60)(?:([-_.,s]?)(\d{1,9}))?(?!\d)"
 )
-_CAMERA = re.compile(r"(?<![a-z])(?:left|right|cam(?:era)?[-_]?\d{1,2})(?![a-z\d])")
+_CAMERA = re.compile(
+    r"(?<![a-z])(?:left|right|cam(?:era)?[-_]?\d{1,2}|rgb|ir|nir|infra[12]?|thermal|depth|colou?r)(?![a-z\d])"
+)
 """What tells one camera of several in a name."""
 _AFTER_DATE = re.compile(r"\s*(?:(Z)\b|([+-])(\d\d):?(\d\d)(?!\d)|([AaPp])\.?[Mm]\b)")
 """What may follow a date: its zone, or the half of the day."""
@@ -44,6 +46,7 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
         DatasetError: Names have two readings.
     """
     _see_one_camera(stems, folder)
+    stems = _without_common_date(stems)
     dates = _dates_s(stems, folder)
     if dates is not None:
         return dates, "dates, read as UTC"
@@ -55,6 +58,14 @@ def stamps_of_names(stems: Sequence[str], folder: object) -> tuple[list[float] |
     if pair is not None:
         return pair
     return _one_number(columns, stems, folder)
+
+
+def _without_common_date(stems: Sequence[str]) -> Sequence[str]:
+    """Names without the date of the recording, where it is the same in all and something else differs."""
+    dates = {None if (found := _DATE.search(stem)) is None else found[0] for stem in stems}
+    return (
+        [_DATE.sub("", stem) for stem in stems] if len(stems) > 1 and len(dates) == 1 and None not in dates else stems
+    )
 
 
 def _see_one_camera(stems: Sequence[str], folder: object) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_trajectory
+from flocc_launch.datasets.camera_clock import of_pictures, told
 from flocc_launch.datasets.files import camera_file, camera_files
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_launch.datasets.pixels import JPEG_QUALITY, ImageWriter
@@ -143,11 +144,20 @@ def convert_video(
     identity = f"video {path.resolve()} every={every} odometry={file}"
     if lens.camera.agent_camera() is None:
         identity += f" of {lens.camera} view={lens.view_rad}"
+    shift_s = lens.time_shift_s
+    if shift_s:
+        at_frames = head.rate_hz > 0 and of_pictures(
+            trajectory.stamps_s.tolist(), [k / head.rate_hz for k in range(head.frames)]
+        )
+        notes = (*notes, f"{path}: {told(shift_s, not at_frames)}")
+        shift_s = 0.0 if at_frames else shift_s
+        identity += f" shift={shift_s}"
     with RecordingWriter(out, identity) as writer:
         images = ImageWriter(lens)
         writer.write_lens(images.lens)
         writer.write_trajectories(trajectory.relative_to_first(), None)
-        for number, (stamp_s, encoded) in enumerate(_frames(path, every), start=1):
+        for number, (taken_s, encoded) in enumerate(_frames(path, every), start=1):
+            stamp_s = taken_s + shift_s
             if writer.last_stamp_s is None or stamp_s > writer.last_stamp_s:
                 writer.add(stamp_s, *images.written(encoded, ".jpg"))
             if progress is not None:

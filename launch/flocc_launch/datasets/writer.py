@@ -19,7 +19,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.pictures import PictureError
 from flocc_agent.runtime.recording import MASK, read_mask, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
-from flocc_launch.datasets.pixels import ImageWriter, read_bytes
+from flocc_launch.datasets.pixels import ImageWriter, encoded_image, read_bytes
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
 Float = NDArray[np.float64]
@@ -285,7 +285,7 @@ def write_source(
     with RecordingWriter(out, identity) as writer:
         writer.write_lens(images.lens)
         writer.write_trajectories(odometry, source.truth)
-        _carry_mask(source, images.lens, out)
+        _carry_mask(source, images, out)
         done_s = writer.last_stamp_s
         for number, (stamp_s, file) in enumerate(source.images, start=1):
             if done_s is None or stamp_s > done_s + 1e-9:
@@ -294,25 +294,21 @@ def write_source(
                 progress(number, len(source.images))
 
 
-def _carry_mask(source: Source, lens: Lens, out: Path) -> None:
-    """Copy the folder's mask; pictures that are straightened no longer lie under it.
+def _carry_mask(source: Source, images: ImageWriter, out: Path) -> None:
+    """Bring the folder's mask to the recording; where pictures are straightened, so is it.
 
     Raises:
-        DatasetError: There is a mask, and the pictures are straightened.
         RecordingError: It is no mask of these images.
     """
     mask = source.path / MASK
-    if not mask.exists():
+    hidden = read_mask(mask, images.straightener)
+    if hidden is None:
         return
-    if source.lens is not None and lens.camera != source.lens.camera:
-        raise DatasetError(
-            f"{mask}: is of the pictures as they were taken, and these are straightened; leave it out, convert, and "
-            f"put one of the straightened pictures into {out}"
-        )
-    camera = lens.camera.agent_camera()
-    if camera is not None:
-        read_mask(mask, camera)
-    shutil.copyfile(mask, out / MASK)
+    if images.straightener.is_needed:
+        data, _ = encoded_image(np.where(hidden, np.uint8(0), np.uint8(255)), lossless=True)
+        (out / MASK).write_bytes(data)
+    else:
+        shutil.copyfile(mask, out / MASK)
 
 
 def _written(images: ImageWriter, file: Path) -> tuple[bytes, str]:

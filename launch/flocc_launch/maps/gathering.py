@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from flocc_agent.config import BackendConfig
 from flocc_agent.runtime.kept_for_maps import BACK_END_FACT, CAMERA_FACT, FRONT_END_FACT, MAP_FACT, UsedMap
-from flocc_agent.runtime.map_folder import MANIFEST, BadMap, LensModel, MapFolder, MapFrontEnd
+from flocc_agent.runtime.map_folder import MANIFEST, BadMap, LensModel, MapFolder, MapFrontEnd, longer_copy
 from flocc_agent.runtime.record_tables import COLUMNS, is_sound
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
@@ -159,10 +159,10 @@ def _reading(file: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _longer(where: Path, log: LogId, one: tuple[bytes, ...], other: tuple[bytes, ...]) -> tuple[bytes, ...]:
-    both = min(len(one), len(other))
-    if one[:both] != other[:both]:
+    longer = longer_copy(one, other)
+    if longer is None:
         raise BadMap(f"{where}: two robots hold different logs {log}: two missions, or two writers of one log")
-    return max(one, other, key=len)
+    return longer
 
 
 def _optics(facts: Mapping[str, bytes]) -> dict[LogId, Optics]:

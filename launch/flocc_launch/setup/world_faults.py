@@ -4,6 +4,7 @@ import errno
 import os
 import sqlite3
 import sys
+from contextlib import suppress
 from io import TextIOWrapper
 
 from flocc_protocol.errors import FloccError
@@ -23,11 +24,15 @@ PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EMFILE, err
 
 
 def speak_utf8() -> None:
-    """See that names and messages are UTF-8 whatever the locale says; where it is not, Python is started anew."""
+    """See that names and messages are UTF-8 whatever the locale says; where it is not, Python is started anew.
+
+    Where it cannot be (its file belongs to somebody else), the command goes on as it is.
+    """
     if sys.getfilesystemencoding().lower() != "utf-8" and not sys.flags.utf8_mode:
         os.environ["PYTHONUTF8"] = "1"
         sys.stdout.flush()
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+        with suppress(OSError):
+            os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

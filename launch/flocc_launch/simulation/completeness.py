@@ -1,17 +1,20 @@
 """Complete: nothing that should be found, registered or solved is left out."""
 
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.effects import PersistRecord
+from flocc_agent.core.effects import PersistRecord, Report
 from flocc_agent.core.events import KeyframeCaptured
+from flocc_agent.core.known_sets import is_beside
 from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.prospects import REFUSED_MIN, UNLIKELY
+from flocc_agent.core.reports import ClosureRejected
+from flocc_agent.core.spared import STRETCH, TOLD
 from flocc_launch.simulation.invariants import Step, core, groups
 from flocc_launch.simulation.rightness import component_of
 from flocc_launch.simulation.swarm import Swarm
@@ -29,7 +32,8 @@ class Complete:
     """Every keyframe is recorded and solved; of each two logs, keyframes that look most alike are registered.
 
     A robot that comes back looks no more for keyframes both of which were registered with one of the other's log.
-    A pair is refused unseen only by a robot that holds refusals of pairs that were seen.
+    A pair is refused unseen only by a robot that holds refusals of pairs that were seen, and one that is spared lies
+    beside as many closures as are enough: when it is spared, and in all logs of the swarm at the end.
     """
 
     _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
@@ -41,6 +45,8 @@ class Complete:
         life = step.station.name, step.station.life
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
         for effect in step.effects:
+            if isinstance(effect, Report) and isinstance(effect.fact, ClosureRejected) and effect.fact.reason == TOLD:
+                yield from _spared_too_early(step.station, CandidatePair.of(effect.fact.query, effect.fact.match))
             if isinstance(effect, PersistRecord) and effect.log == step.station.log:
                 record = decoded(effect.data)
                 if isinstance(record, KeyframeRecord):
@@ -75,7 +81,9 @@ class Complete:
         known = {
             log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
         }
-        resolved = resolved_pairs(logs)
+        copies = _all_copies(swarm, group)
+        resolved = resolved_pairs(copies)
+        told = closures_by_logs(copies)
         partnered = {(end, pair.other(end).log) for pair in resolved for end in (pair.low, pair.high)}
         came_back = {station.log for station in group if station.life > 1}
         for one, other in combinations(known, 2):
@@ -84,7 +92,10 @@ class Complete:
                 continue
             for pair in _alike((one, known[one]), (other, known[other]), threshold):
                 both = {(pair.low, pair.high.log), (pair.high, pair.low.log)} <= partnered
-                if pair not in resolved and not (both and came_back & {one, other}):
+                if pair in resolved or (both and came_back & {one, other}):
+                    continue
+                enough = swarm.scenario.core.loop_closing.closures_enough
+                if not enough or _closures_beside(told, pair) < enough:
                     yield f"nobody registered {pair.low} {pair.high}, which look alike"
 
     def _described(self, copy: LogCopy) -> dict[int, NDArray[np.float32]]:
@@ -113,10 +124,43 @@ def _alike(one: Described, other: Described, threshold: float) -> Iterator[Candi
             yield CandidatePair.of(KeyframeId(low, lefts[i]), KeyframeId(high, rights[j]))
 
 
-def resolved_pairs(logs: dict[LogId, LogCopy]) -> set[CandidatePair]:
+def _all_copies(swarm: Swarm, group: list[Station]) -> list[LogCopy]:
+    """Of each log the copy of one robot; of those of which two versions were seen the copies of all."""
+    return [
+        copy
+        for station in group
+        for log, copy in core(station).gossip.logs.items()
+        if station is group[0] or log in swarm.forked
+    ]
+
+
+def resolved_pairs(logs: Iterable[LogCopy]) -> set[CandidatePair]:
     """Pairs of which some log has a record."""
-    records = (record for copy in logs.values() for record in copy.other_records())
+    records = (record for copy in logs for record in copy.other_records())
     return {CandidatePair.of(r.query, r.match) for r in records if isinstance(r, ClosureRecord | RejectionRecord)}
+
+
+def closures_by_logs(logs: Iterable[LogCopy]) -> dict[tuple[LogId, LogId], set[CandidatePair]]:
+    """Closures by the two logs that they join."""
+    found: dict[tuple[LogId, LogId], set[CandidatePair]] = defaultdict(set)
+    for record in (record for copy in logs for record in copy.other_records()):
+        if isinstance(record, ClosureRecord):
+            pair = CandidatePair.of(record.query, record.match)
+            found[pair.low.log, pair.high.log].add(pair)
+    return found
+
+
+def _closures_beside(closures: dict[tuple[LogId, LogId], set[CandidatePair]], pair: CandidatePair) -> int:
+    """Closures of the same stretches of two ways."""
+    of_logs = closures.get((pair.low.log, pair.high.log), set())
+    return sum(is_beside(pair, other, STRETCH) for other in of_logs)
+
+
+def _spared_too_early(station: Station, pair: CandidatePair) -> Iterator[str]:
+    held = core(station)
+    beside, enough = _closures_beside(closures_by_logs(held.gossip.logs.values()), pair), held.closures_enough
+    if not enough or beside < enough:
+        yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
 
 
 def _second(values: NDArray[np.float32], but: int) -> float:

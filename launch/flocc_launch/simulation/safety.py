@@ -84,7 +84,7 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], ho
             "complete",
             step=complete.step,
             lacking=complete.lacking,
-            wants=frozenset({KeyframeCaptured, PersistRecord}),
+            wants=frozenset({KeyframeCaptured, PersistRecord, Report}),
         ),
         Invariant(
             "right",

@@ -99,7 +99,7 @@ def of_recording(recording: Recording, config: KeyframeConfig) -> Playback:
             frames[k].T_odom_body,
             lambda frame=frames[k]: recording.load_image(frame),  # type: ignore[misc]
             frames[k].image_path,
-            repr(recording.camera if recording.levels == FULL else (recording.camera, recording.levels)).encode(),
+            repr(recording.model if recording.levels == FULL else (recording.model, recording.levels)).encode(),
             measurements.at(frames[k].stamp_s),
         )
         for k in chosen

@@ -5,17 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flocc_agent.backend.descent import Objective, descend
+from flocc_agent.backend import solvers
+from flocc_agent.backend.descent import Objective, Solved, descend
 from flocc_agent.backend.edges import State, state_of
 from flocc_agent.backend.graduated import Graduated, graduated
 from flocc_agent.backend.initial import initial_poses
 from flocc_agent.backend.linear import LinearSolver
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import build
+from flocc_agent.backend.solvers import SEARCH_TOLERANCE_RATIO, best, explains, scheduled, searching, solve
 from flocc_agent.config import BackendConfig, Solver
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.geometry import inverse, pose
-from flocc_lab.graph_family.graphs import Member, member
+from flocc_lab.graph_family.family_spec import Lengths, drawn
+from flocc_lab.graph_family.graphs import Member, made, member
 from flocc_protocol.ids import KeyframeId
 
 LONG_WEAK_CHAIN = 42
@@ -23,11 +26,11 @@ LONG_WEAK_CHAIN = 42
 SMALL = (4, 9, 12, 13)
 
 
-def objective_of(drawn: Member, solver: Solver) -> tuple[Objective, State]:
+def objective_of(graph: Member, solver: Solver) -> tuple[Objective, State]:
     config = BackendConfig(solver=solver, weight_by_probability=False)
-    closures = dict(enumerate(drawn.graph.closures))
-    T = initial_poses(drawn.graph.trajectories, closures, config.steepness, None).T_map_keyframe
-    problem = build(drawn.graph.trajectories, closures, config)
+    closures = dict(enumerate(graph.graph.closures))
+    T = initial_poses(graph.graph.trajectories, closures, config.steepness, None).T_map_keyframe
+    problem = build(graph.graph.trajectories, closures, config)
     linear = LinearSolver(0, config.scale_prior_unknown_sigma_ratio)
     state = state_of(np.concatenate([T[log] for log in problem.logs]), problem.clusters)
     return Objective(problem.edges, problem.closure_rows, linear, config), state
@@ -97,3 +100,34 @@ def solved(graph: PoseGraph, config: BackendConfig) -> GraphSolution:
     solution = optimise(graph, config)
     assert isinstance(solution, GraphSolution)
     return solution
+
+
+@pytest.mark.parametrize("with_wrong_ones", [False, True])
+def test_only_a_solution_that_explains_the_closures_ends_the_search(
+    monkeypatch: pytest.MonkeyPatch, with_wrong_ones: bool
+) -> None:
+    """Where none is turned away no other schedule can explain more; where some are, all schedules run."""
+    spec = drawn(SMALL[0])
+    plain = replace(spec, outliers=0.3 * with_wrong_ones, groups=0, lengths=Lengths.METRIC, heavy_tails=False)
+    true = replace(plain, scale_off=(1.0,) * spec.robots, closure_factor=1.0, odometry_factor=1.0)
+    objective, state = objective_of(made(true), Solver.GNC_TLS)
+    ratios: list[float] = []
+
+    def counted(objective: Objective, state: State, start_ratio: float, hold: bool = False) -> Solved:
+        ratios.append(start_ratio)
+        return scheduled(objective, state, start_ratio, hold)
+
+    monkeypatch.setattr(solvers, "scheduled", counted)
+    solved = best(objective, state, None)
+    assert explains(objective, solved) is not with_wrong_ones
+    assert (len(set(ratios)) == 1) is not with_wrong_ones
+
+
+def test_a_search_is_coarse_and_what_it_found_is_solved_as_far_as_is_configured() -> None:
+    objective, state = objective_of(member(SMALL[0]), Solver.GNC_TLS)
+    fine = replace(objective, config=objective.config.model_copy(update={"relative_tolerance": 1e-9}))
+    assert searching(fine).config.relative_tolerance == SEARCH_TOLERANCE_RATIO
+    assert searching(objective) is objective
+    solved = solve(fine, state)
+    further = descend(fine, solved.state, solved.weights)
+    assert solved.cost - further.cost <= 2e-9 * solved.cost

@@ -108,6 +108,19 @@ def test_the_error_of_a_direction_is_its_angle_however_far_and_grows_up_to_half_
         assert error(turned_rad, 1e-3) < 2e-3, "poses that coincide have no direction"
 
 
+def test_directions_of_poses_that_meet_leave_the_system_regular() -> None:
+    """The length's prior kept its size there while its direction turned: slopes of 1e7, and no covariances at all."""
+    for turned_rad in (0.0, 0.5, 2.0):
+        for length_m in (1e-3, 1e-6, 1e-9):
+            assert jacobians_of(turned_rad, length_m) < 10.0 * jacobians_of(turned_rad, 1.0)
+
+
+def jacobians_of(turned_rad: float, length_m: float) -> float:
+    """The steepest slope of a direction's residual."""
+    edges, state = direction(turned_rad, length_m)
+    return float(np.abs(jacobians(edges, residuals(edges, state)).A_j).max())
+
+
 def test_a_held_scale_pulls_at_its_cluster_and_not_at_its_poses_scale() -> None:
     rng = np.random.default_rng(3)
     edges, state = edge(rng, "random", 0.3, 0, scale=0.5)

@@ -2,7 +2,7 @@
 
 import tracemalloc
 
-from flocc_agent.core.known_sets import KeyframeSet, PairSet
+from flocc_agent.core.known_sets import KeyframeSet, PairSet, PairTable
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
@@ -45,3 +45,18 @@ def test_a_set_of_keyframes_holds_what_was_added() -> None:
     assert KeyframeId(A, 7) not in some
     assert KeyframeId(B, 0) not in some
     assert "a/0" not in some
+
+
+def test_a_table_is_bounded_and_finds_pairs_of_the_same_stretches() -> None:
+    table: PairTable[int] = PairTable(3)
+    for k in range(4):
+        table.put(pair(k, 10), k)
+    assert table.size() == (3, 3)
+    assert pair(0, 10) not in table
+    assert list(table.beside(pair(2, 12), 2)) == [pair(1, 10), pair(2, 10), pair(3, 10)]
+    assert list(table.beside(pair(4, 12), 2)) == [pair(2, 10), pair(3, 10)]
+    assert not list(table.beside(pair(2, 13), 2))
+    assert not list(table.beside(CandidatePair(KeyframeId(A, 2), KeyframeId(LogId("c"), 10)), 2))
+    assert table.pop(pair(2, 10)) == 2
+    assert table.pop(pair(2, 10)) is None
+    assert len(table) == 2

@@ -19,7 +19,6 @@ from flocc_agent.core.prospects import (
     UNLIKELY,
     Prospect,
     Prospects,
-    beside,
     is_probe,
 )
 from flocc_protocol.arrays import Array
@@ -121,11 +120,6 @@ def test_tables_stay_within_their_maximum() -> None:
         prospects.on_unlikely(pair(k, 9000))
         prospects.of(pair(k, 7000), float(k))
     assert all(size <= size_max for size, size_max in prospects.sizes().values())
-
-
-def test_pairs_beside_another_are_those_of_keyframes_up_to_two_away() -> None:
-    assert len(beside(pair(5, 5))) == 24
-    assert len(beside(pair(0, 0))) == 8
 
 
 # Agreement of runs

@@ -8,7 +8,9 @@ import pytest
 
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.geometry import angle_rad, pose, so3_exp
+from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.recording import Recording, RecordingError, read_camera, write_camera
+from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_tum
 
@@ -205,7 +207,10 @@ def test_a_damaged_image_is_named(tmp_path: Path) -> None:
         ("fov = 3", "the key 'camera.fov' does not exist"),
         ("T_body_camera = [[1, 0], [0, 1]]", "four rows of four numbers"),
         ("T_body_camera = [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "the pose is not rigid"),
-        ("distortion = [0, 0]", r"distortion must be \[k1, k2, p1, p2\]"),
+        ("distortion = [0, 0]", r"distortion of the pinhole model must be \[k1, k2, p1, p2, ...\] .* 0 or 4 or 5 or 8"),
+        ("model = 'ds'\nxi = 0.1", "the key 'camera.alpha' is missing"),
+        ("model = 'equidistant'", r"distortion of the equidistant model must be \[k1, k2, k3, k4\]"),
+        ("model = 'thin_prism_fisheye'", "camera.model is 'thin_prism_fisheye'; flocc reads"),
     ],
 )
 def test_a_wrong_camera_key_is_named(tmp_path: Path, line: str, sentence: str) -> None:
@@ -213,3 +218,49 @@ def test_a_wrong_camera_key_is_named(tmp_path: Path, line: str, sentence: str) -
     (tmp_path / "camera.toml").write_text(base + line + "\n")
     with pytest.raises(RecordingError, match=sentence):
         read_camera(tmp_path / "camera.toml")
+
+
+@pytest.mark.parametrize(
+    ("lines", "model"),
+    [
+        ("distortion = [-0.3, 0.1, 0.0, 0.0, 0.05]", CameraModel(32, 24, 30, 31, 16, 12, (-0.3, 0.1, 0, 0, 0.05))),
+        (
+            "distortion = [0.5, -2.6, 0.0, 0.0, 1.5, 0.4, -2.5, 1.4]",
+            CameraModel(32, 24, 30, 31, 16, 12, (0.5, -2.6, 0, 0, 1.5, 0.4, -2.5, 1.4)),
+        ),
+        (
+            "model = 'kannala_brandt'\ndistortion = [0.02, -0.01, 0.003, 0.0]",
+            CameraModel(32, 24, 30, 31, 16, 12, (0.02, -0.01, 0.003, 0.0), LensKind.EQUIDISTANT),
+        ),
+        ("model = 'fov'\nomega = 0.9", CameraModel(32, 24, 30, 31, 16, 12, (), LensKind.FOV, (0.9,))),
+        (
+            "model = 'omni'\nxi = 1.2\ndistortion = [0.1, 0.0, 0.0, 0.0]",
+            CameraModel(32, 24, 30, 31, 16, 12, (0.1, 0, 0, 0), LensKind.OMNIDIRECTIONAL, (1.2,)),
+        ),
+        (
+            "model = 'double-sphere'\nxi = -0.2\nalpha = 0.59",
+            CameraModel(32, 24, 30, 31, 16, 12, (), LensKind.DOUBLE_SPHERE, (-0.2, 0.59)),
+        ),
+        (
+            "model = 'eucm'\nalpha = 0.6\nbeta = 1.1",
+            CameraModel(32, 24, 30, 31, 16, 12, (), LensKind.EUCM, (0.6, 1.1)),
+        ),
+    ],
+)
+def test_a_recording_takes_every_camera_model_and_straightens_its_pictures(
+    tmp_path: Path, lines: str, model: CameraModel
+) -> None:
+    path = write_recording(tmp_path / "r")
+    base = "[camera]\nwidth = 32\nheight = 24\nfx = 30.0\nfy = 31.0\ncx = 16.0\ncy = 12.0\n"
+    (path / "camera.toml").write_text(base + lines + "\n")
+    cv2.imwrite(str(path / "mask.png"), np.vstack([np.zeros((8, 32), np.uint8), np.full((16, 32), 255, np.uint8)]))
+    recording = Recording.open(path)
+    assert recording.model == model
+    assert recording.camera == Straightener(model).camera
+    image = recording.load_image(recording.frames[0])
+    assert image.pixels.shape == (recording.camera.height, recording.camera.width, 3)
+    assert recording.hidden is not None
+    assert recording.hidden.shape == image.pixels.shape[:2]
+    middle = recording.camera.width // 2
+    assert recording.hidden[0, middle]
+    assert not recording.hidden[-1, middle]

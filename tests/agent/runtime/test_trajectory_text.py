@@ -182,6 +182,23 @@ REFUSED = {
     ),
     "w2c.tum": ("# poses are world-to-camera\n" + GOOD, "w2c.tum:1: .*in the body or camera .world_to_camera"),
     "jpl.tum": ("# timestamp tx ty tz qx qy qz qw (JPL)\n" + GOOD, "jpl.tum:1: the quaternions are said to be JPL's"),
+    "w2c_above.tum": (
+        "# world-to-camera extrinsics\n# timestamp tx ty tz qx qy qz qw\n" + GOOD,
+        "w2c_above.tum:1: .*in the body or camera .world_to_camera",
+    ),
+    "cw.txt": (
+        "# timestamp tx_cw ty_cw tz_cw qx_cw qy_cw qz_cw qw_cw\n" + GOOD,
+        "cw.txt:1: the header is not understood",
+    ),
+    "unity.tum": ("# left-handed, as Unity has it\n" + GOOD, "unity.tum:1: the axes are said to be left-handed"),
+    "steps.tum": (
+        "# relative poses between frames\n" + GOOD,
+        "steps.tum:1: the poses are said to be from one to the next",
+    ),
+    "gl.tum": (
+        "# camera poses, OpenGL convention\n" + GOOD,
+        "gl.tum:1: the axes are said to be OpenGL's .*T_body_camera",
+    ),
     "tags.csv": (
         "tag_id,timestamp,x,y,z,qx,qy,qz,qw\n"
         + "".join(f"{k % 3},{line.replace(' ', ',')}\n" for k, line in enumerate(GOOD.splitlines())),

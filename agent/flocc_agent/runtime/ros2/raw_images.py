@@ -57,13 +57,17 @@ _PLANES = {"nv21": "YUV2RGB_NV21", "nv12": "YUV2RGB_NV12"}
 _DEPTH = ("16UC1", "32FC1")
 
 
-def raw_pixels(message: Any) -> Pixels:
+def raw_pixels(message: Any, is_picture: bool = False) -> Pixels:
     """Pixels of an Image message, with their own depth; padding at the ends of rows is left out.
+
+    Args:
+        message: The message.
+        is_picture: Whether values of 16 bits without a meaning are grey, as thermal cameras publish them.
 
     Raises:
         ValueError: An encoding that flocc does not read, or fewer bytes than the size needs.
     """
-    encoding = str(message.encoding)
+    encoding = "mono16" if is_picture and message.encoding == _DEPTH[0] else str(message.encoding)
     if encoding in _DEPTH:
         raise ValueError(
             f"images are encoded as {encoding!r}, which is how depth is published; a grey camera publishes mono16"

@@ -70,6 +70,10 @@ class StaticFrames:
         """A frame of the chain between two that was given more than one place, or None."""
         return min(self._moved & (set(self._ancestors(a)) ^ set(self._ancestors(b))), default=None)
 
+    def root(self, frame: str) -> str:
+        """The frame on which all sit that carry a frame; itself where none carries it."""
+        return list(self._ancestors(frame))[-1]
+
     def between(self, a: str, b: str) -> Float | None:
         """`T_a_b`, or None where no chain of static transforms connects the two."""
         of_a, of_b = self._ancestors(a), self._ancestors(b)

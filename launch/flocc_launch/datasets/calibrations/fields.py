@@ -86,7 +86,7 @@ HARMLESS = re.compile(
     r"depthscale|depthfactor|thdepth|thfarpoints|aabbscale|applied(transform|scale)|perviewreprojectionerrors|imagepoints|"
     r"extrinsicparameters|gridpoints|flagvalue|flags|fixprincipalpoint|ttracking|tlr|left.*|right.*|camera2.*|tcncnm1|"
     r"perviewerrors|stddevintrinsics|stddevextrinsics|intrinsicsstd|camoverlaps|rotationrate|t\d\d|posestd|calibaccel.*|"
-    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile)$"
+    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile|mindist(ance)?|maxcnt|fthreshold|posegraphsavepath|visualizecamerasize)$"
 )
 """Plain names of keys that look as if they mattered and do not: of other sensors or rectified images."""
 
@@ -103,6 +103,9 @@ def lens_of_keys(keys: Keys, size: Size | None) -> Lens:
     """
     model = _model(keys, size)
     T_body_camera = _mounting(keys)
+    shift_s = keys.number("timeshift_cam_imu") or 0.0
+    if not np.isfinite(shift_s):
+        raise ValueError(f"timeshift_cam_imu must be a number of seconds, not {shift_s}")
     _refuse_parts(keys)
     left = keys.left()
     apart = [key for key in left if plain(key) in ("t", "tvec")] if any(plain(key) == "r" for key in left) else []
@@ -112,7 +115,7 @@ def lens_of_keys(keys: Keys, size: Size | None) -> Lens:
             f"the key {strange[0]!r} is not understood and may be about the camera; take it out if it is not"
         )
     notes = (f"not used: {', '.join(left)}",) if left else ()
-    return Lens(model, T_body_camera, notes=notes)
+    return Lens(model, T_body_camera, notes=notes, time_shift_s=shift_s)
 
 
 def _matters(key: str, value: Any) -> bool:

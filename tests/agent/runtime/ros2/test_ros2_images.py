@@ -145,7 +145,9 @@ def test_a_third_radial_coefficient_is_taken_out_of_the_image() -> None:
     payload = cdr_by_hand.image(STAMP, "cam", (60, 80), "rgb8", pixels.tobytes(), 240)
     image = Eye(big).image(TYPES.read(payload, IMAGE))
     expected = cv2.undistort(pixels, big.K(), np.array([0.1, 0.0, 0.0, 0.0, -0.2]))
-    np.testing.assert_array_equal(image.pixels, expected)
+    off = np.abs(image.pixels.astype(int) - expected)[4:-4, 4:-4]  # OpenCV rounds its map
+    assert off.mean() < 1.5
+    assert np.abs(pixels.astype(int) - expected)[4:-4, 4:-4].mean() > 2 * off.mean()
     assert image.camera == Camera(80, 60, 50.0, 50.0, 40.0, 30.0)
 
 

@@ -1,0 +1,164 @@
+"""Pairs that are not registered, because closures beside them tell already what they would.
+
+Two robots that drive along one road have a candidate at every keyframe, and each closure is learnt by the whole team.
+Where `closures_enough` closures between the same stretches of both ways agree, one more tells nothing new: odometry
+carries what they say to every keyframe of the stretch, with less error than a registration has. So a stretch is
+`STRETCH` keyframes to either side of a pair, at both of its ends, and a later visit is another one.
+
+A stretch is weak, and its pairs are registered, where it has few closures in all, where these have no length, where
+odometry is not here or tears them apart, and where some contradict: each of those takes `CONTRADICTED` that agree.
+Nothing is written of a spared pair. Whether it is follows from records, so that all robots which hold the same ones
+spare the same; it is taken up again when a later closure contradicts.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.known_sets import PairTable
+from flocc_agent.core.pulls import remember
+from flocc_protocol.ids import KeyframeId
+from flocc_protocol.messages import CandidatePair
+
+Float = NDArray[np.float64]
+
+TOLD = "closures beside it tell it already"
+"""Why a pair was spared, for people."""
+STRETCH = 5
+"""Keyframes to either side of both ends."""
+TIED_MIN = 2.0
+"""Closures for each keyframe of both stretches, with whatever other keyframes. Where a graph is thinner each closure
+makes it better, also where others say nearly the same."""
+CONTRADICTED = 2
+"""Closures that must agree for each one that does not, besides those that are enough."""
+AGREE_RAD = np.deg2rad(10.0)
+AGREE_LENGTHS = 0.3
+"""How far two closures may differ, against how far apart their cameras are: scales by Eq. (6) differ as much."""
+AGREE_RATIO = 0.1
+"""The same against the way that odometry carries them."""
+AGREE_STEPS = 0.5
+"""The same against the robots' steps."""
+SPARED_MAX = 4000
+LOOKED_MAX = 4000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Foretold:
+    """What closures beside a pair say that a registration of it would find.
+
+    Attributes:
+        T_low_high: (K, 4, 4) pose of the later keyframe in the earlier one, metric.
+        may_m: (K,) how far off each may be.
+    """
+
+    T_low_high: Float
+    may_m: Float
+
+
+class HeldClosures(Protocol):
+    """Closures that a robot knows."""
+
+    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:
+        """Those that have a length between two stretches, as far as their keyframes are known."""
+        ...
+
+    def density(self, keyframe: KeyframeId, reach: int) -> float:
+        """Closures for each keyframe of a stretch, with whatever other keyframes."""
+        ...
+
+    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:
+        """What they say of another pair of these stretches."""
+        ...
+
+
+class NoClosures:
+    """What a robot knows that spares no pair."""
+
+    def beside(self, pair: CandidatePair, reach: int) -> list[CandidatePair]:  # noqa: ARG002
+        """None."""
+        return []
+
+    def density(self, keyframe: KeyframeId, reach: int) -> float:  # noqa: ARG002
+        """None."""
+        return 0.0
+
+    def foretold(self, pair: CandidatePair, closures: list[CandidatePair]) -> Foretold:  # noqa: ARG002
+        """Nothing."""
+        return Foretold(np.empty((0, 4, 4)), np.empty(0))
+
+
+class Spared:
+    """Pairs that one robot found, or was offered, and that are not to be registered."""
+
+    def __init__(self, held: HeldClosures, enough: int) -> None:
+        """Start without any.
+
+        Args:
+            held: Closures.
+            enough: So many that agree; 0: no pair is spared.
+        """
+        self._held = held
+        self._enough = enough
+        self._similarities: PairTable[float] = PairTable(SPARED_MAX)
+        self._weak: dict[CandidatePair, int] = {}
+
+    def __contains__(self, pair: CandidatePair) -> bool:
+        return pair in self._similarities
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        return {"spared": self._similarities.size(), "weak": (len(self._weak), LOOKED_MAX)}
+
+    def is_told(self, pair: CandidatePair) -> bool:
+        """Whether closures beside a pair tell what it would."""
+        if not self._enough:
+            return False
+        beside = self._held.beside(pair, STRETCH)
+        if len(beside) < self._enough or self._weak.get(pair) == len(beside):
+            return False
+        if min(self._held.density(pair.low, STRETCH), self._held.density(pair.high, STRETCH)) < TIED_MIN:
+            return False
+        agreeing = agreeing_of(self._held.foretold(pair, beside))
+        if agreeing - CONTRADICTED * (len(beside) - agreeing) >= self._enough:
+            return True
+        self._weak.pop(pair, None)
+        remember(self._weak, pair, len(beside), LOOKED_MAX)
+        return False
+
+    def add(self, pair: CandidatePair, similarity: float) -> None:
+        """A pair is not to be registered for now."""
+        self._weak.pop(pair, None)
+        self._similarities.put(pair, similarity)
+
+    def remove(self, pair: CandidatePair) -> None:
+        """A record tells of a pair."""
+        self._weak.pop(pair, None)
+        self._similarities.pop(pair)
+
+    def on_closure(self, pair: CandidatePair) -> list[tuple[CandidatePair, float]]:
+        """A closure became known; pairs that it makes weak again, with their similarity. They are spared no more."""
+        near = sorted(self._similarities.beside(pair, STRETCH))
+        if not near or self._agrees(pair):
+            return []
+        again = [other for other in near if not self.is_told(other)]
+        return [(other, self._similarities.pop(other) or 0.0) for other in again]
+
+    def _agrees(self, closure: CandidatePair) -> bool:
+        """Whether all closures beside one agree with it; one whose keyframes are not known says nothing yet."""
+        beside = self._held.beside(closure, STRETCH)
+        if not beside:
+            return True
+        return agreeing_of(self._held.foretold(closure, beside)) == len(beside)
+
+
+def agreeing_of(foretold: Foretold) -> int:
+    """The most closures that agree with one of them."""
+    if not len(foretold.may_m):
+        return 0
+    R, t_m = foretold.T_low_high[:, :3, :3], foretold.T_low_high[:, :3, 3]
+    cosines = (np.einsum("kij,lij->kl", R, R) - 1.0) / 2.0
+    apart_m = np.linalg.norm(t_m[:, None] - t_m[None, :], axis=2)
+    agree = (cosines >= np.cos(AGREE_RAD)) & (apart_m <= foretold.may_m[:, None] + foretold.may_m[None, :])
+    return int(agree.sum(axis=1).max())

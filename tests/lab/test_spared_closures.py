@@ -1,0 +1,48 @@
+"""Which closures a swarm would not have registered, and what two solves say of it."""
+
+import numpy as np
+import pytest
+
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.spared import TIED_MIN
+from flocc_lab.bench.spared_closures import kept_of, of_scenario, walk_scenario
+from flocc_protocol.ids import KeyframeId, LogId
+
+R1, R2 = LogId("r1"), LogId("r2")
+KEYFRAMES = 12
+
+
+def road(off_m: float) -> PoseGraph:
+    """Two robots side by side, each keyframe tied to so many of the other's that no stretch is weak.
+
+    Closures are off by so much, each in another direction.
+    """
+    T = np.tile(np.eye(4), (KEYFRAMES, 1, 1))
+    T[:, 0, 3] = np.arange(KEYFRAMES)
+    ends = [(i, (i + k) % KEYFRAMES) for i in range(KEYFRAMES) for k in range(2 * int(TIED_MIN))]
+    closures = []
+    for number, (i, j) in enumerate(ends):
+        S = np.eye(4)
+        S[:3, 3] = j - i + off_m * np.cos(number), 1.0 + off_m * np.sin(number), 0.0
+        closures.append(LoopClosure(KeyframeId(R1, i), KeyframeId(R2, j), S, metric=True))
+    return PoseGraph({R1: Trajectory(T), R2: Trajectory(T)}, tuple(closures))
+
+
+def test_closures_of_one_stretch_are_left_out_once_enough_agree() -> None:
+    graph = road(0.0)
+    kept = kept_of(graph)
+    assert len(kept) < len(graph.closures)
+    assert kept == sorted(set(kept))
+    assert kept_of(graph, 0) == list(range(len(graph.closures)))
+
+
+def test_where_closures_contradict_all_are_kept() -> None:
+    graph = road(20.0)
+    assert len(kept_of(graph)) == len(graph.closures)
+
+
+@pytest.mark.slow
+def test_a_swarm_is_run_with_all_pairs_and_with_some_spared() -> None:
+    row = of_scenario("walk 1", walk_scenario(1))
+    assert row["registered"] <= row["closures"]
+    assert row["ratio"] <= 1.5
