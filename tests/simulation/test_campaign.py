@@ -79,6 +79,12 @@ def test_a_robot_whose_clock_stepped_registers_no_pair_again() -> None:
     assert run_checked(drawn_scenario(99600047), [step]).violations == ()
 
 
+def test_a_fetch_is_given_up_by_the_clock_of_its_robot() -> None:
+    step = Hardship(HardshipKind.CLOCK, "r5", 14.789, 18.061, 2)
+    full = Hardship(HardshipKind.FULL, "r3", 16.593, 17.762, 116)
+    assert run_checked(drawn_scenario(99450020), [step, full]).violations == ()
+
+
 def test_a_large_family_has_20_robots_and_ten_minutes_with_faults_to_their_end() -> None:
     drawn = [drawn_scenario(seed, FAMILIES["large"]) for seed in range(20)]
     assert {len(scenario.names()) for scenario in drawn} == {20}
