@@ -32,17 +32,18 @@ import numpy as np
 
 from flocc_agent.core.effects import (
     Broadcast,
+    ChooseClosures,
     Deliver,
     Effect,
     Encode,
     FetchLatent,
-    IterateBlock,
     Optimise,
     PersistCorrection,
     PersistRecord,
     PersistTerm,
     Register,
     Report,
+    StepConsensus,
     Unicast,
 )
 from flocc_agent.core.events import Event, MessageReceived
@@ -216,7 +217,7 @@ def _told(effect: Effect) -> str | None:
             return f"optimises in {term} round {number}"
         case Report(fact):
             return _reported(fact)
-        case Unicast() | IterateBlock() | PersistRecord() | PersistTerm() | PersistCorrection():
+        case Unicast() | ChooseClosures() | StepConsensus() | PersistRecord() | PersistTerm() | PersistCorrection():
             return None
         case _:
             assert_never(effect)

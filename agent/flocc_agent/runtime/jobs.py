@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from flocc_agent.core.blocks import BlockProblem, BlockStep
-from flocc_agent.core.effects import Encode, FetchLatent, IterateBlock, Optimise, Register
+from flocc_agent.core.effects import ChooseClosures, Encode, FetchLatent, Optimise, Register, StepConsensus
 from flocc_agent.core.events import (
-    BlockIterated,
-    BlockIterationFailed,
+    ChoiceFailed,
+    ClosuresChosen,
+    ConsensusStepFailed,
+    ConsensusStepped,
     Event,
     GraphOptimisationFailed,
     GraphOptimised,
@@ -31,6 +32,7 @@ from flocc_agent.core.events import (
 from flocc_agent.core.interfaces import Image, ImageWatch, OdometryPair, Perception
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
+from flocc_agent.core.shared_poses import ConsensusProblem, ConsensusStep
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, FetchProblem, Transport
@@ -38,7 +40,7 @@ from flocc_agent.runtime.workers import Workers, WorkFailed
 
 IMAGES_MAX = 8
 
-Job = Encode | FetchLatent | Register | Optimise | IterateBlock
+Job = Encode | FetchLatent | Register | Optimise | ChooseClosures | StepConsensus
 """An effect that takes time and is answered by an event."""
 
 
@@ -78,7 +80,7 @@ class Tools:
         perception: What images are seen with.
         watch: Looks at the robot's own images, one after the other.
         optimise: Pose graph and last solution to a solution; must be importable by a worker process.
-        iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
+        step: One step of this robot's part, in distributed mode; importable like `optimise`.
         workers: Pools off the loop.
         store: Holds latents.
         transport: Fetches latents.
@@ -90,7 +92,7 @@ class Tools:
     perception: Perception
     watch: ImageWatch
     optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
-    iterate: Callable[[BlockProblem], BlockStep | OptimisationFailed]
+    step: Callable[[ConsensusProblem], ConsensusStep | OptimisationFailed]
     workers: Workers
     store: Store
     transport: Transport
@@ -110,8 +112,10 @@ def job_of(effect: Job, tools: Tools) -> Coroutine[Any, Any, Event]:
             return register(effect, tools)
         case Optimise():
             return optimise(effect, tools)
-        case IterateBlock():
-            return iterate(effect, tools)
+        case ChooseClosures():
+            return choose(effect, tools)
+        case StepConsensus():
+            return step(effect, tools)
 
 
 async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEncodingFailed:
@@ -172,10 +176,19 @@ async def optimise(effect: Optimise, tools: Tools) -> GraphOptimised | GraphOpti
     return GraphOptimised(effect.term, effect.round, solution)
 
 
-async def iterate(effect: IterateBlock, tools: Tools) -> BlockIterated | BlockIterationFailed:
-    """Iterate once on the own block in the solver's process."""
-    result = await tools.workers.run("optimise", tools.iterate, effect.problem)
-    step = result if isinstance(result, WorkFailed) else result.value
-    if isinstance(step, (WorkFailed, OptimisationFailed)):
-        return BlockIterationFailed(effect.number, step.reason)
-    return BlockIterated(effect.number, step)
+async def choose(effect: ChooseClosures, tools: Tools) -> ClosuresChosen | ChoiceFailed:
+    """Solve one or two logs for themselves in the solver's process."""
+    result = await tools.workers.run("optimise", tools.optimise, effect.graph, None)
+    solution = result if isinstance(result, WorkFailed) else result.value
+    if isinstance(solution, (WorkFailed, OptimisationFailed)):
+        return ChoiceFailed(effect.number, solution.reason)
+    return ClosuresChosen(effect.number, solution)
+
+
+async def step(effect: StepConsensus, tools: Tools) -> ConsensusStepped | ConsensusStepFailed:
+    """Do a step of the own part in the solver's process."""
+    result = await tools.workers.run("optimise", tools.step, effect.problem)
+    done = result if isinstance(result, WorkFailed) else result.value
+    if isinstance(done, (WorkFailed, OptimisationFailed)):
+        return ConsensusStepFailed(effect.number, done.reason)
+    return ConsensusStepped(effect.number, done)
