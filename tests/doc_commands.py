@@ -11,6 +11,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -60,6 +61,39 @@ def blocks(page: Path) -> list[Block]:
     """Fenced blocks of a page, in order."""
     text = page.read_text(encoding="utf-8")
     return [Block(page, m["language"], m["text"], m["why"]) for m in FENCE.finditer(text)]
+
+
+def named_options(page: Path) -> set[str]:
+    """Options that a page names by themselves, as `--seed` or `--seed N`, outside of its commands and blocks."""
+    return set(re.findall(r"`(--[a-z][a-z0-9-]*)[^`]*`", FENCE.sub("", page.read_text(encoding="utf-8"))))
+
+
+def unknown_options(page: Path) -> set[str]:
+    """Of the options that a page names by themselves, those of no command of flocc and of no module that it names."""
+    unknown = named_options(page) - {option for options in commands().values() for option in options}
+    modules = set(re.findall(r"python -m (flocc_\w+(?:\.\w+)+)", page.read_text(encoding="utf-8")))
+    unknown = {option for option in unknown if not any(f'"{option}"' in _source(module) for module in modules)}
+    return {option for option in unknown if not any(_takes(module, option) for module in sorted(modules))}
+
+
+@cache
+def commands() -> dict[str, tuple[str, ...]]:
+    """Every command of flocc, as `dataset info`, with the long forms of its options, as `--help` lists them."""
+    return dict(_commands(_root(), ""))
+
+
+@cache
+def _root() -> Any:
+    return typer.main.get_command(app)
+
+
+def _commands(command: Any, path: str) -> Iterator[tuple[str, tuple[str, ...]]]:
+    if not hasattr(command, "list_commands"):
+        options = [option for p in command.params for option in (*p.opts, *p.secondary_opts)]
+        yield path.strip(), tuple(option for option in options if option.startswith("--"))
+        return
+    for name in command.list_commands(None):
+        yield from _commands(command.get_command(None, name), f"{path} {name}")
 
 
 def script(page: Path) -> str:
@@ -129,7 +163,7 @@ def complaint(command: str) -> str | None:
 
 def _flocc_complaint(words: list[str]) -> str | None:
     """What the command line itself says; values may be placeholders, names of commands and options may not."""
-    command: Any = typer.main.get_command(app)
+    command = _root()
     words = with_ros_args(words)
     typed = not any(PLACEHOLDER.search(word) for word in words)
     path = ["flocc"]
@@ -184,9 +218,24 @@ def _module_complaint(module: str, words: list[str]) -> str | None:
         return None
     if importlib.util.find_spec(module) is None:
         return f"there is no module {module}"
-    text = _help(module) if any(word.startswith("--") for word in words) else ""
-    unknown = [word for word in words if word.startswith("--") and word.split("=")[0] not in text]
+    options = [word.split("=")[0] for word in words if word.startswith("--")]
+    unknown = [option for option in options if not _takes(module, option)]
     return f"{module} has no option {unknown[0]}" if unknown else None
+
+
+def _takes(module: str, option: str) -> bool:
+    """Whether a module has an option: it stands in its source, or else in its help, which takes a second to ask for."""
+    return f'"{option}"' in _source(module) or re.search(rf"{option}(?![\w-])", _help(module)) is not None
+
+
+def _source(module: str) -> str:
+    """Of a module, or of what runs of a package; "" where it is not there."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        return ""
+    path = Path(spec.origin)
+    path = path.with_name("__main__.py") if path.name == "__init__.py" else path
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 @cache

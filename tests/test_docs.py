@@ -10,7 +10,18 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel, ValidationError
-from tests.doc_commands import ROOT, SHELL, blocks, command_lines, complaint, parsed_commands, runnable, script
+from tests.doc_commands import (
+    ROOT,
+    SHELL,
+    blocks,
+    command_lines,
+    commands,
+    complaint,
+    parsed_commands,
+    runnable,
+    script,
+    unknown_options,
+)
 from tests.doc_props import write_bag, write_own_data
 
 from flocc_agent.config import AgentConfig, ConfigError, refuse_removed
@@ -22,6 +33,8 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / part / "RE
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 TABLES = "core|keyframes|perception|backend|radio|store|transport|source|ros2|metrics"
 KEY = re.compile(rf"`((?:{TABLES})\.[a-z_0-9.]*[a-z0-9](?<!\.py))(?: = [^`]*)?`")
+OF_OTHER_PROGRAMS = {"--build-arg", "--system-site-packages", "--clock"}  # docker, python -m venv, ros2 bag
+NOT_ON_PAGES = {"--no-secure", "--no-verbose"}  # what is so without an option
 LIVE = re.compile(r"^flocc (launch|demo|agent|experiment)\b|^python examples/", re.M)
 
 
@@ -80,6 +93,29 @@ def test_the_index_names_every_page() -> None:
 def test_every_command_is_known_with_its_options(page: Path) -> None:
     complaints = {command: complaint(command) for command in parsed_commands(page)}
     assert {command: why for command, why in complaints.items() if why is not None} == {}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_options_that_a_page_names_alone_exist(page: Path) -> None:
+    assert sorted(unknown_options(page) - OF_OTHER_PROGRAMS) == []
+
+
+def test_every_command_and_option_stands_on_a_page() -> None:
+    """What `--help` says and no page does nobody finds by searching; options of single experiments are too many."""
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in PAGES if page.name != "CHANGELOG.md")
+    words = set(re.findall(r"--[a-z][a-z0-9-]*", pages))
+    assert [command for command in commands() if f"flocc {command}" not in pages] == []
+    wanted = {command: options for command, options in commands().items() if not command.startswith("experiment ")}
+    missing = {command: sorted({*options} - words - NOT_ON_PAGES) for command, options in wanted.items()}
+    assert {command: options for command, options in missing.items() if options} == {}
+
+
+@pytest.mark.parametrize("option", ["--json", "--quiet", "--verbose"])
+def test_the_page_of_commands_says_which_commands_take_an_option(option: str) -> None:
+    table = (ROOT / "docs/commands.md").read_text(encoding="utf-8")
+    (cell,) = re.findall(rf"^\| `{option}`[^|]*\| ([^|]+) \|", table, re.M)
+    named = {name for word in re.findall("`([^`]+)`", cell) for name in commands() if f"{name} ".startswith(f"{word} ")}
+    assert named == {name for name, options in commands().items() if option in options}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)

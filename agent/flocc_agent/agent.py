@@ -478,7 +478,7 @@ class Agent:
             self._store,
             transport,
             self._clock_s,
-            names_latents=sealer is not None,
+            sealer=sealer,
         )
         return Driver(
             core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
@@ -488,7 +488,8 @@ class Agent:
         """What looks at this robot's images."""
         from flocc_agent.perception.watch.camera_watch import CameraWatch
 
-        return CameraWatch(None if self._recording is None else self._recording.hidden)
+        hidden = None if self._recording is None else self._recording.hidden
+        return CameraWatch(hidden, self.config.perception.odometry_up)
 
     @property
     def _method(self) -> str | None:
@@ -509,9 +510,13 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        merging = evidence_of(driver.robot, self.config.core, driver.last_solution).model_dump(mode="json")
+        merging = evidence_of(driver.robot, self.config.core, driver.last_solution)
+        if self._radio is not None:
+            merging = merging.model_copy(update={"emulated": self._radio.parameters.emulated()})
         status = self.status().model_dump(mode="json")
-        return json.dumps({**status, "compute_class": self.config.compute_class, **merging}).encode()
+        return json.dumps(
+            {**status, "compute_class": self.config.compute_class, **merging.model_dump(mode="json")}
+        ).encode()
 
     def _disturb(self, request: bytes) -> bytes:
         """Carry out an operator's order, and say so."""

@@ -138,6 +138,20 @@ class RadioParameters:
                 return override.link
         return self.link
 
+    def emulated(self) -> str | None:
+        """What keeps messages back, in words, whenever it does; None where nothing is emulated."""
+        ratio = self.link.burst_ratio + (1.0 - self.link.burst_ratio) * self.link.loss_ratio
+        rate = self.link.bandwidth_bytes_s
+        said = [
+            None if self.range_m in (None, math.inf) else f"a range of {self.range_m:g} m",
+            f"{100 * ratio:.0f} % loss" if ratio else None,
+            None if rate in (None, math.inf) else f"{rate:g} bytes/s",
+            "links of other qualities" if self.overrides else None,
+            "partitions" if self.partitions else None,
+            "blackouts" if self.blackouts else None,
+        ]
+        return ", ".join(words for words in said if words is not None) or None
+
     def partitioned(self, groups: tuple[tuple[str, ...], ...], now_s: float) -> "RadioParameters":
         """The same links, separated into groups from now on."""
         return replace(self, partitions=(*self.partitions, Partition(groups, now_s)))

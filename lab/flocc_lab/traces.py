@@ -34,6 +34,7 @@ from flocc_agent.core.effects import (
     Broadcast,
     ChooseClosures,
     Deliver,
+    DropLog,
     Effect,
     Encode,
     FetchLatent,
@@ -57,6 +58,7 @@ from flocc_agent.core.reports import (
     LeaderFollowed,
     LeaderLost,
     LogForked,
+    LogGivenUp,
     NameTaken,
     NeighbourDown,
     NeighbourRestarted,
@@ -101,6 +103,10 @@ class PlaceEyes:
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration:  # noqa: ARG002
         """Both cameras stood at one place."""
         return Registration(np.eye(4), 100, 100, 1.0)
+
+    def without(self, latent: bytes, hidden: object) -> bytes:  # noqa: ARG002
+        """Nothing moves with the camera."""
+        return latent
 
 
 def played(text: str) -> str:
@@ -217,7 +223,9 @@ def _told(effect: Effect) -> str | None:
             return f"optimises in {term} round {number}"
         case Report(fact):
             return _reported(fact)
-        case Unicast() | ChooseClosures() | StepConsensus() | PersistRecord() | PersistTerm() | PersistCorrection():
+        case Unicast() | ChooseClosures() | StepConsensus() | PersistRecord() | PersistTerm():
+            return None
+        case PersistCorrection() | DropLog():
             return None
         case _:
             assert_never(effect)
@@ -236,6 +244,8 @@ def _reported(fact: Fact) -> str | None:
             return f"{name_of(fact)} {fact.peer}: {fact.reason}"
         case LatentLost() | LatentFailed():
             return f"{name_of(fact)} {fact.keyframe}"
+        case LogGivenUp():
+            return f"{name_of(fact)} {fact.log}"
         case SolutionIgnored():
             return f"ignores a solution of {fact.term} round {fact.round}"
     return None

@@ -30,6 +30,29 @@ def test_only_default_parameters_are_perfect() -> None:
     assert not RadioParameters(range_m=5.0).is_perfect
 
 
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        (RadioParameters(), None),
+        (RadioParameters(range_m=math.inf), None),
+        (RadioParameters(link=LinkParameters(latency_s=0.1)), None),
+        (RadioParameters(range_m=12.5), "a range of 12.5 m"),
+        (RadioParameters(link=LinkParameters(loss_ratio=0.5, burst_ratio=0.5)), "75 % loss"),
+        (RadioParameters(link=LinkParameters(bandwidth_bytes_s=1000.0)), "1000 bytes/s"),
+        (
+            RadioParameters(
+                overrides=(LinkOverride("r1", "*", PERFECT),),
+                partitions=(Partition((("r1",), ("r2",))),),
+                blackouts=(Blackout(("r1",)),),
+            ),
+            "links of other qualities, partitions, blackouts",
+        ),
+    ],
+)
+def test_what_keeps_messages_back_is_said_in_words(parameters: RadioParameters, words: str | None) -> None:
+    assert parameters.emulated() == words
+
+
 def test_loses_the_given_share_independently() -> None:
     lost = [not arrivals for arrivals in sent(radio_of(LinkParameters(loss_ratio=0.3)))]
     assert np.mean(lost) == pytest.approx(0.3, abs=0.01)

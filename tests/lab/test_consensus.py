@@ -12,12 +12,12 @@ from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import build
 from flocc_agent.backend.shared_stiffness import geometric_mean, stiffness_of
 from flocc_agent.config import BackendConfig, Formulation, Solver
+from flocc_agent.core.own_part import HEAD_BYTES, ROW_BYTES
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
-from flocc_agent.core.shared_poses import HEAD_BYTES, ROW_BYTES
 from flocc_agent.geometry import hats
 from flocc_lab.bench.consensus_sweeps import Sweeps
 from flocc_lab.bench.generated_graph import GeneratedGraph, Noise, generate
-from flocc_lab.consensus import part_of_graph, shared_poses, solved_alone
+from flocc_lab.consensus_graphs import part_of_graph, shared_poses, solved_alone
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_protocol.ids import LogId
 from flocc_protocol.shared_poses import KNOTS_MAX, stiffness_numbers

@@ -15,6 +15,8 @@ import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
 
+from flocc_agent.core.reports import CorrectionApplied
+from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.few_connections import CONNECTIONS_MAX
 from flocc_launch.dashboard import Dashboard, DashboardError, live_dashboard, server
 from flocc_launch.dashboard.page_source import RunSource
@@ -170,6 +172,28 @@ def test_the_server_answers_two_paths_and_nothing_else(tmp_path: Path) -> None:
             assert not re.search(rb"(src|href)=.?https?:", answer.read())
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(dashboard.url + "../run.json")
+
+
+def test_the_page_works_below_a_path_of_a_reverse_proxy(tmp_path: Path) -> None:
+    """Also where the proxy leaves its own path in front; the page asks relative to itself."""
+    with Dashboard(synthetic_run.write(tmp_path / "run"), port=0) as dashboard:
+        below = dashboard.url + "robots/swarm/"
+        with urllib.request.urlopen(below) as answer:
+            assert re.findall(rb"fetch\((.*?),", answer.read()) == [b'"state.json"']
+        with urllib.request.urlopen(below + "state.json?t=1") as answer:
+            assert json.load(answer)["scenario"] == "synthetic-hall"
+
+
+def test_a_correction_is_no_sign_of_life_of_a_robot_that_is_gone() -> None:
+    """A leader corrects the logs of dead robots too; what the robot says itself is what counts."""
+    swarm = SwarmState(["r1"])
+    corrected = CorrectionApplied(term=1, leader="r2", round=3, map_frame="map/r1", T_map_odom=(0, 0, 0, 1, 0, 0, 0))
+    swarm.heard("r1", 5.0)
+    swarm.apply(Reported(80.0, "r1", corrected), by_itself=False)
+    (view,) = swarm.snapshot(81.0, "gone").robots
+    assert (view.last_s, view.state, view.map_frame) == (5.0, "silent", "map/r1")
+    swarm.apply(Reported(90.0, "r1", corrected))
+    assert swarm.snapshot(91.0, "gone").robots[0].last_s == 90.0
 
 
 def test_idle_connections_are_few_and_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,6 +42,7 @@ class Story:
     closures: list[ClosureKnown] = field(default_factory=list)
     best_similarities: dict[str, float] = field(default_factory=dict)
     left_no_result: set[str] = field(default_factory=set)
+    radio: dict[str, Any] = field(default_factory=dict)
 
     def say(self, t: float, robot: str, event: str, **fields: Any) -> "Story":
         self.events.append({"t": t, "robot": robot, "event": event, **fields})
@@ -53,7 +54,7 @@ class Story:
 
     def write(self, path: Path) -> RunFolder:
         folder = RunFolder.create(path)
-        folder.write_run(Run(scenario="broken", robots=["r1", "r2"], settings=SETTINGS))
+        folder.write_run(Run(scenario="broken", robots=["r1", "r2"], settings=SETTINGS, radio=self.radio))
         folder.write_events(self.events)
         for robot in {"r1", "r2"} - self.left_no_result:
             folder.write_result(self.result(robot))
@@ -223,6 +224,19 @@ def settings_of(section: Any, above: str) -> Iterator[str]:
         kind = described.annotation if issubclass(section, BaseModel) else described.type
         if isinstance(kind, type) and (issubclass(kind, BaseModel) or hasattr(kind, "__dataclass_fields__")):
             yield from settings_of(kind, f"{above}{name}.")
+
+
+@pytest.mark.parametrize("cause", ["no-peer", "one-way-link"])
+def test_robots_that_an_emulated_radio_keeps_apart_are_not_sent_to_the_network(tmp_path: Path, cause: str) -> None:
+    """`run.json` has null where a partition never ends."""
+    story = SETUPS[cause]()
+    story.radio = {"range_m": 12.0, "partitions": [{"groups": [["r1"], ["r2"]], "from_s": 3.0, "to_s": None}]}
+    (finding,) = blocking(story.write(tmp_path / "emulated"))
+    assert finding.cause == cause
+    assert "The emulated radio may be why (a range of 12 m, partitions)" in finding.advice
+    story.radio = {"of a later version": 1}
+    (finding,) = blocking(story.write(tmp_path / "later"))
+    assert "emulated" not in finding.advice
 
 
 def test_the_figures_that_show_it_stand_in_the_sentence(tmp_path: Path) -> None:

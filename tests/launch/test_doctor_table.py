@@ -33,7 +33,7 @@ PAGE = Path(__file__).parents[2] / "docs/doctor.md"
 KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
 OF = {
     "run": ("diagnose", "steps", "general", "cameras"),
-    "swarm": ("live", "live_steps"),
+    "swarm": ("live", "live_steps", "cameras"),
     "machine": ("installation", "network_check"),
 }
 
@@ -64,13 +64,12 @@ ROWS = table()
 
 def causes_in(module: str) -> set[str]:
     """Causes that the code of a module names."""
-    if module == "cameras":
-        return {*cameras.CAUSES.values(), cameras.OTHER_CAUSE}
     source = Path(doctor.__path__[0]) / f"{module}.py"
     calls = [node for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
     makers = ("Finding", "blocked", "good", "discovered")
     first = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id in makers and call.args]
-    return {str(cause.value) for cause in first if isinstance(cause, ast.Constant)}
+    named = {str(cause.value) for cause in first if isinstance(cause, ast.Constant)}
+    return named | ({*cameras.CAUSES.values(), cameras.OTHER_CAUSE} if module == "cameras" else set())
 
 
 @pytest.mark.parametrize("of", OF)
@@ -159,6 +158,10 @@ def of_a_run(cause: str, path: Path) -> list[Finding]:
     return diagnose(STORIES[cause]().write(path))
 
 
+def doubt(what: str, amount: float, withheld: bool = False) -> dict[str, object]:
+    return {"doubt": what, "amount": amount, "where": "bottom", "pairs": 5, "withheld": withheld}
+
+
 SWARMS = {
     "merged": [row("r1", "r2"), row("r2", "r1")],
     "no-answer": [row("r1", "r2"), row("r2", state=NO_ANSWER)],
@@ -173,6 +176,15 @@ SWARMS = {
     "low-similarity": apart(best_similarities={"r2": 0.41}),
     "registrations-rejected": apart(pairs=[pair(rejected=3, best_ratio=0.21)]),
     "closures-not-connecting": apart(pairs=[pair(accepted=3)], solver={"components": [["r1"], ["r2"]]}),
+    "merged-doubtfully": [row("r1", "r2"), row("r2", "r1", camera=[doubt("mounting", 179.9, True)])],
+    "focal-length": [row("r1", "r2", camera=[doubt("focal length", 0.8)]), row("r2", "r1")],
+    "camera-turned": [row("r1", "r2", camera=[doubt("mounting", 5.0)]), row("r2", "r1")],
+    "mirrored": [row("r1", "r2", camera=[doubt("mirrored", 1.0)]), row("r2", "r1")],
+    "inverted-poses": [row("r1", "r2", camera=[doubt("inverted poses", 1.0)]), row("r2", "r1")],
+    "mixed-frames": [row("r1", "r2", camera=[doubt("mixed frames", 1.0)]), row("r2", "r1")],
+    "overlay": [row("r1", "r2", camera=[doubt("overlay", 0.3)]), row("r2", "r1")],
+    "frozen-pictures": [row("r1", "r2", camera=[doubt("frozen", 10)]), row("r2", "r1")],
+    "camera": [row("r1", "r2", camera=[doubt("out of focus", 1.0)]), row("r2", "r1")],
     "not-merged-yet": apart(pairs=[pair(accepted=3)]),
 }
 

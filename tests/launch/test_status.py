@@ -11,10 +11,13 @@ from tests.launch.synthetic_run import Synthetic
 from typer.testing import CliRunner
 
 from flocc_agent.config import ConfigError, Mast3rConfig, PerceptionConfig, TransportConfig
+from flocc_agent.core.reports import CameraDoubted
+from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_launch.commands.tools import add_tools
 from flocc_launch.dashboard.status_table import (
     RobotStatus,
     StatusError,
+    cells_of,
     status_from,
     status_json,
     status_of_run,
@@ -104,6 +107,18 @@ def test_the_doctor_of_a_running_swarm_names_the_cause(rows: list[RobotStatus], 
     assert [finding.cause for finding in diagnose_live(rows)] == causes
 
 
+@pytest.mark.parametrize(
+    "rows", [[row("r1"), row("r2")], [row("r1", "r2"), row("r2")]], ids=["no-peer", "one-way-link"]
+)
+def test_an_emulated_radio_is_no_firewall(rows: list[RobotStatus]) -> None:
+    """Under `--range` advice on networks would send people the wrong way first; 5 % of loss explains nothing."""
+    real = diagnose_live(rows)[1]
+    assert "emulated" not in real.advice
+    emulated = diagnose_live([each.model_copy(update={"emulated": "a range of 12 m"}) for each in rows])[1]
+    assert emulated.cause == real.cause
+    assert emulated.advice.startswith("The emulated radio may be why (a range of 12 m): change [radio]")
+
+
 def test_the_figures_of_a_running_swarm_stand_in_the_sentence() -> None:
     (similar,) = diagnose_live(apart(best_similarities={"r2": 0.41}))
     assert "the best similarity so far is 0.41, below the threshold of 0.5" in similar.sentence
@@ -176,3 +191,45 @@ def test_the_command_line_knows_the_tools(tmp_path: Path) -> None:
 
 def test_a_status_of_nothing_says_what_to_give() -> None:
     assert isinstance(CliRunner().invoke(tools(), ["status"]).exception, ConfigError)
+
+
+UPSIDE_DOWN = {"doubt": "mounting", "amount": 179.9, "where": "0 degrees about x", "pairs": 5, "withheld": True}
+BUMPER = {"doubt": "overlay", "amount": 0.3, "where": "bottom", "pairs": 4}
+
+
+def test_what_robots_doubt_of_their_cameras_is_in_the_table() -> None:
+    rows = [row("r1", "r2", camera=[BUMPER]), row("r2", "r1", camera=[UPSIDE_DOWN])]
+    assert [cells_of(each)["camera"] for each in rows] == ["overlay 30 %", "mounting 180° (kept out)"]
+    assert cells_of(row("r3"))["camera"] == "-"
+
+
+def test_the_doctor_of_a_running_swarm_names_a_camera_that_is_kept_out_as_what_blocks() -> None:
+    rows = apart(camera=[UPSIDE_DOWN], pairs=[pair(accepted=3)])
+    (finding,) = diagnose_live(rows)
+    assert (finding.cause, finding.severity, finding.robots) == ("camera-turned", Severity.BLOCKS, ("r1",))
+    assert finding.sentence.startswith("r1's camera is turned by 179.9 degrees against its odometry")
+
+
+def test_robots_that_merged_before_a_camera_was_found_turned_are_not_believed() -> None:
+    findings = diagnose_live([row("r1", "r2"), row("r2", "r1", camera=[UPSIDE_DOWN])])
+    assert [finding.cause for finding in findings] == ["merged-doubtfully", "camera-turned"]
+    assert "Do not believe where r2 is." in findings[0].sentence
+
+
+def test_what_a_robot_leaves_out_itself_is_a_note_and_a_frozen_picture_is_not() -> None:
+    frozen = {"doubt": "frozen", "amount": 10}
+    findings = diagnose_live([row("r1", "r2", camera=[BUMPER]), row("r2", "r1", camera=[frozen])])
+    causes = [(finding.cause, finding.severity) for finding in findings]
+    assert causes == [
+        ("merged", Severity.GOOD),
+        ("overlay", Severity.NOTE),
+        ("frozen-pictures", Severity.HINDERS),
+    ]
+
+
+def test_the_status_of_a_run_tells_of_cameras(tmp_path: Path) -> None:
+    folder = synthetic_run.write(tmp_path / "run", Synthetic())
+    told = Reported(1.0, "r2", CameraDoubted(doubt="mirrored", amount=1.0, where="", pairs=5, withheld=True))
+    with (folder.path / "events.jsonl").open("a", encoding="utf-8") as events:
+        events.write(json.dumps(line_of(told)) + "\n")
+    assert [[doubt.doubt for doubt in each.camera] for each in status_of_run(folder.path)] == [[], ["mirrored"], []]

@@ -53,7 +53,7 @@ def test_messages_of_an_older_version_are_named_as_such(version: int) -> None:
 
 def test_the_records_of_version_2_are_read_as_ever() -> None:
     """Stores hold them; records have no version, and a change of their bytes is a new code."""
-    older = [data for name, data in lines_of(2) if name not in MESSAGE_KINDS]
+    older = [data for name, data in lines_of(2) if name[0].isupper()]
     read = [decode_record(bytes.fromhex(data)) for data in older]
     assert read == list(RECORDS[: len(older)])
 

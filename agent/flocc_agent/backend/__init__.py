@@ -8,8 +8,8 @@ from collections.abc import Callable
 from functools import partial
 
 from flocc_agent.config import BackendConfig
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
-from flocc_agent.core.shared_poses import ConsensusProblem, ConsensusStep
 
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
 ConsensusStepper = Callable[[ConsensusProblem], ConsensusStep | OptimisationFailed]

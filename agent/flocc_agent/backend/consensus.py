@@ -34,8 +34,8 @@ from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residu
 from flocc_agent.backend.problem import closure_edges, concatenate, odometry_edges
 from flocc_agent.backend.shared_stiffness import SharedStiffness, geometric_mean, rows_of, stiffness_of
 from flocc_agent.config import BackendConfig
+from flocc_agent.core.own_part import ToldPoses
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
-from flocc_agent.core.shared_poses import ToldPoses
 from flocc_agent.geometry import inverse, poses_from_tq, quaternions
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.shared_poses import STIFFNESS_EDITIONS
@@ -307,7 +307,7 @@ class ConsensusPart:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Beginning:
+class PartBeginning:
     """Where a robot's part begins.
 
     Attributes:
@@ -328,7 +328,7 @@ def part_of(
     config: BackendConfig,
     trajectory: Trajectory,
     owned: Sequence[LoopClosure],
-    begins: Beginning,
+    begins: PartBeginning,
     neighbours: Mapping[LogId, PairedRobot],
 ) -> ConsensusPart:
     """Put a robot's part together; places of the shared poses in `neighbours` are set here."""
@@ -365,7 +365,7 @@ def paired(lower: bool, keyframes: Sequence[KeyframeId], information: Float, edi
 
 
 def _with_copies(
-    begins: Beginning, owned: Sequence[LoopClosure], at: Mapping[KeyframeId, int], copies: Sequence[KeyframeId]
+    begins: PartBeginning, owned: Sequence[LoopClosure], at: Mapping[KeyframeId, int], copies: Sequence[KeyframeId]
 ) -> Float:
     """Own poses, then copies of others'."""
     poses = np.concatenate([begins.T, np.tile(np.eye(4), (len(copies), 1, 1))])

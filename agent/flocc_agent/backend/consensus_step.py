@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.consensus import (
-    Beginning,
     ConsensusPart,
     PairedRobot,
+    PartBeginning,
     Tidings,
     information_by_keyframe,
     paired,
@@ -24,8 +24,8 @@ from flocc_agent.backend.measured import measured_odometry
 from flocc_agent.backend.problem import initial_scale
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.config import BackendConfig
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusState, ConsensusStep, SharedWith, ToldPoses
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed
-from flocc_agent.core.shared_poses import ConsensusProblem, ConsensusState, ConsensusStep, SharedWith, ToldPoses
 from flocc_agent.geometry import inverse, nearest_rotation, pose
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -95,7 +95,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
     before = part.T
     part.step()
     after = _state_of(part, problem)
-    origin = _origin(problem, after.T, aligned)
+    origin = _origin(problem, after.T)
     poses = part.state.poses()
     gaps = [float(np.abs(poses[n.index] - n.T).max()) for n in part.neighbours.values() if n.T is not None]
     return ConsensusStep(
@@ -185,7 +185,7 @@ def _part(config: BackendConfig, problem: ConsensusProblem, state: PartState, sc
     owned = [each.closure for each in problem.owned]
     weights = np.array([each.weight for each in problem.owned])
     trajectory = measured_odometry(problem.trajectory, config)
-    begins = Beginning(state.T, state.copies, scale, weights)
+    begins = PartBeginning(state.T, state.copies, scale, weights)
     part = part_of(problem.log, config, trajectory, owned, begins, state.pairs)
     found = [(c, state.scales.get((o.query, o.match))) for c, o in zip(_clusters(part, problem), owned, strict=True)]
     for cluster, before in found:
@@ -225,8 +225,8 @@ def _state_of(part: ConsensusPart, problem: ConsensusProblem) -> PartState:
     return PartState(poses[: part.own], dict(zip(copies, poses[part.own :], strict=True)), of_closure, part.neighbours)
 
 
-def _origin(problem: ConsensusProblem, T: Float, aligned: bool) -> Float:
+def _origin(problem: ConsensusProblem, T: Float) -> Float:
     """Where the map frame lies (4, 4): at the anchor's first keyframe, less its odometry; else as heard."""
-    if problem.origin is not None and (aligned or not problem.anchored):
+    if problem.origin is not None and not problem.anchored:
         return problem.origin
     return np.asarray(T[0] @ inverse(np.asarray(problem.trajectory.T_odom_keyframe[0], dtype=float)))

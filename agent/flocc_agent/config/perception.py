@@ -1,11 +1,18 @@
 """The sections of the perception back-ends, and which of them is used."""
 
+import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from flocc_agent.config.section import Section, inner
+
+
+def _is_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not all(map(math.isfinite, value)) or not any(value):
+        raise ValueError("a direction is three finite numbers, not all of them 0")
+    return value
 
 
 class ClassicalConfig(Section):
@@ -116,6 +123,9 @@ class PerceptionConfig(Section):
     brings."""
     options: dict[str, Any] = Field(default_factory=dict)
     """What an installed package's perception is to know; flocc hands it on as it is."""
+    odometry_up: Annotated[tuple[float, float, float], AfterValidator(_is_direction)] | None = None
+    """Direction against gravity in the odometry frame where odometry keeps roll and pitch, as a VIO does: [0, 0, 1] by
+    ROS's convention. The classical and the learned front end then register with gravity; none: it is not known."""
     classical: ClassicalConfig = ClassicalConfig()
     learned: LearnedConfig = LearnedConfig()
     synthetic: SyntheticConfig = SyntheticConfig()

@@ -229,6 +229,22 @@ class GraphAssembly:
         """The newest closures of a log; their records are not read."""
         return self._ends.ties(log, ties_max)
 
+    def tied(self) -> set[LogId]:
+        """Logs that the graph needs: closures tie them, or stand in them, or something was measured there."""
+        ends = {end for link in self._ends.links() for end in link}
+        writers = {log for log, _ in self._closures.values()}
+        saved = set() if self._saved is None else set(self._saved.logs)
+        return ends | writers | saved | self._measured.writers()
+
+    def forget(self, log: LogId) -> None:
+        """Hold nothing more of a log that is not tied."""
+        odometry = self._odometry.pop(log, None)
+        if odometry is not None:
+            self.keyframes -= len(odometry)
+            self.revision += 1
+        for keyframe in [keyframe for keyframe in self._odometry_pairs if keyframe.log == log]:
+            del self._odometry_pairs[keyframe]
+
     def measured(self, log: LogId) -> Sequence[MeasuredFactor]:
         """What else was measured at a log's keyframes, or of them."""
         return self._measured.of(log, self._odometry, self._known)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.claims import CorrectionClaim
 from flocc_agent.core.correction_evidence import HeldGraph, Placed
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, PersistCorrection, Report, Unicast
 from flocc_agent.core.gossip import Sealer, may_hold
@@ -235,6 +236,12 @@ class Corrections:
             return False
         return message.log == self._own or self._follows_all or self._requests.waits(message.log, now)
 
+    def claim(self, message: LogCorrection, now: float) -> CorrectionClaim | None:
+        """What `refused` would check of a correction that is news; None where it would not come to that."""
+        if not self.is_news(message, now) or (message.log not in self._newest and not self._is_room(message.log)):
+            return None
+        return CorrectionClaim(message.term.leader, encode_correction(message), message.signature)
+
     def refused(self, peer: str, message: LogCorrection) -> list[Effect]:
         """Refuse a newer correction for which there is no room, or which its leader did not make."""
         if message.log in self._wanted:
@@ -279,6 +286,13 @@ class Corrections:
         applied = self.applied
         if applied is not None and self._own not in self._newest:
             self._keep(applied)
+
+    def forget_log(self, log: LogId) -> None:
+        """A log is held no more, and neither is where it lies."""
+        if self._newest.pop(log, None) is not None:
+            self._announcer.remove(log)
+        self._whole.pop(log, None)
+        self._wanted.pop(log, None)
 
     def _placed(self, own: LogCorrection) -> Placed:
         """A correction of the own log and what is known of the other logs."""

@@ -21,13 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
-from flocc_agent.core.parameters import DistributedParameters
-from flocc_agent.core.peer_budgets import Muted
-from flocc_agent.core.plausibility import HELD_BACK_S
-from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.core.reports import PartMoved, PeerRefused, RoundFailed
-from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
-from flocc_agent.core.shared_poses import (
+from flocc_agent.core.own_part import (
     ConsensusProblem,
     ConsensusState,
     ConsensusStep,
@@ -35,6 +29,12 @@ from flocc_agent.core.shared_poses import (
     SharedWith,
     ToldPoses,
 )
+from flocc_agent.core.parameters import DistributedParameters
+from flocc_agent.core.peer_budgets import Muted
+from flocc_agent.core.plausibility import HELD_BACK_S
+from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.reports import PartMoved, PeerRefused, RoundFailed
+from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S
 from flocc_agent.geometry import inverse, pose7, pose_from_tq
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
@@ -148,6 +148,7 @@ class DistributedOptimisation:
         self.anchor = own
         self.number = number
         self.is_settled = False
+        self._is_back = number > 0
         self._own = own
         self._source = source
         self._parameters = parameters
@@ -158,6 +159,7 @@ class DistributedOptimisation:
         self._origin: Float | None = None
         self._origin_step = -1
         self._seen: tuple[int, int] | None = None
+        self._seen_s = float("-inf")
         self._graph = PoseGraph({})
         self._shown: dict[LogId, Shown] = {}
         self._choices: dict[LogId, _Choice] = {}
@@ -205,8 +207,7 @@ class DistributedOptimisation:
             if before is None or message.step > before.step:
                 pair.heard = message
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
-        else:
-            self._has_news |= message.anchor < self.anchor
+        self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
 
     def on_step(self, number: int, step: ConsensusStep, now: float) -> list[Effect]:
@@ -219,7 +220,7 @@ class DistributedOptimisation:
         if step.aligned and self._moving_to is not None:
             said = self._pairs[self._moving_to].said
             assert said is not None, "it said where the poses are to be moved"
-            self.anchor, self._origin_step = said.anchor, said.origin_step
+            self.anchor, self._origin_step, self._is_back = said.anchor, said.origin_step, False
         self._moving_to = None
         self._origin = step.origin
         if self.anchor == self._own:
@@ -313,7 +314,7 @@ class DistributedOptimisation:
             effects += self.on_failed(self.number, "it took too long", now)
         if self._choosing is not None and self._choosing.until_s <= now:
             effects += self.on_choice_failed(self._choosing.number, "it took too long", now)
-        self._look()
+        self._look(now)
         if self._choosing is None and self._choose_due_s() <= now:
             effects += self._choose(now)
         if self._running_until_s is None and self._begin_at_s() <= now:
@@ -329,7 +330,7 @@ class DistributedOptimisation:
         deliver_s = self._deliver_at_s if self._undelivered else float("inf")
         step_s = self._begin_at_s() if self._running_until_s is None else self._running_until_s
         choice_s = self._choose_due_s() if self._choosing is None else self._choosing.until_s
-        return min(step_s, choice_s, self._repeat_at_s, deliver_s)
+        return min(step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s())
 
     def component(self, now: float) -> Component | None:
         """This robot's corrected poses, at most once per period, None where there is nothing new."""
@@ -362,28 +363,55 @@ class DistributedOptimisation:
         """Tables with their maximum."""
         return {"shared_with": (len(self._pairs), NEIGHBOURS_MAX), **self._distrusted.sizes("not_agreed_with")}
 
+    # What others may look at
+
+    def shares_with(self) -> tuple[LogId, ...]:
+        """Robots with which it shares poses."""
+        return tuple(sorted(other for other, pair in self._pairs.items() if pair.keyframes))
+
+    @property
+    def solved(self) -> int:
+        """Own keyframes in its part."""
+        return 0 if self._step is None else len(self._step.T_map_keyframe)
+
+    @property
+    def has_chosen(self) -> bool:
+        """Whether all closures that it knows of were chosen or turned away."""
+        return self._choosing is None and self._choose_due_s() == float("inf")
+
+    @property
+    def gap(self) -> float:
+        """Largest difference from where neighbours have the shared poses, after its last step."""
+        return 0.0 if self._step is None else self._step.gap
+
     # What it knows
 
     @property
     def _trajectory(self) -> Trajectory:
         return self._graph.trajectories.get(self._own, Trajectory(np.zeros((0, 4, 4))))
 
-    def _look(self) -> None:
-        """Take in what the logs gained: every closure, keyframes in steps."""
+    def _look(self, now: float) -> None:
+        """Take in what the logs gained: every closure, keyframes in steps, the last few after a while."""
         revision, keyframes = self._source.revision, self._source.keyframes
-        if keyframes == 0:
+        if keyframes == 0 or self._look_at_s() > now:
             return
-        if self._seen is not None:
-            grown = keyframes - self._seen[1]
-            if revision == self._seen[0] and grown < KEYFRAMES_PER_ROUND:
-                return
-        self._seen = (revision, keyframes)
+        self._seen, self._seen_s = (revision, keyframes), now
         graph = self._source.graph()
         if self._own not in graph.trajectories:
             return
         self._graph = graph
         self._shown = self._shown_now()
         self._has_news = True
+
+    def _look_at_s(self) -> float:
+        """When it is time to take in what the logs gained; never where they gained nothing."""
+        if self._seen is None:
+            return float("-inf") if self._source.keyframes else float("inf")
+        revision, keyframes = self._seen
+        grown = self._source.keyframes - keyframes
+        if revision != self._source.revision or grown >= KEYFRAMES_PER_ROUND:
+            return self._seen_s
+        return self._seen_s + PATIENCE_S if grown else float("inf")
 
     def _shown_now(self) -> dict[LogId, Shown]:
         """Of what each choice of this robot is to be made: by the other robot, its own log by its own name."""
@@ -541,10 +569,8 @@ class DistributedOptimisation:
         shared = {other: self._shared_with(other, pair) for other, pair in self._pairs.items() if pair.keyframes}
         for pair in self._pairs.values():
             pair.heard, pair.is_news = None, False
-        origin = self._origin
-        if moves_to is not None:
-            said = self._pairs[moves_to[0]].said
-            origin = None if said is None else pose_from_tq(np.array(said.origin))
+        said = None if moves_to is None else self._pairs[moves_to[0]].said
+        origin = self._origin if said is None else pose_from_tq(np.array(said.origin))
         return StepConsensus(
             self.number,
             ConsensusProblem(
@@ -553,7 +579,7 @@ class DistributedOptimisation:
                 owned=tuple(each for each in self._owned() if self._is_known(each.closure)),
                 shared=shared,
                 T_alone=self._T_alone,
-                anchored=self.anchor == self._own,
+                anchored=(self.anchor if said is None else said.anchor) == self._own,
                 origin=origin,
                 move_to=moves_to,
                 state=self._state,
@@ -579,7 +605,7 @@ class DistributedOptimisation:
             (pair.said.anchor, -pair.said.origin_step, other, pair.said)
             for other, pair in self._pairs.items()
             if pair.said is not None
-            and pair.said.anchor < self.anchor
+            and (pair.said.anchor < self.anchor or (self._is_back and pair.said.anchor == self.anchor))
             and pair.said.edition == pair.edition
             and 0 < len(pair.said) == len(pair.keyframes)
         ]
@@ -590,6 +616,7 @@ class DistributedOptimisation:
 
     def _begin_alone(self) -> None:
         self.anchor, self._state, self._origin, self._origin_step = self._own, None, None, -1
+        self._is_back = True
         self._has_news = True
 
     def _said(self) -> list[Effect]:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from flocc_agent.core.own_part import ConsensusProblem
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
 from flocc_agent.core.reports import Fact
-from flocc_agent.core.shared_poses import ConsensusProblem
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import CandidatePair, LogCorrection, Message
@@ -126,6 +126,13 @@ class PersistRecord(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class DropLog:
+    """Keep nothing more of another robot's log."""
+
+    log: LogId
+
+
+@dataclass(frozen=True, slots=True)
 class PersistTerm:
     """Remember the highest term counter that this robot claimed."""
 
@@ -165,5 +172,6 @@ Effect = (
     | PersistRecord
     | PersistTerm
     | PersistCorrection
+    | DropLog
     | Report
 )

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.own_part import ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import CameraDoubted
-from flocc_agent.core.shared_poses import ConsensusStep
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, Term

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple, Protocol
 
 from flocc_agent.core.announcing import Announcer
+from flocc_agent.core.claims import RecordClaim
 from flocc_agent.core.cold_storage import ColdPieces
 from flocc_agent.core.effects import Effect, PersistRecord, Report, Unicast
 from flocc_agent.core.log_copy import LogCopy, decoded
@@ -86,6 +87,8 @@ class Gossip:
     Attributes:
         logs: Its copies, and its own.
         failed_signers: Robots whose records the swarm's keys did not open, until somebody clears it.
+        wanting_room: A log that was not taken in since there is no room for it, until somebody clears it.
+        given_up: Logs that made room for others; they are taken in again once their writer is heard.
     """
 
     def __init__(
@@ -116,6 +119,9 @@ class Gossip:
         self._told: dict[tuple[str, str], None] = {}
         self._announcer: Announcer[LogDigest] = Announcer()
         self._doubted_until_s: dict[str, float] = {}
+        self.wanting_room: LogId | None = None
+        self.given_up: dict[LogId, None] = {}
+        self._grown_s: dict[LogId, float] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -126,6 +132,7 @@ class Gossip:
             "refused": (len(self._told), REMEMBERED_MAX),
             **({} if self._cold is None else {"warm_record_blocks": self._cold.size()}),
             "doubted": (len(self._doubted_until_s), REMEMBERED_MAX),
+            "given_up": (len(self.given_up), REMEMBERED_MAX),
         }
 
     def restore(self, log: LogId, data: bytes) -> NewRecord:
@@ -167,7 +174,20 @@ class Gossip:
 
     def has_news(self, digests: tuple[LogDigest, ...]) -> bool:
         """Whether somebody holds more than this robot."""
-        return any(digest.count > self._held(digest.log) for digest in digests)
+        return any(digest.count > self._held(digest.log) for digest in digests if digest.log not in self.given_up)
+
+    def forget(self, log: LogId) -> None:
+        """Hold nothing more of another robot's log, nor take it from those who do."""
+        assert log != self._own
+        del self.logs[log]
+        self._grown_s.pop(log, None)
+        self._announcer.remove(log)
+        self._pulls.forget(log)
+        remember(self.given_up, log, None)
+
+    def silent_s(self, log: LogId, now: float) -> float:
+        """For how long nothing new of a log came; counted from the first question where that is not known."""
+        return now - self._grown_s.setdefault(log, now)
 
     def on_lost(self, peer: str) -> None:
         """A robot is out of range."""
@@ -177,6 +197,8 @@ class Gossip:
         self, sender: LogId, digests: tuple[LogDigest, ...], now: float, at_once: bool = False
     ) -> list[Effect]:
         """Ask for what others have more of; at once where the digests were asked for."""
+        if sender in self.given_up and any(digest.log == sender for digest in digests):
+            del self.given_up[sender]
         effects = [effect for digest in digests for effect in self._on_digest(sender.robot, digest, now)]
         return effects + self._pulls.ask(now, at_once)
 
@@ -194,8 +216,11 @@ class Gossip:
 
     def _behind(self, peer: str, log: LogId, count: int) -> list[Effect]:
         """Another robot has more of a log, or says so: note whom to ask."""
+        if log in self.given_up:
+            return []
         refusal = self._no_room(log)
         if refusal is not None:
+            self.wanting_room = log
             return self._refused(peer, refusal)
         if (log, peer) not in self._forked:
             self._pulls.on_ahead(peer, log, count)
@@ -239,6 +264,19 @@ class Gossip:
             effects += self._pulls.ask_on(sender.robot, now, left_out)
         return new, effects
 
+    def claims(self, batch: RecordBatch) -> list[RecordClaim]:
+        """Records of a batch whose signatures `on_records` would check: those that could be taken in."""
+        copy = self.logs.get(batch.log)
+        known = [] if copy is None else copy.encoded[batch.first : batch.first + len(batch.records)]
+        if batch.log != self._own:
+            is_gap = batch.first > self._held(batch.log)
+            if is_gap or batch.log in self.given_up or self._no_room(batch.log) is not None:
+                return []
+            if copy is not None and not copy.agrees(batch.first, batch.checksum_before, batch.records):
+                return []
+        new = [k for k, data in enumerate(batch.records) if k >= len(known) or known[k] != data]
+        return [RecordClaim(batch.log, batch.first + k, batch.records[k]) for k in new]
+
     def _on_batch(self, sender: LogId, batch: RecordBatch, now: float) -> tuple[list[NewRecord], list[Effect]]:
         peer = sender.robot
         if batch.log == self._own:
@@ -251,12 +289,16 @@ class Gossip:
         if not copy.agrees(batch.first, batch.checksum_before, batch.records):
             self._pulls.on_level(peer, batch.log)
             return [], self._fork(peer, batch.log, "two writers of one log")
+        if batch.log in self.given_up:
+            return [], []
         refusal = self._no_room(batch.log)
         if refusal is not None:
+            self.wanting_room = batch.log
             return [], self._refused(peer, refusal)
         new, effects = self._take(peer, copy, batch)
         if new:
             self.logs[batch.log] = copy
+            self._grown_s[batch.log] = now
             self._announce(batch.log, copy)
         self._pulls.on_answer(peer, batch.log, bool(new))
         return new, effects

@@ -50,11 +50,13 @@ class Image:
         pixels: (H, W, 3) uint8 in RGB order.
         camera: That took them.
         hidden: (H, W) pixels that move with the camera and show no scene; None: there are none.
+        up: (3,) direction against gravity in the camera frame, of length one; None: it is not known.
     """
 
     pixels: NDArray[np.uint8]
     camera: Camera
     hidden: NDArray[np.bool_] | None = None
+    up: Float | None = None
 
     def __post_init__(self) -> None:
         expected = (self.camera.height, self.camera.width, 3)
@@ -120,6 +122,20 @@ class PictureEncoder(Encoder, Protocol):
         Args:
             latent: What `encode` gave.
             encode_bytes: What the link carries while the asker encodes a picture; None where it wants no picture.
+        """
+        ...
+
+
+@runtime_checkable
+class MaskingEncoder(Encoder, Protocol):
+    """An encoder that can take out of a latent what turned out later to move with the camera."""
+
+    def without(self, latent: bytes, hidden: NDArray[np.bool_], /) -> bytes:
+        """Give a latent of its own without the features at hidden pixels.
+
+        Args:
+            latent: What `encode` gave.
+            hidden: (H, W) of the camera's picture.
         """
         ...
 
@@ -218,6 +234,10 @@ class Perception:
         """Give what is sent of a stored latent; see `PictureEncoder.part`."""
         return self.encoder.part(latent, encode_bytes) if isinstance(self.encoder, PictureEncoder) else latent
 
+    def without(self, latent: bytes, hidden: NDArray[np.bool_]) -> bytes:
+        """Give a latent without what is hidden, where the encoder can; see `MaskingEncoder.without`."""
+        return self.encoder.without(latent, hidden) if isinstance(self.encoder, MaskingEncoder) else latent
+
     def encode_s(self) -> float | None:
         """Tell how long encoding a received picture takes, seconds; None where pictures are not wanted."""
         return self.encoder.encode_s if isinstance(self.encoder, PictureEncoder) else None
@@ -232,12 +252,14 @@ class KeyframeLook:
         latent: The same.
         fault: Why it was not.
         doubts: What is odd about the camera, told for the first time.
+        hidden: (H, W) what moves with the camera, where that is told with this keyframe: the latents before show it.
     """
 
     descriptor: Array | None
     latent: bytes | None
     fault: str = ""
     doubts: tuple[CameraDoubted, ...] = ()
+    hidden: NDArray[np.bool_] | None = None
 
 
 class ImageWatch(Protocol):

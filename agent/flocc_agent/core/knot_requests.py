@@ -38,6 +38,10 @@ class _Question:
         """Whether it was asked for often enough, for others."""
         return self.asked >= ASKED_MAX and not self.own
 
+    def waiting(self, now: float) -> list[str]:
+        """Robots that asked not long ago; these do not have the knots. Who asked before may have them by now."""
+        return [peer for peer, until_s in sorted(self.peers.items()) if until_s > now]
+
 
 class KnotRequests:
     """Questions for knots that are open at one robot."""
@@ -84,7 +88,7 @@ class KnotRequests:
     def waits(self, log: LogId, now: float) -> bool:
         """Whether another robot waits for the knots of a log."""
         question = self._open.get(log)
-        return question is not None and any(until_s > now for until_s in question.peers.values())
+        return question is not None and bool(question.waiting(now))
 
     def on_knots(self, version: CorrectionVersion, now: float) -> list[str]:
         """Knots came; to whom they are to be passed on."""
@@ -93,7 +97,7 @@ class KnotRequests:
             return []
         if version >= question.version:
             del self._open[version.log]
-        return [peer for peer, until_s in sorted(question.peers.items()) if until_s > now]
+        return question.waiting(now)
 
     def ask(self, now: float) -> list[Effect]:
         """Ask for what is due, each of one robot in range; other robots in turn."""
@@ -103,7 +107,8 @@ class KnotRequests:
         for question in self._open.values():
             if question.next_s > now or question.is_given_up():
                 continue
-            on_the_way = [peer for peer in self._towards(question.version.term) if peer not in question.peers]
+            waiting = question.waiting(now)
+            on_the_way = [peer for peer in self._towards(question.version.term) if peer not in waiting]
             if not on_the_way:
                 continue
             asked = questions.setdefault(on_the_way[question.asked % len(on_the_way)], [])

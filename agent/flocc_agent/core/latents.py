@@ -172,6 +172,10 @@ class LatentNames:
         numbers.extend([0] * (keyframe.index + 1 - len(numbers)))
         numbers[keyframe.index] = numbers[keyframe.index] or number
 
+    def forget(self, log: LogId) -> None:
+        """A log is held no more."""
+        self._numbers.pop(log, None)
+
     def of(self, keyframe: KeyframeId) -> LatentRecord | None:
         """What a latent is."""
         numbers = self._numbers.get(keyframe.log, ())

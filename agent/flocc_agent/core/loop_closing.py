@@ -148,6 +148,18 @@ class LoopClosing:
             self._offers.remove(pair)
             self._chosen, self._changed = None, True
 
+    def forget(self, log: LogId) -> None:
+        """A log is held no more: its pairs wait for nothing."""
+        for pair in self.open_pairs():
+            if log in (pair.low.log, pair.high.log):
+                self.on_resolved(pair)
+                self._resolved.discard(pair)
+        self.latents.names.forget(log)
+
+    def is_written(self, log: LogId) -> bool:
+        """Whether the writer of a log is in range."""
+        return self._reach.writes(log)
+
     def on_closure(self, pair: CandidatePair, now: float) -> None:
         """A record of this pair is in a log, and it is a closure; what was refused unseen beside it has a chance."""
         if self._spectral is not None:

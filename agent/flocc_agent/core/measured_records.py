@@ -46,6 +46,12 @@ class MeasuredRecords:
             self._unmade.setdefault(robot, {})[new.log, new.number] = new
         return (record.query, record.match) if isinstance(record, MetricClosureRecord) else ()
 
+    def writers(self) -> set[LogId]:
+        """Logs in which something measured stands, or of which it speaks."""
+        unmade = {log for places in self._unmade.values() for log, _ in places}
+        made = {log for places in self._made.values() for log, _ in places}
+        return unmade | made | set(self._made) | set(self._edges)
+
     def awaited(self, robot: str, stamp_s: float) -> bool:
         """Whether a sighting of a robot waited for its odometry to reach this stamp; it is told once."""
         stamps_s = self._waiting.get(robot)

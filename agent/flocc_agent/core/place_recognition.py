@@ -180,15 +180,28 @@ class _Rows:
         """Hold the oldest rows of a log here again, as many as are looked through at one time."""
         standing = self._standing.get(log, 0)
         while (lowest := self.places(log)[standing : standing + THINNED_AT_ONCE].min()) < self._first:
-            number = bisect_right(self._lent_ends, lowest) - 1
-            first, end = self._lent_ends[number], self._lent_ends[number + 1]
-            self._make_room(end - first)
-            held = self._count - self._first
-            self._rows[held : held + end - first] = self._lent.pop(number).rows
-            self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
-            self._order_columns(first, np.concatenate([np.arange(end, self._count), np.arange(first, end)]))
+            self._take_back_lent(bisect_right(self._lent_ends, lowest) - 1)
+
+    def _take_back_lent(self, number: int) -> None:
+        """Hold what was lent as the so manieth here again."""
+        first, end = self._lent_ends[number], self._lent_ends[number + 1]
+        self._make_room(end - first)
+        held = self._count - self._first
+        self._rows[held : held + end - first] = self._lent.pop(number).rows
+        self._lent_ends = list(accumulate((len(each.rows) for each in self._lent), initial=0))
+        self._order_columns(first, np.concatenate([np.arange(end, self._count), np.arange(first, end)]))
 
     # Old rows
+
+    def forget(self, log: int) -> None:
+        """Hold no row of a log any more."""
+        for number in reversed(range(len(self._lent))):
+            if self._lent[number].log == log:
+                self._take_back_lent(number)
+        self._standing.setdefault(log, 0)
+        self._leave_out(log, self.places(log))
+        for table in (self._by_log, self._standing, self._unthinned, self._same_place):
+            table.pop(log, None)
 
     def thin(self, log: int, held: int) -> None:
         """Keep a log's newest so many rows whole, and at most so many that stand for its older ones.
@@ -377,6 +390,7 @@ class PlaceRecognition:
         self._best: list[float] = []
         self._own_rows: _Rows | None = None
         self._others: dict[int, _Rows] = {}
+        self._forgotten: set[int] = set()
         self.refused = 0
 
     @property
@@ -423,6 +437,17 @@ class PlaceRecognition:
         if indices and number is not None and others is not None and self._dimensions[number] == others.dimension:
             others.lend(number, indices, rows)
 
+    def forget(self, log: LogId) -> None:
+        """Compare a log's keyframes with no further ones."""
+        number = self._numbers.get(log)
+        if number is None:
+            return
+        self._forgotten.add(number)
+        self._best[number] = -1.0
+        others = self._others.get(self._dimensions[number])
+        if others is not None and number in others.numbers:
+            others.forget(number)
+
     def agreement(self, pair: CandidatePair) -> float | None:
         """How well the keyframes around a pair's agree in order, -1 to 1; None where too few are known."""
         one, other = self._around(pair.low, RUN_REACH), self._around(pair.high, RUN_REACH + 1)
@@ -458,14 +483,15 @@ class PlaceRecognition:
 
     def _meet(self, keyframes: Iterable[tuple[KeyframeId, Array]]) -> None:
         """Number logs that are new: each has a smaller share then, also one that gets no more keyframes."""
-        known = len(self._logs)
+        known = len(self._logs) - len(self._forgotten)
         for keyframe, place in keyframes:
+            self._forgotten.discard(self._numbers.get(keyframe.log, -1))
             if keyframe.log not in self._numbers and (descriptor := comparable(place)) is not None:
                 self._numbers[keyframe.log] = len(self._logs)
                 self._logs.append(keyframe.log)
                 self._dimensions.append(len(descriptor.row))
                 self._best.append(-1.0)
-        if len(self._logs) == known:
+        if len(self._logs) - len(self._forgotten) == known:
             return
         for rows in (*self._others.values(), *([] if self._own_rows is None else [self._own_rows])):
             for number in rows.numbers:
@@ -474,7 +500,7 @@ class PlaceRecognition:
     @property
     def _share(self) -> int:
         """Rows of one log that are compared whole: all robots that know the same logs have the same of each."""
-        return self._keyframes_held // max(len(self._logs) - 1, 1)
+        return self._keyframes_held // max(len(self._logs) - len(self._forgotten) - 1, 1)
 
     def _among_all(self, keyframe: KeyframeId, descriptor: Descriptor) -> list[Found]:
         """Candidates of one of this robot's keyframes, with each other robot's and, if wanted, with its own."""

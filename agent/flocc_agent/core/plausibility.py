@@ -91,11 +91,12 @@ def _frame(
 def _away(placed: Placed, camera: Float, graph: HeldGraph) -> str | None:
     """A robot is not farther from the beginning of its map than all ways together are long, nor is its anchor.
 
-    A way is longer by what odometry missed, as far as closures say so.
+    A way is longer by what odometry missed, as far as closures say so. Where the anchor's own way is not here yet,
+    nothing says where its map begins.
     """
     start, anchor = graph.odometry(placed.own.anchor), placed.others.get(placed.own.anchor)
     if not len(start):
-        return None
+        return UNTIED
     if anchor is not None and anchor.anchor == anchor.log:
         drifted_m = corrected(anchor, start[-1:], np.array([len(start) - 1]))[0, :3, 3] - start[-1, :3, 3]
         beyond_m = float(np.linalg.norm(drifted_m)) - VIEW_M - DRIFTED_RATIO * way_m(start)

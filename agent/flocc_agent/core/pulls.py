@@ -88,6 +88,11 @@ class Pulls:
         if ahead is not None and ahead.pop(log, None) is not None and not ahead:
             del self._ahead[peer]
 
+    def forget(self, log: LogId) -> None:
+        """A log is of no interest any more."""
+        for peer in list(self._ahead):
+            self.on_level(peer, log)
+
     def on_lost(self, peer: str) -> None:
         """A peer is out of range; what it was to send may be asked of others at once."""
         self._ahead.pop(peer, None)

@@ -206,6 +206,13 @@ class LatentLost:
     keyframe: KeyframeId
 
 
+@fact("log_given_up")
+class LogGivenUp:
+    """A log to which nothing refers, and of which nothing new came for an hour, made room for another one."""
+
+    log: LogId
+
+
 # Leadership
 
 

@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
+from flocc_agent.core.claims import Claim
 from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import STEPS_AFTER_RESTART, DistributedOptimisation
-from flocc_agent.core.effects import Broadcast, Effect, Encode, Optimise, Report, Unicast
+from flocc_agent.core.effects import Broadcast, DropLog, Effect, Encode, Optimise, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
     LATENT_FALSE,
@@ -36,6 +37,7 @@ from flocc_agent.core.events import (
     MessageReceived,
     PairRegistered,
 )
+from flocc_agent.core.giving_up import LOOK_PERIOD_S, expendable
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
 from flocc_agent.core.in_map import InMap
 from flocc_agent.core.judgement import judged, told
@@ -64,6 +66,7 @@ from flocc_agent.core.reports import (
     LatentArrived,
     LatentFailed,
     LatentLost,
+    LogGivenUp,
     NeighbourDown,
     PeerRefused,
     RoundFailed,
@@ -222,6 +225,8 @@ class Robot:
         )
         self._has_keys = sealer is not None
         self._overtaken_s = float("-inf")
+        self._looked_for_room_s = float("-inf")
+        self._closed = closed
         self._distrusted = Muted(DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S)
         self.election = LeaderElection(
             log, compute_class, restored.counter_max(), parameters.election, now, compute_classes
@@ -236,6 +241,9 @@ class Robot:
     def handle(self, event: Event, now: float) -> list[Effect]:
         """Something happened."""
         effects = self._dispatch(event, now)
+        if self.gossip.wanting_room is not None:
+            effects += self._make_room(self.gossip.wanting_room, now)
+            self.gossip.wanting_room = None
         return self._placed(effects + self._settle(now), now)
 
     def tick(self, now: float) -> list[Effect]:
@@ -251,6 +259,23 @@ class Robot:
         if self.in_map is None:
             return effects
         return effects + self.in_map.told(effects, self.gossip.logs[self.log].keyframes, now)
+
+    def claims(self, envelope: Envelope, now: float) -> list[Claim]:
+        """What of a message its sealer will be asked for, as far as this robot knows now; nothing changes."""
+        peer, message = envelope.sender.robot, envelope.message
+        if peer == self.log.robot:
+            return []
+        match message:
+            case Records(batches):
+                heard = [batch for batch in batches if not self._muted.is_muted(peer, batch.log.robot, now)]
+                return [claim for batch in heard for claim in self.gossip.claims(batch)]
+            case CorrectionBatch(corrections):
+                heard_of = [c for c in corrections if not self._muted.is_muted(peer, c.term.leader.robot, now)]
+                trusted = [c for c in heard_of if not self._is_distrusted(c.term.leader, now)]
+                found = [self.corrections.claim(correction, now) for correction in trusted]
+                return [claim for claim in found if claim is not None]
+            case _:
+                return []
 
     def deadline(self) -> float:
         """When `tick` is due next, in seconds of the driver's clock."""
@@ -397,6 +422,8 @@ class Robot:
 
     def _on_correction(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
         """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
+        if message.log in self.gossip.given_up:
+            return []
         if self._is_distrusted(message.term.leader, now):
             return self._overtaken(sender, message, now)
         if self.distributed is not None and message.term.leader != message.log:
@@ -452,7 +479,11 @@ class Robot:
 
     def _on_digests(self, sender: LogId, message: Digests, now: float) -> list[Effect]:
         """What others hold: whoever has less of a log or an older correction asks for it."""
-        versions = tuple(each for each in message.versions if not self._is_distrusted(each.term.leader, now))
+        versions = tuple(
+            each
+            for each in message.versions
+            if each.log not in self.gossip.given_up and not self._is_distrusted(each.term.leader, now)
+        )
         helped = self.gossip.has_news(message.digests) or self.corrections.has_news(versions)
         self.comparisons.on_digests(sender.robot, message, helped, now)
         effects = self.gossip.on_digests(sender, message.digests, now, at_once=True)
@@ -599,6 +630,27 @@ class Robot:
         for log, number in filled:
             self._lend_rows(log, number // BLOCK_RECORDS)
         return effects
+
+    def _make_room(self, wanting: LogId, now: float) -> list[Effect]:
+        """Give up a log that nothing refers to, where one is asked for that has no room."""
+        if now < self._looked_for_room_s + LOOK_PERIOD_S:
+            return []
+        self._looked_for_room_s = now
+        kept = self.assembly.tied() | self._closed | {self.log}
+        log = expendable(
+            self.gossip.logs,
+            wanting,
+            lambda each: each not in kept and not self.closing.is_written(each),
+            lambda each: self.gossip.silent_s(each, now),
+        )
+        if log is None:
+            return []
+        self.gossip.forget(log)
+        self.assembly.forget(log)
+        self.recognition.forget(log)
+        self.closing.forget(log)
+        self.corrections.forget_log(log)
+        return [DropLog(log), Report(LogGivenUp(log=log))]
 
     def _lend_rows(self, log: LogId, block: int) -> None:
         """Descriptors of a full block are held once, by the log."""

@@ -92,6 +92,32 @@ def unpack(data: bytes, kind: str) -> Latent:
     return Latent(header, arrays)
 
 
+UP_LENGTH_TOLERANCE = 1e-3
+
+
+def with_up(header: Mapping[str, Any], up: NDArray[np.float64] | None) -> dict[str, Any]:
+    """A header that says which way is up, where that is known: (3,) against gravity in the camera frame."""
+    return dict(header) if up is None else {**header, "up": [round(float(part), 6) for part in up]}
+
+
+def up_of(header: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """Which way is up, as `with_up` wrote it; None where the header does not say.
+
+    Raises:
+        BadLatent: It says something else than a direction.
+    """
+    told = header.get("up")
+    if told is None:
+        return None
+    if not isinstance(told, list) or len(told) != 3 or not all(isinstance(part, (int, float)) for part in told):
+        raise BadLatent("the latent's direction against gravity is not three numbers")
+    up = np.array(told, np.float64)
+    length = float(np.linalg.norm(up))
+    if not abs(length - 1.0) <= UP_LENGTH_TOLERANCE:
+        raise BadLatent("the latent's direction against gravity is not of length one")
+    return np.asarray(up / length)
+
+
 def _description(data: bytes) -> tuple[dict[str, Any], int]:
     """Read the JSON description and the offset behind it."""
     if len(data) > LATENT_BYTES_MAX or len(data) < 8 or data[:4] != MAGIC:

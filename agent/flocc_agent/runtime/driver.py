@@ -18,6 +18,7 @@ from flocc_agent.core.effects import (
     Broadcast,
     ChooseClosures,
     Deliver,
+    DropLog,
     Effect,
     Encode,
     FetchLatent,
@@ -52,18 +53,20 @@ from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.admission import Refusal, admitted
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.given_keyframes import GivenKeyframes, checked_keyframe
-from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, fetch, job_of
+from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, check, fetch, job_of
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.persistence import DiskQueue, Persist
 from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
 from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.sending import Sender
+from flocc_agent.runtime.signature_queue import SignatureQueue
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.telemetry import Sizes, Telemetry
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.keys import Kind
+from flocc_protocol.messages import Envelope
 
 logger = logging.getLogger(__name__)
 
@@ -95,6 +98,8 @@ class Driver:
         self._opened = asyncio.Event()
         self._given = GivenKeyframes.of(robot)
         self._jobs: set[asyncio.Task[Event]] = set()
+        self._signed = SignatureQueue(robot.claims, lambda claims: check(claims, tools), self._on_envelope)
+        self._checking: asyncio.Task[None] | None = None
         self._stopping = False
         self._subscribers: list[asyncio.Queue[Correction | None]] = []
         self._disk = DiskQueue(tools.store, tools.clock_s())
@@ -189,7 +194,8 @@ class Driver:
     def busy(self) -> bool:
         """Whether images, fetches, registrations or rounds are under way, or a leader still owes a round."""
         owes_round = self.robot.rounds.deadline() < float("inf")
-        return bool(self._inbox or self._tools.images or self._jobs or self.robot.closing.load or owes_round)
+        waits = self._inbox or self._tools.images or self._signed.is_waiting()
+        return bool(waits or self._jobs or self.robot.closing.load or owes_round)
 
     def status(self) -> AgentStatus:
         """What this robot does now: leader, neighbours, sizes, map frame, bytes, refusals."""
@@ -232,6 +238,9 @@ class Driver:
                 now = self._clock_s()
                 self._tools.workers.stages.observe("inbox_wait", now - put_s)
                 await self._carry_out(self.robot.handle(event, now))
+                if isinstance(event, MessageReceived):
+                    self._signed.on_handled(event.envelope)
+            self._check_signatures()
             self._sender.send_due_records()
             self._telemetry.count_bytes()
             await self._disk.write_due(self._clock_s())
@@ -244,6 +253,7 @@ class Driver:
             return
         self._wake.clear()
         due_s = min(self.robot.deadline(), self._telemetry.due_s(), self._disk.due_s(), self._sender.due_s())
+        due_s = min(due_s, self._signed.due_s())
         pause_s = due_s - self._clock_s()
         alarm = asyncio.get_running_loop().call_later(max(pause_s, 0.0), self._wake.set)
         try:
@@ -254,9 +264,10 @@ class Driver:
     async def _close(self) -> None:
         """End everything, whatever fails of it: threads of an open transport would keep the process from ending."""
         try:
-            for job in list(self._jobs):
+            jobs = [*self._jobs, *([] if self._checking is None else [self._checking])]
+            for job in jobs:
                 job.cancel()
-            await asyncio.gather(*self._jobs, return_exceptions=True)
+            await asyncio.gather(*jobs, return_exceptions=True)
             await self._disk.flush()
             self._telemetry.count_bytes(last=True)
         finally:
@@ -273,6 +284,7 @@ class Driver:
             "inbox": (len(self._inbox), INBOX_MAX),
             "images": (len(self._tools.images), IMAGES_MAX),
             "disk": self._disk.size(),
+            "signed": self._signed.size(),
         }
 
     # What peers send
@@ -288,7 +300,28 @@ class Driver:
             return
         if kind == Kind.HEARTBEAT.value:
             self._heard_gap.mark(sender, self._clock_s())
+        if self._tools.sealer is None or not self._signed.is_for(envelope):
+            self._on_envelope(envelope)
+        elif self._signed.put(envelope, self._clock_s()):
+            self._wake.set()
+        else:
+            self._telemetry.refuse(sender, "too many signed messages wait")
+
+    def _on_envelope(self, envelope: Envelope) -> None:
         self.put(MessageReceived(envelope))
+
+    def _check_signatures(self) -> None:
+        """Begin the next turn of signed messages, if one is due."""
+        turn = self._signed.next_turn(self._clock_s())
+        if turn:
+            self._checking = asyncio.create_task(self._signed.run_turn(turn, self._clock_s()))
+            self._checking.add_done_callback(self._checked)
+
+    def _checked(self, turn: asyncio.Task[None]) -> None:
+        """What a turn brings is in the inbox; one that raised is a bug, and ends the agent."""
+        if not turn.cancelled() and (error := turn.exception()) is not None:
+            logger.error("%s: looking at signatures failed", self.robot.log, exc_info=error)
+            self.stop()
 
     def _latent_named(self, key: str, encode_bytes: int | None) -> bytes | None:
         """A latent for the transport, by a name that a peer gave, or the part of it that reaches him sooner."""
@@ -307,7 +340,7 @@ class Driver:
             match effect:
                 case PersistRecord(log=log) if log != self.robot.log:
                     self._disk.put(effect)
-                case PersistRecord() | PersistTerm() | PersistCorrection():
+                case PersistRecord() | PersistTerm() | PersistCorrection() | DropLog():
                     kept.append(effect)
                 case Report(fact):
                     self._tell(fact)

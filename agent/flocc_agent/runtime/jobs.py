@@ -6,13 +6,15 @@ inbox; whatever fails becomes the event that says so.
 
 import asyncio
 import hashlib
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from flocc_agent.core.claims import Claim
 from flocc_agent.core.effects import ChooseClosures, Encode, FetchLatent, Optimise, Register, StepConsensus
 from flocc_agent.core.events import (
     ChoiceFailed,
@@ -30,13 +32,15 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.interfaces import Image, ImageWatch, OdometryPair, Perception
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
-from flocc_agent.core.shared_poses import ConsensusProblem, ConsensusStep
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.transport import Fetched, FetchProblem, Transport
 from flocc_agent.runtime.workers import Workers, WorkFailed
+from flocc_protocol.ids import KeyframeId
 
 IMAGES_MAX = 8
 
@@ -86,7 +90,7 @@ class Tools:
         transport: Fetches latents.
         clock_s: Seconds since the start of the run.
         images: Those that wait for the encoder.
-        names_latents: The robot's log says what its latents are: the swarm has keys.
+        sealer: Checks signatures, where the swarm has keys; the robot's log then says what its latents are.
     """
 
     perception: Perception
@@ -98,7 +102,7 @@ class Tools:
     transport: Transport
     clock_s: Callable[[], float]
     images: ImageSlots = field(default_factory=ImageSlots)
-    names_latents: bool = False
+    sealer: RecordSealer | None = None
 
 
 def job_of(effect: Job, tools: Tools) -> Coroutine[Any, Any, Event]:
@@ -128,9 +132,50 @@ async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEnco
     looked = result.value
     if looked.descriptor is None or looked.latent is None:
         return KeyframeEncodingFailed(effect.keyframe, looked.fault, looked.doubts)
+    if looked.hidden is not None and tools.sealer is None:
+        await asyncio.to_thread(hide_in_earlier, effect.keyframe, looked.hidden, tools.perception.without, tools.store)
     await asyncio.to_thread(tools.store.put_latent, effect.keyframe, looked.latent)
-    sha256 = await asyncio.to_thread(_sent_forms, looked.latent, tools.perception) if tools.names_latents else b""
+    sha256 = await asyncio.to_thread(_sent_forms, looked.latent, tools.perception) if tools.sealer is not None else b""
     return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts, sha256)
+
+
+class KeepsLatents(Protocol):
+    """What keeps latents by keyframe."""
+
+    def latent(self, keyframe: KeyframeId, /) -> bytes | None:
+        """Give a latent, None where there is none."""
+        ...
+
+    def replace_latent(self, keyframe: KeyframeId, latent: bytes, /) -> None:
+        """Keep another latent in the place of one that is there."""
+        ...
+
+
+EARLIER_MAX = 64
+"""Keyframes whose latents lose what turns out to move with the camera: it is found among the first few, mostly."""
+
+
+def hide_in_earlier(
+    keyframe: KeyframeId,
+    hidden: NDArray[np.bool_],
+    without: Callable[[bytes, NDArray[np.bool_]], bytes],
+    store: KeepsLatents,
+) -> None:
+    """Take what moves with the camera out of the latents that were encoded before it was known.
+
+    Where a robot's log says what its latents are, they stay: another one would be refused as false.
+
+    Args:
+        keyframe: With which it became known.
+        hidden: (H, W) of the camera's picture.
+        without: Takes what is hidden out of a latent.
+        store: Where they are.
+    """
+    for index in range(max(0, keyframe.index - EARLIER_MAX), keyframe.index):
+        earlier = KeyframeId(keyframe.log, index)
+        latent = store.latent(earlier)
+        if latent is not None:
+            store.replace_latent(earlier, without(latent, hidden))
 
 
 def _sent_forms(latent: bytes, perception: Perception) -> bytes:
@@ -174,6 +219,13 @@ async def optimise(effect: Optimise, tools: Tools) -> GraphOptimised | GraphOpti
     if isinstance(solution, (WorkFailed, OptimisationFailed)):
         return GraphOptimisationFailed(effect.term, effect.round, solution.reason)
     return GraphOptimised(effect.term, effect.round, solution)
+
+
+async def check(messages: Sequence[Sequence[Claim]], tools: Tools) -> list[int]:
+    """Look at the signatures of messages in a worker; gives how many of each. The robot does what is left."""
+    assert tools.sealer is not None
+    result = await tools.workers.run("check", tools.sealer.check, messages)
+    return [len(claims) for claims in messages] if isinstance(result, WorkFailed) else result.value
 
 
 async def choose(effect: ChooseClosures, tools: Tools) -> ClosuresChosen | ChoiceFailed:

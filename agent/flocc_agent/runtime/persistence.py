@@ -5,7 +5,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import assert_never
 
-from flocc_agent.core.effects import PersistCorrection, PersistRecord, PersistTerm
+from flocc_agent.core.effects import DropLog, PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.robot import Restored
 from flocc_agent.runtime.map_folder import BadMap, MapFolder
@@ -18,7 +18,7 @@ from flocc_protocol.records import decode_record
 
 logger = logging.getLogger(__name__)
 
-Persist = PersistRecord | PersistTerm | PersistCorrection
+Persist = PersistRecord | PersistTerm | PersistCorrection | DropLog
 
 FRAME_CHANGED = "frame_changed"
 """Fact: the kept correction, or one that was about to be kept, changed the map frame."""
@@ -96,6 +96,8 @@ def write(store: Store, effects: Iterable[Persist]) -> None:
                 store.put_correction(correction.log.robot, stored(correction))
                 if not frame_changed and store.fact(FRAME_CHANGED) == b"1":
                     store.put_fact(FRAME_CHANGED, b"0")
+            case DropLog(log):
+                store.drop_log(log)
             case PersistRecord():
                 pass
             case _:

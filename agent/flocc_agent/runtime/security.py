@@ -6,12 +6,15 @@ TLS proves who the next hop is; records travel through relays, so each carries a
 
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flocc_agent.config import TlsConfig
+from flocc_agent.core.claims import Claim, RecordClaim
+from flocc_agent.core.pulls import remember
 from flocc_agent.extras import to_install
 from flocc_agent.runtime.transport import TransportError
 from flocc_protocol import keys
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 CA, CERTIFICATE, KEY, SIGNING_KEY, MEMBERS = "ca.crt", "robot.crt", "robot.key", "signing.key", "members.json"
 SIGNATURE_BYTES = 64
 MEMBERS_MAX = 1000
+VERDICTS_MAX = 4096
+"""Signatures whose check is remembered until the robot asks for it: more than four messages can hold."""
 
 WRITES = ["put", "delete", "liveliness_token", "declare_queryable", "reply"]
 READS = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
@@ -173,7 +178,8 @@ class RecordSealer:
     """Signs this robot's records and checks those of all members: record bytes in, record bytes plus 64 out.
 
     The signature covers swarm, log and number as well, so that a record cannot be moved to another place. Corrections
-    are signed by the leader that made them, apart from their bytes.
+    are signed by the leader that made them, apart from their bytes. What was checked beforehand, on another thread, is
+    not checked again.
 
     Attributes:
         compute_classes: Those of the list of members, None where it names none.
@@ -190,6 +196,7 @@ class RecordSealer:
         self._swarm = swarm
         self._signing_key = signing_key
         self._verifying_keys = {robot: _public_key(key) for robot, key in members.items()}
+        self._verdicts: dict[bytes, bool] = {}
 
     @classmethod
     def of(cls, tls: TlsConfig) -> "RecordSealer":
@@ -240,22 +247,64 @@ class RecordSealer:
         if not self._is_of(leader, signature, signed_correction(self._swarm, correction)):
             raise DecodeError(f"a correction carries no signature of {leader.robot}")
 
+    def check(self, messages: Sequence[Sequence[Claim]]) -> list[int]:
+        """Check what a robot is about to ask for, message by message; on one other thread, while the robot goes on.
+
+        What is claimed of a robot after one of its signatures in a message was wrong is not looked at.
+
+        Returns:
+            How many signatures of each message were looked at.
+        """
+        return [self._check(claims) for claims in messages]
+
+    def _check(self, claims: Sequence[Claim]) -> int:
+        failed: set[str] = set()
+        looked_at = 0
+        for claim in claims:
+            signer, signature, text = self._claimed(claim)
+            if signer.robot in failed or signer.robot not in self._verifying_keys:
+                continue
+            digest = _digest(signer, signature, text)
+            verdict = self._verdicts.get(digest)
+            if verdict is None:
+                looked_at += 1
+                verdict = self._verify(signer, signature, text)
+                remember(self._verdicts, digest, verdict, VERDICTS_MAX)
+            if not verdict:
+                failed.add(signer.robot)
+        return looked_at
+
+    def _claimed(self, claim: Claim) -> tuple[LogId, bytes, bytes]:
+        """Who is said to have signed what, and the signature."""
+        if not isinstance(claim, RecordClaim):
+            return claim.leader, claim.signature, signed_correction(self._swarm, claim.correction)
+        record, signature = claim.sealed[:-SIGNATURE_BYTES], claim.sealed[-SIGNATURE_BYTES:]
+        return claim.log, signature, signed_text(self._swarm, claim.log, claim.number, record)
+
     def _is_of(self, log: LogId, signature: bytes, text: bytes) -> bool:
         """Whether the robot of a log signed a text.
 
         Raises:
             DecodeError: The robot is no member.
         """
+        if log.robot not in self._verifying_keys:
+            raise DecodeError(f"log {log} is of no member of the swarm")
+        known = self._verdicts.get(_digest(log, signature, text)) if self._verdicts else None
+        return self._verify(log, signature, text) if known is None else known
+
+    def _verify(self, log: LogId, signature: bytes, text: bytes) -> bool:
         from cryptography.exceptions import InvalidSignature
 
-        verifying_key = self._verifying_keys.get(log.robot)
-        if verifying_key is None:
-            raise DecodeError(f"log {log} is of no member of the swarm")
         try:
-            verifying_key.verify(signature, text)
+            self._verifying_keys[log.robot].verify(signature, text)
         except InvalidSignature:
             return False
         return True
+
+
+def _digest(log: LogId, signature: bytes, text: bytes) -> bytes:
+    """Names one check: whose signature, which, and over what."""
+    return blake2b(bytes([len(signature)]) + signature + text, digest_size=32, key=log.robot.encode()).digest()
 
 
 def signed_text(swarm: str, log: LogId, number: int, record: bytes) -> bytes:

@@ -18,6 +18,18 @@ class StageBrief(BaseModel):
     max_s: float = 0.0
 
 
+class CameraStatus(BaseModel):
+    """What a robot doubts of its own camera, as `CameraDoubted` tells it."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    doubt: str
+    amount: float = 1.0
+    where: str = ""
+    pairs: int = 0
+    withheld: bool = False
+
+
 class AgentStatus(BaseModel):
     """What one robot does now.
 
@@ -49,6 +61,7 @@ class AgentStatus(BaseModel):
         disk_failure: Why it can no longer write to its disk, None while it can.
         doubles: Names under which it heard two robots, its own among them.
         in_map: Whether it has found itself in the map that it opened, a sentence; None where it opened none.
+        camera: What it doubts of its camera, the latest of each kind.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -80,6 +93,7 @@ class AgentStatus(BaseModel):
     disk_failure: str | None = None
     in_map: str | None = None
     doubles: tuple[str, ...] = ()
+    camera: tuple[CameraStatus, ...] = ()
 
 
 class PairStatus(BaseModel):
@@ -129,6 +143,7 @@ class MergeStatus(BaseModel):
         match_ratio_threshold: R_thr.
         pairs: By two robots.
         solver: Of the last own solution, None where it made none.
+        emulated: What of its radio is emulated, in words; None where messages come as the network brings them.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -138,3 +153,4 @@ class MergeStatus(BaseModel):
     match_ratio_threshold: float | None = None
     pairs: list[PairStatus] = []
     solver: SolverStatus | None = None
+    emulated: str | None = None

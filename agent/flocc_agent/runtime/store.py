@@ -48,6 +48,7 @@ CREATE TABLE IF NOT EXISTS latents(
     age INTEGER PRIMARY KEY AUTOINCREMENT, keyframe TEXT UNIQUE, sha256 BLOB NOT NULL, bytes INTEGER NOT NULL,
     data BLOB NOT NULL);
 """
+REPLACE_LATENT = "UPDATE latents SET sha256 = ?, bytes = ?, data = ? WHERE keyframe = ?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +200,13 @@ class Store:
         self._others_bytes += len(record.data)
         return True
 
+    def drop_log(self, log: LogId) -> None:
+        """Keep nothing of another robot's log any more."""
+        assert log != self.identity.log
+        with self._lock:
+            self._records.write("DELETE FROM records WHERE log = ?", [(str(log),)])
+            self._measure()
+
     def records(self, log: LogId, first: int = 0) -> list[StoredRecord]:
         """Give a log's records from a number on, in order; in others' logs numbers may be missing."""
         rows = self._records.read("SELECT number, data FROM records WHERE log = ? AND number >= ?", (str(log), first))
@@ -221,6 +229,14 @@ class Store:
             self._latent_bytes += len(latent) if added > 0 else 0
             while self._latent_bytes > self._latent_bytes_max():
                 self._evict_oldest()
+
+    def replace_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
+        """Keep a smaller latent in the place of one that is there."""
+        row = (hashlib.sha256(latent).digest(), len(latent), latent, str(keyframe))
+        with self._lock:
+            known = self._latents.read("SELECT bytes FROM latents WHERE keyframe = ?", (str(keyframe),))
+            if known and self._latents.write(REPLACE_LATENT, [row]) > 0:
+                self._latent_bytes += len(latent) - known[0][0]
 
     def _latent_bytes_max(self) -> int:
         on_disk = self._folder is not None and self._latents.failure is None

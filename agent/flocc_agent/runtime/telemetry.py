@@ -18,6 +18,7 @@ from flocc_agent.core.reports import (
     LeaderFollowed,
     LeaderLost,
     LogForked,
+    LogGivenUp,
     NameTaken,
     NeighbourDown,
     NeighbourUp,
@@ -34,7 +35,7 @@ from flocc_agent.runtime.jobs import Tools
 from flocc_agent.runtime.metrics import Look
 from flocc_agent.runtime.punctuality import LongestGap
 from flocc_agent.runtime.reporting import Reporter
-from flocc_agent.runtime.status import AgentStatus, StageBrief
+from flocc_agent.runtime.status import AgentStatus, CameraStatus, StageBrief
 from flocc_agent.runtime.transport import TransportCounters
 from flocc_agent.stages import brief_of, counts_of
 
@@ -84,6 +85,7 @@ class Telemetry:
         self.heartbeat_gaps = heartbeat_gaps
         self._driver_sizes = driver_sizes
         self.refusals = Refusals()
+        self._camera: dict[str, CameraDoubted] = {}
         self._began_s = tools.clock_s()
         self._bytes_due_s = self._began_s + BYTES_PERIOD_S
         self._account_due_s = self._began_s + ACCOUNT_PERIOD_S
@@ -121,6 +123,7 @@ class Telemetry:
             busy=busy,
             in_map=self._in_map(),
             doubles=robot.neighbours.doubles(),
+            camera=tuple(CameraStatus.model_validate(values_of(told)) for told in self._camera.values()),
         )
 
     def _in_map(self) -> str | None:
@@ -168,7 +171,9 @@ class Telemetry:
     # By itself
 
     def report(self, fact: Fact) -> None:
-        """Log a fact, and tell it."""
+        """Log a fact, and tell it; what is said of the camera stands in the status from then on."""
+        if isinstance(fact, CameraDoubted):  # of nine kinds at most
+            self._camera[fact.doubt] = fact
         if logger.isEnabledFor(level := _level(fact)):
             logger.log(level, "%s: %s %s", self._robot.log, name_of(fact), _brief(fact))
         self._on_report(self.reporter.reported(fact, self._tools.clock_s()))
@@ -209,7 +214,16 @@ class Telemetry:
         return AccountKept(since_s=round(self._began_s, 6), **counters.links(), stages=stages)
 
 
-_WARNINGS = (CameraDoubted, FrontEndsDiffer, PeerRefused, NameTaken, LogForked, LatentLost, RoundFailed)
+_WARNINGS = (
+    CameraDoubted,
+    FrontEndsDiffer,
+    PeerRefused,
+    NameTaken,
+    LogForked,
+    LogGivenUp,
+    LatentLost,
+    RoundFailed,
+)
 _INFOS = (LeaderFollowed, LeaderLost, NeighbourUp, NeighbourDown, ClosureAccepted, CorrectionApplied, RoundSolved)
 
 

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-THREADS = {"encode": 1, "register": 1}
+THREADS = {"encode": 1, "register": 1, "check": 1}
 PROCESS_KINDS = frozenset({"optimise"})
 LENGTH = struct.Struct(">Q")
 NICENESS = 5

@@ -19,7 +19,7 @@ from flocc_agent.backend.alignment import align
 from flocc_agent.backend.consensus import ConsensusPart, Tidings
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import PoseGraph, Trajectory
-from flocc_lab.consensus import part_of_graph, solved_alone
+from flocc_lab.consensus_graphs import part_of_graph, solved_alone
 from flocc_lab.experiments.distributed import OPTIMA
 from flocc_lab.rbcd.run import cut_by_time, graph_cost
 from flocc_launch.graph_files import read_g2o

@@ -7,12 +7,12 @@ frame survives: the lowest robot's. A robot gives corrections to itself only, wi
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.distributed_optimisation import GraphSource
+from flocc_agent.core.pose_graph import Component, LoopClosure, Trajectory
 from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
 from flocc_agent.geometry import inverse
 from flocc_lab.rbcd.blocks import BlockProblem, BlockState, BlockStep
@@ -61,24 +61,6 @@ class IterateBlock:
 
 
 Effect = Separators | IterateBlock
-
-
-class GraphSource(Protocol):
-    """Where the pose graph comes from: the robot's copies of all logs."""
-
-    @property
-    def keyframes(self) -> int:
-        """Number of keyframes of all logs."""
-        ...
-
-    @property
-    def revision(self) -> int:
-        """Grows with every closure and log."""
-        ...
-
-    def graph(self) -> PoseGraph:
-        """The pose graph of everything known."""
-        ...
 
 
 @dataclass(slots=True)

@@ -14,8 +14,8 @@ from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import between, inverse
 from flocc_lab.rbcd.block import isotropic_weights, iterate_block
+from flocc_lab.rbcd.block_descent import lifted, squared_residuals
 from flocc_lab.rbcd.blocks import BlockStep
-from flocc_lab.rbcd.descent import lifted, squared_residuals
 from flocc_lab.rbcd.machine import Effect, IterateBlock, RbcdMachine, RbcdParameters
 from flocc_lab.rbcd.separators import Separators, decoded, encoded
 from flocc_launch.simulation.agenda import Agenda

@@ -95,7 +95,7 @@ class AgentSource:
         """Take a newer correction, or its knots, and where that puts the log's keyframes."""
         event = self._heard.correction(correction, t)
         if event is not None:
-            self._state.apply(event)
+            self._state.apply(event, by_itself=event.robot == self._name)
         if event is not None or correction.knots is not self._knots.get(correction.log):
             self._knots[correction.log] = correction.knots
             poses = corrected(correction, T_odom_camera, np.arange(len(T_odom_camera)))

@@ -148,18 +148,19 @@ def handler_of(source: SnapshotSource) -> type[BaseHTTPRequestHandler]:
     """A request handler for one source."""
 
     class Handler(BaseHTTPRequestHandler):
-        """GET / and /state.json."""
+        """GET / and state.json."""
 
         timeout = IDLE_S
 
         def do_GET(self) -> None:
-            """Answer."""
-            if self.path == "/":
+            """Answer, also below a path that a reverse proxy left in front."""
+            name = self.path.split("?")[0].rpartition("/")[2]
+            if name == "":
                 self._answer(HTTPStatus.OK, "text/html; charset=utf-8", page())
-            elif self.path == "/state.json":
+            elif name == "state.json":
                 self._answer_state()
             else:
-                self._answer(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"there is only / and /state.json\n")
+                self._answer(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"there is only / and state.json\n")
 
         def _answer_state(self) -> None:
             try:

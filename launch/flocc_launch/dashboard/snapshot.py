@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from flocc_agent.core.reports import CameraDoubted
+
 
 @dataclass(frozen=True, slots=True)
 class LinkView:
@@ -38,6 +40,7 @@ class RobotView:
         map_frame: Of its last correction.
         keyframes: That it took.
         candidates: Pairs that it found.
+        camera: What it doubts of its camera, the latest of each kind.
         accepted: Pairs that it accepted.
         rejected: Pairs that it rejected.
         sent: Payload by kind of message.
@@ -58,6 +61,7 @@ class RobotView:
     map_frame: str | None
     keyframes: int
     candidates: int
+    camera: Sequence[CameraDoubted]
     accepted: int
     rejected: int
     sent: Mapping[str, int]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.reports import (
+    CameraDoubted,
     CandidateFound,
     ClosureAccepted,
     ClosureRejected,
@@ -51,6 +52,7 @@ class RobotState:
     corrected_m: dict[int, Float] = field(default_factory=dict)
     incarnation: int = 0
     candidates: int = 0
+    camera: dict[str, CameraDoubted] = field(default_factory=dict)
     accepted: int = 0
     rejected: int = 0
     sent: Mapping[str, int] = field(default_factory=dict)
@@ -108,10 +110,17 @@ class SwarmState:
         self.optimised: Reported[RoundSolved] | None = None
         self.t = 0.0
 
-    def apply(self, event: Reported[Fact]) -> None:
-        """Take one event; those of one robot come in order."""
+    def apply(self, event: Reported[Fact], by_itself: bool = True) -> None:
+        """Take one event; those of one robot come in order.
+
+        Args:
+            event: What happened.
+            by_itself: Whether the robot said or did it. A leader's correction also comes for robots that are gone.
+        """
         robot = self.robots.setdefault(event.robot, RobotState())
-        self.t, robot.last_s = max(self.t, event.t), event.t
+        self.t = max(self.t, event.t)
+        if by_itself:
+            robot.last_s = event.t
         apply_to(robot, event.fact)
         if isinstance(event.fact, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
             self.closures[event.fact.query, event.fact.match] = event.fact.probability
@@ -182,6 +191,8 @@ def apply_to(robot: RobotState, fact: Fact) -> None:
             robot.loss, robot.queues = fact.loss, fact.queues
         case AccountKept():
             robot.sent_to, robot.received_from = totals(fact.sent_to), totals(fact.received_from)
+        case CameraDoubted():
+            robot.camera[fact.doubt] = fact
         case AgentDied():
             robot.end, robot.leader, robot.neighbours = "died", None, set()
         case AgentStopped():
@@ -219,6 +230,7 @@ def robot_view(name: str, robot: RobotState, now_s: float | None, server: bool) 
         map_frame=robot.map_frame,
         keyframes=len(robot.positions_odom_m),
         candidates=robot.candidates,
+        camera=list(robot.camera.values()),
         accepted=robot.accepted,
         rejected=robot.rejected,
         sent=dict(sorted(robot.sent.items())),

@@ -14,7 +14,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from flocc_agent.config import TransportConfig
-from flocc_agent.runtime.status import MergeStatus
+from flocc_agent.runtime.event_lines import values_of
+from flocc_agent.runtime.status import CameraStatus, MergeStatus
 from flocc_launch.dashboard.page_source import RunSource
 from flocc_launch.dashboard.snapshot import RobotView
 from flocc_launch.runs.run_folder import RunFolder
@@ -23,9 +24,9 @@ from flocc_protocol.errors import FloccError
 if TYPE_CHECKING:
     from flocc_agent.runtime.zenoh_admin import Survey
 
-OPTIONAL = frozenset({"waiting", "lost %", "refused"})
+OPTIONAL = frozenset({"waiting", "lost %", "refused", "camera"})
 NO_ANSWER = "no answer"
-LEFT = frozenset({"robot", "state", "leader", "map frame", "hears"})
+LEFT = frozenset({"robot", "state", "leader", "map frame", "hears", "camera"})
 
 
 class StatusError(FloccError):
@@ -52,6 +53,7 @@ class RobotStatus(MergeStatus):
     loss: dict[str, float] = Field(default_factory=dict)
     queues: dict[str, int] = Field(default_factory=dict)
     doubles: tuple[str, ...] = ()
+    camera: tuple[CameraStatus, ...] = ()
 
 
 def status_of_swarm(config: TransportConfig, swarm: str, timeout_s: float = 3.0) -> list[RobotStatus]:
@@ -143,6 +145,7 @@ def status_of_robot(robot: RobotView) -> RobotStatus:
         received_bytes=robot.received_bytes,
         loss={peer: link.loss_ratio for peer, link in robot.links.items() if link.loss_ratio is not None},
         queues=dict(robot.queues),
+        camera=tuple(CameraStatus.model_validate(values_of(told)) for told in robot.camera),
     )
 
 
@@ -180,7 +183,23 @@ def cells_of(row: RobotStatus) -> dict[str, str]:
         "sent kB": kilobytes(row.sent_bytes),
         "received kB": kilobytes(row.received_bytes),
         "refused": shown(sum(row.refused.values()) or None),
+        "camera": "; ".join(doubted(doubt) for doubt in row.camera) or "-",
     }
+
+
+def doubted(doubt: CameraStatus) -> str:
+    """A doubt in a word, with its figure where it has one, and whether it keeps the robot's keyframes out."""
+    figure = AMOUNTS.get(doubt.doubt, "").format(doubt.amount, 100 * doubt.amount)
+    return doubt.doubt + figure + " (kept out)" * doubt.withheld
+
+
+AMOUNTS = {
+    "focal length": " x{0:.2f}",
+    "focal length and mounting": " x{0:.2f}",
+    "mounting": " {0:.0f}\N{DEGREE SIGN}",
+    "overlay": " {1:.0f} %",
+    "frozen": " {0:.0f}",
+}
 
 
 def shown(value: Any) -> str:

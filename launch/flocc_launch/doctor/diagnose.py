@@ -6,15 +6,13 @@ did not merge, the pair that came furthest is looked at, and the first step that
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 from flocc_agent.runtime.facts import AgentDied
-from flocc_launch.doctor.cameras import finding_of, kept_out
-from flocc_launch.doctor.finding import Finding, Severity
+from flocc_launch.doctor.cameras import finding_of, kept_out, merged_doubtfully
+from flocc_launch.doctor.finding import Finding, Severity, together
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.merge_evidence import named
 from flocc_launch.doctor.steps import STEPS
-from flocc_launch.runs.camera_doubts import DoubtSentence
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.timeline import ends
@@ -51,14 +49,6 @@ def merging(loaded: LoadedRun) -> list[Finding]:
     return [furthest(loaded, first, second) for k, first in enumerate(groups) for second in groups[k + 1 :]]
 
 
-def merged_doubtfully(sentence: str, misplaced: Sequence[DoubtSentence]) -> Finding:
-    """One map, with robots in it whose cameras' axes are not their odometry's: closures from before that was known."""
-    who = tuple(sorted({doubt.robot for doubt in misplaced}))
-    why = " ".join(doubt.headline for doubt in misplaced)
-    doubtful = f"{why} Do not believe where {named(who)} {'is' if len(who) == 1 else 'are'}. {sentence}"
-    return Finding("merged-doubtfully", Severity.HINDERS, doubtful, misplaced[0].advice, who)
-
-
 def living(loaded: LoadedRun, group: Sequence[str]) -> str:
     """That others do not count, where there are any."""
     others = [robot for robot in loaded.robots if robot not in group and robot not in loaded.run.servers]
@@ -93,14 +83,3 @@ def stop(loaded: LoadedRun, a: str, b: str) -> tuple[int, Finding]:
             return number_of, found
     sentence = f"{a} and {b} have closures and corrections, and yet two maps."
     return len(STEPS), Finding("unknown", Severity.BLOCKS, sentence, "Please report this run.", (a, b))
-
-
-def together(findings: Iterable[Finding]) -> list[Finding]:
-    """Findings with equal sentences become one, as severe as the first."""
-    found: dict[tuple[str, str], Finding] = {}
-    for finding in findings:
-        key = (finding.cause, finding.sentence)
-        known = found.get(key)
-        robots = finding.robots if known is None else tuple(sorted({*known.robots, *finding.robots}))
-        found[key] = replace(known or finding, robots=robots)
-    return list(found.values())

@@ -1,8 +1,10 @@
 """What the doctor says."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+
+ONE_WAY_ADVICE = "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power."
 
 
 class Severity(Enum):
@@ -51,3 +53,24 @@ def blocked(cause: str, sentence: str, advice: str, *robots: str) -> Finding:
 def good(cause: str, sentence: str) -> Finding:
     """A finding that all is well."""
     return Finding(cause, Severity.GOOD, sentence)
+
+
+def together(findings: Iterable[Finding]) -> list[Finding]:
+    """Findings with equal sentences become one, as severe as the first."""
+    found: dict[tuple[str, str], Finding] = {}
+    for finding in findings:
+        key = (finding.cause, finding.sentence)
+        known = found.get(key)
+        robots = finding.robots if known is None else tuple(sorted({*known.robots, *finding.robots}))
+        found[key] = replace(known or finding, robots=robots)
+    return list(found.values())
+
+
+def kept_apart(emulated: str | None, advice: str) -> str:
+    """What to do where robots do not hear each other: advice on the network, after what is emulated of the radio."""
+    if emulated is None:
+        return advice
+    return (
+        f"The emulated radio may be why ({emulated}): change [radio], or what the scenario's faults do to it. "
+        f"If it is not: {advice[0].lower()}{advice[1:]}"
+    )

@@ -4,7 +4,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from flocc_launch.dashboard.status_table import NO_ANSWER, RobotStatus
-from flocc_launch.doctor.finding import Finding, Severity, blocked
+from flocc_launch.doctor.cameras import doubts_told, finding_of, findings_of, merged_doubtfully
+from flocc_launch.doctor.finding import (
+    ONE_WAY_ADVICE,
+    Finding,
+    Severity,
+    blocked,
+    kept_apart,
+    together,
+)
 from flocc_launch.doctor.live_steps import apart, is_server
 from flocc_launch.doctor.merge_evidence import named
 
@@ -27,10 +35,11 @@ def late(silent: Sequence[str]) -> list[Finding]:
 def _answered(rows: Sequence[RobotStatus]) -> list[Finding]:
     checks = (shared, lonely, unheard, without_keyframes, leaderless, refusing)
     found = [finding for check in checks for finding in check(rows)]
+    cameras = findings_of(doubts_told(rows))
     first = merging(rows, any(finding.cause != "refused" for finding in found))
     if any(finding.cause == "merged" for finding in first):
         found = [replace(finding, severity=Severity.HINDERS) for finding in found]
-    return [*first, *found]
+    return together([*first, *found, *cameras])
 
 
 def merging(rows: Sequence[RobotStatus], explained: bool) -> list[Finding]:
@@ -40,10 +49,14 @@ def merging(rows: Sequence[RobotStatus], explained: bool) -> list[Finding]:
     if len(moving) > 1 and len(frames) == 1 and all(row.map_frame for row in moving):
         robots = tuple(row.robot for row in moving)
         sentence = f"All {len(moving)} robots that answered are in {frames[0]}."
+        misplaced = [doubt for doubt in doubts_told(moving) if doubt.withheld]
+        if misplaced:
+            return [merged_doubtfully(sentence, misplaced)]
         return [Finding("merged", Severity.GOOD, sentence, "", robots)]
     if explained or len(rows) < 2:
         return []
-    return apart(rows) or [not_merged_yet(rows, len(frames))]
+    blocking = [finding_of(doubt, Severity.BLOCKS) for doubt in doubts_told(moving) if doubt.withheld]
+    return blocking or apart(rows) or [not_merged_yet(rows, len(frames))]
 
 
 def not_merged_yet(rows: Sequence[RobotStatus], maps: int) -> Finding:
@@ -74,7 +87,10 @@ def lonely(rows: Sequence[RobotStatus]) -> list[Finding]:
         blocked(
             "no-peer",
             f"{named(alone)} hear{'s' * (len(alone) == 1)} no other robot.",
-            "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            kept_apart(
+                emulated_of(rows),
+                "Check range, multicast or the roster's endpoints, and that all run one version and one swarm name.",
+            ),
             *alone,
         )
     ]
@@ -87,7 +103,7 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         blocked(
             "one-way-link",
             f"{a} hears {b}, but {b} does not hear {a}.",
-            "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power.",
+            kept_apart(emulated_of(rows), ONE_WAY_ADVICE),
             a,
             b,
         )
@@ -95,6 +111,11 @@ def unheard(rows: Sequence[RobotStatus]) -> list[Finding]:
         for b in sorted(hears[a])
         if b in hears and a not in hears[b]
     ]
+
+
+def emulated_of(rows: Sequence[RobotStatus]) -> str | None:
+    """What of the radio is emulated, as the first robot says that has any of it emulated."""
+    return next((row.emulated for row in rows if row.emulated is not None), None)
 
 
 def without_keyframes(rows: Sequence[RobotStatus]) -> list[Finding]:

@@ -1,7 +1,11 @@
 """What a run shows about two of its robots."""
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
+from pydantic import ValidationError
+
+from flocc_agent.config import RadioConfig
 from flocc_agent.core.reports import CorrectionApplied
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_launch.runs.closure_table import Pair
@@ -12,6 +16,21 @@ from flocc_protocol.ids import LogId
 def heard_s(loaded: LoadedRun, robot: str, peer: str) -> float:
     """For how long one robot heard another."""
     return sum(link.to_s - link.from_s for link in loaded.links if (link.robot, link.peer) == (robot, peer))
+
+
+def emulated_radio(loaded: LoadedRun) -> str | None:
+    """What of the radio was emulated from the start, in words; None where nothing was, or in a form not known here."""
+    try:
+        return RadioConfig.model_validate(without_nulls(loaded.run.radio)).parameters().emulated()
+    except ValidationError:
+        return None
+
+
+def without_nulls(value: Any) -> Any:
+    """JSON without keys that are null, which stand for defaults: `run.json` has no infinity."""
+    if isinstance(value, dict):
+        return {key: without_nulls(held) for key, held in value.items() if held is not None}
+    return [without_nulls(held) for held in value] if isinstance(value, list) else value
 
 
 def holds(loaded: LoadedRun, a: str, b: str) -> bool | None:

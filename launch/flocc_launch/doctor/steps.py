@@ -9,10 +9,11 @@ from flocc_agent.core.election import ANSWER_TIMEOUT_S
 from flocc_agent.core.reports import LatentFailed, NameTaken, PeerRefused, RoundFailed, RoundSolved
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
-from flocc_launch.doctor.finding import Finding, blocked
+from flocc_launch.doctor.finding import ONE_WAY_ADVICE, Finding, blocked, kept_apart
 from flocc_launch.doctor.merge_evidence import (
     best_similarity,
     components_join,
+    emulated_radio,
     heard_s,
     held_records,
     holds,
@@ -75,14 +76,15 @@ def never_met(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     if heard_s(loaded, a, b) or heard_s(loaded, b, a) or holds(loaded, a, b) or pairs_between(loaded, a, b):
         return None
     alone = [robot for robot in (a, b) if not any(link.robot == robot for link in loaded.links)]
-    limit = setting_number(loaded.run.radio, "range_m")
-    reach = f" Emulated range is {limit:g} m." if limit else ""
     who = f"{named(alone)} heard nobody at all" if alone else f"{a} and {b} never heard each other"
     return blocked(
         "no-peer",
-        f"{who}, and no third robot carried records between them.{reach}",
-        "Check that the robots share one swarm name and network, that multicast or the listed endpoints reach the "
-        "other robot, and that they come into range of each other at least once.",
+        f"{who}, and no third robot carried records between them.",
+        kept_apart(
+            emulated_radio(loaded),
+            "Check that the robots share one swarm name and network, that multicast or the listed endpoints reach the "
+            "other robot, and that they come into range of each other at least once.",
+        ),
         a,
         b,
     )
@@ -100,7 +102,7 @@ def heard_one_way(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     return blocked(
         "one-way-link",
         f"{hearing} hears {deaf}, but {deaf} does not hear {hearing}.",
-        "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power.",
+        kept_apart(emulated_radio(loaded), ONE_WAY_ADVICE),
         a,
         b,
     )

@@ -69,10 +69,12 @@ class DoubtSentence:
 def camera_doubts(events: Iterable[Reported[Fact]]) -> list[DoubtSentence]:
     """Every robot's doubts, by name."""
     latest = {(told.robot, told.fact.doubt): told.fact for told in of_kind(events, CameraDoubted)}
-    return [
-        DoubtSentence(robot, doubt, _sentence(robot, fact), _advice(fact), fact.withheld)
-        for (robot, doubt), fact in sorted(latest.items())
-    ]
+    return [doubt_of(robot, fact) for (robot, _), fact in sorted(latest.items())]
+
+
+def doubt_of(robot: str, fact: CameraDoubted) -> DoubtSentence:
+    """What is to be said of one doubt."""
+    return DoubtSentence(robot, fact.doubt, _sentence(robot, fact), _advice(fact), fact.withheld)
 
 
 def _sentence(robot: str, fact: CameraDoubted) -> str:

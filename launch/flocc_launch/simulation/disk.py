@@ -73,6 +73,11 @@ class Disk:
         else:
             self._waiting[log] = self._waiting.get(log, 0) + 1
 
+    def drop_log(self, log: LogId) -> None:
+        """Keep nothing of another robot's log any more."""
+        self.records.pop(log, None)
+        self._waiting.pop(log, None)
+
     def put_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
         """Keep a latent; the oldest make room."""
         self.latent_bytes += len(latent) - len(self.latents.pop(keyframe, b""))
@@ -80,6 +85,11 @@ class Disk:
         while self.latent_bytes > self.latent_bytes_max and len(self.latents) > 1:
             oldest = next(iter(self.latents))
             self.latent_bytes -= len(self.latents.pop(oldest))
+
+    def replace_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
+        """Keep another latent in the place of one that is there."""
+        self.latent_bytes += len(latent) - len(self.latents[keyframe])
+        self.latents[keyframe] = latent
 
     def latent(self, keyframe: KeyframeId) -> bytes | None:
         """A latent of its own, or of the map."""

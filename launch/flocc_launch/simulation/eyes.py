@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-CACHE_FORM = b"4"
+CACHE_FORM = b"5"
 """Changes with what a file of the cache holds."""
 
 
@@ -36,6 +36,7 @@ class ImageEyes:
 
     def __init__(self, perception: Perception, config: PerceptionConfig, cache: Path | None) -> None:
         self._perception = perception
+        self.up_odom = config.odometry_up
         self.cache = cache if config.method in OWN else None  # of a stranger's code nobody knows what it depends on
         self._config_key = b"" if self.cache is None else CACHE_FORM + repr(config).encode() + _code_hash()
 
@@ -59,6 +60,10 @@ class ImageEyes:
         _write(path, _packed(result))
         return result
 
+    def without(self, latent: bytes, hidden: Mask) -> bytes:
+        """Give a latent without what is hidden, (H, W)."""
+        return self._perception.without(latent, hidden)
+
     def path(self, *parts: bytes) -> Path:
         """Where something is kept that depends on the configuration and these parts."""
         assert self.cache is not None
@@ -79,7 +84,7 @@ class CachedWatch:
 
     def __init__(self, eyes: ImageEyes, hidden: Mask | None) -> None:
         self._eyes = eyes
-        self._watch = CameraWatch(hidden)
+        self._watch = CameraWatch(hidden, eyes.up_odom)
         self._history = hashlib.blake2b(b"" if hidden is None else hidden.tobytes(), digest_size=20)
         self._unseen: list[tuple[Capture, Float]] = []
 
@@ -105,17 +110,23 @@ def _packed_look(looked: KeyframeLook) -> list[Any]:
     d = looked.descriptor
     descriptor = None if d is None else [d.dtype, list(d.shape), d.data, d.scale]
     doubts = [[d.doubt, d.amount, d.where, d.pairs, d.withheld] for d in looked.doubts]
-    return [descriptor, looked.latent, looked.fault, doubts]
+    hidden = None if looked.hidden is None else [list(looked.hidden.shape), np.packbits(looked.hidden).tobytes()]
+    return [descriptor, looked.latent, looked.fault, doubts, hidden]
 
 
 def _looked(packed: list[Any]) -> KeyframeLook:
-    descriptor, latent, fault, doubts = packed
+    descriptor, latent, fault, doubts, hidden = packed
     array = None if descriptor is None else Array(descriptor[0], tuple(descriptor[1]), *descriptor[2:])
     told = tuple(
         CameraDoubted(doubt=doubt, amount=amount, where=where, pairs=n, withheld=withheld)
         for doubt, amount, where, n, withheld in doubts
     )
-    return KeyframeLook(array, latent, fault, told)
+    return KeyframeLook(array, latent, fault, told, None if hidden is None else _mask(*hidden))
+
+
+def _mask(shape: list[int], data: bytes) -> Mask:
+    bits = np.unpackbits(np.frombuffer(data, np.uint8), count=shape[0] * shape[1])
+    return bits.reshape(shape).astype(np.bool_)
 
 
 def _code_hash() -> bytes:

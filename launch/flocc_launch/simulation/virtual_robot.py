@@ -12,6 +12,7 @@ from flocc_agent.core.effects import (
     Broadcast,
     ChooseClosures,
     Deliver,
+    DropLog,
     Effect,
     Encode,
     FetchLatent,
@@ -279,7 +280,7 @@ class Station:
     def _is_own_write(self, effect: Effect) -> bool:
         if isinstance(effect, PersistRecord):
             return effect.log == self.log
-        return isinstance(effect, PersistTerm | PersistCorrection)
+        return isinstance(effect, PersistTerm | PersistCorrection | DropLog)
 
     def _wait_for_disk(self, effects: list[Effect]) -> None:
         """What follows a write happens when it is done, and so does whatever else comes meanwhile."""
@@ -317,6 +318,8 @@ class Station:
                 self.later(self.workers.stepped_at_s(now_s), lambda: self.workers.step(effect))
             case PersistTerm(counter):
                 self.disk.term_counter = max(self.disk.term_counter, counter)
+            case DropLog(log):
+                self.disk.drop_log(log)
             case PersistCorrection(correction, frame_changed):
                 self.disk.correction, self.disk.frame_changed = correction, frame_changed
             case Deliver() | Report():

@@ -27,10 +27,11 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.interfaces import KeyframeLook, OdometryPair
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
-from flocc_agent.core.shared_poses import ConsensusProblem, ConsensusStep
 from flocc_agent.geometry import pose_from_tq
+from flocc_agent.runtime.jobs import hide_in_earlier
 from flocc_agent.stages import StageTimes
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture
@@ -63,6 +64,10 @@ class Eyes(Protocol):
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Registration | RegistrationFailed:
         """Register the match's latent with the query's."""
+        ...
+
+    def without(self, latent: bytes, hidden: Mask) -> bytes:
+        """Give a latent without what is hidden, (H, W)."""
         ...
 
 
@@ -135,6 +140,8 @@ class VirtualWorkers:
             return KeyframeEncodingFailed(keyframe, str(error))
         if looked.descriptor is None or looked.latent is None:
             return KeyframeEncodingFailed(keyframe, looked.fault, looked.doubts)
+        if looked.hidden is not None:
+            hide_in_earlier(keyframe, looked.hidden, self._eyes.without, disk)
         disk.put_latent(keyframe, looked.latent)
         return KeyframeEncoded(keyframe, looked.descriptor, looked.doubts)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.distributed_optimisation import DELIVER_PERIOD_S, VAIN_STEPS_MAX, DistributedOptimisation
 from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
+from flocc_agent.core.own_part import ConsensusState, ConsensusStep, ToldPoses
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.plausibility import HELD_BACK_S
 from flocc_agent.core.pose_graph import (
@@ -21,7 +22,6 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
 )
 from flocc_agent.core.reports import PeerRefused, RoundFailed
-from flocc_agent.core.shared_poses import ConsensusState, ConsensusStep, ToldPoses
 from flocc_agent.geometry import pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId

@@ -1,7 +1,7 @@
 """Questions for knots: a robot that needs them does not stop asking, one that asks for others does."""
 
 from flocc_agent.core.effects import Unicast
-from flocc_agent.core.knot_requests import ASKED_MAX, RARELY_S, KnotRequests
+from flocc_agent.core.knot_requests import ASKED_MAX, INTEREST_S, RARELY_S, KnotRequests
 from flocc_protocol.ids import LogId, Term
 from flocc_protocol.messages import CorrectionVersion
 
@@ -31,3 +31,11 @@ def test_an_own_need_outlives_a_newer_version_that_another_robot_asks_for() -> N
     requests.want(VERSION, 0.0)
     requests.on_interest("r3", VERSION._replace(round=11), 1.0)
     assert len(asked_at_s(requests, 600)) > 2 * ASKED_MAX
+
+
+def test_who_asked_long_ago_may_have_them_by_now() -> None:
+    """Seed 99200197: the robot that leads by now had asked for knots of an older leader, and was never asked itself."""
+    requests = KnotRequests(lambda _: ["r2"])
+    requests.on_interest("r2", VERSION, 0.0)
+    requests.on_interest("r3", VERSION._replace(term=Term(4, LogId("r2"))), 1.0)
+    assert asked_at_s(requests, int(INTEREST_S) + 3)[0] == INTEREST_S

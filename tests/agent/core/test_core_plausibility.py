@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.closure_ends import Tie
 from flocc_agent.core.correction_evidence import Placed
 from flocc_agent.core.knots import Track, knots_of
-from flocc_agent.core.plausibility import BENT, TORN, contradiction
+from flocc_agent.core.plausibility import BENT, TORN, UNTIED, contradiction
 from flocc_agent.core.pose_graph import WORLD, MeasuredFactor, landmark
 from flocc_agent.geometry import pose
 from flocc_protocol.ids import KeyframeId, LogId, Term
@@ -46,6 +46,8 @@ class _Held:
     def judged(self, T_map_camera: Float) -> str | None:
         T_map_odom, knots = knots_of(Track(self.T_odom, T_map_camera, np.eye(4), None))
         own = LogCorrection(OWN, Term(1, OWN), 1, OTHER, T_map_odom, knots)
+        if not len(self.T_map):
+            return contradiction(Placed(own, {}), None, self)
         there = LogCorrection(OTHER, Term(1, OWN), 1, OTHER, *knots_of(Track(self.T_map, self.T_map, np.eye(4), None)))
         return contradiction(Placed(own, {OTHER: there}), None, self)
 
@@ -70,6 +72,15 @@ def test_rides_that_were_measured_on_both_sides_are_no_lies(rides: tuple[float, 
 @pytest.mark.parametrize("met", [(), (0, 5, 10)])
 def test_a_ride_after_the_last_measurement_is_a_lie(met: tuple[int, ...]) -> None:
     assert _Held(60.0, met=met).judged(ridden(60.0, 20.0)) == BENT
+
+
+def test_a_map_whose_anchor_is_not_here_yet_is_waited_for() -> None:
+    """Seed 99200016: the closure was here before the anchor's keyframes, and a liar moved the robot by 1,000 km."""
+    held = _Held(60.0, met=(5,))
+    assert held.judged(held.T_map) is None
+    odometry = held.T_map
+    held.T_map = np.empty((0, 4, 4))
+    assert held.judged(odometry + 1e6 * np.eye(4, k=3)) == UNTIED
 
 
 def test_a_ride_that_measurements_deny_is_a_lie() -> None:

@@ -11,6 +11,7 @@ from flocc_agent.core.registration import Registration, RegistrationFailed, Regi
 from flocc_agent.geometry import angle_rad, between
 from flocc_agent.perception.classical import classical_registrar
 from flocc_agent.perception.classical.encoder import MODEL, decode_features, encode_features
+from flocc_agent.perception.classical.features import Features
 from flocc_agent.perception.latent import BadLatent, pack
 from flocc_agent.perception.multiview import registrar as pair_registrar
 
@@ -161,19 +162,23 @@ def test_odometry_pairs_are_kept_by_key_up_to_a_limit(monkeypatch: pytest.Monkey
     query, match = latent_from(scene, QUERY, 1), latent_from(scene, MATCH, 2)
     monkeypatch.setattr(pair_registrar, "ODOMETRY_PAIRS_MAX", 2)
     registrar = classical_registrar(ClassicalConfig(acceptance="ratio"))
-    neighbour = latent_from(scene, NEIGHBOUR, 3)
+    neighbour, changed = latent_from(scene, NEIGHBOUR, 3), latent_from(scene, NEIGHBOUR, 4)
+    read: list[bytes] = []
+    decode = registrar._read
 
-    def with_key(key: str, latent: bytes) -> Registration | RegistrationFailed:
-        return registrar.register(query, match, OdometryPair(latent, between(NEIGHBOUR, QUERY), key))
+    def reading(latent: bytes) -> Features:
+        read.append(latent)
+        return decode(latent)
 
-    first = with_key("a", neighbour)
-    assert isinstance(with_key("a", b"not read again"), Registration)
-    assert first.odometry_correspondences > 0
-    with_key("b", neighbour)
-    with_key("c", neighbour)
-    dropped = with_key("a", b"read again")
-    assert isinstance(dropped, RegistrationFailed)
-    assert dropped.failure is RegistrationFailure.BAD_LATENT
+    monkeypatch.setattr(registrar, "_read", reading)
+
+    def times_read(key: str, latent: bytes = neighbour) -> int:
+        read.clear()
+        registrar.register(query, match, OdometryPair(latent, between(NEIGHBOUR, QUERY), key))
+        return read.count(latent)
+
+    assert [times_read(key) for key in "aabca"] == [1, 0, 1, 1, 1]
+    assert times_read("a", changed) == 1  # a latent that lost what moves with the camera is another one
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,18 @@ async def test_what_cannot_be_used_is_refused_and_the_agent_goes_on() -> None:
             break
 
 
+async def test_the_status_tells_what_the_robot_doubts_of_its_camera() -> None:
+    pixels = np.random.default_rng(1).integers(0, 255, (120, 160, 3), np.uint8)
+    config = CONFIG.model_copy(update={"perception": PerceptionConfig()})
+    async with Agent(config, Camera(160, 120, 130.0, 130.0, 80.0, 60.0)) as agent:
+        assert agent.status().camera == ()
+        for k in range(3):
+            await agent.add_keyframe(pixels, at_m(float(k)), 1.0 + k)
+        while not agent.status().camera:
+            await asyncio.sleep(0.01)
+        assert [(told.doubt, told.amount, told.withheld) for told in agent.status().camera] == [("frozen", 2.0, False)]
+
+
 async def test_a_robot_whose_disk_is_behind_what_it_published_begins_another_log(tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"folder": tmp_path, "incarnation": 0})
     async with Agent(config, camera()) as agent:

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from flocc_agent.config import StoreConfig
+from flocc_agent.core.effects import DropLog, PersistRecord
 from flocc_agent.runtime.database import StoreError
+from flocc_agent.runtime.persistence import write
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -84,6 +86,15 @@ def test_others_records_stop_at_the_bound_and_own_ones_never_do(store: Store) ->
         store.put_record(OWN, number, bytes(MEBIBYTE // 4))
     assert len(store.records(OTHER)) == 4
     assert len(store.records(OWN)) == 5
+
+
+def test_of_a_log_that_is_dropped_nothing_stays_and_its_room_is_free_again(store: Store) -> None:
+    r2, r3, much = LogId("r2"), LogId("r3"), bytes(MEBIBYTE)
+    write(store, [PersistRecord(r2, 0, much), PersistRecord(r3, 0, b"no room")])
+    assert store.logs() == [r2]
+    write(store, [DropLog(r2)])
+    write(store, [PersistRecord(r3, 0, b"room")])
+    assert store.logs() == [r3]
 
 
 def test_comes_back_with_everything_and_the_same_numbering(tmp_path: Path) -> None:

@@ -1,14 +1,16 @@
 """The classical latent: local features as bytes, 136 bytes per feature and a header of about 200 bytes."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import ClassicalConfig
-from flocc_agent.core.interfaces import Image
+from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.classical.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features
-from flocc_agent.perception.latent import BadLatent, pack, unpack
+from flocc_agent.perception.latent import BadLatent, pack, unpack, up_of, with_up
+from flocc_agent.perception.multiview.picture import at_pixels, distorted
 
 MODEL = "classical/sift-2"
 FEATURES_MAX = 10_000
@@ -35,7 +37,17 @@ class ClassicalEncoder:
             "height": camera.height,
             "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
         }
-        return encode_features(self._extractor.extract(image), size_and_intrinsics)
+        bent = {"distortion": list(camera.distortion)} if any(camera.distortion) else {}
+        return encode_features(self._extractor.extract(image), size_and_intrinsics | bent)
+
+    def without(self, latent: bytes, hidden: NDArray[np.bool_]) -> bytes:
+        """Give a latent of its own without the features at hidden pixels (H, W) of the camera's picture."""
+        header, features = unpack(latent, MODEL).header, decode_features(latent)
+        fx, fy, cx, cy = header["intrinsics"]
+        camera = Camera(header["width"], header["height"], fx, fy, cx, cy, tuple(header.get("distortion", (0.0,) * 4)))
+        shown = ~at_pixels(hidden, distorted(features.points.astype(np.float64), camera))
+        kept = replace(features, points=features.points[shown], descriptors=features.descriptors[shown])
+        return encode_features(kept, dict(header))
 
 
 def encode_features(features: Features, header: dict[str, Any]) -> bytes:
@@ -44,7 +56,7 @@ def encode_features(features: Features, header: dict[str, Any]) -> bytes:
         "points": features.points.astype("<f4"),
         "descriptors": features.descriptors,
     }
-    return pack(MODEL, {**header, "focal_px": features.focal_px}, arrays)
+    return pack(MODEL, with_up({**header, "focal_px": features.focal_px}, features.up), arrays)
 
 
 def decode_features(latent: bytes) -> Features:
@@ -64,4 +76,4 @@ def decode_features(latent: bytes) -> Features:
         raise BadLatent("the latent has too many features, or one that no camera sees")
     if not isinstance(focal_px, (int, float)) or not 1.0 <= focal_px <= 1e6:
         raise BadLatent(f"the latent's focal length {str(focal_px)[:32]} is not between 1 and 1e6 pixels")
-    return Features(points, descriptors, float(focal_px))
+    return Features(points, descriptors, float(focal_px), up_of(content.header))

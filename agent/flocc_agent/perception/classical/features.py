@@ -30,11 +30,13 @@ class Features:
         points: (N, 2) float32, x/z and y/z in the camera frame, free of distortion.
         descriptors: (N, 128) uint8, RootSIFT times 512.
         focal_px: Mean focal length in pixels of the picture that was searched; turns rays into its pixels.
+        up: (3,) direction against gravity in the camera frame, of length one; None: it is not known.
     """
 
     points: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
     focal_px: float
+    up: NDArray[np.float64] | None = None
 
 
 class FeatureExtractor:
@@ -57,7 +59,7 @@ class FeatureExtractor:
         height, width = reduced.shape
         points, focal_px = rays_of(pixels, (width, height), image.camera)
         found = np.zeros((0, DESCRIPTOR_LENGTH)) if sift is None else sift[:count]
-        return Features(points.astype(np.float32), root_sift(np.asarray(found, np.float32)), focal_px)
+        return Features(points.astype(np.float32), root_sift(np.asarray(found, np.float32)), focal_px, image.up)
 
     def _found(
         self, picture: NDArray[np.uint8], hidden: NDArray[np.bool_] | None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.interfaces import Camera
-from flocc_agent.perception.latent import BadLatent, pack, unpack
+from flocc_agent.perception.latent import BadLatent, pack, unpack, up_of, with_up
 from flocc_agent.perception.multiview.picture import rays_of
 
 Float32 = NDArray[np.float32]
@@ -35,6 +35,7 @@ class LearnedFeatures:
         descriptors: (N, D) float32 of unit length.
         size_px: Width and height of the searched picture.
         focal_px: Mean focal length in its pixels.
+        up: (3,) direction against gravity in the camera frame, of length one; None: it is not known.
     """
 
     pixels: Float32
@@ -42,10 +43,16 @@ class LearnedFeatures:
     descriptors: Float32
     size_px: tuple[int, int]
     focal_px: float
+    up: NDArray[np.float64] | None = None
 
 
 def write_features(
-    model: str, pixels: Float32, descriptors: Float32, size_px: tuple[int, int], camera: Camera
+    model: str,
+    pixels: Float32,
+    descriptors: Float32,
+    size_px: tuple[int, int],
+    camera: Camera,
+    up: NDArray[np.float64] | None = None,
 ) -> bytes:
     """Serialise what a network found in a picture of this size, which was made from the camera's image."""
     steps = np.clip(np.rint(pixels * POSITION_STEPS), 0, np.iinfo(np.uint16).max)
@@ -55,7 +62,7 @@ def write_features(
         "size_px": list(size_px),
         "camera": [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
     }
-    return pack(model, header, {"pixels": steps.astype("<u2"), "descriptors": levels.astype(np.int8)})
+    return pack(model, with_up(header, up), {"pixels": steps.astype("<u2"), "descriptors": levels.astype(np.int8)})
 
 
 def read_features(latent: bytes, model: str, descriptor_length: int) -> LearnedFeatures:
@@ -76,7 +83,8 @@ def read_features(latent: bytes, model: str, descriptor_length: int) -> LearnedF
     lengths = np.linalg.norm(levels.astype(np.float32), axis=1, keepdims=True)
     descriptors = levels / np.maximum(lengths, 1.0)
     points, focal_px = rays_of(pixels.astype(np.float64), size_px, camera)
-    return LearnedFeatures(pixels, points.astype(np.float32), descriptors.astype(np.float32), size_px, focal_px)
+    up = up_of(content.header)
+    return LearnedFeatures(pixels, points.astype(np.float32), descriptors.astype(np.float32), size_px, focal_px, up)
 
 
 def _size(value: Any) -> tuple[int, int]:

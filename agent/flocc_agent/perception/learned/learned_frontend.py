@@ -7,15 +7,23 @@ pairs of views (docs/learned.md has the figures); it would cost no less on the w
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from flocc_agent.config import ClassicalConfig, LearnedConfig
 from flocc_agent.core.interfaces import Describer, Encoder, Image, Registrar
 from flocc_agent.perception.classical.describer import ClassicalDescriber
+from flocc_agent.perception.latent import pack, unpack
 from flocc_agent.perception.learned.acceptance_by_model import ACCEPTANCE, GEOMETRY
-from flocc_agent.perception.learned.keypoints import SIDE_MAX_PX, LearnedFeatures, read_features, write_features
+from flocc_agent.perception.learned.keypoints import (
+    POSITION_STEPS,
+    SIDE_MAX_PX,
+    LearnedFeatures,
+    read_features,
+    write_features,
+)
 from flocc_agent.perception.learned.networks import VARIANTS, Networks
 from flocc_agent.perception.learned.weight_sources import BadWeights, weights_folder
-from flocc_agent.perception.multiview.picture import reduced_to
+from flocc_agent.perception.multiview.picture import at_pixels, reduced_to
 from flocc_agent.perception.multiview.registrar import PairRegistrar
 
 PIXELS_MAX = 307_200
@@ -47,11 +55,23 @@ class LearnedEncoder:
             picture = np.where(hidden[..., None], np.uint8(GREY), picture)
         pixels, descriptors = self._networks.detect(picture)
         if image.hidden is not None:
-            near = cv2.dilate(hidden.astype(np.uint8), np.ones((EDGE_PX, EDGE_PX), np.uint8)) > 0
-            columns, rows = np.clip(np.rint(pixels).astype(int), 0, [width - 1, height - 1]).T
-            shown = ~near[rows, columns]
+            shown = ~at_pixels(_with_edge(hidden), pixels)
             pixels, descriptors = pixels[shown], descriptors[shown]
-        return write_features(self.model, pixels, descriptors, (width, height), image.camera)
+        return write_features(self.model, pixels, descriptors, (width, height), image.camera, image.up)
+
+    def without(self, latent: bytes, hidden: NDArray[np.bool_]) -> bytes:
+        """Give a latent of its own without the features at hidden pixels (H, W) of the camera's picture."""
+        content = unpack(latent, self.model)
+        width, height = content.header["size_px"]
+        reduced = cv2.resize(hidden.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        pixels = content.arrays["pixels"].astype(np.float64) / POSITION_STEPS
+        shown = ~at_pixels(_with_edge(reduced), pixels)
+        return pack(self.model, content.header, {name: array[shown] for name, array in content.arrays.items()})
+
+
+def _with_edge(hidden: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What is hidden, and what the edge of the paint over it may look like a feature to."""
+    return np.asarray(cv2.dilate(hidden.astype(np.uint8), np.ones((EDGE_PX, EDGE_PX), np.uint8)) > 0)
 
 
 def build(config: LearnedConfig) -> tuple[Describer, Encoder, Registrar]:

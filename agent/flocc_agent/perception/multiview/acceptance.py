@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure, match_ratio
 from flocc_agent.geometry import angle_rad, inverse
+from flocc_agent.perception.multiview.bundle import TiltPrior
 from flocc_agent.perception.multiview.two_view import TwoView
 
 Float = NDArray[np.float64]
@@ -24,6 +25,8 @@ RATIO_CORRESPONDENCES_MIN = 20
 ROTATION_AGREES_RAD = float(np.radians(5.0))
 """Both pairs' rotations are right within 1 to 3 degrees where they are right at all."""
 DIRECTION_AGREES_RAD = float(np.radians(15.0))
+TILT_AGREES_RAD = float(np.radians(3.0))
+"""Two visual-inertial odometries know roll and pitch to a degree each, and wrong poses are tilted any way."""
 NEVER = 100_000
 """More correspondences than any picture has features."""
 
@@ -48,6 +51,7 @@ class Evidence:
         rotation_sigma_rad: How uncertain the rotation is about its worst axis; what few, badly spread points leave.
         neighbour: What the neighbour says.
         neighbour_correspondences: Verified ones of the neighbour with the match.
+        tilt_rad: By how much the pose turns one camera's up away from the other's; None where not both know it.
     """
 
     correspondences: int
@@ -56,6 +60,7 @@ class Evidence:
     rotation_sigma_rad: float
     neighbour: OdometryNeighbour = OdometryNeighbour.NOT_ASKED
     neighbour_correspondences: int = 0
+    tilt_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +86,13 @@ class Acceptance:
         with_scale: What a pair needs whose length three views agree on.
         without_scale: What another one needs.
         match_ratio_min: Eq. (1) that suffices for either, from `RATIO_CORRESPONDENCES_MIN` correspondences on.
+        upright: What suffices beside that where gravity, which both robots know, and the neighbour agree.
     """
 
     with_scale: Needed
     without_scale: Needed
     match_ratio_min: float
+    upright: Needed | None = None
 
     def has_ratio(self, evidence: Evidence) -> bool:
         """Whether the paper's rule accepts the pair."""
@@ -98,11 +105,8 @@ class Acceptance:
 
     def needs_neighbour(self, evidence: Evidence) -> bool:
         """Whether the neighbour's word decides."""
-        needed = self.needed(evidence)
-        in_doubt = needed.agreeing <= evidence.correspondences < needed.alone
-        return (
-            in_doubt and not self.has_ratio(evidence) and evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
-        )
+        agreed = replace(evidence, neighbour=OdometryNeighbour.AGREES)
+        return self.ratio(replace(evidence, neighbour=OdometryNeighbour.NOT_ASKED)) < 1.0 <= self.ratio(agreed)
 
     def accepts(self, evidence: Evidence) -> bool:
         """Whether the evidence suffices."""
@@ -115,7 +119,16 @@ class Acceptance:
         is_certain = evidence.rotation_sigma_rad <= needed.rotation_sigma_max_rad
         by_count = evidence.correspondences / enough if is_certain else 0.0
         by_ratio = evidence.match_ratio / self.match_ratio_min if self.has_ratio(evidence) else 0.0
-        return max(by_count, by_ratio)
+        return max(by_count, by_ratio, self._by_gravity(evidence))
+
+    def _by_gravity(self, evidence: Evidence) -> float:
+        """Correspondences over those needed where gravity has its say; 0 elsewhere."""
+        if self.upright is None or evidence.tilt_rad is None or evidence.tilt_rad > TILT_AGREES_RAD:
+            return 0.0
+        if evidence.rotation_sigma_rad > self.upright.rotation_sigma_max_rad:
+            return 0.0
+        agrees = evidence.neighbour is OdometryNeighbour.AGREES
+        return evidence.correspondences / (self.upright.agreeing if agrees else self.upright.alone)
 
     def judged(self, result: Registration, evidence: Evidence) -> Registration | RegistrationFailed:
         """The registration with its ratio, or why it is not trusted."""
@@ -132,12 +145,14 @@ class Acceptance:
         return RegistrationFailed(RegistrationFailure.UNCONVINCING, detail, *counts)
 
 
-def evidence_of(result: Registration) -> Evidence:
-    """What a registration says for itself."""
+def evidence_of(result: Registration, tilt: TiltPrior | None = None) -> Evidence:
+    """What a registration says for itself, and gravity, where it is known, of its rotation."""
     assert result.covariance is not None
     variance = float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1])
     ratio = match_ratio(result.correspondences, result.odometry_correspondences)
-    return Evidence(result.correspondences, ratio, result.scale_initial is not None, float(np.sqrt(max(variance, 0.0))))
+    has_scale, sigma_rad = result.scale_initial is not None, float(np.sqrt(max(variance, 0.0)))
+    tilt_rad = None if tilt is None else tilt.error_rad(result.T_query_match_unscaled[:3, :3].T)
+    return Evidence(result.correspondences, ratio, has_scale, sigma_rad, tilt_rad=tilt_rad)
 
 
 def evidence_of_neighbour(

@@ -35,6 +35,19 @@ class DirectionPrior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TiltPrior:
+    """Which way is up in both images, (3,) of length one, and how far apart these may be: two degrees of freedom."""
+
+    up_query: Float
+    up_view: Float
+    sigma_rad: float
+
+    def error_rad(self, R_view_query: Float) -> float:
+        """Angle between the two directions under a rotation."""
+        return float(np.arccos(np.clip(self.up_view @ (R_view_query @ self.up_query), -1.0, 1.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BundleView:
     """One image beside the query.
 
@@ -45,6 +58,7 @@ class BundleView:
         focal_px: Turns errors into pixels.
         unit_translation: Whether the translation is a direction of length one.
         prior: What is known of the pose.
+        tilt: What is known of roll and pitch.
     """
 
     T_view_query: Float
@@ -53,6 +67,7 @@ class BundleView:
     focal_px: float
     unit_translation: bool
     prior: DirectionPrior | None = None
+    tilt: TiltPrior | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +184,7 @@ def _linearise(rays: Float, inverse_depths: Float, views: tuple[BundleView, ...]
         H_mixed[:, block] += np.einsum("nij,ni->nj", weighted, J_depth)
         H_depth += weights * (J_depth * J_depth).sum(axis=1)
         b_depth += weights * (J_depth * errors).sum(axis=1)
-        cost += _add_prior(view, H[block, block], b[block])
+        cost += _add_prior(view, H[block, block], b[block]) + _add_tilt(view, H[block, block], b[block])
     cost += float((inverse_depths**2).sum()) * INVERSE_DEPTH_SIGMA**-2
     return _Linearised(cost, H, b, H_depth, b_depth, H_mixed)
 
@@ -208,6 +223,18 @@ def _add_prior(view: BundleView, H: Float, b: Float) -> float:
     b[:3] += rotation_error / view.prior.rotation_sigma_rad
     b[3:] += direction_error / view.prior.direction_sigma_rad
     return float(rotation_error @ rotation_error + direction_error @ direction_error)
+
+
+def _add_tilt(view: BundleView, H: Float, b: Float) -> float:
+    """Add what is known of roll and pitch to the view's blocks and return its cost."""
+    if view.tilt is None:
+        return 0.0
+    turned = view.T_view_query[:3, :3] @ view.tilt.up_query
+    error = crossed(view.tilt.up_view, turned) / view.tilt.sigma_rad
+    J = -hat(view.tilt.up_view) @ hat(turned) / view.tilt.sigma_rad
+    H[:3, :3] += J.T @ J
+    b[:3] += J.T @ error
+    return float(error @ error)
 
 
 def _reduce(state: _Linearised, damping: float) -> tuple[Float, Float]:

@@ -30,6 +30,22 @@ def undistorted(pixels: Float, camera: Camera) -> Float:
     return np.asarray(points, np.float64).reshape(-1, 2)
 
 
+def distorted(points: Float, camera: Camera) -> Float:
+    """Turn x/z and y/z (N, 2) in the camera frame into pixels (N, 2): what `undistorted` takes back."""
+    if len(points) == 0:
+        return points
+    rays = np.column_stack([points, np.ones(len(points))])
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.K(), np.array(camera.distortion))
+    return np.asarray(pixels, np.float64).reshape(-1, 2)
+
+
+def at_pixels(mask: NDArray[np.bool_], pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """What a mask (H, W) says at pixels (N, 2); beyond its border what it says there."""
+    height, width = mask.shape
+    columns, rows = np.clip(np.rint(pixels).astype(np.intp), 0, [width - 1, height - 1]).T
+    return np.asarray(mask[rows, columns])
+
+
 def rays_of(pixels: Float, size_px: tuple[int, int], camera: Camera) -> tuple[Float, float]:
     """Rays (N, 2) of pixels in a picture that was made from a camera's image, and the focal length in its pixels."""
     factors = np.array([camera.width / size_px[0], camera.height / size_px[1]])

@@ -30,7 +30,7 @@ from flocc_agent.perception.multiview.acceptance import Acceptance, Evidence, ev
 from flocc_agent.perception.multiview.bundle import DirectionPrior, Refined, covariance_of_view
 from flocc_agent.perception.multiview.degeneracy import degeneracy
 from flocc_agent.perception.multiview.three_view import three_view
-from flocc_agent.perception.multiview.two_view import TwoView, two_view
+from flocc_agent.perception.multiview.two_view import TwoView, tilt_of, two_view
 from flocc_agent.perception.multiview.view_parameters import Geometry, Indices, LocalFeatures, Matched
 from flocc_agent.perception.watch.seen_motion import STAYS_MAX_PX, Flow, flow_of, moves_with_the_scene
 from flocc_agent.stages import stage
@@ -91,7 +91,7 @@ class PairRegistrar(Generic[F]):
         self._match = match
         self._geometry = geometry
         self._acceptance = acceptance
-        self._own_pairs: OrderedDict[str, OwnPair] = OrderedDict()
+        self._own_pairs: OrderedDict[tuple[str, int, int], OwnPair] = OrderedDict()
         self._lock = threading.Lock()
 
     def register(self, query: bytes, match: bytes, odometry: OdometryPair | None) -> Result:
@@ -118,13 +118,13 @@ class PairRegistrar(Generic[F]):
         with stage("decode"):
             query_features, match_features = self._read(query), self._read(match)
         with stage("match"):
-            own = self._own_pair(query_features, odometry)
+            own = self._own_pair(query, query_features, odometry)
             loop_pair = self._loop_pair(query_features, match_features, own.hidden[0])
         with stage("pose"):
             result = self._posed(query_features, loop_pair, own.pair, odometry)
         if isinstance(result, RegistrationFailed):
             return result, None
-        evidence = evidence_of(result)
+        evidence = evidence_of(result, tilt_of(query_features, match_features, self._geometry))
         rule = self._acceptance
         if odometry is not None and (always or (rule is not None and rule.needs_neighbour(evidence))):
             with stage("match"):
@@ -185,17 +185,18 @@ class PairRegistrar(Generic[F]):
             return RegistrationFailed(RegistrationFailure.DEGENERATE, reason, *counts)
         return registration(loop_pair.refined, 0, counts, None)
 
-    def _own_pair(self, query: F, odometry: OdometryPair | None) -> OwnPair:
-        """Verify the odometry pair, or look it up."""
+    def _own_pair(self, latent: bytes, query: F, odometry: OdometryPair | None) -> OwnPair:
+        """Verify the odometry pair, or look it up; a latent may have lost features since."""
         if odometry is None:
             return OwnPair()
+        key = odometry.key, hash(latent), hash(odometry.latent)
         with self._lock:
-            known = self._own_pairs.get(odometry.key)
+            known = self._own_pairs.get(key)
         if known is not None:
             return known
         own = self._verified(query, self._read(odometry.latent), odometry.T_neighbour_query)
         with self._lock:
-            self._own_pairs[odometry.key] = own
+            self._own_pairs[key] = own
             while len(self._own_pairs) > ODOMETRY_PAIRS_MAX:
                 self._own_pairs.popitem(last=False)
         return own

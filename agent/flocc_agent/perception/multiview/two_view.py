@@ -11,19 +11,28 @@ from flocc_agent.perception.multiview.bundle import (
     BundleView,
     DirectionPrior,
     Refined,
+    TiltPrior,
     inverse_depths_from,
     refine,
     reprojection_errors_px,
 )
+from flocc_agent.perception.multiview.upright import upright_poses
 from flocc_agent.perception.multiview.view_parameters import Geometry, Indices, LocalFeatures, Matched
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+Found = tuple[BundleView, Float, Mask] | int
+"""The other image as a view of the verified points, their inverse depths, and which are verified; or how many are
+where they are too few."""
+
 GENERATOR_STATE = 20_260_101
 """Start of the robust estimators' own generators: the same input gives the same result, in any thread."""
 INVERSE_DEPTH_MIN = -0.01
 """A point at infinity may come out slightly behind the camera, in baselines^-1."""
+UPRIGHT_WIDTH_PX = 5.0
+"""A degree of tilt moves points by about so much, before the refinement takes it back."""
+UPRIGHT_TRIED = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +83,9 @@ def two_view(
     points = query.points[query_indices].astype(np.float64)
     observed = other.points[other_indices].astype(np.float64)
     found = _verified(points, observed, other.focal_px, geometry)
+    tilt = tilt_of(query, other, geometry)
+    if tilt is not None and _count(found) < geometry.sure_without_gravity:
+        found = max(found, _verified_upright(points, observed, other.focal_px, geometry, tilt), key=_count)
     if isinstance(found, int):
         return found
     view, depths, verified = found
@@ -88,9 +100,14 @@ def two_view(
     return TwoView(query_indices[verified], other_indices[verified], refined)
 
 
-def _verified(
-    points: Float, observed: Float, focal_px: float, geometry: Geometry
-) -> tuple[BundleView, Float, Mask] | int:
+def tilt_of(query: LocalFeatures, other: LocalFeatures, geometry: Geometry) -> TiltPrior | None:
+    """What gravity says of the pair; None where not both know which way is up."""
+    if query.up is None or other.up is None or not np.isfinite(geometry.tilt_sigma_rad):
+        return None
+    return TiltPrior(query.up, other.up, geometry.tilt_sigma_rad)
+
+
+def _verified(points: Float, observed: Float, focal_px: float, geometry: Geometry) -> Found:
     """Find the relative pose and verify the matches with it, the same way for loop pairs and odometry pairs.
 
     Returns:
@@ -104,14 +121,38 @@ def _verified(
     if int(agree.sum()) < geometry.correspondences_min:
         return int(agree.sum())
     view = BundleView(T_other_query, observed, agree, focal_px, unit_translation=True)
-    refined = refine(points, inverse_depths_from(points, T_other_query, observed), (view,), geometry.sigma_px)
+    return _refined_and_verified(points, view, geometry)
+
+
+def _verified_upright(points: Float, observed: Float, focal_px: float, geometry: Geometry, tilt: TiltPrior) -> Found:
+    """The same from three correspondences and gravity, which remains as a prior: what it does not fit, it loses."""
+    width = UPRIGHT_WIDTH_PX / focal_px
+    best: Found = 0
+    for T in upright_poses(points, observed, (tilt.up_query, tilt.up_view), width, UPRIGHT_TRIED):
+        errors = reprojection_errors_px(
+            points,
+            inverse_depths_from(points, T, observed),
+            BundleView(T, observed, np.ones(len(points), np.bool_), focal_px, unit_translation=True),
+        )
+        view = BundleView(T, observed, errors < 2.0 * UPRIGHT_WIDTH_PX, focal_px, unit_translation=True, tilt=tilt)
+        best = max(best, _refined_and_verified(points, view, geometry), key=_count)
+    return best
+
+
+def _count(found: Found) -> int:
+    return found if isinstance(found, int) else int(found[2].sum())
+
+
+def _refined_and_verified(points: Float, view: BundleView, geometry: Geometry) -> Found:
+    """Refine a pose with the correspondences that agree with it, and verify all with the result."""
+    depths = inverse_depths_from(points, view.T_view_query, view.observed)
+    refined = refine(points, depths, (view,), geometry.sigma_px)
     errors = reprojection_errors_px(points, refined.inverse_depths, refined.views[0])
     verified = (errors < geometry.inlier_threshold_px) & (refined.inverse_depths > INVERSE_DEPTH_MIN)
     count = int(verified.sum())
     if count < geometry.correspondences_min:
         return count
-    pose_found = refined.views[0].T_view_query
-    view = BundleView(pose_found, observed[verified], np.ones(count, np.bool_), focal_px, unit_translation=True)
+    view = replace(refined.views[0], observed=view.observed[verified], seen=np.ones(count, np.bool_))
     return view, refined.inverse_depths[verified], verified
 
 

@@ -24,6 +24,11 @@ class LocalFeatures(Protocol):
         """Mean focal length in pixels of the picture that the features were found in; turns rays into pixels."""
         ...
 
+    @property
+    def up(self) -> NDArray[np.float64] | None:
+        """(3,) direction against gravity in the camera frame, of length one, where odometry knew it."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
@@ -42,6 +47,9 @@ class Geometry:
         odometry_rotation_sigma_rad: How far odometry's rotation between neighbours may be from the images',
             calibration error included.
         odometry_direction_sigma_rad: How far odometry's direction of motion may be from the images'.
+        tilt_sigma_rad: How far off two cameras' directions against gravity may be from each other; infinite: they are
+            not looked at.
+        sure_without_gravity: From so many verified correspondences on gravity is not asked for another estimate.
     """
 
     inlier_threshold_px: float = 2.0
@@ -53,3 +61,5 @@ class Geometry:
     direction_sigma_max_rad: float = 0.35
     odometry_rotation_sigma_rad: float = 0.03
     odometry_direction_sigma_rad: float = 0.2
+    tilt_sigma_rad: float = 0.02
+    sure_without_gravity: int = 60

@@ -8,6 +8,7 @@ keyframes carry odometry only: closures with them would put the robot where it i
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -61,13 +62,15 @@ class SeesFlow(Protocol):
 class CameraWatch:
     """What is known of one robot's camera."""
 
-    def __init__(self, hidden: Mask | None = None) -> None:
+    def __init__(self, hidden: Mask | None = None, up_odom: Sequence[float] | None = None) -> None:
         """Start without suspicion.
 
         Args:
             hidden: (H, W) pixels that the user says move with the camera.
+            up_odom: (3,) direction against gravity in the odometry frame, where odometry keeps roll and pitch.
         """
         self._given = hidden
+        self._up_odom = None if up_odom is None else np.array(up_odom) / np.linalg.norm(up_odom)
         self._finder: OverlayFinder | None = None
         self._before: tuple[bytes, Float] | None = None
         self._pairs: deque[WatchedPair] = deque(maxlen=PAIRS_MAX)
@@ -92,7 +95,8 @@ class CameraWatch:
             if repeats:
                 reason = "the picture is one that was taken before, though the robot moved"
                 return KeyframeLook(None, None, reason, tuple(doubts))
-        image = self._without_hidden(image)
+        told = any(doubt.doubt == "overlay" for doubt in doubts)
+        image = self._upright(self._without_hidden(image), T_odom_camera)
         with stage("describe"):
             descriptor = perception.describe(image)
         with stage("encode"):
@@ -102,7 +106,7 @@ class CameraWatch:
                 doubts += self._motion(perception.registrar, latent, T_odom_camera)
         if self._withheld:
             return KeyframeLook(None, None, WITHHELD, tuple(doubts))
-        return KeyframeLook(descriptor, latent, "", tuple(doubts))
+        return KeyframeLook(descriptor, latent, "", tuple(doubts), image.hidden if told else None)
 
     def _look_at(self, image: Image, T_odom_camera: Float) -> bool:
         """Take the picture in; whether it repeats an earlier one."""
@@ -118,6 +122,10 @@ class CameraWatch:
         given = self._given if self._given is not None and self._given.shape == size[::-1] else None
         masks = [mask for mask in (found, given) if mask is not None]
         return replace(image, hidden=np.logical_or.reduce(masks)) if masks else image
+
+    def _upright(self, image: Image, T_odom_camera: Float) -> Image:
+        """The image with the direction against gravity, where odometry knows it."""
+        return image if self._up_odom is None else replace(image, up=T_odom_camera[:3, :3].T @ self._up_odom)
 
     def _repeated(self) -> list[CameraDoubted]:
         self._repeats += 1

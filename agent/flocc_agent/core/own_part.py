@@ -92,7 +92,7 @@ class ConsensusProblem:
         owned: Closures that it uses: within it, and those between it and higher robots.
         shared: Of every robot with which it shares poses.
         T_alone: (N, 4, 4) where its first keyframes begin, in its own frame; odometry follows them.
-        anchored: The part is the anchor's: its first keyframe's odometry says where the map frame lies.
+        anchored: The part is the anchor's, once moved: its first keyframe's odometry says where the map frame lies.
         origin: (4, 4) where the map frame lies among the poses, as last heard; of the frame that is moved to, if any.
         move_to: A robot, and what it told in another frame into which the part is to be moved first; else None.
         state: Where the part stands; None before the first step.

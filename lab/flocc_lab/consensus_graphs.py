@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.consensus import (
-    Beginning,
     ConsensusPart,
+    PartBeginning,
     information_by_keyframe,
     paired,
     part_of,
@@ -51,7 +51,7 @@ def part_of_graph(graph: PoseGraph, log: LogId, config: BackendConfig, T: Float)
         other: paired(log < other, keyframes, np.array([informations[k] for k in keyframes]))
         for other, keyframes in shared_poses(graph, log).items()
     }
-    begins = Beginning(T, {}, scale, np.ones(len(owned)))
+    begins = PartBeginning(T, {}, scale, np.ones(len(owned)))
     return part_of(log, config, graph.trajectories[log], owned, begins, neighbours)
 
 
