@@ -31,6 +31,9 @@ from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 
+AGREED = 0.05
+"""Two robots agree on a pose that they have no farther from each other, in metres or entries of a rotation."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartState(ConsensusState):
@@ -83,7 +86,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
     state = replace(state, T=_extended(state.T, np.asarray(problem.trajectory.T_odom_keyframe, dtype=float)))
     owned = [each.closure for each in problem.owned]
     scale = np.array([initial_scale(c.closure, config) if c.scale is None else c.scale for c in problem.owned])
-    state = replace(state, copies=_copies(problem, state))
+    state = replace(state, copies={**state.copies, **_copies(problem, state)})
     information = _informations(problem, owned, scale, config)
     pairs = {other: _neighbour(problem, state, other, information) for other in problem.shared}
     state = replace(state, pairs=pairs)
@@ -146,24 +149,34 @@ def _informations(
 def _neighbour(
     problem: ConsensusProblem, state: PartState, other: LogId, information: Mapping[LogId, Float]
 ) -> PairedRobot:
-    """What is known of a neighbour; where poses are listed anew, those that stay keep their target and force."""
+    """What is known of a neighbour; where poses are listed anew, those that stay are pulled as before."""
     shared, held = problem.shared[other], state.pairs.get(other)
-    if held is not None and held.edition == shared.edition:
-        return replace(held, ours=dict(held.ours), theirs=dict(held.theirs))
     told = information[other] if problem.log < other else shared.information
     assert told is not None, "who does not own closures was told their information"
     neighbour = paired(problem.log < other, shared.keyframes, told, shared.edition)
     if held is None or held.T is None:
+        same = held is not None and held.edition == shared.edition
+        return replace(held, ours=dict(held.ours), theirs=dict(held.theirs)) if held is not None and same else neighbour
+    T_held = _poses_of(problem.log, state, held.keyframes)
+    if shared.forgotten and T_held is not None and float(np.abs(T_held - held.T).max()) > AGREED:
         return neighbour
-    at = {keyframe: k for k, keyframe in enumerate(held.keyframes)}
-    kept = [(k, at[keyframe]) for k, keyframe in enumerate(shared.keyframes) if keyframe in at]
-    if not kept:
+    if held.edition == shared.edition:
+        return replace(held, ours=dict(held.ours), theirs=dict(held.theirs))
+    T = _poses_of(problem.log, state, shared.keyframes)
+    kept = [(k, held.keyframes.index(each)) for k, each in enumerate(shared.keyframes) if each in held.keyframes]
+    if T is None or T_held is None or not kept:
         return neighbour
     new, old = np.array(kept).T
-    T = np.array([_pose_of(problem.log, state, keyframe) for keyframe in shared.keyframes])
     force = np.zeros((len(T), 6))
-    T[new], force[new] = held.T[old], held.force.reshape(-1, 6)[old]
+    force[new] = held.pull(T_held).reshape(-1, 6)[old]
     return replace(neighbour, T=T, force=force.ravel())
+
+
+def _poses_of(log: LogId, state: PartState, keyframes: tuple[KeyframeId, ...]) -> Float | None:
+    """Poses (S, 4, 4) of keyframes, None where a copy of one is no longer here."""
+    if any(each.log != log and each not in state.copies for each in keyframes):
+        return None
+    return np.array([_pose_of(log, state, each) for each in keyframes])
 
 
 def _pose_of(log: LogId, state: PartState, keyframe: KeyframeId) -> Float:

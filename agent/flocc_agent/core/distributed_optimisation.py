@@ -50,6 +50,10 @@ DELIVER_PERIOD_S = 2.0
 """Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
 FAILURES_MAX = 6
+OVERTAKEN_S = 5.0
+"""A message that is older than the last one by its number is new by its time after so long: its sender began again."""
+SILENT_S = 30.0
+"""After so long without a word what a neighbour said last counts only where both had agreed."""
 VAIN_STEPS_MAX, NEARER_RATIO = 40, 0.9
 """After so many steps that brought a robot no nearer to its neighbours it rests all the same."""
 DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
@@ -84,6 +88,7 @@ class _Pair:
         information: (S, 2) of the closures there; of an owner's own as its last step gave it.
         owned: Closures of the pair that this robot, the lower one, uses.
         said: The other's last message, of whatever edition.
+        said_s: When that came.
         heard: The same, where it is of this edition and frame and no step has taken it yet.
         is_news: It came since the last step began.
         told: What this robot's last step wants told.
@@ -94,6 +99,7 @@ class _Pair:
     information: Array | None = None
     owned: tuple[OwnedClosure, ...] = ()
     said: SharedPoses | None = None
+    said_s: float = float("-inf")
     heard: SharedPoses | None = None
     is_news: bool = True
     told: ToldPoses | None = None
@@ -149,6 +155,7 @@ class DistributedOptimisation:
         self.number = number
         self.is_settled = False
         self._is_back = number > 0
+        self._number_min = number
         self._own = own
         self._source = source
         self._parameters = parameters
@@ -195,20 +202,28 @@ class DistributedOptimisation:
                 return []
             pair = self._pairs[sender] = _Pair()
         if pair.said is not None and message.step < pair.said.step:
-            return []
+            if now < pair.said_s + OVERTAKEN_S:
+                return []  # messages overtake each other, but not for so long: it began again
+            pair.said = pair.heard = None
+            if sender < self._own:
+                pair.edition, pair.keyframes = 0, ()
         if sender < self._own and message.edition != pair.edition and not self._take_list(sender, pair, message):
             return []
-        before, pair.said = pair.said, message
+        before, pair.said, pair.said_s = pair.said, message, now
         if message.edition != pair.edition or len(message) != len(pair.keyframes) or not len(message):
             return []
         pair.is_news = pair.is_news or before is None or message.step > before.step
-        if message.anchor == self.anchor:
+        if message.anchor == self.anchor and not self._is_back:
             self._take_origin(message)
             if before is None or message.step > before.step:
                 pair.heard = message
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
         self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
+
+    def on_own_correction(self, number: int) -> None:
+        """Others hold a correction that this robot gave itself before it lost its disk: it counts on above that."""
+        self._number_min = max(self._number_min, number)
 
     def on_step(self, number: int, step: ConsensusStep, now: float) -> list[Effect]:
         """A step ended: tell neighbours; an answer that is late or of another step counts for nothing."""
@@ -557,7 +572,7 @@ class DistributedOptimisation:
         return pair.said is not None and pair.said.anchor == self.anchor and self._near(other.robot)
 
     def _begin(self, now: float) -> Effect:
-        self.number = min(self.number + 1, INDEX_MAX)
+        self.number = min(max(self.number, self._number_min) + 1, INDEX_MAX)
         self._running_until_s = now + self._parameters.timeout_s
         self._next_s = now + self._parameters.period_s
         self._wait_until_s = now + self._parameters.wait_s
@@ -566,10 +581,13 @@ class DistributedOptimisation:
             self._begin_alone()  # what brought it into another's frame was taken back
         moves_to = self._in_lower_frame()
         self._moving_to = None if moves_to is None else moves_to[0]
-        shared = {other: self._shared_with(other, pair) for other, pair in self._pairs.items() if pair.keyframes}
+        said = None if moves_to is None else self._pairs[moves_to[0]].said
+        anchor = self.anchor if said is None else said.anchor
+        shared = {
+            other: self._shared_with(other, pair, anchor, now) for other, pair in self._pairs.items() if pair.keyframes
+        }
         for pair in self._pairs.values():
             pair.heard, pair.is_news = None, False
-        said = None if moves_to is None else self._pairs[moves_to[0]].said
         origin = self._origin if said is None else pose_from_tq(np.array(said.origin))
         return StepConsensus(
             self.number,
@@ -579,7 +597,7 @@ class DistributedOptimisation:
                 owned=tuple(each for each in self._owned() if self._is_known(each.closure)),
                 shared=shared,
                 T_alone=self._T_alone,
-                anchored=(self.anchor if said is None else said.anchor) == self._own,
+                anchored=anchor == self._own,
                 origin=origin,
                 move_to=moves_to,
                 state=self._state,
@@ -590,13 +608,19 @@ class DistributedOptimisation:
         ends = [end for end in (closure.query, closure.match) if end.log == self._own]
         return all(end.index < len(self._trajectory) for end in ends)
 
-    def _shared_with(self, other: LogId, pair: _Pair) -> SharedWith:
+    def _shared_with(self, other: LogId, pair: _Pair, anchor: LogId, now: float) -> SharedWith:
+        """What it shares with another; what that one said in another frame than this step's is not heard.
+
+        One that fell silent before both agreed pulls no more: of one that agreed the last word stands.
+        """
         high = max(self._own, other)
+        heard = pair.heard if pair.heard is not None and pair.heard.anchor == anchor else None
         return SharedWith(
             pair.edition,
             tuple(KeyframeId(high, index) for index in pair.keyframes),
             None if pair.information is None else pair.information.numpy(),
-            None if pair.heard is None else _told_by(pair.heard),
+            None if heard is None else _told_by(heard),
+            forgotten=pair.said_s + SILENT_S <= now,
         )
 
     def _in_lower_frame(self) -> tuple[LogId, ToldPoses] | None:

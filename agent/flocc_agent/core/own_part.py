@@ -68,12 +68,14 @@ class SharedWith:
         keyframes: The list, of the higher robot.
         information: (S, 2) of the closures there, of rotation and translation; None where this robot owns them.
         told: What it heard in this robot's frame since the last step; None for nothing.
+        forgotten: What it heard before counts only where both have the shared poses in the same places.
     """
 
     edition: int
     keyframes: tuple[KeyframeId, ...]
     information: Float | None = None
     told: ToldPoses | None = None
+    forgotten: bool = False
 
 
 class ConsensusState:

@@ -428,6 +428,8 @@ class Robot:
             return self._overtaken(sender, message, now)
         if self.distributed is not None and message.term.leader != message.log:
             return self._other_mode(message.term.leader)
+        if self.distributed is not None and message.log == self.log:
+            self.distributed.on_own_correction(message.round)
         if not self.corrections.is_news(message, now):
             return []
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term, now)
