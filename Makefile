@@ -5,7 +5,8 @@
 # make docs    the pages as a searchable site: build/site/index.html
 # make release-check   builds what would be published, checks its metadata, installs it in a fresh environment, runs flocc demo --small
 # make campaign     cores broken on purpose, with the seeds that each took; the back end and others on 300 drawn graphs
-#                   (DRAWS=60 for a sweep), at most an hour (LIMIT_S)
+#                   (DRAWS=60 for a sweep), at most an hour (LIMIT_S); what a leader holds over eight simulated hours
+#                   (MISSION_MINUTES)
 # make clean   removes .venv and everything that was generated
 
 SHELL := /bin/bash
@@ -14,6 +15,7 @@ VENV ?= .venv
 JOBS ?= 2
 DRAWS ?= 300
 LIMIT_S ?= 3600
+MISSION_MINUTES ?= 480
 DEMO_OUT ?= runs/demo
 TEST_EXTRAS := $(shell sed -n '/^\[project.optional-dependencies\]/,/^\[/s/^\([a-z0-9]*\) = \[.*/\1/p' pyproject.toml | paste -sd,)
 
@@ -64,12 +66,15 @@ tests:
 swarm-test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -m scenarios
 
-# Every mutant of the core; then the back end on 300 graphs of the family, beside what others do, whose rows stay.
+# Every mutant of the core; then the back end on 300 graphs of the family, beside what others do, whose rows stay; then
+# eight simulated hours of ten robots, and what their leader holds.
 campaign: $(VENV)/.test
 	@mkdir -p build
 	FLOCC_MUTANTS=all nice -n 19 $(BIN)/python -m pytest -q -s -n0 tests/simulation/test_mutants.py
 	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/python -m flocc_lab.graph_family --draws $(DRAWS) --methods "" \
 		--rows build/graph_family.jsonl --limit-s $(LIMIT_S) | tee build/graph_family.md
+	OMP_NUM_THREADS=1 nice -n 19 $(BIN)/python -m flocc_lab.held --robots 10 --minutes $(MISSION_MINUTES) --held 5000 \
+		--area-m 2000 --parts 8 | tee build/held.jsonl
 
 docs: $(VENV)/.test
 	$(BIN)/python -m flocc_lab.reference.site_pages build/pages

@@ -72,4 +72,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python examples/saved_map.py FOLDER")
     main(Path(sys.argv[1]))

@@ -461,7 +461,7 @@ class Agent:
             sealer,
             distributed,
             None if sealer is None else sealer.compute_classes,
-            PageFile(config.folder),
+            PageFile(config.folder, config.store.record_bytes_max),
         )
         transport = ZenohTransport(
             config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
@@ -510,7 +510,7 @@ class Agent:
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
         driver = self._started
-        merging = evidence_of(driver.robot, self.config.core, driver.last_solution)
+        merging = evidence_of(driver.robot, self.config.core, driver.solved)
         if self._radio is not None:
             merging = merging.model_copy(update={"emulated": self._radio.parameters.emulated()})
         status = self.status().model_dump(mode="json")
@@ -591,8 +591,8 @@ class Agent:
 
     def _state(self) -> tuple[AgentStatus, tuple[str, ...]]:
         """What a robot monitor is told: the status, and what the last own solution warned of."""
-        solution = self._started.last_solution
-        return self.status(), () if solution is None else solution.warnings
+        solved = self._started.solved
+        return self.status(), () if solved is None else tuple(solved.warnings)
 
     def _begin_anew(self) -> None:
         """End this journey: who runs the agent starts it again, and it begins another log."""

@@ -275,10 +275,11 @@ def interpolated(T_a_b: Float, T_a_c: Float, share: float) -> Float:
 
 
 def symmetric(upper: Float) -> Float:
-    """Covariance (6, 6) of its upper triangle (21,)."""
-    out = np.empty((6, 6))
-    out[_UPPER] = upper
-    out.T[_UPPER] = upper
+    """Covariances (..., 6, 6) of their upper triangles (..., 21)."""
+    out = np.empty((*upper.shape[:-1], 6, 6))
+    rows, columns = _UPPER
+    out[..., rows, columns] = upper
+    out[..., columns, rows] = upper
     return out
 
 

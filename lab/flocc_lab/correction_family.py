@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_ends import Tie, length_m, tie_of
+from flocc_agent.core.closure_rows import Tie, length_m, tie_of
 from flocc_agent.core.correction_evidence import TIES_MIN, Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import contradiction

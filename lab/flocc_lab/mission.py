@@ -27,6 +27,8 @@ from flocc_launch.simulation.swarm import Swarm
 from flocc_protocol.ids import KeyframeId, LogId
 
 ALL_HELD = 10**9
+AREA_M = 60.0
+"""Side of a town in which robots are back at old places all the time."""
 OLD_S = 120.0
 """A closure is to an old place when its keyframes are so far apart in time."""
 SIMILARITY = 0.6
@@ -77,11 +79,11 @@ def _run(robots: int, minutes: float, held: int) -> dict[str, Any]:
     }
 
 
-def town_swarm(robots: int, minutes: float, held: int) -> Swarm:
-    """A swarm in a town of 60 m, with this many keyframes held."""
+def town_swarm(robots: int, minutes: float, held: int, area_m: float = AREA_M) -> Swarm:
+    """A swarm in a town, with this many keyframes held."""
     fields = {
         "name": "mission",
-        "tracks": {"robots": robots, "seed": 3, "area_m": 60.0, "length_m": 42.0 * minutes},
+        "tracks": {"robots": robots, "seed": 3, "area_m": area_m, "length_m": 42.0 * minutes},
         "keyframes": {"distance_m": 1.0, "rotation_rad": 0.7},
         "radio": {"latency_s": 0.02},
         "perception": {"method": "synthetic", "synthetic": {"dimension": 128}},

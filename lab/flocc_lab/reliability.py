@@ -22,7 +22,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flocc_agent.config import KeyframeConfig, PerceptionConfig, RadioConfig, SourceConfig
-from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
+from flocc_agent.core.parameters import (
+    KEYFRAMES_HELD,
+    CoreParameters,
+    MemoryParameters,
+    PlaceRecognitionParameters,
+)
 from flocc_agent.core.reports import CorrectionApplied, Fact, LeaderFollowed, NeighbourDown
 from flocc_agent.runtime.event_lines import Reported, of_kind, reported_of
 from flocc_launch.scenarios.recordings import recordings
@@ -247,10 +252,12 @@ async def idle(folder: Path, duration_s: float) -> dict[str, Any]:
     return {"agents": len(used), "cpu_ratio": spread(used), "rss_mib": spread(resident)}
 
 
-async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
+async def load(
+    folder: Path, agents: int, duration_s: float, area_m: float = CROWD_AREA_M, held: int = KEYFRAMES_HELD
+) -> dict[str, Any]:
     """Many agents with two keyframes per second each, once all have started: CPU, memory, queues, late heartbeats."""
     start_s = CROWD_START_PER_AGENT_S * agents
-    swarm = LiveSwarm(crowd(agents, duration_s), folder, start_s=start_s)
+    swarm = LiveSwarm(crowd(agents, duration_s, area_m, held), folder, start_s=start_s)
     await swarm.start()
     watched = WatchedSwarm()
     try:
@@ -268,6 +275,7 @@ async def load(folder: Path, agents: int, duration_s: float) -> dict[str, Any]:
         await swarm.stop()
     return {
         "agents": agents,
+        "held": held,
         "duration_s": round(lasted_s, 1),
         "keyframes": after["keyframes"] - before["keyframes"],
         "keyframes_intended": round(KEYFRAMES_PER_S * lasted_s * agents),
@@ -333,16 +341,19 @@ def _records_behind(agents: Sequence[AgentProcess]) -> int:
     return max(count - logs.get(log, NOTHING)[0] for logs in held for log, count in longest.items())
 
 
-def crowd(robots: int, duration_s: float) -> Scenario:
+def crowd(robots: int, duration_s: float, area_m: float, held: int) -> Scenario:
     """Many robots in one town, all in range of each other: 1 m/s, two keyframes per second each."""
     return Scenario(
         name="crowd",
         tracks=TracksScenario(
-            robots=robots, seed=3, area_m=CROWD_AREA_M, speed_m_s=1.0, length_m=duration_s + SETTLE_S + 30.0
+            robots=robots, seed=3, area_m=area_m, speed_m_s=1.0, length_m=duration_s + SETTLE_S + 30.0
         ),
         keyframes=KeyframeConfig(distance_m=0.45, rotation_rad=math.pi),
         perception=PerceptionConfig(method="synthetic"),
-        core=CoreParameters(place_recognition=PlaceRecognitionParameters(similarity_threshold=0.6)),
+        core=CoreParameters(
+            place_recognition=PlaceRecognitionParameters(similarity_threshold=0.6),
+            memory=MemoryParameters(keyframes_held=held),
+        ),
     )
 
 
@@ -399,7 +410,7 @@ async def _measured(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
         case "idle":
             return await idle(folder, given.duration_s)
         case _:
-            return await load(folder, given.agents, given.duration_s)
+            return await load(folder, given.agents, given.duration_s, given.area_m, given.held)
 
 
 def main() -> None:
@@ -410,6 +421,8 @@ def main() -> None:
     parser.add_argument("--outage-s", type=float, default=60.0)
     parser.add_argument("--duration-s", type=float, default=30.0)
     parser.add_argument("--agents", type=int, default=30)
+    parser.add_argument("--area-m", type=float, default=CROWD_AREA_M, help="Of the town of `load`.")
+    parser.add_argument("--held", type=int, default=KEYFRAMES_HELD, help="Keyframes that each agent holds in full.")
     given = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="flocc-reliability-"))
     try:

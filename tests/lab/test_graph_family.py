@@ -12,8 +12,8 @@ from flocc_lab.graph_family.graphs import made, member
 from flocc_lab.graph_family.judge import judged
 from flocc_lab.graph_family.methods import NoAnswer, flocc, oracle, settings
 
-TEN = (2, 3, 4, 5, 7, 9, 12, 13, 14, 15)
-"""The first ten with fewer than a thousand keyframes."""
+TEN = (3, 4, 7, 9, 13, 19, 20, 29, 31, 35)
+"""The first ten with fewer than five hundred keyframes, but slow 27; `make campaign` has all."""
 
 
 def test_specs_lie_within_the_stated_ranges_and_use_them() -> None:
@@ -73,7 +73,7 @@ def test_the_default_holds_on_ten_members(tmp_path: Path) -> None:
     verdicts = run(TEN, {"flocc": flocc(settings())}, rows, limit_s=300.0)
     plain = [v for v in verdicts if not v.groups]
     assert np.median([v.ratio for v in plain]) <= 1.1
-    assert [v.seed for v in plain if v.failed] in ([], [2])  # parallel lines: no better than odometry
+    assert [v.seed for v in plain if v.failed] == []
     assert [v.seed for v in read_rows(rows)] == [v.seed for v in verdicts] == list(TEN)
     assert "| flocc | 10 |" in table(verdicts)
 

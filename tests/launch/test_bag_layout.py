@@ -68,11 +68,11 @@ def test_odometry_may_be_transforms_alone(tmp_path: Path) -> None:
         convert(bag, tmp_path / "other", odometry_topic="/tf:odom.base")
 
 
-def team() -> BagScript:
-    """Two robots with cameras, intrinsics and odometry under their namespaces."""
+def team(frames: tuple[str, str] | None = None) -> BagScript:
+    """Two robots with cameras, intrinsics and odometry under their namespaces; frames of image and odometry."""
     script = BagScript(False)
     for number, name in enumerate(("Alpha", "bob_2")):
-        script.frame, script.child = f"{name}/camera", f"{name}/camera"
+        script.frame, script.child = frames or (f"{name}/camera", f"{name}/camera")
         script.camera_info(f"/{name}/cam/camera_info", ZERO_NS)
         for k in range(4):
             script.odometry(f"/{name}/odom", ZERO_NS + k * S, float(10 * number + k))
@@ -80,6 +80,11 @@ def team() -> BagScript:
             script.raw(f"/{name}/depth/image", ZERO_NS + k * S, np.zeros((4, 4), np.uint16), "16UC1")
     script.messages.sort(key=lambda message: message[2])
     return script
+
+
+def test_what_is_so_for_all_robots_of_a_bag_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    convert(team(("camera", "body")).write(tmp_path / "team", "mcap"), tmp_path / "out")
+    assert re.findall(r"nothing says where the camera .* if not(.*)", caplog.text) == [" (so for 2 robots)"]
 
 
 def test_a_bag_of_two_robots_becomes_two_recordings(tmp_path: Path) -> None:

@@ -288,6 +288,9 @@ def test_map_info_names_contradicted_keyframes_those_of_most_logs_first(block: P
         assert lines[:2] == [("contradicted r2/5", "by r1, r3, r4"), ("contradicted r1/0", "by r2, r3")]
         assert lines[-1] == ("contradicted", "2 keyframes more, in map.json")
         assert len(lines) == 11
+        weights = MapFolder.open(folder).saved().weights
+        assert len(weights) == 12
+        assert (weights[KeyframeId.parse("r2/5")], weights[KeyframeId.parse("r1/0")]) == (1 / 4, 1 / 3)
 
 
 def test_a_fixed_map_does_not_move(block: Path, tmp_path: Path) -> None:

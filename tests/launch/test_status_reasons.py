@@ -16,7 +16,7 @@ from flocc_launch.doctor.live import diagnose_live
 from flocc_launch.setup.credentials import make_keys
 from flocc_protocol.keys import Admin
 
-pytestmark = pytest.mark.swarm
+pytestmark = [pytest.mark.swarm, pytest.mark.beside]
 
 
 def agent(config: TransportConfig, robot: str = "r1", answer: bytes = b'{"keyframes": 7}') -> ZenohTransport:

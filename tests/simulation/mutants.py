@@ -12,14 +12,16 @@ from unittest.mock import patch
 
 import numpy as np
 
-from flocc_agent.core import assembly, election, judgement, log_copy, loop_closing, plausibility, robot
-from flocc_agent.core.assembly import GraphAssembly, _Odometry
-from flocc_agent.core.cold_storage import ColdPieces
+from flocc_agent.core import assembly, closure_rows, election, judgement, log_copy, loop_closing, plausibility, robot
+from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.closure_rows import ClosureTable
+from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.correction_evidence import CorrectionEvidence
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, PersistCorrection, PersistTerm, Report
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.gossip import Gossip
+from flocc_agent.core.known_sets import KeyframeSet
 from flocc_agent.core.latents import Latents, Reach
 from flocc_agent.core.log_copy import EncodedRecords, _Block
 from flocc_agent.core.loop_closing import LoopClosing
@@ -69,13 +71,15 @@ class Mutant:
 
 @contextmanager
 def small_pieces() -> Iterator[None]:
-    """Logs and odometry in pieces of four, of which one stays in memory: what drawn swarms record fills some."""
+    """Logs, odometry and closures in pieces of four, of which one stays in memory: drawn swarms fill some."""
     with ExitStack() as stack:
         for owner, name in (
             (log_copy, "BLOCK_RECORDS"),
             (robot, "BLOCK_RECORDS"),
             (assembly, "POSES_OF_A_PIECE"),
             (robot, "POSES_OF_A_PIECE"),
+            (closure_rows, "ROWS_OF_A_PIECE"),
+            (robot, "ROWS_OF_A_PIECE"),
         ):
             stack.enter_context(patch.object(owner, name, 4))
         stack.enter_context(patch.object(robot, "ColdPieces", lambda storage, _held: ColdPieces(storage, 1)))
@@ -237,7 +241,7 @@ def _delivers_twice(effects: Any) -> Any:
 
 def _refetches(original: Callable[..., Any]) -> Callable[..., Any]:
     def broken(self: Latents, keyframe: Any, reach: Any, now: float) -> Any:
-        held, self._held = self._held, set()
+        held, self._held = self._held, KeyframeSet()
         try:
             return original(self, keyframe, reach, now)
         finally:
@@ -303,10 +307,9 @@ def _follows_whoever_came_first(original: Callable[..., Any]) -> Callable[..., A
     return broken
 
 
-def _moves_cold_odometry(original: Callable[..., Any]) -> Callable[..., Any]:
-    def broken(self: _Odometry, number: int) -> Any:
-        rows = original(self, number)
-        return rows + 0.5 if isinstance(self._pieces[number], int) else rows
+def _gives_the_piece_before(original: Callable[..., Any]) -> Callable[..., Any]:
+    def broken(self: RowPieces, number: int) -> Any:
+        return original(self, max(0, number - isinstance(self._pieces[number], int)))
 
     return broken
 
@@ -346,8 +349,8 @@ MUTANTS = (
     Mutant("all closures are rejected", robot, "judged", afterwards(_refused)),
     Mutant("closures without a covariance", robot, "judged", afterwards(_without_covariance)),
     Mutant("refusals become closures", judgement, "match_ratio", always(5.0)),
-    Mutant("the graph has closures the other way round", assembly, "_loop_closures", afterwards(_turned_closures)),
-    Mutant("the graph has closures of another scale", assembly, "_loop_closures", afterwards(_unscaled)),
+    Mutant("the graph has closures the other way round", ClosureTable, "closures", afterwards(_turned_closures)),
+    Mutant("the graph has closures of another scale", ClosureTable, "closures", afterwards(_unscaled)),
     Mutant("the graph has half of the closures", GraphAssembly, "graph", _gives_own_keyframes_only),
     Mutant("the graph lacks the last keyframes", GraphAssembly, "graph", afterwards(_without_the_last_keyframe)),
     # keyframes and places
@@ -405,6 +408,6 @@ MUTANTS = (
         "a block's checksum is another", EncodedRecords, "block_checksum", afterwards(lambda c: c ^ 1), in_pieces=True
     ),
     Mutant("what left memory comes back as something else", ColdPieces, "get", _gives_the_first_piece, in_pieces=True),
-    Mutant("odometry comes back moved", _Odometry, "_piece", _moves_cold_odometry, in_pieces=True),
+    Mutant("rows come back as those before", RowPieces, "_piece", _gives_the_piece_before, in_pieces=True),
     Mutant("nothing leaves memory", ColdPieces, "add", _lets_nothing_go, in_pieces=True),
 )

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from flocc_agent.core.pose_graph import map_frame
-from flocc_agent.runtime.evidence import evidence_of
+from flocc_agent.runtime.evidence import evidence_of, solver_of
 from flocc_launch.dashboard.status_table import RobotStatus, status_from
 from flocc_launch.doctor import Finding, Severity, diagnose
 from flocc_launch.doctor.live import diagnose_live
@@ -165,6 +165,7 @@ def answers(swarm: Swarm) -> list[RobotStatus]:
         core = station.core
         assert core is not None
         term, applied = core.election.term, core.corrections.applied
+        solved = solver_of(station.solution) if station.solution else None
         fields = {
             "robot": name,
             "leader": None if term is None else term.leader.robot,
@@ -174,7 +175,7 @@ def answers(swarm: Swarm) -> list[RobotStatus]:
             "closures": core.assembly.closures,
             "logs": {str(digest.log): [digest.count, digest.checksum] for digest in core.gossip.digests()},
             "compute_class": swarm.scenario.robot(name).compute_class,
-            **evidence_of(core, swarm.scenario.core, station.solution).model_dump(),
+            **evidence_of(core, swarm.scenario.core, solved).model_dump(),
         }
         rows.append(status_from(name, json.dumps(fields).encode()))
     return rows

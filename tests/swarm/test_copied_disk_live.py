@@ -13,7 +13,7 @@ from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_launch.dashboard.status_table import status_of_swarm
 from flocc_launch.doctor.live import diagnose_live
 
-pytestmark = pytest.mark.swarm
+pytestmark = [pytest.mark.swarm, pytest.mark.beside]
 
 TOLD_WITHIN_S = 20.0
 

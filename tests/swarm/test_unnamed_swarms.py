@@ -12,7 +12,7 @@ from flocc_agent import Agent, AgentConfig
 from flocc_agent.config import PeerEndpoints, PerceptionConfig, TlsConfig, TransportConfig
 from flocc_agent.runtime.network_faults import found_by
 
-pytestmark = pytest.mark.swarm
+pytestmark = [pytest.mark.swarm, pytest.mark.beside]
 
 MEETING_S = 15.0
 

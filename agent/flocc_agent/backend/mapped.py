@@ -3,9 +3,10 @@
 `with_map` goes before the optimiser, `without_map` after it; what lies between knows of no maps. Each log of the map
 becomes one whose odometry are its saved poses, and each closure that its solution used the relative pose that it has
 there, with the spread that the closure had: so the map lies where it was saved, bends as its covariance allows, and
-no closure of it is judged again. A map that must not move becomes one stiff log of the few keyframes that something
-holds to, so that a round costs nothing for the rest. The names of these logs sort before all others: the frame is
-the map's, whatever the robots that join it are called. A map that nothing joins is not solved at all.
+no closure of it is judged again. What a team measures at keyframes that several logs contradict counts less. A map that
+must not move becomes one stiff log of the few keyframes that something holds to, so that a round costs nothing for the
+rest. The names of these logs sort before all others: the frame is the map's, whatever the robots that join it are
+called. A map that nothing joins is not solved at all.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -117,7 +118,7 @@ def with_map(graph: PoseGraph, saved: SavedMap, config: BackendConfig, initial: 
     posed = replace(
         graph,
         trajectories={**live, **trajectories},
-        closures=(*(_renamed(graph.closures[k], mapped) for k in outer), *inner.values(), *ties),
+        closures=(*(_renamed(weighed(graph.closures[k], saved), mapped) for k in outer), *inner.values(), *ties),
         measured=tuple(_renamed_factor(graph.measured[k], mapped) for k in factors),
         saved=None,
     )
@@ -261,6 +262,12 @@ def _ties(mapped: Mapped) -> list[LoopClosure]:
         )
         for log in others
     ]
+
+
+def weighed(closure: LoopClosure, saved: SavedMap) -> LoopClosure:
+    """A closure as it counts: less where a map's keyframe is one that several logs contradict."""
+    weight = min(saved.weights.get(end, 1.0) for end in (closure.query, closure.match))
+    return closure if weight == 1.0 else replace(closure, weight=weight * closure.weight)
 
 
 def _renamed(closure: LoopClosure, mapped: Mapped) -> LoopClosure:

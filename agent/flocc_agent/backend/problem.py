@@ -209,7 +209,7 @@ def closure_edges(
 
 
 def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, config: BackendConfig) -> Float:
-    """Covariances (L, 6, 6) in metres, divided by the probability of Eq. (2): it multiplies the information."""
+    """Covariances (L, 6, 6) in metres, divided by the probability of Eq. (2) and by the closure's weight."""
     default = diagonal_covariance(config.closure_rotation_sigma_rad, config.closure_translation_sigma_m)
     units = np.ones((len(closures), 6))
     units[:, 3:] = scale_initial[:, None]
@@ -219,6 +219,7 @@ def closure_covariances(closures: Sequence[LoopClosure], scale_initial: Float, c
         out[k] = default if own is None else own * units[k] * units[k][:, None]
         if config.weight_by_probability:
             out[k] /= closure_probability(closure.match_ratio, config.steepness)
+        out[k] /= closure.weight
     return out
 
 

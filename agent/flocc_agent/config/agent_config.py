@@ -67,7 +67,8 @@ class StoreConfig(Section):
     latent_bytes_max: int = Field(2 * 1024**3, ge=1024 * 1024)
     """Latents kept, bytes; beyond it the oldest go first and can no longer be fetched."""
     record_bytes_max: int = Field(1024**3, ge=1024 * 1024)
-    """Records of other robots kept, bytes; more are held in memory only. Own records are always written."""
+    """Records of other robots kept, bytes, and as much for what left memory; more is held in memory only. Own records
+    are always written."""
 
 
 class AgentConfig(Section):

@@ -102,7 +102,7 @@ class Mast3rConfig(Section):
     """Number format of a sent latent; int8 (per channel) halves it to 0.8 MB."""
     place_input: Literal["native", "shorter-side", "swarm-slam"] = inner("swarm-slam")
     """What CosPlace sees: the picture, the picture resized, or Swarm-SLAM's central square; equal on all robots."""
-    subsample_px: int = Field(8, ge=1, le=64)
+    subsample_px: int = inner(8, ge=1, le=64)
     """Distance of the matcher's seeds; 16 is four times faster with a quarter of the matches; equal on all robots."""
     calibrated: bool = True
     """Use the camera's calibration; false estimates focal lengths from the pointmaps, with a second decode."""

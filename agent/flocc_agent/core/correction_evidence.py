@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_ends import Tie
+from flocc_agent.core.closure_rows import Tie
 from flocc_agent.core.geodesy import T_earth_enu
 from flocc_agent.core.knots import corrected
 from flocc_agent.core.pose_graph import MeasuredFactor, is_landmark

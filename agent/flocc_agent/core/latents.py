@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 from flocc_agent.core.effects import Effect, FetchLatent
+from flocc_agent.core.known_sets import KeyframeSet
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.pulls import remember
 from flocc_protocol.ids import KeyframeId, LogId
@@ -191,7 +192,7 @@ class Latents:
         self.names = LatentNames()
         self._own = own
         self._parameters = parameters
-        self._held: set[KeyframeId] = set()
+        self._held = KeyframeSet()
         self._fetches: dict[KeyframeId, _Fetch] = {}
         self._relayed: dict[KeyframeId, float] = {}
         self._wished_s: dict[KeyframeId, float] = {}

@@ -18,9 +18,9 @@ from collections.abc import Iterable, Iterator
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
 from flocc_agent.core.front_ends import FrontEnds
+from flocc_agent.core.known_sets import PairSet
 from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
 from flocc_agent.core.offers import Offers, Recipient
-from flocc_agent.core.pair_set import PairSet
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.prospects import UNLIKELY, Agreement, Prospect, Prospects

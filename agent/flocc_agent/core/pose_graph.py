@@ -53,6 +53,7 @@ class LoopClosure:
         covariance: (6, 6) of the measurement in its own units, or None for the back end's configured model.
         metric: The translation is in metres and no scale is estimated.
         support: How many closures it counts as where maps are joined; a single visual one may be wrong.
+        weight: How much of its information counts: less where what it shows is known to have changed.
     """
 
     query: KeyframeId
@@ -63,6 +64,7 @@ class LoopClosure:
     covariance: Float | None = None
     metric: bool = False
     support: int = 1
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

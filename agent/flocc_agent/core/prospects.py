@@ -15,6 +15,7 @@ from collections.abc import Callable
 from enum import Enum
 from itertools import product
 
+from flocc_agent.core.known_sets import PairSet
 from flocc_agent.core.pulls import remember
 from flocc_protocol.ids import KeyframeId
 from flocc_protocol.messages import CandidatePair
@@ -57,7 +58,7 @@ class Prospects:
         self._fresh: dict[CandidatePair, bool] = {}
         self._judged: dict[CandidatePair, Judged] = {}
         self._order: list[Judged] = []
-        self._closures: dict[CandidatePair, None] = {}
+        self._closures = PairSet()
         self._unlikely: dict[CandidatePair, None] = {}
         self._held_since_s: dict[CandidatePair, float] = {}
 
@@ -66,7 +67,6 @@ class Prospects:
         return {
             "agreements": (len(self._found), UNLIKELY_MAX),
             "judged": (len(self._fresh) + len(self._judged), 2 * JUDGED_MAX),
-            "closures beside": (len(self._closures), UNLIKELY_MAX),
             "unlikely": (len(self._unlikely), UNLIKELY_MAX),
             "held": (len(self._held_since_s), UNLIKELY_MAX),
         }
@@ -84,7 +84,7 @@ class Prospects:
             remember(self._fresh, pair, is_closure, JUDGED_MAX)
         if not is_closure:
             return []
-        remember(self._closures, pair, None, UNLIKELY_MAX)
+        self._closures.add(pair)
         again = [other for other in beside(pair) if other in self._unlikely] if self._unlikely else []
         for other in again:
             del self._unlikely[other]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.claims import Claim
+from flocc_agent.core.closure_rows import ROWS_OF_A_PIECE
 from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
@@ -195,7 +196,8 @@ class Robot:
         self.comparisons = Comparisons(parameters.neighbours.neighbours_max)
         self._answers = AnswerBudget()
         self._muted = Muted()
-        self.assembly = GraphAssembly(restored.saved, self._record_at, cold_odometry)
+        cold_closures = None if cold is None else ColdPieces(cold, max(1, held // ROWS_OF_A_PIECE))
+        self.assembly = GraphAssembly(restored.saved, cold_odometry, cold_closures)
         closed = restored.closed()
         self.recognition = PlaceRecognition(log, parameters.place_recognition, closed, held)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None
@@ -231,7 +233,7 @@ class Robot:
         self.election = LeaderElection(
             log, compute_class, restored.counter_max(), parameters.election, now, compute_classes
         )
-        self.rounds = Rounds(self.assembly, parameters.rounds)
+        self.rounds = Rounds(self.assembly, parameters.rounds, cold, held)
         self.distributed = self._distributed(restored.correction) if distributed else None
         self._of_other_mode: set[LogId] = set()
         self._restore(restored, now)

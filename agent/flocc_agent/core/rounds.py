@@ -1,8 +1,9 @@
 """Optimisation rounds: the leader optimises what its logs hold; no robot is asked, none is waited for."""
 
 from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.cold_storage import ColdStorage, ColdValue
 from flocc_agent.core.effects import Effect, Optimise, Report
-from flocc_agent.core.parameters import RoundParameters
+from flocc_agent.core.parameters import KEYFRAMES_HELD, RoundParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
 from flocc_agent.core.reports import RoundSolved, RoundTimedOut
 from flocc_protocol.ids import Term
@@ -26,7 +27,22 @@ HURRY_MAX_S = 2.0
 class Rounds:
     """When a leader optimises, and what it makes of the answer."""
 
-    def __init__(self, assembly: GraphAssembly, parameters: RoundParameters) -> None:
+    def __init__(
+        self,
+        assembly: GraphAssembly,
+        parameters: RoundParameters,
+        cold: ColdStorage | None = None,
+        keyframes_held: int = KEYFRAMES_HELD,
+    ) -> None:
+        """Start without a solution.
+
+        Args:
+            assembly: Gives the graph.
+            parameters: When rounds are.
+            cold: Where the last solution is between rounds, once it is large.
+            keyframes_held: One of more keyframes is large.
+        """
+        self._keyframes_held = keyframes_held
         self._assembly = assembly
         self._parameters = parameters
         self._term: Term | None = None
@@ -37,7 +53,7 @@ class Rounds:
         self._hurried_until_s = float("-inf")
         self._started: tuple[int, int] | None = None
         self._failures = 0
-        self._solution: GraphSolution | None = None
+        self._solution: ColdValue[GraphSolution] = ColdValue(cold)
 
     @property
     def round(self) -> int:
@@ -51,6 +67,10 @@ class Rounds:
             self._round = 0
             self._running_until_s = None
             self._started = None
+
+    def solution(self) -> GraphSolution | None:
+        """The last solution that counted, also of an earlier term."""
+        return self._solution.get()
 
     def hurry(self, now: float) -> None:
         """Groups meet, and news are to be expected: for one short period rounds may follow each other quickly."""
@@ -69,7 +89,8 @@ class Rounds:
         self._running_until_s = None
         self._failures = 0
         self._next_s = max(self._next_s, now + (solution.solve_s or now - self._started_s))
-        self._solution = solution
+        keyframes = sum(len(T) for component in solution.components for T in component.T_map_keyframe.values())
+        self._solution.put(solution, keyframes > self._keyframes_held)
         return True
 
     def on_failed(self, term: Term, round_number: int, now: float) -> None:
@@ -105,7 +126,7 @@ class Rounds:
         self._started_s = now
         self._next_s = now + (HURRIED_PERIOD_S if now < self._hurried_until_s else self._period_s())
         self._started = (self._assembly.revision, self._assembly.keyframes)
-        return Optimise(term, self._round, self._assembly.graph(), self._solution)
+        return Optimise(term, self._round, self._assembly.graph(), self.solution())
 
     def _period_s(self) -> float:
         return max(self._parameters.period_s, PERIOD_PER_KEYFRAME_S * self._assembly.keyframes)

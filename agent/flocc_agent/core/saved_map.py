@@ -33,6 +33,7 @@ class SavedMap:
         T_map_camera: (N, 4, 4) saved camera poses of each log with poses.
         closures: The closures that its solution used, by (query, match).
         is_fixed: Its poses do not move, whatever a team measures.
+        weights: Of keyframes that several logs contradict, how much of a closure to one counts, below 1.
     """
 
     logs: tuple[LogId, ...]
@@ -40,6 +41,7 @@ class SavedMap:
     T_map_camera: Mapping[LogId, Float]
     closures: Mapping[tuple[KeyframeId, KeyframeId], SavedClosure] = field(default_factory=dict)
     is_fixed: bool = False
+    weights: Mapping[KeyframeId, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.logs:

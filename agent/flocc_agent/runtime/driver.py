@@ -42,7 +42,6 @@ from flocc_agent.core.events import (
 )
 from flocc_agent.core.interfaces import Image
 from flocc_agent.core.measurements import Measurement, belongs_to, record_of
-from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.reports import (
     Fact,
     LogForked,
@@ -52,6 +51,7 @@ from flocc_agent.core.reports import (
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.admission import Refusal, admitted
 from flocc_agent.runtime.event_lines import Reported
+from flocc_agent.runtime.evidence import solver_of
 from flocc_agent.runtime.given_keyframes import GivenKeyframes, checked_keyframe
 from flocc_agent.runtime.jobs import IMAGES_MAX, Job, Tools, check, fetch, job_of
 from flocc_agent.runtime.metrics import Look
@@ -61,7 +61,7 @@ from flocc_agent.runtime.reporting import Reporter, corrected_bodies, result_of
 from flocc_agent.runtime.robot_result import RobotResult
 from flocc_agent.runtime.sending import Sender
 from flocc_agent.runtime.signature_queue import SignatureQueue
-from flocc_agent.runtime.status import AgentStatus
+from flocc_agent.runtime.status import AgentStatus, SolverStatus
 from flocc_agent.runtime.telemetry import Sizes, Telemetry
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId
@@ -109,7 +109,7 @@ class Driver:
         self._telemetry = Telemetry(robot, tools, reporter, on_report, gaps, self._sizes)
         self._corrector = Corrector(robot)
         self.last_correction: Correction | None = None
-        self.last_solution: GraphSolution | None = None
+        self.solved: SolverStatus | None = None
 
     async def opened(self, run: "asyncio.Task[None]") -> None:
         """Wait until the network is open; raises what `run` raised."""
@@ -207,7 +207,7 @@ class Driver:
 
     def result(self) -> RobotResult:
         """What this robot knows, for `result.json`."""
-        return result_of(self.robot, self._T_body_camera, self.last_solution)
+        return result_of(self.robot, self._T_body_camera, self.robot.rounds.solution())
 
     # The loop
 
@@ -406,7 +406,7 @@ class Driver:
             return
         event = job.result()
         if isinstance(event, GraphOptimised):
-            self.last_solution = event.solution
+            self.solved = solver_of(event.solution)
         self.put(event)
 
 

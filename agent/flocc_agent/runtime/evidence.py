@@ -39,7 +39,7 @@ class PairEvidence:
         )
 
 
-def evidence_of(robot: Robot, parameters: CoreParameters, solution: GraphSolution | None) -> MergeStatus:
+def evidence_of(robot: Robot, parameters: CoreParameters, solver: SolverStatus | None) -> MergeStatus:
     """Similarities and thresholds, closures and refusals by pair of robots, and what the last own solution said."""
     found = sorted(pairs_of(robot).items(), key=lambda item: (item[1].accepted, item[0]))[:PAIRS_MAX]
     return MergeStatus(
@@ -47,7 +47,7 @@ def evidence_of(robot: Robot, parameters: CoreParameters, solution: GraphSolutio
         similarity_threshold=parameters.place_recognition.similarity_threshold,
         match_ratio_threshold=parameters.loop_closing.match_ratio_threshold,
         pairs=[pair.status(robots) for robots, pair in found],
-        solver=None if solution is None else solver_of(solution),
+        solver=solver,
     )
 
 

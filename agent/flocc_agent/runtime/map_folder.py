@@ -355,9 +355,19 @@ class MapFolder:
         """
         try:
             poses = self.poses()
-            return SavedMap(tuple(poses), self.closed(), poses, self.used_closures(), is_fixed)
+            weights = {
+                KeyframeId.parse(keyframe): 1.0 / (1 + len(logs))
+                for keyframe, logs in self.manifest.contradicted.items()
+            }
+            return SavedMap(tuple(poses), self.closed(), poses, self.used_closures(), is_fixed, weights)
         except (KeyError, IndexError, ValueError) as error:
             raise BadMap(f"{self.path / self.manifest.solution.name}: does not fit the map: {error}") from error
+
+
+def longer_copy(one: tuple[bytes, ...], other: tuple[bytes, ...]) -> tuple[bytes, ...] | None:
+    """The longer of two copies of a log; None where neither is the other's beginning."""
+    both = min(len(one), len(other))
+    return max(one, other, key=len) if one[:both] == other[:both] else None
 
 
 def read_manifest(path: Path) -> MapManifest:

@@ -1,7 +1,8 @@
 """A file without a name, in which the core's old records and poses are while the process lives.
 
 It is no second store: what a robot needs after its death is in `robot.sqlite`. The file is made when the first piece is
-put, and vanishes with the process, however that ends. Where the disk is full, pieces stay in memory.
+put, and vanishes with the process, however that ends. Where the disk, or so much of it as may be used, is full,
+pieces stay in memory.
 """
 
 import logging
@@ -14,15 +15,19 @@ from flocc_agent.runtime.database import StoreError
 
 logger = logging.getLogger(__name__)
 
+BYTES_MAX = 1 << 30
+
 
 class PageFile:
     """Pieces of bytes on a disk."""
 
-    def __init__(self, folder: Path | None = None) -> None:
-        """Use a folder's disk; without one, that of the system's temporary files."""
+    def __init__(self, folder: Path | None = None, bytes_max: int = BYTES_MAX) -> None:
+        """Use a folder's disk, so much of it at most; without one, that of the system's temporary files."""
         self._folder = folder
+        self._bytes_max = bytes_max
         self._file: IO[bytes] | None = None
         self._bytes = 0
+        self._free: dict[int, list[int]] = {}
         self._is_full = False
 
     @property
@@ -31,25 +36,39 @@ class PageFile:
 
     @property
     def size_bytes(self) -> int:
-        """What was put so far."""
+        """How long the file is."""
         return self._bytes
 
     def put(self, piece: bytes) -> int | None:
         """Keep a piece: its place, or None where the disk takes no more."""
+        if not self._free.get(len(piece)) and self._bytes + len(piece) > self._bytes_max:
+            self._warn(f"they fill {self._bytes_max} bytes of {self._where}")
+            return None
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(buffering=0, dir=self._folder)  # noqa: SIM115
-            written, place = 0, self._bytes
+            free = self._free.get(len(piece))
+            written, place = 0, free[-1] if free else self._bytes
             while written < len(piece):
                 written += os.pwrite(self._file.fileno(), piece[written:], place + written)
         except OSError as error:
-            if not self._is_full:
-                logger.warning("old records stay in memory: %s", error)
-            self._is_full = True
+            self._warn(str(error))
             return None
-        self._bytes += len(piece)
+        if free:
+            free.pop()
+        else:
+            self._bytes += len(piece)
         self._is_full = False
         return place
+
+    def _warn(self, why: str) -> None:
+        if not self._is_full:
+            logger.warning("old records stay in memory: %s", why)
+        self._is_full = True
+
+    def free(self, place: int, size_bytes: int) -> None:
+        """Let the next piece of this size take the room of one that is needed no more."""
+        self._free.setdefault(size_bytes, []).append(place)
 
     def get(self, place: int, size_bytes: int) -> bytes:
         """A piece again.

@@ -8,7 +8,7 @@ from typing import assert_never
 from flocc_agent.core.effects import DropLog, PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.gossip import Sealer
 from flocc_agent.core.robot import Restored
-from flocc_agent.runtime.map_folder import BadMap, MapFolder
+from flocc_agent.runtime.map_folder import BadMap, MapFolder, longer_copy
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_agent.runtime.stored_correction import correction_in, stored
 from flocc_protocol.errors import DecodeError
@@ -152,11 +152,10 @@ def joined_logs(
                 f"{opened.path}: holds the log {log}, which robot {log.robot} goes on writing: "
                 "begin a new journey (--new-journey), or give another folder"
             )
-        kept = held.get(log, ())
-        both = min(len(kept), len(records))
-        if kept[:both] != records[:both]:
+        joined = longer_copy(held.get(log, ()), records)
+        if joined is None:
             raise BadMap(f"{opened.path}: holds another log {log} than the robot's own folder")
-        found[log] = max(kept, records, key=len)
+        found[log] = joined
     return found
 
 

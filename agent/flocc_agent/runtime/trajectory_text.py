@@ -39,6 +39,9 @@ FORMS = {
 """Names for `--trajectory-format`; any other value is itself a line that names the columns."""
 MATRIX_FORM = "kitti"
 DAMAGED_RATIO_MAX = 0.2
+JUMPS = "jump away from those on both sides"
+TOO_FAST = f"lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
+TOO_FAST_ASKED = ": is the length in metres, and the stamp in its unit?"
 POSITION_MAX_M = 1e8
 NUMBER_MAX = 1e20
 """More than nanoseconds since 1970."""
@@ -470,11 +473,11 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     stamps_s, T, lines = stamps_s[moved], T[moved], lines[moved]
     good = possible(stamps_s, T[:, :3, 3])
     if not np.all(good):
-        notes.append(_too_fast(path, lines[~good], len(lines)))
+        notes.append(_left_out(path, lines[~good], len(lines), TOO_FAST, TOO_FAST_ASKED))
     stamps_s, T, lines = stamps_s[good], T[good], lines[good]
     odd = spikes(T[:, :3, 3])
     if np.any(odd):
-        notes.append(_jumps(path, lines[odd], len(lines)))
+        notes.append(_left_out(path, lines[odd], len(lines), JUMPS))
     stamps_s, T, lines = stamps_s[~odd], T[~odd], lines[~odd]
     anew = breaks(stamps_s, T)
     if np.any(anew):
@@ -486,25 +489,13 @@ def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     return Trajectory(stamps_s, T), tuple(notes)
 
 
-def _jumps(path: Path, lines: NDArray[np.int64], count: int) -> str:
-    """Say how many single poses jump away from both sides.
+def _left_out(path: Path, lines: NDArray[np.int64], count: int, what: str, asked: str = "") -> str:
+    """Say how many poses are no use, and what is wrong with them.
 
     Raises:
-        RecordingError: They are too many.
+        RecordingError: They are too many; what is asked then stands behind.
     """
-    fault = f"{len(lines)} of {count} poses jump away from those on both sides"
+    fault = f"{path}:{lines[0]}: {len(lines)} of {count} poses {what}"
     if len(lines) > DAMAGED_RATIO_MAX * count:
-        raise RecordingError(f"{path}:{lines[0]}: {fault}")
-    return f"{path}:{lines[0]}: {fault} and were left out"
-
-
-def _too_fast(path: Path, lines: NDArray[np.int64], count: int) -> str:
-    """Say how many poses lie out of reach of the others.
-
-    Raises:
-        RecordingError: They are too many.
-    """
-    fault = f"{len(lines)} of {count} poses lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
-    if len(lines) > DAMAGED_RATIO_MAX * count:
-        raise RecordingError(f"{path}:{lines[0]}: {fault}: is the length in metres, and the stamp in its unit?")
-    return f"{path}:{lines[0]}: {fault} and were left out"
+        raise RecordingError(fault + asked)
+    return f"{fault} and were left out"

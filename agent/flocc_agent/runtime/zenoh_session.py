@@ -1,6 +1,6 @@
 """zenoh sessions as flocc needs them: peer mode, no shared memory, explicit endpoints beside scouting.
 
-Each choice is measured in facts/zenoh.md: two sessions per agent (control, bulk) because bulk on a shared link
+Each choice was measured with zenoh 1.10.2: two sessions per agent (control, bulk) because bulk on a shared link
 delays heartbeats; one link per pair (max_links 1, the higher name dials); short open_timeout because attempts that
 hang keep pairs apart under loss; shared memory off because it bypasses emulated links. What RUNTIME and
 BULK_LEASE_FACTOR save is in docs/reliability.md.
@@ -21,12 +21,12 @@ from flocc_agent.runtime.transport import TransportError
 
 RX_MESSAGE_MARGIN_BYTES = 64 * 1024
 BULK_LEASE_FACTOR = 4
+"""Bulk links are idle most of the time, and each sends four signs of life per lease: with 30 robots that is as many
+messages as their heartbeats. Control links are never idle."""
 OPEN_TIMEOUT_S = 2.0
 """Time for one attempt to open a link; a longer one leaves pairs apart for longer under heavy loss."""
 RETRY_MAX_S = 1.0
 """Longest pause between two attempts to dial a robot of the roster: robots meet for seconds."""
-"""Bulk links are idle most of the time, and each sends four signs of life per lease: with 30 robots that is as many
-messages as their heartbeats. Control links are never idle."""
 RUNTIME = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx))"
 """One thread for all that zenoh does on links: waking six for small messages costs a quarter more. Nothing may hold
 it up, hence `linger`."""

@@ -22,7 +22,7 @@ from flocc_agent.geometry import between, inverse, pose_from_tq, so3_log
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.trajectory_text import read_tum
-from flocc_launch.maps.map_export import stamps_s
+from flocc_launch.maps.gathering import stamps_s
 from flocc_launch.maps.map_saving import save_map
 from flocc_launch.maps.opening import MapUse
 from flocc_launch.maps.solving import NotSolved

@@ -27,10 +27,23 @@ MOVED_STEP_PX = 12
 """How much farther right, and half as much down, each next robot shows the same."""
 
 
-def overlay_robot(source: Path, out: Path, cover: Overlay, mask: Overlay | None = None) -> None:
-    """Copy one robot's folder with covered pictures, and a mask of what the second overlay touches."""
+def overlay_robot(
+    source: Path, out: Path, cover: Overlay, mask: Overlay | None = None, first: int | None = None
+) -> None:
+    """Copy one robot's folder with covered pictures, the first ones only where so asked.
+
+    Args:
+        source: The robot's folder, of the plain layout.
+        out: Where the copy is to be.
+        cover: What its pictures show beside the scene.
+        mask: The copy has a mask of what this one touches.
+        first: Pictures that are kept.
+    """
     shutil.copytree(source, out, ignore=shutil.ignore_patterns("*.npz"))
-    for k, file in enumerate(sorted((out / "images").iterdir())):
+    files = sorted((out / "images").iterdir())
+    for file in files[len(files) if first is None else first :]:
+        file.unlink()
+    for k, file in enumerate(files[:first]):
         pixels = np.asarray(cv2.imread(str(file)), np.uint8)
         file.chmod(0o644)
         cv2.imwrite(str(file), cover(pixels, k), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -78,6 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--share", type=float, default=0.3)
     parser.add_argument("--same", action="store_true", help="all robots show the same")
     parser.add_argument("--moved", action="store_true", help="all robots show the same, at other pixels")
+    parser.add_argument("--first", type=int, help="only so many pictures of each robot")
     parser.add_argument("--mask", action="store_true", help="each folder says what moves with the camera")
     parser.add_argument("--judge", type=Path, nargs="+", help="instead: run folders, a line each")
     given = parser.parse_args(arguments)
@@ -93,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seed = 0 if given.same or given.moved else k
         offset_px = (k * MOVED_STEP_PX, k * MOVED_STEP_PX // 2) if given.moved else (0, 0)
         cover = overlay(given.kind, size_of(robot), given.share, seed, offset_px)
-        overlay_robot(robot, given.out / robot.name, cover, cover if given.mask else None)
+        overlay_robot(robot, given.out / robot.name, cover, cover if given.mask else None, given.first)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from flocc_lab.experiments.experiment import (
     judged,
 )
 from flocc_lab.experiments.formulation_claims import MeasuredClaim, formulation_findings
-from flocc_lab.experiments.full_system_data import METHODS, FullSystemSettings, recordings_of, scenario_of
+from flocc_lab.experiments.full_system_data import METHODS, PICTURES, FullSystemSettings, recordings_of, scenario_of
 from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.plots import COLOURS, MARKERS, label_logarithmic
 from flocc_lab.experiments.statistics import grouped, middle, values, with_spread
@@ -54,7 +54,7 @@ def cells(settings: FullSystemSettings) -> list[Cell]:
 
 def _runs_on(source: str, method: str) -> bool:
     """Single pictures give no metric closures."""
-    return source not in ("world", "sevenscenes") or not METHODS[method].metric
+    return source not in PICTURES or not METHODS[method].metric
 
 
 def prepare(settings: FullSystemSettings, progress: Progress) -> None:
@@ -67,7 +67,7 @@ def prepare(settings: FullSystemSettings, progress: Progress) -> None:
         if method not in METHODS:
             raise ExperimentError(f"there is no method {method!r}; there are {', '.join(METHODS)}")
     for number, source in enumerate(settings.sources):
-        if source not in (*COSMO, "tracks", "world", "sevenscenes"):
+        if source not in (*COSMO, "tracks", *PICTURES):
             raise ExperimentError(f"there is no source {source!r}; see --help")
         given = scenario_of(settings, source, METHODS[DEFAULT], seed=1)
         require_overlap(playbacks_of(given, recordings_of(settings, source, given)), NEAR_M, source)

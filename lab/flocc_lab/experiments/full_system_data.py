@@ -33,10 +33,13 @@ from flocc_launch.graph_files.graph_recording import (
     odometry_sigmas,
     write_recordings,
 )
+from flocc_launch.scenarios.own_data import OwnData
 from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import DatasetScenario, RobotScenario, Scenario, TracksScenario, WorldScenario
 from flocc_launch.setup.cache import cache_folder
 
+PICTURES = ("world", "sevenscenes", "street", "herz_jesu")
+"""Sources with real pictures: single ones, which give no metric closures."""
 SETTLE_S = 20.0
 """A run on cosmo_bench is quiet when nothing happened for a round's period and this."""
 
@@ -82,8 +85,10 @@ class FullSystemSettings(Settings):
     data: Path = Path("../shared/data")
     """Folder of shared data; cosmo_bench and sevenscenes are looked for there."""
     sources: tuple[str, ...] = ("cosmo-wifi", "cosmo-proradio", "tracks")
-    """cosmo-wifi, cosmo-proradio: recorded robots; tracks: walks with synthetic perception; world: a generated town
-    and sevenscenes: a video cut among robots, both with real pictures and the classical front end."""
+    """cosmo-wifi, cosmo-proradio: recorded robots; tracks: walks with synthetic perception; with pictures: world, a
+    generated town, sevenscenes, a video cut among robots, street and herz_jesu, robots of one place."""
+    perception: PerceptionConfig = PerceptionConfig()
+    """Front end of the sources with pictures: a configuration file whose [perception] is taken."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Lines of the table."""
     runs: int = Field(1, ge=1, le=100)
@@ -146,15 +151,25 @@ def scenario_of(settings: FullSystemSettings, source: str, method: Method, seed:
             core=core,
             backend=BackendConfig(**backend),
         )
-    data = (
-        {"world": WorldScenario()}
-        if source == "world"
-        else {"dataset": DatasetScenario(source=settings.data / "sevenscenes", robots=3)}
+    return Scenario.model_validate(
+        {
+            **_with_pictures(settings, source),
+            **common,
+            "perception": settings.perception,
+            "core": core,
+            "backend": BackendConfig(**backend),
+        }
     )
-    apart = {"distance_m": 0.1, "rotation_rad": 0.17} if source == "sevenscenes" else {}
-    return Scenario(
-        **common, **data, keyframes=KeyframeConfig.model_validate(apart), core=core, backend=BackendConfig(**backend)
-    )
+
+
+def _with_pictures(settings: FullSystemSettings, source: str) -> dict[str, Any]:
+    """Where a source's pictures are, and its keyframes."""
+    if source == "world":
+        return {"world": WorldScenario()}
+    if source == "sevenscenes":
+        dataset = DatasetScenario(source=settings.data / source, robots=3)
+        return {"dataset": dataset, "keyframes": KeyframeConfig(distance_m=0.1, rotation_rad=0.17)}
+    return OwnData.open(settings.data / source).fields()
 
 
 def recordings_of(settings: FullSystemSettings, source: str, scenario: Scenario) -> dict[str, Path]:

@@ -17,6 +17,7 @@ from flocc_lab.bench.registration_scenes import (
     RegistrationScene,
     fountain,
     from_recordings,
+    robots_beside,
     sevenscenes,
     stereo_revisits,
 )
@@ -32,6 +33,8 @@ RESEARCH_SETS: dict[str, tuple[str, Callable[[Path], RegistrationScene]]] = {
     "sevenscenes": ("sevenscenes", sevenscenes),
     "fountain": ("strecha_fountain/fountain-P11", fountain),
     "loop_pairs": ("loop_pairs", stereo_revisits),
+    "street": ("street", lambda folder: robots_beside(folder, 3.0)),
+    "herz_jesu": ("herz_jesu", lambda folder: robots_beside(folder, 4.0)),
 }
 
 
@@ -39,7 +42,9 @@ class RegistrationSettings(Settings):
     """Which pairs are drawn, and when a registration is wrong."""
 
     data: Path | None = None
-    """Folder of the research sets, as ../shared/data; those of sevenscenes, fountain and loop_pairs that are there."""
+    """Folder of the research sets, as ../shared/data; those of `sets` that are there are taken."""
+    sets: tuple[str, ...] = ("sevenscenes", "fountain", "loop_pairs")
+    """Research sets that are taken from `data`; street and herz_jesu are known, too."""
     datasets: tuple[Path, ...] = ()
     """Data sets of one robot with ground truth, each cut by time into robots."""
     recordings: tuple[Path, ...] = ()
@@ -105,8 +110,11 @@ def _all_scenes(settings: RegistrationSettings) -> dict[str, RegistrationScene]:
     if settings.data is not None:
         if not settings.data.is_dir():
             raise ExperimentError(f"{settings.data}: is not a folder")
+        unknown = sorted(set(settings.sets) - set(RESEARCH_SETS))
+        if unknown:
+            raise ExperimentError(f"there is no research set {unknown[0]!r}; there are {', '.join(RESEARCH_SETS)}")
         for name, (part, read) in RESEARCH_SETS.items():
-            if (settings.data / part).is_dir():
+            if name in settings.sets and (settings.data / part).is_dir():
                 scenes[name] = read(settings.data / part)
     for path in settings.datasets:
         scenes[path.name] = sevenscenes(path, settings.robots)

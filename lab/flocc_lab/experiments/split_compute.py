@@ -10,10 +10,16 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Literal, Self
 
+import cv2
+import numpy as np
 from pydantic import Field, model_validator
 
+from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.core.reports import ClosureAccepted, ClosureRejected, Fact, KeyframeTaken
+from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.event_lines import Reported, of_kind
+from flocc_lab.bench.acceptance_rows import perception_of
+from flocc_lab.codebook.procedural import random_scene, random_view
 from flocc_lab.experiments.experiment import (
     Cell,
     Experiment,
@@ -40,7 +46,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NetworkSize = Literal["none", "tiny", "small", "full"]
+PICTURES_SEED = 7
+FOCAL_PX = 500.0
+NetworkSize = Literal["none", "tiny", "small", "full", "classical", "xfeat-lighterglue", "aliked-lightglue"]
+SIZE_PX = (640, 480)
+"""Of the pictures whose features are found and matched."""
 
 COUNTS, TIMES = "counts", "times"
 LATENT_LOST = "a latent was lost"
@@ -59,7 +69,8 @@ class SplitComputeSettings(Settings):
     runs: int = Field(1, ge=1, le=100)
     """Repetitions with other seeds."""
     network: NetworkSize = "full"
-    """MASt3R whose times are measured here with keyed weights; full takes 3 GB of memory. none: only given times."""
+    """What is timed here: MASt3R (tiny, small, full) with keyed weights, full takes 3 GB of memory; the classical front
+    end, or a model of the learned one with its own weights. none: only given times."""
     rounds: int = Field(5, ge=1, le=100)
     """Times that each is measured; the median counts."""
     device: str = "other device"
@@ -130,11 +141,14 @@ def counts(events: Sequence[Reported[Fact]]) -> Row:
 
 
 def measured_times(network: NetworkSize, rounds: int) -> Row:
-    """Median seconds of encode and decode with keyed weights on this machine's CPU or GPU.
+    """Median seconds to encode a picture and to decode, or match, a pair on this machine's CPU or GPU.
 
     Raises:
-        ExperimentError: torch is not installed.
+        FloccError: torch or weights are not there.
     """
+    assert network != "none", "the settings say which"
+    if network == "classical" or network == "xfeat-lighterglue" or network == "aliked-lightglue":
+        return _times_of_features(network, rounds)
     engine, size = keyed_engine(network), SIZES_PX[network]
     pictures = keyed_pictures(size)
     first, second = (engine.place(latent[0].float().cpu().numpy(), size) for latent in engine.encode(pictures))
@@ -143,6 +157,27 @@ def measured_times(network: NetworkSize, rounds: int) -> Row:
         "encode_s": median(_seconds(lambda: engine.encode(pictures[:1])) for _ in range(rounds)),
         "decode_s": median(_seconds(lambda: engine.decode([(first, second)])) for _ in range(rounds)),
     }
+
+
+def _times_of_features(front_end: str, rounds: int) -> Row:
+    """The same of a front end with local features: what encoding a picture takes, and registering two latents."""
+    skills = build_perception(perception_of(front_end))
+    first, second = procedural_images()
+    latents = skills.encode(first), skills.encode(second)
+    skills.register(*latents, None)
+    return {
+        "encode_s": median(_seconds(lambda: skills.encode(first)) for _ in range(rounds)),
+        "decode_s": median(_seconds(lambda: skills.register(*latents, None)) for _ in range(rounds)),
+    }
+
+
+def procedural_images() -> tuple[Image, Image]:
+    """Two views of a generated scene."""
+    rng = np.random.default_rng(PICTURES_SEED)
+    scene, camera = random_scene(rng), Camera(*SIZE_PX, FOCAL_PX, FOCAL_PX, SIZE_PX[0] / 2, SIZE_PX[1] / 2)
+    views = (cv2.resize(random_view(scene, rng), SIZE_PX) for _ in range(2))
+    first, second = (Image(np.repeat(view[..., None], 3, axis=2), camera) for view in views)
+    return first, second
 
 
 def _seconds(work: Callable[[], object]) -> float:

@@ -85,14 +85,29 @@ def info(folder: MapArgument, json_out: Json = False) -> None:
 
 @maps.command()
 def export(
-    folder: MapArgument, out: Annotated[Path, typer.Option(help="Folder for trajectories, pose graph and points.")]
+    folder: MapArgument,
+    out: Annotated[Path, typer.Option(help="Folder for trajectories, pose graph and points.")],
+    points: Annotated[bool, typer.Option("--points", help="Also what closures triangulate (PLY).")] = False,
+    recordings: Annotated[
+        list[Path] | None, typer.Option(help="Recordings, or a folder of them: the points' colours.")
+    ] = None,
 ) -> None:
     """Write a map as trajectories (TUM), pose graph (g2o) and camera poses (PLY)."""
     from flocc_agent.runtime.map_folder import MapFolder
-    from flocc_launch.maps.map_export import export_map
+    from flocc_launch.commands.common import progress_bar
+    from flocc_launch.maps.map_export import export_map, export_points
 
-    for path in export_map(MapFolder.open(folder), out):
+    opened = MapFolder.open(folder)
+    for path in export_map(opened, out):
         typer.echo(path)
+    if not points:
+        return
+    with progress_bar("matching", "closure") as progress:
+        cloud = export_points(opened, out, recordings or [], progress)
+    if cloud is None:
+        typer.echo("no points: the front end that made this map cannot tell what it matched")
+    else:
+        typer.echo(f"{cloud[0]}: {cloud[1]} points of {cloud[2]} closures")
 
 
 @maps.command()

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -153,14 +154,15 @@ def _convert_robots(
             faults.append(error)
     if runs:
         _pass_over(layout.bag, runs, progress)
+    said: Counter[str] = Counter()
     for run in runs:
         try:
             run.judge()
+            said.update(run.notes)
         except DatasetError as error:
             faults.append(error)
-            continue
-        for note in run.notes:
-            logger.warning("%s", note)
+    for note, count in said.items():
+        logger.warning("%s%s", note, f" (so for {count} robots)" if count > 1 else "")
     for fault in faults[1:]:
         logger.warning("%s", fault)
     if faults:

@@ -93,7 +93,8 @@ def networks(config: PerceptionConfig) -> list[Finding]:
 
 def device(config: Mast3rConfig) -> list[Finding]:
     """Where the networks will run."""
-    from flocc_agent.perception.mast3r.device import DeviceError, choose_compute
+    from flocc_agent.perception.mast3r.device import choose_compute
+    from flocc_agent.perception.torch_device import DeviceError
 
     try:
         compute = choose_compute(config.device, config.dtype)

@@ -18,12 +18,12 @@ from pydantic import ValidationError
 
 from flocc_agent.config import BackendConfig
 from flocc_agent.runtime.kept_for_maps import BACK_END_FACT, CAMERA_FACT, FRONT_END_FACT, MAP_FACT, UsedMap
-from flocc_agent.runtime.map_folder import MANIFEST, BadMap, LensModel, MapFrontEnd
+from flocc_agent.runtime.map_folder import MANIFEST, BadMap, LensModel, MapFolder, MapFrontEnd, longer_copy
 from flocc_agent.runtime.record_tables import COLUMNS, is_sound
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.records import SIGNATURE_BYTES, Record, decode_record
+from flocc_protocol.records import SIGNATURE_BYTES, KeyframeRecord, Record, decode_record
 
 Logs = Mapping[LogId, tuple[bytes, ...]]
 DECODED_MAX = 50_000
@@ -159,10 +159,10 @@ def _reading(file: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _longer(where: Path, log: LogId, one: tuple[bytes, ...], other: tuple[bytes, ...]) -> tuple[bytes, ...]:
-    both = min(len(one), len(other))
-    if one[:both] != other[:both]:
+    longer = longer_copy(one, other)
+    if longer is None:
         raise BadMap(f"{where}: two robots hold different logs {log}: two missions, or two writers of one log")
-    return max(one, other, key=len)
+    return longer
 
 
 def _optics(facts: Mapping[str, bytes]) -> dict[LogId, Optics]:
@@ -216,3 +216,13 @@ def opened_record(data: bytes) -> tuple[Record, bool]:
         return decode_record(data), False
     except DecodeError:
         return decode_record(data[:-SIGNATURE_BYTES]), True
+
+
+def stamps_s(opened: MapFolder, log: LogId) -> list[float]:
+    """Stamp of each keyframe of a log; the place of one that cannot be read is taken by the next."""
+    found: list[float] = []
+    for data in opened.records[log]:
+        record = opened_record(data)[0]
+        if isinstance(record, KeyframeRecord):
+            found += [record.stamp_s] * (record.index + 1 - len(found))
+    return found

@@ -1,5 +1,6 @@
 """`flocc map export`: a map as files that other programs read."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ from flocc_agent.core.pose_graph import LoopClosure
 from flocc_agent.geometry import inverse, pose7, pose_from_tq
 from flocc_agent.runtime.map_folder import BadMap, MapFolder
 from flocc_launch.graph_files.g2o import write_g2o
-from flocc_launch.maps.gathering import opened_record
+from flocc_launch.maps.gathering import stamps_s
+from flocc_launch.maps.map_merging import perception_of
+from flocc_launch.maps.map_points import Progress, points_of, recordings_of
 from flocc_protocol.ids import LogId
-from flocc_protocol.records import KeyframeRecord
 
 Float = NDArray[np.float64]
 
@@ -19,7 +21,7 @@ COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (181, 80, 143), (201, 138
 VERTEX = np.dtype([("p", "<f4", 3), ("n", "<f4", 3), ("c", "u1", 3)])
 PLY_HEADER = """ply
 format binary_little_endian 1.0
-comment camera positions of a flocc map, normals along the optical axes, a colour for each log
+comment {comment}
 element vertex {count}
 property float x
 property float y
@@ -32,6 +34,8 @@ property uchar green
 property uchar blue
 end_header
 """
+CAMERAS = "camera positions of a flocc map, normals along the optical axes, a colour for each log"
+POINTS = "points that two keyframes of a closure of a flocc map see, without normals"
 
 
 def export_map(opened: MapFolder, out: Path) -> list[Path]:
@@ -49,20 +53,34 @@ def export_map(opened: MapFolder, out: Path) -> list[Path]:
         poses = opened.poses()
         written = [_write_tum(out / f"{log}.tum", opened, log, T) for log, T in poses.items()]
         write_g2o(out / "map.g2o", poses, _closures(opened, poses))
-        (out / "cameras.ply").write_bytes(_ply(poses))
+        (out / "cameras.ply").write_bytes(_cameras(poses))
     except OSError as error:
         raise BadMap(f"{out}: cannot be written: {error.strerror or error}") from error
     return [*written, out / "map.g2o", out / "cameras.ply"]
 
 
-def stamps_s(opened: MapFolder, log: LogId) -> list[float]:
-    """Stamp of each keyframe of a log; the place of one that cannot be read is taken by the next."""
-    found: list[float] = []
-    for data in opened.records[log]:
-        record = opened_record(data)[0]
-        if isinstance(record, KeyframeRecord):
-            found += [record.stamp_s] * (record.index + 1 - len(found))
-    return found
+def export_points(
+    opened: MapFolder, out: Path, recordings: Sequence[Path], progress: Progress
+) -> tuple[Path, int, int] | None:
+    """Write a sparse cloud (PLY) beside them; its path, its points and the closures that gave them.
+
+    None where the front end that made the map cannot tell what it matched.
+
+    Raises:
+        FloccError: The map is damaged or does not say what made it, or the file cannot be written.
+    """
+    poses = opened.poses()
+    colour_of = {log: COLOURS[number % len(COLOURS)] for number, log in enumerate(poses)}
+    points = points_of(opened, perception_of(opened), recordings_of(opened, recordings), colour_of, progress)
+    if points is None:
+        return None
+    vertices = np.zeros(len(points.at_m), dtype=VERTEX)
+    vertices["p"], vertices["c"] = points.at_m, points.colours
+    try:
+        (out / "points.ply").write_bytes(_ply(vertices, POINTS))
+    except OSError as error:
+        raise BadMap(f"{out}: cannot be written: {error.strerror or error}") from error
+    return out / "points.ply", len(vertices), points.closures
 
 
 def _write_tum(path: Path, opened: MapFolder, log: LogId, T_map_camera: Float) -> Path:
@@ -84,11 +102,15 @@ def _closures(opened: MapFolder, poses: dict[LogId, Float]) -> list[LoopClosure]
     ]
 
 
-def _ply(poses: dict[LogId, Float]) -> bytes:
+def _cameras(poses: dict[LogId, Float]) -> bytes:
     vertices = np.zeros(sum(map(len, poses.values())), dtype=VERTEX)
     first = 0
     for number, T in enumerate(poses.values()):
         rows = vertices[first : first + len(T)]
         rows["p"], rows["n"], rows["c"] = T[:, :3, 3], T[:, :3, 2], COLOURS[number % len(COLOURS)]
         first += len(T)
-    return PLY_HEADER.format(count=len(vertices)).encode() + vertices.tobytes()
+    return _ply(vertices, CAMERAS)
+
+
+def _ply(vertices: NDArray[np.void], comment: str) -> bytes:
+    return PLY_HEADER.format(count=len(vertices), comment=comment).encode() + vertices.tobytes()

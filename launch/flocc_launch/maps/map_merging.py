@@ -84,7 +84,7 @@ def merge_maps(
     pairs = like_pairs(a, b, limits.place_recognition.best_matches)
     threshold = limits.place_recognition.similarity_threshold
     candidates = [pair for pair in pairs if pair.similarity >= threshold][:REGISTRATIONS_MAX]
-    perception = _perception(a)
+    perception = perception_of(a)
     closures, registered = _closures(a, b, candidates, perception, limits, progress)
     joining = LogId(MERGER, clock_ms())
     records = tuple(encode_record(closure) for closure in closures)
@@ -136,7 +136,12 @@ def _check_pair(a: MapFolder, b: MapFolder) -> None:
         )
 
 
-def _perception(a: MapFolder) -> Perception:
+def perception_of(a: MapFolder) -> Perception:
+    """The front end that made a map, built again.
+
+    Raises:
+        BadMap: The map does not say which, or it is another one here.
+    """
     front_end = a.manifest.front_end
     if front_end.method is None:
         raise BadMap(f"{a.path}: does not say which front end made it, so its latents cannot be registered")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.config import BackendConfig, validated
-from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapFrontEnd, MapManifest
+from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapFrontEnd, MapManifest, longer_copy
 from flocc_launch.maps.gathering import Gathered, Logs, Optics, gathered
 from flocc_launch.maps.map_page import map_page
 from flocc_launch.maps.solving import NotSolved, SolvedMap, solved_map
@@ -126,11 +126,10 @@ def _with(earlier: MapFolder, logs: Logs) -> dict[LogId, tuple[bytes, ...]]:
     """The logs of a map and of a mission in it."""
     joined = dict(earlier.records)
     for log, records in logs.items():
-        known = joined.get(log, ())
-        both = min(len(known), len(records))
-        if known[:both] != records[:both]:
+        copy = longer_copy(joined.get(log, ()), records)
+        if copy is None:
             raise BadMap(f"{earlier.path}: holds another log {log} than the mission in it")
-        joined[log] = max(known, records, key=len)
+        joined[log] = copy
     return joined
 
 

@@ -132,9 +132,11 @@ def _solved_anew(
     graph: PoseGraph, saved: SavedMap, config: BackendConfig | None, wanted: list[KeyframeId], in_map: Solved
 ) -> Solved:
     """The solution of all measurements at once, in the map's frame; that in the map where this one joins less."""
+    from flocc_agent.backend.mapped import weighed
     from flocc_agent.backend.optimiser import optimise
 
-    solution = optimise(replace(graph, saved=None), config or BackendConfig(), None, wanted)
+    closures = tuple(weighed(closure, saved) for closure in graph.closures)
+    solution = optimise(replace(graph, closures=closures, saved=None), config or BackendConfig(), None, wanted)
     if isinstance(solution, OptimisationFailed):
         return in_map
     joined = {*saved.logs, *in_map[1].logs}

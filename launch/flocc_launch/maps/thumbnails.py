@@ -38,15 +38,20 @@ def thumbnails(recordings: Mapping[LogId, Path], logs: Logs) -> list[Thumbnail]:
 
 def _of_log(log: LogId, recording: Recording, records: tuple[bytes, ...], count_max: int) -> list[Thumbnail]:
     taken = [r for data in records if isinstance(r := opened_record(data)[0], KeyframeRecord)]
-    stamps_s = np.array([frame.stamp_s for frame in recording.frames])
     found = []
     for k in np.unique(np.linspace(0, len(taken) - 1, min(count_max, len(taken))).astype(int)):
-        apart_s = np.minimum(np.abs(stamps_s - taken[k].stamp_s), np.abs(stamps_s - stamps_s[0] - taken[k].stamp_s))
-        nearest = int(np.argmin(apart_s))
-        if apart_s[nearest] <= STAMP_TOLERANCE_S:
-            jpeg = _small(recording, nearest)
-            found += [Thumbnail(KeyframeId(log, taken[k].index), jpeg)]
+        frame = frame_at(recording, taken[k].stamp_s)
+        if frame is not None:
+            found += [Thumbnail(KeyframeId(log, taken[k].index), _small(recording, frame))]
     return found
+
+
+def frame_at(recording: Recording, stamp_s: float) -> int | None:
+    """Number of the picture that was taken at a stamp, of the recording or since its beginning; None without one."""
+    stamps_s = np.array([frame.stamp_s for frame in recording.frames])
+    apart_s = np.minimum(np.abs(stamps_s - stamp_s), np.abs(stamps_s - stamps_s[0] - stamp_s))
+    nearest = int(np.argmin(apart_s))
+    return nearest if apart_s[nearest] <= STAMP_TOLERANCE_S else None
 
 
 def _small(recording: Recording, frame: int) -> bytes:

@@ -219,6 +219,9 @@ def test_a_full_disk_keeps_pieces_in_memory() -> None:
         def get(self, place: int, size_bytes: int) -> bytes:
             raise AssertionError((place, size_bytes))
 
+        def free(self, place: int, size_bytes: int) -> None:
+            raise AssertionError((place, size_bytes))
+
     copy = LogCopy(ColdPieces(Full(), 1))
     data = [encode_record(KeyframeRecord(k, float(k), (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None)) for k in range(300)]
     for each in data:

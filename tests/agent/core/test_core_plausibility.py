@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.core.closure_ends import Tie
+from flocc_agent.core.closure_rows import Tie
 from flocc_agent.core.correction_evidence import Placed
 from flocc_agent.core.knots import Track, knots_of
 from flocc_agent.core.plausibility import BENT, TORN, UNTIED, contradiction

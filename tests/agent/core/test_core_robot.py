@@ -24,6 +24,17 @@ def heartbeat(boot: int, sequence: int = 1) -> Heartbeat:
     return Heartbeat(sequence, boot, 0, None, 0, 0)
 
 
+def two_of_whom_r1_walked() -> Robots:
+    """r1 has three keyframes, of which r2 has heard."""
+    robots = Robots()
+    robots.add("r1")
+    robots.add("r2")
+    for k in range(3):
+        robots.capture("r1", float(k), look=k)
+    robots.run(3.0)
+    return robots
+
+
 def disk_of(robots: Robots, name: str) -> Restored:
     """What a robot has persisted."""
     written = [effect for effect in robots.effects(name, PersistRecord) if isinstance(effect, PersistRecord)]
@@ -87,12 +98,7 @@ def test_a_silent_robot_is_out_of_range_after_the_timeout() -> None:
 
 
 def test_a_restarted_robot_continues_its_numbering() -> None:
-    robots = Robots()
-    robots.add("r1")
-    robots.add("r2")
-    for k in range(3):
-        robots.capture("r1", float(k), look=k)
-    robots.run(3.0)
+    robots = two_of_whom_r1_walked()
     disk = disk_of(robots, "r1")
     robots.kill("r1")
     robots.add("r1", restored=disk)
@@ -146,12 +152,7 @@ def test_a_restarted_robot_looks_for_no_other_partner_of_a_keyframe_that_had_one
 
 
 def test_a_robot_that_lost_its_disk_is_a_new_incarnation_and_its_old_log_stays() -> None:
-    robots = Robots()
-    robots.add("r1")
-    robots.add("r2")
-    for k in range(3):
-        robots.capture("r1", float(k), look=k)
-    robots.run(3.0)
+    robots = two_of_whom_r1_walked()
     robots.kill("r1")
     robots.add("r1", incarnation=1)
     robots.capture("r1", 0.0, look=9)
@@ -199,12 +200,7 @@ def test_two_robots_with_one_name_are_told_from_a_restart() -> None:
 
 
 def test_two_robots_with_one_name_corrupt_neither_log() -> None:
-    robots = Robots()
-    robots.add("r1")
-    robots.add("r2")
-    for k in range(3):
-        robots.capture("r1", float(k), look=k)
-    robots.run(3.0)
+    robots = two_of_whom_r1_walked()
     kept = list(robots.cores["r2"].gossip.logs[R1].encoded)
     twin = Robots(now_s=robots.now_s)
     twin.add("r1")

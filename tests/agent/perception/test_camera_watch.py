@@ -381,6 +381,22 @@ def test_what_stays_at_its_pixel_is_no_match_of_two_places() -> None:
     assert len(kept) > 0.8 * (count - 10)
 
 
+@pytest.mark.parametrize(("staying", "left"), [(29, 20), (40, 0)])
+def test_what_changes_on_an_overlay_that_two_robots_share_goes_with_what_stays(staying: int, left: int) -> None:
+    """A clock: most digits are the same in both pictures, and those that are not look like others beside them."""
+    rng = np.random.default_rng(10)
+    points = np.concatenate([rng.uniform([-0.1, 0.3], [0.1, 0.4], (staying + 20, 2)), [[-0.5, -0.4]]])
+    elsewhere = points.copy()
+    elsewhere[staying:-1] = rng.uniform([-0.1, 0.3], [0.1, 0.4], (20, 2))
+    elsewhere[-1] += 0.1
+    descriptors = np.zeros((len(points), 128), np.uint8)
+    first, second = (Features(p.astype(np.float32), descriptors, FOCAL_PX) for p in (points, elsewhere))
+    every = np.arange(len(points))
+    kept = without_overlay(first, second, (every, every))[0]
+    assert kept[-1] == len(points) - 1
+    assert len(kept) - 1 == pytest.approx(left, abs=1)
+
+
 def test_a_robot_that_does_not_turn_keeps_matches_that_stay() -> None:
     points = np.random.default_rng(7).uniform(-0.5, 0.5, (20, 2))
     straight, turned = pose(np.eye(3), np.array([0, 0, 1.0])), pose(so3_exp(np.array([0, 0.1, 0])), np.zeros(3))

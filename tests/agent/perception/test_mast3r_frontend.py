@@ -18,7 +18,6 @@ from flocc_agent.perception.mast3r import build  # noqa: E402
 from flocc_agent.perception.mast3r import device as device_module  # noqa: E402
 from flocc_agent.perception.mast3r.device import (  # noqa: E402
     Compute,
-    DeviceError,
     NotEnoughMemory,
     choose_compute,
     choose_dtype,
@@ -30,6 +29,7 @@ from flocc_agent.perception.mast3r.pair import mean_confidence  # noqa: E402
 from flocc_agent.perception.mast3r.preprocess import BadImage  # noqa: E402
 from flocc_agent.perception.mast3r.sizes import TINY  # noqa: E402
 from flocc_agent.perception.mast3r.two_view_network import DenseView, Mast3r  # noqa: E402
+from flocc_agent.perception.torch_device import DeviceError  # noqa: E402
 from flocc_launch.setup.weight_files import synthesize  # noqa: E402
 
 CPU = Compute(torch.device("cpu"), torch.float32, torch.float32)

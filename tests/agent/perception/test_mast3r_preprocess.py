@@ -1,15 +1,12 @@
 """Preparation of pictures: bit for bit as the reference, with the calibration carried along."""
 
 import hashlib
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="torch, an optional extra, is not installed")
 
-from PIL import Image as Pillow
 from tests.agent.perception.mast3r_examples import golden
 
 from flocc_agent.core.interfaces import Camera, Image
@@ -18,7 +15,6 @@ from flocc_agent.perception.mast3r.preprocess import (
     mast3r_input,
     plan_crop,
     resized,
-    rgb_pixels,
     without_distortion,
 )
 
@@ -77,35 +73,6 @@ def test_distortion_is_removed_and_the_calibration_kept() -> None:
     assert straight.camera == Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
     columns = straight.pixels[:, :60, 0].argmax(axis=1)
     assert columns[5] != columns[60]
-
-
-def exotic_pictures() -> dict[str, Any]:
-    grey = np.tile(np.arange(64, dtype=np.uint8), (48, 1))
-    return {
-        "grey": Pillow.fromarray(grey),
-        "16 bit": Pillow.fromarray(grey.astype(np.uint16) * 257),
-        "alpha": Pillow.merge("RGBA", [Pillow.fromarray(grey)] * 3 + [Pillow.new("L", (64, 48), 7)]),
-        "palette": Pillow.fromarray(grey).convert("P"),
-        "one bit": Pillow.fromarray(grey).convert("1"),
-        "float": Pillow.fromarray(grey.astype(np.float32)),
-    }
-
-
-@pytest.mark.parametrize("name", list(exotic_pictures()))
-def test_pictures_of_every_kind_become_rgb(name: str) -> None:
-    pixels = rgb_pixels(exotic_pictures()[name])
-    assert pixels.shape == (48, 64, 3)
-    assert pixels.dtype == np.uint8
-    if name in ("grey", "16 bit", "alpha", "float"):
-        assert np.array_equal(pixels[0, :, 0], np.arange(64))
-
-
-def test_exif_rotation_is_applied(tmp_path: Path) -> None:
-    exif = Pillow.Exif()
-    exif[0x0112] = 6
-    Pillow.fromarray(np.zeros((20, 30, 3), np.uint8)).save(tmp_path / "turned.jpg", exif=exif)
-    with Pillow.open(tmp_path / "turned.jpg") as turned:
-        assert rgb_pixels(turned).shape == (30, 20, 3)
 
 
 @pytest.mark.parametrize("size", [(1, 500), (4000, 40), (20_000, 20_000)])

@@ -44,3 +44,19 @@ def test_what_is_not_there_is_said(tmp_path: Path) -> None:
     pages.put(b"12345")
     with pytest.raises(StoreError, match="ends early"):
         pages.get(3, 5)
+
+
+def test_no_more_of_the_disk_is_used_than_may_be(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pages = PageFile(tmp_path, bytes_max=10)
+    first, second = pages.put(b"12345"), pages.put(b"67890")
+    assert first is not None
+    assert second is not None
+    assert pages.put(b"x") is None
+    assert pages.put(b"y") is None
+    assert [record.getMessage() for record in caplog.records] == [
+        f"old records stay in memory: they fill 10 bytes of {tmp_path}"
+    ]
+    pages.free(first, 5)
+    assert pages.put(b"abcde") == first
+    assert (pages.get(first, 5), pages.get(second, 5)) == (b"abcde", b"67890")
+    pages.close()

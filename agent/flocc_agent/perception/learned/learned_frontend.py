@@ -6,7 +6,6 @@ pairs of views (docs/learned.md has the figures); it would cost no less on the w
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from flocc_agent.config import ClassicalConfig, LearnedConfig
@@ -22,9 +21,10 @@ from flocc_agent.perception.learned.keypoints import (
     write_features,
 )
 from flocc_agent.perception.learned.networks import VARIANTS, Networks
-from flocc_agent.perception.learned.weight_sources import BadWeights, weights_folder
+from flocc_agent.perception.learned.weight_sources import weights_folder
 from flocc_agent.perception.multiview.picture import at_pixels, reduced_to
 from flocc_agent.perception.multiview.registrar import PairRegistrar
+from flocc_agent.perception.torch_device import choose_device
 
 PIXELS_MAX = 307_200
 """Larger images are shrunk to 640x480: what the networks were made for, and what bounds their time and memory."""
@@ -81,7 +81,7 @@ def build(config: LearnedConfig) -> tuple[Describer, Encoder, Registrar]:
         BadWeights: A file is missing or is not the expected one, or the device is not there.
     """
     variant = VARIANTS[config.model]
-    networks = Networks(variant, config.weights or weights_folder(), device_of(config.device))
+    networks = Networks(variant, config.weights or weights_folder(), choose_device(config.device))
 
     def read(latent: bytes) -> LearnedFeatures:
         return read_features(latent, variant.identity, variant.descriptor_length)
@@ -89,17 +89,3 @@ def build(config: LearnedConfig) -> tuple[Describer, Encoder, Registrar]:
     rule = ACCEPTANCE[variant.name] if config.acceptance == "fitted" else None
     registrar = PairRegistrar(read, networks.match, GEOMETRY, rule)
     return ClassicalDescriber(ClassicalConfig()), LearnedEncoder(networks), registrar
-
-
-def device_of(name: str) -> torch.device:
-    """The device asked for, or the best there is.
-
-    Raises:
-        BadWeights: The device asked for is not there.
-    """
-    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if name == "auto":
-        return torch.device(next(kind for kind, there in available.items() if there))
-    if not available[name]:
-        raise BadWeights(f"perception.learned.device: torch has no '{name}' on this machine")
-    return torch.device(name)

@@ -7,19 +7,15 @@ from typing import Literal
 
 import torch
 
+from flocc_agent.perception.torch_device import DeviceName, choose_device
 from flocc_protocol.errors import FloccError
 
-DeviceName = Literal["auto", "cuda", "mps", "cpu"]
 DtypeName = Literal["auto", "fp32", "bf16", "fp16"]
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 AMPERE = (8, 0)
 VOLTA = (7, 0)
 MEMINFO = Path("/proc/meminfo")
-
-
-class DeviceError(FloccError):
-    """A device or number format that this machine does not have."""
 
 
 class NotEnoughMemory(FloccError):
@@ -50,20 +46,6 @@ def cpu_has_fast_bf16() -> bool:
     except OSError:
         return False
     return any(flag in flags for flag in (" amx_bf16", " avx512_bf16"))
-
-
-def choose_device(name: DeviceName) -> torch.device:
-    """The device asked for, or the best there is.
-
-    Raises:
-        DeviceError: The device asked for is not there.
-    """
-    available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    if name == "auto":
-        return torch.device(next(kind for kind, there in available.items() if there))
-    if not available[name]:
-        raise DeviceError(f"the device '{name}' is not available to torch on this machine")
-    return torch.device(name)
 
 
 def choose_dtype(name: DtypeName, device: torch.device) -> torch.dtype:

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
-from PIL import ImageOps
 
 from flocc_agent.core.interfaces import Camera, Image
 from flocc_agent.perception.mast3r.sizes import PATCH_PX
@@ -149,14 +148,3 @@ def without_distortion(image: Image) -> Image:
     pixels = cv2.undistort(image.pixels, camera.K(), np.array(camera.distortion))
     pinhole = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     return Image(np.asarray(pixels, np.uint8), pinhole)
-
-
-def rgb_pixels(picture: Pillow.Image) -> Pixels:
-    """(H, W, 3) uint8 of any Pillow picture: EXIF rotation applied, alpha dropped, 16 bit scaled, grey tripled."""
-    picture = ImageOps.exif_transpose(picture)
-    if picture.mode.startswith(("I", "F")):
-        values = np.asarray(picture, np.float64)
-        top = 65535.0 if picture.mode.startswith("I") and values.max(initial=0) > 255 else 255.0
-        grey = np.clip(np.nan_to_num(values) * (255.0 / top), 0, 255).round().astype(np.uint8)
-        return np.repeat(grey[:, :, None], 3, axis=2)
-    return np.asarray(picture.convert("RGB"))

@@ -53,6 +53,10 @@ Result = Registration | RegistrationFailed
 AMONG_PX = 40.0
 AMONG_MIN = 3
 """A feature with so many that move with the camera within that many pixels moves with it, too."""
+SHARED_STAY_MIN = 30
+"""So many matches that stay at their pixel are one overlay on both cameras; 256 pairs of five places had 10 at most."""
+SHARED_AMONG_PX = 60.0
+"""What changes on such an overlay is looked for farther around: neither robot's own pictures have shown it yet."""
 NOTHING = np.zeros(0, np.intp)
 
 
@@ -221,20 +225,27 @@ class PairRegistrar(Generic[F]):
         return OwnPair(two_view(query, neighbour, scene, self._geometry, prior), hidden)
 
 
-def features_among(features: LocalFeatures, those: Indices) -> Indices:
+def features_among(features: LocalFeatures, those: Indices, radius_px: float = AMONG_PX) -> Indices:
     """All features that have several of those close by: what changes on an overlay lies among what does not."""
     if len(those) < AMONG_MIN:
         return those
     points = features.points * np.float32(features.focal_px)
     squares = (points**2).sum(axis=1)
     distances = squares[:, None] - 2.0 * points @ points[those].T + squares[those]
-    return np.union1d(those, np.flatnonzero((distances < AMONG_PX**2).sum(axis=1) >= AMONG_MIN))
+    return np.union1d(those, np.flatnonzero((distances < radius_px**2).sum(axis=1) >= AMONG_MIN))
 
 
 def without_overlay(first: LocalFeatures, second: LocalFeatures, matched: Matched) -> Matched:
-    """Matches that do not stay at their pixel: what does, in pictures from two places, is on both cameras' lenses."""
+    """Matches that do not stay at their pixel: what does, in pictures from two places, is on both cameras' lenses.
+
+    Where many do, both show one thing, such as a burnt-in clock, and what lies among them goes as well.
+    """
     moved = first.points[matched[0]] - second.points[matched[1]]
     moves = np.linalg.norm(moved, axis=1) * first.focal_px > STAYS_MAX_PX
+    stay = matched[0][~moves], matched[1][~moves]
+    if len(stay[0]) >= SHARED_STAY_MIN:
+        for features, of_pair, staying in zip((first, second), matched, stay, strict=True):
+            moves &= ~np.isin(of_pair, features_among(features, staying, SHARED_AMONG_PX))
     return matched[0][moves], matched[1][moves]
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from flocc_agent.core import measured_records
 from flocc_agent.core.assembly import GraphAssembly
-from flocc_agent.core.closure_ends import Tie
+from flocc_agent.core.closure_rows import Tie
 from flocc_agent.core.factors import Tracks, factor_of
 from flocc_agent.core.gossip import NewRecord
 from flocc_protocol.arrays import Array
@@ -25,15 +25,11 @@ def closure(one: KeyframeId, other: KeyframeId, length_unscaled: float, scale: f
     return ClosureRecord(one, other, T, 60, 100, 0.6, scale)
 
 
-def unread(log: LogId, number: int) -> Record:
-    raise AssertionError(f"record {number} of {log} was read")
-
-
 class Known:
     """An assembly, and how long each log is."""
 
     def __init__(self) -> None:
-        self.assembly = GraphAssembly(record_at=unread)
+        self.assembly = GraphAssembly()
         self._counts: dict[LogId, int] = {}
         for log in (R1, R2, R3):
             for k in range(KEYFRAMES):
@@ -45,7 +41,7 @@ class Known:
         self.assembly.add(NewRecord(log, number, record))
 
 
-def test_ties_are_a_logs_newest_closures_and_no_record_is_read() -> None:
+def test_ties_are_a_logs_newest_closures() -> None:
     known = Known()
     for record in (
         closure(at(R1, 0), at(R2, 1), 1.0),

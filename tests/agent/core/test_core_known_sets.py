@@ -2,7 +2,7 @@
 
 import tracemalloc
 
-from flocc_agent.core.pair_set import PairSet
+from flocc_agent.core.known_sets import KeyframeSet, PairSet
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
@@ -32,4 +32,16 @@ def test_a_pair_takes_few_bytes() -> None:
         some.add(pair(1000 + k, 2000 + k // 2))
     held = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert held <= 160 * 20_000
+    assert held <= 10 * 20_000
+
+
+def test_a_set_of_keyframes_holds_what_was_added() -> None:
+    some = KeyframeSet()
+    for index in (7, 0, INDEX_MAX, 7):
+        some.add(KeyframeId(A, index))
+    assert [k for k in (0, 1, 7, INDEX_MAX) if KeyframeId(A, k) in some] == [0, 7, INDEX_MAX]
+    some.discard(KeyframeId(A, 7))
+    some.discard(KeyframeId(B, 7))
+    assert KeyframeId(A, 7) not in some
+    assert KeyframeId(B, 0) not in some
+    assert "a/0" not in some

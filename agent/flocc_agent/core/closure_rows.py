@@ -1,0 +1,212 @@
+"""All closures that a robot knows: one of each pair, those of a log, and the graph's.
+
+Every robot takes in every closure, and it is looked at now and then: what a closure says is a row of bytes, of which
+old ones leave memory; 12 bytes of its pair and 4 for each of its logs remain.
+"""
+
+import math
+from array import array
+from collections.abc import Callable, Iterable, Sequence, Set
+from struct import Struct
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flocc_agent.core.cold_storage import ColdPieces, RowPieces
+from flocc_agent.core.known_sets import pair_number, place_of
+from flocc_agent.core.pose_graph import LoopClosure
+from flocc_agent.geometry import poses_from_tq, symmetric
+from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
+from flocc_protocol.messages import CandidatePair
+from flocc_protocol.records import UPPER_TRIANGLE, ClosureRecord
+
+Rows = NDArray[np.void]
+
+ROWS_OF_A_PIECE = 64
+"""Closures that leave memory together: some 17 kB."""
+ROW = np.dtype(
+    [
+        ("query_log", "<u4"),
+        ("query", "<u4"),
+        ("match_log", "<u4"),
+        ("match", "<u4"),
+        ("log", "<u4"),
+        ("number", "<u4"),
+        ("has_scale", "<u4"),
+        ("has_covariance", "<u4"),
+        ("T", "<f8", 7),
+        ("match_ratio", "<f8"),
+        ("scale", "<f8"),
+        ("covariance", "<f8", UPPER_TRIANGLE),
+    ]
+)
+"""Both keyframes, by the numbers of their logs here; log and number of the record; what it says."""
+PACKED = Struct(f"<8I7ddd{UPPER_TRIANGLE}d")
+WHERE = Struct("<8I3d")
+"""Of a row: what comes before the rotation."""
+SCALE_AT = ROW.fields["scale"][1] if ROW.fields is not None else 0
+NO_COVARIANCE = (0.0,) * UPPER_TRIANGLE
+
+
+class Tie(NamedTuple):
+    """One closure of a log: its keyframe there, the other end, and how long its translation is, metres or 0."""
+
+    near: int
+    far: KeyframeId
+    length_m: float
+
+
+def length_m(closure: ClosureRecord) -> float:
+    """How far apart its cameras are; 0 without a scale."""
+    x, y, z = closure.T_query_match_unscaled[:3]
+    return (closure.scale_initial or 0.0) * math.hypot(x, y, z)
+
+
+def tie_of(log: LogId, query: KeyframeId, match: KeyframeId, length_m: float) -> Tie:
+    """A closure as one of its logs sees it."""
+    return Tie(query.index, match, length_m) if query.log == log else Tie(match.index, query, length_m)
+
+
+class ClosureTable:
+    """Closures by their pairs and by their logs."""
+
+    def __init__(self, cold: ColdPieces | None = None) -> None:
+        """Start with none; with a cold storage, old rows leave memory."""
+        self._logs: list[LogId] = []
+        self._numbers: dict[LogId, int] = {}
+        self._rows = RowPieces(ROW.itemsize, ROWS_OF_A_PIECE, cold)
+        self._of_pair: dict[tuple[LogId, LogId], tuple[array[int], array[int]]] = {}
+        """Numbers of the pairs of two logs, and their rows."""
+        self._of_log: dict[LogId, array[int]] = {}
+        """Rows of a log, in the order in which they became known."""
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, log: LogId, number: int, closure: ClosureRecord) -> bool:
+        """Take in the closure of a log's record; False where another registration of its pair counts.
+
+        Of several registrations of one pair the one in the lowest log counts, on every robot.
+        """
+        pair = CandidatePair.of(closure.query, closure.match)
+        key = (pair.low.log, pair.high.log)
+        of_pair = self._of_pair.get(key)
+        if of_pair is None:
+            of_pair = self._of_pair[key] = array("Q"), array("I")
+        numbers, rows = of_pair
+        packed = pair_number(pair)
+        at, is_there = place_of(numbers, packed)
+        if is_there:
+            held = rows[at]
+            if (log, number) >= self._registered(held):
+                return False
+            for each in set(key):
+                self._of_log[each].remove(held)
+            rows[at] = len(self._rows)
+        else:
+            numbers.insert(at, packed)
+            rows.insert(at, len(self._rows))
+            self._count += 1
+        for each in set(key):
+            of_log = self._of_log.get(each)
+            if of_log is None:
+                of_log = self._of_log[each] = array("I")
+            of_log.append(len(self._rows))
+        self._rows.append(self._packed(log, number, closure))
+        return True
+
+    def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
+        """The newest ones of a log, the newest first."""
+        rows = self._of_log.get(log)
+        return [] if rows is None else [self._tie(log, row) for row in rows[-ties_max:][::-1]]
+
+    def links(self) -> list[tuple[LogId, LogId]]:
+        """Pairs of logs with closures between them, or within one."""
+        return sorted(self._of_pair)
+
+    def logs(self) -> set[LogId]:
+        """Logs that closures are of, or stand in."""
+        return set(self._logs)
+
+    def closures(self, counts: Callable[[LogId], int], unread: Set[KeyframeId]) -> list[LoopClosure]:
+        """Those of which both keyframes are known, in the order of their pairs.
+
+        Args:
+            counts: From which number on no keyframe of a log is known.
+            unread: Keyframes before that of which nothing is known.
+        """
+        chosen = self._in_order(counts)
+        if not len(chosen):
+            return []
+        rows = np.frombuffer(self._rows.all(), dtype=ROW)[chosen]
+        built = list(self._built(rows))
+        return [c for c in built if c.query not in unread and c.match not in unread] if unread else built
+
+    def _in_order(self, counts: Callable[[LogId], int]) -> NDArray[np.intp]:
+        """Rows of pairs whose keyframes are below the counts of their logs, in the order of the pairs."""
+        columns: list[tuple[NDArray[np.int64], ...]] = []
+        rank = {log: k for k, log in enumerate(sorted(self._logs))}
+        for (low, high), (numbers, rows) in self._of_pair.items():
+            packed = np.array(numbers, dtype=np.int64)
+            lows, highs = packed // (INDEX_MAX + 1), packed % (INDEX_MAX + 1)
+            near = (lows < counts(low)) & (highs < counts(high))
+            shape = int(np.count_nonzero(near))
+            logs = (np.full(shape, rank[low]), np.full(shape, rank[high]))
+            columns.append((logs[0], lows[near], logs[1], highs[near], np.array(rows, dtype=np.int64)[near]))
+        if not columns:
+            return np.empty(0, dtype=np.intp)
+        low_logs, lows, high_logs, highs, rows_of_all = map(np.concatenate, zip(*columns, strict=True))
+        return np.asarray(rows_of_all[np.lexsort((highs, high_logs, lows, low_logs))], dtype=np.intp)
+
+    def _built(self, rows: Rows) -> Iterable[LoopClosure]:
+        poses, covariances = poses_from_tq(rows["T"]), symmetric(rows["covariance"])
+        columns = (rows[name].tolist() for name in ("query_log", "query", "match_log", "match", "match_ratio"))
+        scales, has_scale, has = (rows[name].tolist() for name in ("scale", "has_scale", "has_covariance"))
+        for k, (query_log, query, match_log, match, ratio) in enumerate(zip(*columns, strict=True)):
+            yield LoopClosure(
+                query=KeyframeId(self._logs[query_log], query),
+                match=KeyframeId(self._logs[match_log], match),
+                T_query_match_unscaled=poses[k],
+                match_ratio=ratio,
+                scale_initial=scales[k] if has_scale[k] else None,
+                covariance=covariances[k] if has[k] else None,
+            )
+
+    def _packed(self, log: LogId, number: int, closure: ClosureRecord) -> bytes:
+        (query_log, query), (match_log, match) = closure.query, closure.match
+        triangle, scale = closure.covariance, closure.scale_initial
+        return PACKED.pack(
+            self._number(query_log),
+            query,
+            self._number(match_log),
+            match,
+            self._number(log),
+            number,
+            scale is not None,
+            triangle is not None,
+            *closure.T_query_match_unscaled,
+            closure.match_ratio,
+            scale or 0.0,
+            *(NO_COVARIANCE if triangle is None else triangle.numpy().tolist()),
+        )
+
+    def _registered(self, row: int) -> tuple[LogId, int]:
+        """Log and number of the record of a row."""
+        log, number = WHERE.unpack_from(self._rows.row(row))[4:6]
+        return self._logs[log], number
+
+    def _tie(self, log: LogId, row: int) -> Tie:
+        data = self._rows.row(row)
+        query_log, query, match_log, match, _, _, _, _, *t = WHERE.unpack_from(data)
+        (scale,) = Struct("<d").unpack_from(data, SCALE_AT)
+        ends = KeyframeId(self._logs[query_log], query), KeyframeId(self._logs[match_log], match)
+        return tie_of(log, *ends, scale * math.hypot(*t))
+
+    def _number(self, log: LogId) -> int:
+        number = self._numbers.get(log)
+        if number is None:
+            number = self._numbers[log] = len(self._logs)
+            self._logs.append(log)
+        return number
