@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend import build_iterator, build_optimiser
+from flocc_agent.backend import build_optimiser, build_stepper
 from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Camera, Image, ImageWatch, Perception
@@ -473,7 +473,7 @@ class Agent:
             perception,
             self._camera_watch(),
             build_optimiser(config.backend),
-            build_iterator(config.backend),
+            build_stepper(config.backend),
             self._workers,
             self._store,
             transport,

@@ -32,18 +32,19 @@ import numpy as np
 
 from flocc_agent.core.effects import (
     Broadcast,
+    ChooseClosures,
     Deliver,
     DropLog,
     Effect,
     Encode,
     FetchLatent,
-    IterateBlock,
     Optimise,
     PersistCorrection,
     PersistRecord,
     PersistTerm,
     Register,
     Report,
+    StepConsensus,
     Unicast,
 )
 from flocc_agent.core.events import Event, MessageReceived
@@ -222,7 +223,9 @@ def _told(effect: Effect) -> str | None:
             return f"optimises in {term} round {number}"
         case Report(fact):
             return _reported(fact)
-        case Unicast() | IterateBlock() | PersistRecord() | PersistTerm() | PersistCorrection() | DropLog():
+        case Unicast() | ChooseClosures() | StepConsensus() | PersistRecord() | PersistTerm():
+            return None
+        case PersistCorrection() | DropLog():
             return None
         case _:
             assert_never(effect)

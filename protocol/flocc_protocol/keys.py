@@ -43,7 +43,7 @@ class Kind(StrEnum):
     RECORDS = "records"
     RECORD_REQUEST = "want-records"
     CANDIDATES = "candidates"
-    SEPARATORS = "separators"
+    SHARED_POSES = "shared-poses"
 
 
 class Admin(StrEnum):

@@ -10,7 +10,15 @@ from typing import Any
 
 import msgspec
 
-from flocc_protocol import candidate_pairs, digests, elections, heartbeats, log_corrections, record_batches, separators
+from flocc_protocol import (
+    candidate_pairs,
+    digests,
+    elections,
+    heartbeats,
+    log_corrections,
+    record_batches,
+    shared_poses,
+)
 from flocc_protocol.candidate_pairs import OFFERS_MAX, CandidateOffer, CandidatePair
 from flocc_protocol.codec import LOG_ID, LOGS_MAX, MESSAGE_BYTES_MAX, Codec, Reader, listed, packed
 from flocc_protocol.digests import DigestRequest, Digests, LogDigest, TableState
@@ -49,7 +57,7 @@ from flocc_protocol.record_batches import (
     RecordRequest,
     Records,
 )
-from flocc_protocol.separators import RANK_MAX, RANK_MIN, SEPARATORS_MAX, Separators
+from flocc_protocol.shared_poses import SHARED_MAX, SharedPoses
 
 __all__ = [
     "Answer",
@@ -85,15 +93,13 @@ __all__ = [
     "Message",
     "OFFERS_MAX",
     "PROTOCOL_VERSION",
-    "RANK_MAX",
-    "RANK_MIN",
     "RECORDS_BATCH_BYTES_MAX",
     "RECORDS_BATCH_MAX",
     "RecordBatch",
     "RecordRequest",
     "Records",
-    "SEPARATORS_MAX",
-    "Separators",
+    "SHARED_MAX",
+    "SharedPoses",
     "TableState",
     "UnknownVersion",
     "WANTS_MAX",
@@ -104,7 +110,7 @@ __all__ = [
     "version_of",
 ]
 
-PROTOCOL_VERSION = 4
+PROTOCOL_VERSION = 5
 VERSION_MAX = 127
 
 
@@ -126,7 +132,7 @@ Message = (
     | CorrectionRequest
     | KnotRequest
     | CandidateOffer
-    | Separators
+    | SharedPoses
 )
 
 
@@ -145,7 +151,7 @@ _CODECS: dict[str, tuple[type[Message], Codec[Any]]] = {
     **record_batches.CODECS,
     **log_corrections.CODECS,
     **candidate_pairs.CODECS,
-    **separators.CODECS,
+    **shared_poses.CODECS,
 }
 _KINDS: dict[type[Message], str] = {cls: kind for kind, (cls, _) in _CODECS.items()}
 _READERS = {kind: Reader(codec, MESSAGE_BYTES_MAX) for kind, (_, codec) in _CODECS.items()}

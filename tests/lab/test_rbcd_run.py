@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from flocc_agent.backend.optimiser import optimise
-from flocc_agent.config import BackendConfig, BackendMode, Formulation, Solver
-from flocc_agent.core.parameters import DistributedParameters
+from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution, PoseGraph
 from flocc_lab.bench.generated_graph import GeneratedGraph, Noise, generate
 from flocc_lab.experiments.distributed import DISTRIBUTED, OPTIMA, DistributedSettings, cells, measure
-from flocc_lab.experiments.rbcd_run import cut_by_time, graph_cost, optimise_together
+from flocc_lab.rbcd.machine import RbcdParameters
+from flocc_lab.rbcd.run import cut_by_time, graph_cost, optimise_together
 from flocc_launch.graph_files.graph_file import ate_m
 from flocc_protocol.ids import LogId
 
 
-def base(solver: Solver, mode: BackendMode = BackendMode.DISTRIBUTED) -> BackendConfig:
-    return BackendConfig(mode=mode, formulation=Formulation.BASE, solver=solver, weight_by_probability=False)
+def base(solver: Solver) -> BackendConfig:
+    return BackendConfig(formulation=Formulation.BASE, solver=solver, weight_by_probability=False)
 
 
 def metric_graph(outlier_ratio: float) -> GeneratedGraph:
@@ -27,7 +27,7 @@ def metric_graph(outlier_ratio: float) -> GeneratedGraph:
 
 
 def central(graph: PoseGraph, solver: Solver) -> GraphSolution:
-    solution = optimise(graph, base(solver, BackendMode.CENTRALISED))
+    solution = optimise(graph, base(solver))
     assert isinstance(solution, GraphSolution)
     return solution
 
@@ -49,7 +49,7 @@ def test_wrong_closures_are_rejected_together_as_a_central_solver_rejects_them(l
     reference = central(made.graph, Solver.GNC_TLS)
     rejected = sum(result.state is not ClosureState.USED for result in reference.closures)
     run = optimise_together(
-        made.graph, base(Solver.GNC_TLS), DistributedParameters(), loss_ratio=loss_ratio, seed=5, iterations_max=500
+        made.graph, base(Solver.GNC_TLS), RbcdParameters(), loss_ratio=loss_ratio, seed=5, iterations_max=500
     )
     assert run.is_settled
     assert set(run.anchors.values()) == {LogId("r00")}
@@ -65,9 +65,7 @@ def test_wrong_closures_are_rejected_together_as_a_central_solver_rejects_them(l
 def test_the_same_seed_gives_the_same_run() -> None:
     made = metric_graph(outlier_ratio=0.0)
     runs = [
-        optimise_together(
-            made.graph, base(Solver.LM), DistributedParameters(), loss_ratio=0.3, seed=seed, iterations_max=20
-        )
+        optimise_together(made.graph, base(Solver.LM), RbcdParameters(), loss_ratio=0.3, seed=seed, iterations_max=20)
         for seed in (1, 1, 2)
     ]
     assert runs[0].traffic == runs[1].traffic
@@ -77,7 +75,7 @@ def test_the_same_seed_gives_the_same_run() -> None:
 
 def test_the_map_frame_is_the_odometry_frame_of_the_lowest_robot() -> None:
     made = metric_graph(outlier_ratio=0.0)
-    run = optimise_together(made.graph, base(Solver.LM), DistributedParameters(), iterations_max=300)
+    run = optimise_together(made.graph, base(Solver.LM), RbcdParameters(), iterations_max=300)
     first = np.asarray(made.graph.trajectories[LogId("r00")].T_odom_keyframe)[0]
     assert np.allclose(run.T_map_keyframe[LogId("r00")][0], first, atol=1e-6)
     (component,) = central(made.graph, Solver.LM).components

@@ -17,11 +17,9 @@ from flocc_protocol.messages import (
     KNOTS_MAX,
     LOGS_MAX,
     OFFERS_MAX,
-    RANK_MAX,
-    RANK_MIN,
     RECORDS_BATCH_BYTES_MAX,
     RECORDS_BATCH_MAX,
-    SEPARATORS_MAX,
+    SHARED_MAX,
     WANTS_MAX,
     Answer,
     CandidateOffer,
@@ -46,7 +44,7 @@ from flocc_protocol.messages import (
     RecordBatch,
     RecordRequest,
     Records,
-    Separators,
+    SharedPoses,
     TableState,
 )
 from flocc_protocol.records import (
@@ -69,6 +67,7 @@ from flocc_protocol.records import (
     TagSightingRecord,
     encode_record,
 )
+from flocc_protocol.shared_poses import stiffness_numbers
 
 IDENTITY: Pose7 = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -80,17 +79,29 @@ def knots(count: int, covariance: Array | None = None, seed: int = 0) -> Knots:
     return Knots(covariance, about, Array.of(np.arange(1, 2 * count, 2), "u4"), Array.of(twists, "f4"))
 
 
-def lifted_array(count: int, rank: int = 3) -> Array:
-    """(count, 4, rank) float64 relaxed poses: signed unit vectors, then a position; exact in binary."""
-    poses = np.zeros((count, 4, rank))
-    poses[:, :3, :3] = np.diag([1.0, -1.0, 1.0])
-    poses[:, 3] = np.arange(count)[:, None] + 0.5
-    return Array.of(poses, "f8")
-
-
-def lifted_origin(rank: int = 3) -> Array:
-    """(4, rank) float64: the identity."""
-    return Array.of(np.eye(4, rank), "f8")
+def shared(anchor: LogId, step: int, count: int, listed: bool, stiff: bool) -> SharedPoses:
+    """That many shared poses in a row, exact in binary; with their list, with a stiffness."""
+    rows = np.zeros((count, 13))
+    rows[:, 0], rows[:, 3], rows[:, 7:] = np.arange(count), 1.0, 0.25
+    origin = (1.0, 2.0, -0.5, 1.0, 0.0, 0.0, 0.0)
+    keyframes = tuple(range(INDEX_MAX - count + 1, INDEX_MAX + 1)) if listed else ()
+    information = Array.of(np.full((len(keyframes), 2), 4.0))
+    stiffness = Array.of(np.full(stiffness_numbers(count) if stiff else 0, 0.5))
+    base_m = Array.of(np.array([10.0, -20.0, 0.5]), "f8")
+    return SharedPoses(
+        anchor,
+        step,
+        origin,
+        step,
+        step,
+        keyframes,
+        information,
+        base_m,
+        Array.of(rows),
+        1,
+        2 if stiff else 0,
+        stiffness,
+    )
 
 
 def descriptor(dimension: int = 512, seed: int = 0) -> Array:
@@ -164,17 +175,7 @@ MESSAGES: tuple[Message, ...] = (
     CorrectionRequest((ALICE, BOB)),
     KnotRequest((CorrectionVersion(ALICE, TERM, 4),)),
     CandidateOffer((CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),), True),
-    Separators(
-        ALICE,
-        17,
-        2,
-        lifted_origin(),
-        16,
-        (3, 8),
-        lifted_array(2),
-        (CandidatePair.of(KeyframeId(BOB, 8), KeyframeId(ALICE, 3)),),
-        Array.of(np.array([0.25])),
-    ),
+    shared(ALICE, 17, 2, listed=True, stiff=False),
 )
 ENVELOPES = tuple(Envelope(BOB, message) for message in MESSAGES)
 
@@ -242,17 +243,7 @@ def largest_messages() -> list[Message]:
         KnotRequest(tuple(CorrectionVersion(_long(k), leader, INDEX_MAX) for k in range(KNOT_REQUESTS_MAX))),
         CorrectionRequest(tuple(_long(k) for k in range(LOGS_MAX))),
         CandidateOffer((CandidatePair(keyframe, other),) * OFFERS_MAX, True),
-        Separators(
-            _long(0),
-            INDEX_MAX,
-            INDEX_MAX,
-            lifted_origin(RANK_MAX),
-            INDEX_MAX,
-            (INDEX_MAX,) * SEPARATORS_MAX,
-            lifted_array(SEPARATORS_MAX, RANK_MAX),
-            (CandidatePair(keyframe, other),) * OFFERS_MAX,
-            Array.of(np.ones(OFFERS_MAX)),
-        ),
+        shared(_long(0), INDEX_MAX, SHARED_MAX, listed=True, stiff=True),
     ]
 
 
@@ -395,21 +386,5 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(CorrectionRequest, _tuples(log_ids, LOGS_MAX)),
     st.builds(KnotRequest, _tuples(st.builds(CorrectionVersion, log_ids, terms, _counts), KNOT_REQUESTS_MAX)),
     st.builds(CandidateOffer, _tuples(pairs, OFFERS_MAX), st.booleans()),
-    st.builds(
-        lambda anchor, iteration, n, rank: Separators(
-            anchor,
-            iteration,
-            n,
-            lifted_origin(rank),
-            n,
-            tuple(range(n)),
-            lifted_array(n, rank),
-            (),
-            Array.of(np.zeros(0)),
-        ),
-        log_ids,
-        _counts,
-        st.integers(0, 20),
-        st.integers(RANK_MIN, RANK_MAX),
-    ),
+    st.builds(shared, log_ids, _counts, st.integers(0, 20), st.booleans(), st.booleans()),
 )

@@ -1,4 +1,4 @@
-"""Distributed optimisation between processes over real zenoh: separators travel, everybody corrects itself."""
+"""Distributed optimisation between processes over real zenoh: shared poses travel, everybody corrects itself."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_three_processes_optimise_together_over_a_lossy_link(
     assert report.map_frames == ["map/r1"]
     assert report.ate_joint_m is not None
     assert report.ate_joint_m < 1.0
-    assert report.bytes["separators"] > 0
+    assert report.bytes["shared-poses"] > 0
     lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     assert "optimised" not in {line["event"] for line in lines}
     givers = {(line["robot"], line["leader"]) for line in lines if line["event"] == "correction"}

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from functools import partial
 
 from flocc_agent.config import BackendConfig
-from flocc_agent.core.blocks import BlockProblem, BlockStep
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
-Iterator = Callable[[BlockProblem], BlockStep | OptimisationFailed]
+ConsensusStepper = Callable[[ConsensusProblem], ConsensusStep | OptimisationFailed]
 
 
 def build_optimiser(config: BackendConfig) -> Optimiser:
@@ -20,9 +20,9 @@ def build_optimiser(config: BackendConfig) -> Optimiser:
     return partial(optimise_graph, config)
 
 
-def build_iterator(config: BackendConfig) -> Iterator:
-    """Make what iterates on a robot's block in distributed mode; it can be sent to a worker process."""
-    return partial(iterate_own_block, config)
+def build_stepper(config: BackendConfig) -> ConsensusStepper:
+    """Make what does a step of a robot's part in distributed mode; it can be sent to a worker process."""
+    return partial(step_own_part, config)
 
 
 def optimise_graph(
@@ -34,8 +34,8 @@ def optimise_graph(
     return optimise(graph, config, initial)
 
 
-def iterate_own_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | OptimisationFailed:
-    """Do one iteration of a robot's block (distributed optimisation), in whatever process this is called in."""
-    from flocc_agent.backend.block import iterate_block
+def step_own_part(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep | OptimisationFailed:
+    """Do one step of a robot's part (distributed optimisation), in whatever process this is called in."""
+    from flocc_agent.backend.consensus_step import consensus_step
 
-    return iterate_block(config, problem)
+    return consensus_step(config, problem)

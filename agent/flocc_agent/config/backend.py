@@ -46,10 +46,8 @@ class BackendConfig(Section):
     """The pose-graph optimiser."""
 
     mode: BackendMode = BackendMode.CENTRALISED
-    """centralised: the elected leader optimises everything; distributed: every robot its own block (RBCD), with scales
-    held at their initial values. All robots of a swarm need the same."""
-    rank: int = inner(5, ge=3, le=5)
-    """Dimensions to which distributed mode relaxes rotations; 3 relaxes nothing, more leave fewer local minima."""
+    """centralised: the elected leader optimises everything; distributed: every robot its own part, and neighbours agree
+    on the poses that both have. All robots of a swarm need the same."""
     formulation: Formulation = Formulation.INDEPENDENT
     """Scales of closures: fixed, one each, one each but linked within a cluster, or one for all."""
     solver: Solver = Solver.GNC_TLS
@@ -103,10 +101,6 @@ class BackendConfig(Section):
 
     @model_validator(mode="after")
     def _is_known_to_distributed_mode(self) -> Self:
-        if self.mode is BackendMode.CENTRALISED:
-            return self
-        if self.formulation is not Formulation.BASE:
-            raise ValueError("mode = 'distributed' holds scales constant; it needs formulation = 'base'")
-        if self.solver not in (Solver.LM, Solver.GNC_TLS):
-            raise ValueError("mode = 'distributed' knows the solvers 'lm' and 'gnc-tls'")
+        if self.mode is BackendMode.DISTRIBUTED and self.formulation is Formulation.SHARED:
+            raise ValueError("mode = 'distributed' has no scale that all robots share, as formulation = 'shared' has")
         return self

@@ -71,7 +71,7 @@ REMOVED: dict[str, str] = {
     "perception.mast3r.place_input": "always swarm-slam",
     "backend.pairwise_consistency": "a choice of flocc optimise; an agent's solver rejects outliers by GNC",
     "backend.scale_initial": "scales start by Eq. (6); flocc optimise and experiments have the other choices",
-    "backend.rank": "always 5",
+    "backend.rank": "of RBCD, which is in the lab",
     "backend.closure_rotation_sigma_rad": "always 0.05; a covariance that perception gives counts instead",
     "backend.closure_translation_sigma_m": "always 0.2; a covariance that perception gives counts instead",
     "backend.cluster_keyframes_max": "always 10",

@@ -345,14 +345,22 @@ class Corrections:
         """Send what a round changed, as the leader; a log whose solution leaves the map keeps its last correction."""
         return self._publish(term, round_number, [(c, log) for c in solution.components for log in c.logs])
 
-    def publish_own(self, component: Component, round_number: int) -> list[Effect]:
-        """Send this robot's own part of a distributed optimisation; its term is below every leader's.
+    def publish_own(self, component: Component, round_number: int) -> tuple[list[Effect], str | None]:
+        """Send this robot's own part of a distributed optimisation, or say what speaks against it.
 
-        After a leader's correction, of a time when the swarm optimised centrally, the term is above that one.
+        Its term is below every leader's; after a leader's correction, of a time when the swarm optimised centrally, it
+        is above that one.
         """
         applied = self.applied
-        counter = 0 if applied is None else applied.term.counter + (applied.term.leader != self._own)
-        return self._publish(Term(counter, self._own), round_number, [(component, self._own)])
+        term = Term(0 if applied is None else applied.term.counter + (applied.term.leader != self._own), self._own)
+        try:
+            made = self._made(component, self._own, term, round_number)
+        except ValueError as error:
+            return [], f"robot {self._own.robot}: {error}"
+        if made is None:
+            return [], None
+        why = self.doubts.speaks_against(self._placed(made))
+        return ([], why) if why is not None else (self._publish(term, round_number, [(component, self._own)]), None)
 
     def _publish(self, term: Term, round_number: int, solved: Sequence[tuple[Component, LogId]]) -> list[Effect]:
         """Knots to those owners that are in range, the rest in short to all."""

@@ -1,36 +1,63 @@
-"""Distributed optimisation: no leader; every robot iterates on its own block with the separators it heard last.
+"""Distributed optimisation: no leader; every robot solves its own part and agrees with one neighbour at a time.
 
-Robots exchange only separators: their own keyframes at the ends of closures between robots. A robot iterates when it
-has news of every neighbour that shares its frame, or has waited long enough; what is lost is said again, with pauses
-that double. Every robot starts in its own frame and moves into that of a neighbour whose anchor is lower, so that one
-frame survives: the lowest robot's. A robot gives corrections to itself only, with its iteration as the round.
+Which closures are right is decided before robots agree on anything, from logs alone: each robot solves its own log, and
+the lower robot of each pair both logs together, with the whole back end. So wrong ones are found as a leader finds
+them, and nothing that robots say while they move feeds back into that choice. The lower robot lists the poses that the
+pair shares; the list has an edition, and what is told of another one counts for nothing.
+
+A robot steps when it has news of every neighbour in range, or has waited long enough; then it tells each of them, in
+range, where it has the shared poses. What is lost is said again, with pauses that double. Every robot starts in its own
+frame and moves into that of a neighbour whose anchor is lower, so that one frame survives: the lowest robot's. A robot
+gives corrections to itself only, with its step as the round; one that contradicts its own log is not given, and the
+robot begins again alone.
 """
 
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep
-from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
+from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
+from flocc_agent.core.own_part import (
+    ConsensusProblem,
+    ConsensusState,
+    ConsensusStep,
+    OwnedClosure,
+    SharedWith,
+    ToldPoses,
+)
 from flocc_agent.core.parameters import DistributedParameters
-from flocc_agent.core.pose_graph import Component, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.core.reports import BlockMoved, RoundFailed
-from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
-from flocc_agent.geometry import inverse
+from flocc_agent.core.peer_budgets import Muted
+from flocc_agent.core.plausibility import HELD_BACK_S
+from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.reports import PartMoved, PeerRefused, RoundFailed
+from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S
+from flocc_agent.geometry import inverse, pose7, pose_from_tq
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
-from flocc_protocol.messages import OFFERS_MAX, SEPARATORS_MAX, CandidatePair, Separators
+from flocc_protocol.messages import SHARED_MAX, SharedPoses
 
 Float = NDArray[np.float64]
+Shown = tuple[int, int, int]
+"""Closures between two robots, within the lower and within the higher one: of which a choice was made."""
 
-ITERATIONS_AFTER_RESTART = 1000
+STEPS_AFTER_RESTART = 1000
 """A restarted robot counts on from its last correction and this: above whatever it said before."""
 DELIVER_PERIOD_S = 2.0
 """Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
 FAILURES_MAX = 6
+OVERTAKEN_S = 5.0
+"""A message that is older than the last one by its number is new by its time after so long: its sender began again."""
+SILENT_S = 30.0
+"""After so long without a word what a neighbour said last counts only where both had agreed."""
+VAIN_STEPS_MAX, NEARER_RATIO = 40, 0.9
+"""After so many steps that brought a robot no nearer to its neighbours it rests all the same."""
+DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
+"""How long neighbours are not heard whose word led to what the own log contradicts: the first time, and at most."""
 
 
 class GraphSource(Protocol):
@@ -52,15 +79,50 @@ class GraphSource(Protocol):
 
 
 @dataclass(slots=True)
-class _Neighbour:
-    """What another robot said last."""
+class _Pair:
+    """What a robot shares with another, and what that one said last.
 
-    anchor: LogId
-    iteration: int
-    origin: Float
-    origin_iteration: int
-    poses: dict[int, Float] = field(default_factory=dict)
+    Attributes:
+        edition: Of the list of shared poses; 0 before there is one.
+        keyframes: It: numbers in the higher robot's log.
+        information: (S, 2) of the closures there; of an owner's own as its last step gave it.
+        owned: Closures of the pair that this robot, the lower one, uses.
+        said: The other's last message, of whatever edition.
+        said_s: When that came.
+        heard: The same, where it is of this edition and frame and no step has taken it yet.
+        is_news: It came since the last step began.
+        told: What this robot's last step wants told.
+    """
+
+    edition: int = 0
+    keyframes: tuple[int, ...] = ()
+    information: Array | None = None
+    owned: tuple[OwnedClosure, ...] = ()
+    said: SharedPoses | None = None
+    said_s: float = float("-inf")
+    heard: SharedPoses | None = None
     is_news: bool = True
+    told: ToldPoses | None = None
+
+
+@dataclass(slots=True)
+class _Choice:
+    """What was chosen of one log or two, and of what; `shown` is None before the first time."""
+
+    shown: Shown | None = None
+    not_before_s: float = float("-inf")
+    failures: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Choosing:
+    """A choice that is being made."""
+
+    number: int
+    other: LogId
+    shown: Shown
+    until_s: float
+    graph: PoseGraph = field(repr=False)
 
 
 class DistributedOptimisation:
@@ -68,8 +130,8 @@ class DistributedOptimisation:
 
     Attributes:
         anchor: Log after which the frame of this robot's poses is named.
-        iteration: Number of its iterations.
-        is_settled: Its poses stand still and its robust weights are final.
+        number: Number of its steps.
+        is_settled: Its poses stand still, where its neighbours have them.
     """
 
     def __init__(
@@ -77,30 +139,45 @@ class DistributedOptimisation:
         own: LogId,
         source: GraphSource,
         parameters: DistributedParameters,
-        iteration: int = 0,
+        near: Callable[[str], bool],
+        number: int = 0,
     ) -> None:
+        """Start alone.
+
+        Args:
+            own: The log that this robot writes.
+            source: Copies of all logs.
+            parameters: Rates and tolerance.
+            near: Whether a robot of this name is in range.
+            number: Steps are counted from here on.
+        """
         self.anchor = own
-        self.iteration = iteration
+        self.number = number
         self.is_settled = False
+        self._is_back = number > 0
+        self._number_min = number
         self._own = own
         self._source = source
         self._parameters = parameters
-        self._neighbours: dict[LogId, _Neighbour] = {}
-        self._heard: dict[CandidatePair, float] = {}
-        self._epoch = 0
+        self._near = near
+        self._pairs: dict[LogId, _Pair] = {}
+        self._within: tuple[OwnedClosure, ...] = ()
+        self._T_alone: Float = np.zeros((0, 4, 4))
         self._origin: Float | None = None
-        self._origin_iteration = -1
+        self._origin_step = -1
         self._seen: tuple[int, int] | None = None
-        self._trajectory = Trajectory(np.zeros((0, 4, 4)))
-        self._closures: tuple[LoopClosure, ...] = ()
-        self._separators: tuple[int, ...] = ()
-        self._far_ends: tuple[KeyframeId, ...] = ()
-        self._joined: tuple[LogId, ...] = ()
-        self._state: BlockState | None = None
-        self._step: BlockStep | None = None
+        self._seen_s = float("-inf")
+        self._graph = PoseGraph({})
+        self._shown: dict[LogId, Shown] = {}
+        self._choices: dict[LogId, _Choice] = {}
+        self._choosing: _Choosing | None = None
+        self._choices_made = 0
+        self._choose_at_s = float("-inf")
+        self._state: ConsensusState | None = None
+        self._step: ConsensusStep | None = None
         self._has_news = False
         self._running_until_s: float | None = None
-        self._aligning: _Neighbour | None = None
+        self._moving_to: LogId | None = None
         self._next_s = float("-inf")
         self._wait_until_s = float("-inf")
         self._repeat_at_s = float("inf")
@@ -108,84 +185,167 @@ class DistributedOptimisation:
         self._deliver_at_s = float("-inf")
         self._undelivered = False
         self._failures = 0
+        self._distrusted = Muted(DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S)
+        self._contradicted_s: float | None = None
+        self._least_gap = float("inf")
+        self._vain_steps = 0
 
     # Events
 
-    def on_separators(self, sender: LogId, message: Separators) -> None:
-        """Keep what another robot says of its separators, and the weights that are its to decide."""
-        held = self._neighbours.get(sender)
-        if held is not None and message.iteration < held.iteration:
-            return
-        if held is None and len(self._neighbours) >= NEIGHBOURS_MAX:
-            return
-        if held is None or held.anchor != message.anchor:
-            origin = message.origin.numpy()
-            held = self._neighbours[sender] = _Neighbour(message.anchor, message.iteration, origin, -1)
-            self._has_news = True
-        held.is_news = held.is_news or message.iteration > held.iteration
-        held.iteration = message.iteration
-        if held.anchor == self.anchor and message.epoch > self._epoch:
-            self._epoch = message.epoch
-            self._has_news = True
-        if message.origin_iteration > held.origin_iteration:
-            held.origin, held.origin_iteration = message.origin.numpy(), message.origin_iteration
-        if held.anchor == self.anchor and held.origin_iteration > self._origin_iteration:
-            self._origin, self._origin_iteration = held.origin, held.origin_iteration
-        self._has_news |= self._take_poses(held, message) | self._take_weights(sender, message)
+    def on_shared_poses(self, sender: LogId, message: SharedPoses, now: float) -> list[Effect]:
+        """Keep what another robot says of the poses that both have."""
+        if self._is_distrusted(sender, now):
+            return []
+        pair = self._pairs.get(sender)
+        if pair is None:
+            if len(self._pairs) >= NEIGHBOURS_MAX or not message.keyframes:
+                return []
+            pair = self._pairs[sender] = _Pair()
+        if pair.said is not None and message.step < pair.said.step:
+            if now < pair.said_s + OVERTAKEN_S:
+                return []  # messages overtake each other, but not for so long: it began again
+            pair.said = pair.heard = None
+            if sender < self._own:
+                pair.edition, pair.keyframes = 0, ()
+        if sender < self._own and message.edition != pair.edition and not self._take_list(sender, pair, message):
+            return []
+        before, pair.said, pair.said_s = pair.said, message, now
+        if message.edition != pair.edition or len(message) != len(pair.keyframes) or not len(message):
+            return []
+        pair.is_news = pair.is_news or before is None or message.step > before.step
+        if message.anchor == self.anchor and not self._is_back:
+            self._take_origin(message)
+            if before is None or message.step > before.step:
+                pair.heard = message
+                self._has_news |= before is None or not self._rests() or self._says_more(message, before)
+        self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
+        return []
 
-    def on_step(self, number: int, step: BlockStep, now: float) -> list[Effect]:
-        """An iteration ended: say the separators; an answer that is late or of another iteration counts for nothing."""
-        if self._running_until_s is None or number != self.iteration:
+    def on_own_correction(self, number: int) -> None:
+        """Others hold a correction that this robot gave itself before it lost its disk: it counts on above that."""
+        self._number_min = max(self._number_min, number)
+
+    def on_step(self, number: int, step: ConsensusStep, now: float) -> list[Effect]:
+        """A step ended: tell neighbours; an answer that is late or of another step counts for nothing."""
+        if self._running_until_s is None or number != self.number:
             return []
         self._running_until_s = None
         self._failures = 0
         self._state, self._step = step.state, step
-        if step.aligned and self._aligning is not None:
-            self.anchor = self._aligning.anchor
-            self._origin_iteration = self._aligning.origin_iteration
-        self._aligning = None
+        if step.aligned and self._moving_to is not None:
+            said = self._pairs[self._moving_to].said
+            assert said is not None, "it said where the poses are to be moved"
+            self.anchor, self._origin_step, self._is_back = said.anchor, said.origin_step, False
+        self._moving_to = None
         self._origin = step.origin
         if self.anchor == self._own:
-            self._origin_iteration = number
-        self.is_settled = step.moved <= self._parameters.tolerance and step.finished
-        self._has_news |= not self.is_settled or step.aligned
+            self._origin_step = number
+        for other, told in step.told.items():
+            pair = self._pairs.get(other)
+            if pair is not None and len(told.rows) == len(pair.keyframes):
+                pair.told = told
+        for other, information in step.information.items():
+            pair = self._pairs.get(other)
+            if pair is not None and len(information) == len(pair.keyframes):
+                pair.information = Array.of(information)
+        self.is_settled = max(step.moved, step.gap) <= self._parameters.tolerance
+        self._has_news |= step.aligned or step.moved > self._parameters.tolerance
+        self._watch_gap(step.gap)
         self._undelivered = True
         self._repeat_pause_s = self._parameters.repeat_s
         self._repeat_at_s = now + self._repeat_pause_s
-        return [Broadcast(message) for message in self._said()]
+        reports = [self._refuse(other, reason) for other, reason in sorted(step.refused.items())]
+        return [*reports, *self._said()]
 
     def on_failed(self, number: int, reason: str, now: float) -> list[Effect]:
-        """An iteration without a result: it is tried again after a growing pause."""
-        if self._running_until_s is None or number != self.iteration:
+        """A step without a result: it is tried again after a growing pause."""
+        if self._running_until_s is None or number != self.number:
             return []
         self._running_until_s = None
+        self._moving_to = None
         self._failures = min(self._failures + 1, FAILURES_MAX)
         self._next_s = now + self._parameters.period_s * 2**self._failures
         self._has_news = True
         return [Report(RoundFailed(term=Term(0, self._own), round=number, reason=reason))]
 
+    def on_chosen(self, number: int, solution: GraphSolution, now: float) -> list[Effect]:
+        """One or two logs were solved for themselves: take the closures that are right."""
+        choosing = self._choosing
+        if choosing is None or choosing.number != number:
+            return []
+        self._choosing = None
+        self._choices[choosing.other] = _Choice(choosing.shown, now + self._parameters.choose_s)
+        if choosing.other == self._own:
+            self._take_own(choosing.graph, solution)
+        else:
+            self._take_pair(choosing, solution)
+        return []
+
+    def on_choice_failed(self, number: int, reason: str, now: float) -> list[Effect]:
+        """They could not be solved: tried again after a growing pause."""
+        choosing = self._choosing
+        if choosing is None or choosing.number != number:
+            return []
+        self._choosing = None
+        held = self._choices.setdefault(choosing.other, _Choice())
+        held.failures = min(held.failures + 1, FAILURES_MAX)
+        held.not_before_s = now + self._parameters.choose_s * 2**held.failures
+        return [Report(RoundFailed(term=Term(0, self._own), round=self.number, reason=reason))]
+
+    def on_judged(self, why: str | None, now: float) -> list[Effect]:
+        """Whether something in this robot's own log speaks against its part; what lasts was brought by neighbours.
+
+        Then it begins again alone, and does not hear for a while those that it had heard. Others' corrections and
+        records may be on their way, so that it waits before that; meanwhile its last correction stands.
+        """
+        if why is None:
+            self._contradicted_s = None
+            return []
+        if self._contradicted_s is None:
+            self._contradicted_s = now
+        self._undelivered = True
+        if now < self._contradicted_s + HELD_BACK_S:
+            return []
+        self._contradicted_s = None
+        heard = sorted(other for other, pair in self._pairs.items() if pair.said is not None)
+        for other in heard:
+            self._distrusted.on_failed(other.robot, other.robot, now)
+        self._begin_alone()
+        self._step, self._undelivered = None, False
+        self._next_s = now + self._parameters.period_s
+        for pair in self._pairs.values():
+            pair.said = pair.heard = pair.told = None
+            if not pair.owned:
+                pair.edition, pair.keyframes, pair.information = 0, (), None
+        reason = f"{why}: it goes on alone"
+        return [self._refuse(other, reason) for other in heard]
+
     # Time
 
     def tick(self, now: float) -> list[Effect]:
-        """Give up an overdue iteration, begin the next one, repeat what may have been lost."""
+        """Give up what is overdue, choose closures, begin the next step, repeat what may have been lost."""
         effects: list[Effect] = []
         if self._running_until_s is not None and self._running_until_s <= now:
-            effects += self.on_failed(self.iteration, "it took too long", now)
-        self._look()
+            effects += self.on_failed(self.number, "it took too long", now)
+        if self._choosing is not None and self._choosing.until_s <= now:
+            effects += self.on_choice_failed(self._choosing.number, "it took too long", now)
+        self._look(now)
+        if self._choosing is None and self._choose_due_s() <= now:
+            effects += self._choose(now)
         if self._running_until_s is None and self._begin_at_s() <= now:
             effects.append(self._begin(now))
         if self._repeat_at_s <= now:
             self._repeat_pause_s = min(2.0 * self._repeat_pause_s, self._parameters.repeat_max_s)
             self._repeat_at_s = now + self._repeat_pause_s
-            effects += [Broadcast(message) for message in self._said()]
+            effects += self._said()
         return effects
 
     def deadline(self) -> float:
         """When `tick` or `component` is due next."""
         deliver_s = self._deliver_at_s if self._undelivered else float("inf")
-        if self._running_until_s is not None:
-            return min(self._running_until_s, self._repeat_at_s, deliver_s)
-        return min(self._begin_at_s(), self._repeat_at_s, deliver_s)
+        step_s = self._begin_at_s() if self._running_until_s is None else self._running_until_s
+        choice_s = self._choose_due_s() if self._choosing is None else self._choosing.until_s
+        return min(step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s())
 
     def component(self, now: float) -> Component | None:
         """This robot's corrected poses, at most once per period, None where there is nothing new."""
@@ -199,148 +359,350 @@ class DistributedOptimisation:
         return Component(logs, {self._own: T}, {self._own: T_map_odom}, {}, cost=self._step.cost)
 
     def report(self) -> Report:
-        """Where this robot's block stands, for people."""
-        step, state = self._step, self._state
-        fact = BlockMoved(
-            iteration=self.iteration,
+        """Where this robot's part stands, for people."""
+        step = self._step
+        fact = PartMoved(
+            step=self.number,
             anchor=self.anchor,
             neighbours=len(self._sharing()),
-            separators=len(self._separators),
+            shared_poses=sum(len(pair.keyframes) for pair in self._pairs.values()),
             cost=None if step is None else step.cost,
             moved=None if step is None else step.moved,
-            closures_rejected=0 if step is None else step.rejected,
-            weights_final=step is not None and step.finished,
-            keyframes=0 if state is None else len(state.X),
+            gap=None if step is None else step.gap,
+            closures_used=len(self._owned()),
+            keyframes=0 if step is None else len(step.T_map_keyframe),
         )
         return Report(fact)
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
-        return {"separators": (len(self._neighbours), NEIGHBOURS_MAX)}
+        return {"shared_with": (len(self._pairs), NEIGHBOURS_MAX), **self._distrusted.sizes("not_agreed_with")}
+
+    # What others may look at
+
+    def shares_with(self) -> tuple[LogId, ...]:
+        """Robots with which it shares poses."""
+        return tuple(sorted(other for other, pair in self._pairs.items() if pair.keyframes))
+
+    @property
+    def solved(self) -> int:
+        """Own keyframes in its part."""
+        return 0 if self._step is None else len(self._step.T_map_keyframe)
+
+    @property
+    def has_chosen(self) -> bool:
+        """Whether all closures that it knows of were chosen or turned away."""
+        return self._choosing is None and self._choose_due_s() == float("inf")
+
+    @property
+    def gap(self) -> float:
+        """Largest difference from where neighbours have the shared poses, after its last step."""
+        return 0.0 if self._step is None else self._step.gap
 
     # What it knows
 
-    def _look(self) -> None:
-        """Take in what the logs gained: every closure, keyframes in steps."""
+    @property
+    def _trajectory(self) -> Trajectory:
+        return self._graph.trajectories.get(self._own, Trajectory(np.zeros((0, 4, 4))))
+
+    def _look(self, now: float) -> None:
+        """Take in what the logs gained: every closure, keyframes in steps, the last few after a while."""
         revision, keyframes = self._source.revision, self._source.keyframes
-        if keyframes == 0:
+        if keyframes == 0 or self._look_at_s() > now:
             return
-        if self._seen is not None:
-            grown = keyframes - self._seen[1]
-            if revision == self._seen[0] and grown < KEYFRAMES_PER_ROUND:
-                return
-        self._seen = (revision, keyframes)
+        self._seen, self._seen_s = (revision, keyframes), now
         graph = self._source.graph()
         if self._own not in graph.trajectories:
             return
-        self._trajectory = graph.trajectories[self._own]
-        self._closures = tuple(c for c in graph.closures if self._own in (c.query.log, c.match.log))
-        ends = [self._ends(c) for c in self._closures if c.query.log != c.match.log]
-        self._separators = tuple(sorted({own.index for own, _ in ends}))
-        self._far_ends = tuple(sorted({other for _, other in ends}))
-        self._joined = tuple(sorted({other.log for _, other in ends}))
+        self._graph = graph
+        self._shown = self._shown_now()
         self._has_news = True
 
-    def _ends(self, closure: LoopClosure) -> tuple[KeyframeId, KeyframeId]:
-        """The own and the other end of a closure between two robots."""
-        return (closure.query, closure.match) if closure.query.log == self._own else (closure.match, closure.query)
+    def _look_at_s(self) -> float:
+        """When it is time to take in what the logs gained; never where they gained nothing."""
+        if self._seen is None:
+            return float("-inf") if self._source.keyframes else float("inf")
+        revision, keyframes = self._seen
+        grown = self._source.keyframes - keyframes
+        if revision != self._source.revision or grown >= KEYFRAMES_PER_ROUND:
+            return self._seen_s
+        return self._seen_s + PATIENCE_S if grown else float("inf")
 
-    def _heard_of(self) -> list[_Neighbour]:
-        """Neighbours that closures join to this robot and that said something."""
-        return [self._neighbours[log] for log in self._joined if log in self._neighbours]
+    def _shown_now(self) -> dict[LogId, Shown]:
+        """Of what each choice of this robot is to be made: by the other robot, its own log by its own name."""
+        ends = Counter(tuple(sorted((c.query.log, c.match.log))) for c in self._graph.closures)
+        within = {low: count for (low, high), count in ends.items() if low == high}
+        own = within.get(self._own, 0)
+        shown = {
+            high: (count, own, within.get(high, 0))
+            for (low, high), count in sorted(ends.items())
+            if low == self._own != high
+        }
+        return {**shown, self._own: (0, own, 0)} if own else shown
 
-    def _sharing(self) -> list[_Neighbour]:
-        """Those of them that are in this robot's frame."""
-        return [neighbour for neighbour in self._heard_of() if neighbour.anchor == self.anchor]
+    def _is_distrusted(self, log: LogId, now: float) -> bool:
+        return self._distrusted.is_muted(log.robot, log.robot, now)
 
-    def _take_poses(self, held: _Neighbour, message: Separators) -> bool:
-        """Whether a pose moved enough to begin anew."""
-        moved = False
-        for index, pose in zip(message.keyframes, message.poses.numpy(), strict=True):
-            before = held.poses.get(index)
-            same = before is not None and before.shape == pose.shape
-            moved |= not same or bool(np.abs(pose - before).max() > 0.5 * self._parameters.tolerance)
-            held.poses[index] = pose
-        return moved
+    def _take_list(self, sender: LogId, pair: _Pair, message: SharedPoses) -> bool:
+        """Take the list of shared poses that a lower robot made, if it is newer and closures here bear it out."""
+        listed = tuple(message.keyframes)
+        if message.edition <= pair.edition or not listed or listed[-1] >= len(self._trajectory):
+            return False
+        tied = {
+            own.index
+            for c in self._graph.closures
+            for own, other in ((c.query, c.match), (c.match, c.query))
+            if own.log == self._own and other.log == sender
+        }
+        if not tied.issuperset(listed):
+            return False
+        pair.edition, pair.keyframes, pair.information = message.edition, listed, message.information
+        pair.heard = pair.told = None
+        self._has_news = True
+        return True
 
-    def _take_weights(self, sender: LogId, message: Separators) -> bool:
-        changed = False
-        for pair, weight in zip(message.pairs, message.weights.numpy().tolist(), strict=True):
-            if pair.low.log == sender and pair.high.log == self._own and self._heard.get(pair) != weight:
-                self._heard[pair] = weight
-                changed = True
-        return changed
+    def _take_origin(self, message: SharedPoses) -> None:
+        if self.anchor != self._own and message.origin_step > self._origin_step:
+            self._origin, self._origin_step = pose_from_tq(np.array(message.origin)), message.origin_step
+
+    def _says_more(self, message: SharedPoses, before: SharedPoses) -> bool:
+        """Whether a message moved something since the last one."""
+        if (message.edition, message.anchor, message.known) != (before.edition, before.anchor, before.known):
+            return True
+        if message.stiffness_edition:
+            return True
+        apart = message.rows.numpy()[:, :7] - before.rows.numpy()[:, :7]
+        apart[:, :3] += message.base_m.numpy() - before.base_m.numpy()
+        return bool(np.abs(apart).max() > 0.5 * self._parameters.tolerance)
+
+    def _sharing(self) -> list[_Pair]:
+        """Those with whom it agrees on poses in its frame."""
+        return [p for p in self._pairs.values() if p.keyframes and p.said is not None and p.said.anchor == self.anchor]
+
+    def _rests(self) -> bool:
+        """Whether its poses stand still where neighbours have them, or come no nearer to that."""
+        return self.is_settled or self._vain_steps >= VAIN_STEPS_MAX
+
+    def _watch_gap(self, gap: float) -> None:
+        """Count steps that brought it no nearer to its neighbours."""
+        nearer = gap < NEARER_RATIO * self._least_gap
+        self._vain_steps = 0 if nearer else min(self._vain_steps + 1, VAIN_STEPS_MAX)
+        self._least_gap = gap if nearer or gap > self._least_gap / NEARER_RATIO**4 else self._least_gap
+
+    def _owned(self) -> tuple[OwnedClosure, ...]:
+        return (*self._within, *(each for pair in self._pairs.values() for each in pair.owned))
+
+    # What it chooses
+
+    def _choose_due_s(self) -> float:
+        due = [
+            max(self._choose_at_s, choice.not_before_s)
+            for other, shown in self._shown.items()
+            if (choice := self._choices.get(other, _Choice())).shown != shown
+        ]
+        return min(due, default=float("inf"))
+
+    def _choose(self, now: float) -> list[Effect]:
+        """Have the next log or pair solved for itself."""
+        due = [
+            (choice.not_before_s, other)
+            for other, shown in self._shown.items()
+            if (choice := self._choices.get(other, _Choice())).shown != shown and choice.not_before_s <= now
+        ]
+        if not due:
+            return []
+        _, other = min(due)
+        logs = {self._own, other}
+        graph = PoseGraph(
+            {log: self._graph.trajectories[log] for log in sorted(logs) if log in self._graph.trajectories},
+            tuple(c for c in self._graph.closures if {c.query.log, c.match.log} <= logs),
+        )
+        self._choices_made += 1
+        self._choose_at_s = now + self._parameters.period_s
+        until_s = now + self._parameters.timeout_s
+        self._choosing = _Choosing(self._choices_made, other, self._shown[other], until_s, graph)
+        return [ChooseClosures(self._choices_made, graph)]
+
+    def _take_own(self, graph: PoseGraph, solution: GraphSolution) -> None:
+        component = next((c for c in solution.components if self._own in c.logs), None)
+        if component is None:
+            return
+        T = np.asarray(component.T_map_keyframe[self._own], dtype=float)
+        self._within = _used(graph.closures, solution, {self._own: T})
+        self._T_alone = T
+        if not any(pair.said is not None for pair in self._pairs.values()):
+            self._state = None  # nobody was heard yet: what was found alone is all there is
+        self._has_news = True
+
+    def _take_pair(self, choosing: _Choosing, solution: GraphSolution) -> None:
+        """Share what was found right; the list is a new one only where it is another one."""
+        other = choosing.other
+        component = next((c for c in solution.components if {self._own, other} <= set(c.logs)), None)
+        T = {} if component is None else {log: component.T_map_keyframe[log] for log in (self._own, other)}
+        between = [c for c in choosing.graph.closures if c.query.log != c.match.log]
+        used = _used(choosing.graph.closures, solution, T, between)
+        shared = sorted({max(each.closure.query, each.closure.match).index for each in used})
+        if len(shared) > SHARED_MAX:
+            evenly = np.round(np.linspace(0, len(shared) - 1, SHARED_MAX)).astype(int)
+            shared = [shared[k] for k in evenly.tolist()]
+            used = tuple(c for c in used if max(c.closure.query, c.closure.match).index in set(shared))
+        pair = self._pairs.get(other)
+        if pair is None:
+            if not shared or len(self._pairs) >= NEIGHBOURS_MAX:
+                return
+            pair = self._pairs[other] = _Pair()
+        if tuple(shared) != pair.keyframes or {_named(c) for c in used} != {_named(c) for c in pair.owned}:
+            pair.edition = min(max(self.number, pair.edition) + 1, INDEX_MAX)
+            pair.information = pair.heard = pair.told = None
+        pair.keyframes, pair.owned = tuple(shared), used
+        self._has_news = True
 
     # What it does
 
     def _begin_at_s(self) -> float:
         if not self._has_news or len(self._trajectory) == 0:
             return float("inf")
-        waits = not self.is_settled and any(not neighbour.is_news for neighbour in self._sharing())
+        waits = not self.is_settled and any(
+            not pair.is_news for other, pair in self._pairs.items() if pair.heard is None and self._is_met(other, pair)
+        )
         return max(self._next_s, self._wait_until_s) if waits else self._next_s
 
+    def _is_met(self, other: LogId, pair: _Pair) -> bool:
+        """Whether a neighbour in this robot's frame is in range."""
+        return pair.said is not None and pair.said.anchor == self.anchor and self._near(other.robot)
+
     def _begin(self, now: float) -> Effect:
-        self.iteration = min(self.iteration + 1, INDEX_MAX)
+        self.number = min(max(self.number, self._number_min) + 1, INDEX_MAX)
         self._running_until_s = now + self._parameters.timeout_s
         self._next_s = now + self._parameters.period_s
         self._wait_until_s = now + self._parameters.wait_s
         self._has_news = self.is_settled = False
-        for neighbour in self._neighbours.values():
-            neighbour.is_news = False
-        self._aligning = self._in_lower_frame()
-        align_to = {} if self._aligning is None else self._poses_in(self._aligning.anchor)
-        return IterateBlock(
-            self.iteration,
-            BlockProblem(
+        if self.anchor != self._own and not any(pair.keyframes for pair in self._pairs.values()):
+            self._begin_alone()  # what brought it into another's frame was taken back
+        moves_to = self._in_lower_frame()
+        self._moving_to = None if moves_to is None else moves_to[0]
+        said = None if moves_to is None else self._pairs[moves_to[0]].said
+        anchor = self.anchor if said is None else said.anchor
+        shared = {
+            other: self._shared_with(other, pair, anchor, now) for other, pair in self._pairs.items() if pair.keyframes
+        }
+        for pair in self._pairs.values():
+            pair.heard, pair.is_news = None, False
+        origin = self._origin if said is None else pose_from_tq(np.array(said.origin))
+        return StepConsensus(
+            self.number,
+            ConsensusProblem(
                 log=self._own,
                 trajectory=self._trajectory,
-                closures=self._closures,
-                others=self._poses_in(self.anchor),
-                heard=dict(self._heard),
-                epoch=self._epoch,
-                anchored=self.anchor == self._own,
-                origin=self._origin if self._aligning is None else self._aligning.origin,
-                align_to=align_to,
+                owned=tuple(each for each in self._owned() if self._is_known(each.closure)),
+                shared=shared,
+                T_alone=self._T_alone,
+                anchored=anchor == self._own,
+                origin=origin,
+                move_to=moves_to,
                 state=self._state,
             ),
         )
 
-    def _in_lower_frame(self) -> _Neighbour | None:
-        """A neighbour with closures in the lowest frame that is lower than this robot's; the freshest of several."""
-        lower = [neighbour for neighbour in self._heard_of() if neighbour.anchor < self.anchor]
-        return min(lower, key=lambda n: (n.anchor, -n.origin_iteration), default=None)
+    def _is_known(self, closure: LoopClosure) -> bool:
+        ends = [end for end in (closure.query, closure.match) if end.log == self._own]
+        return all(end.index < len(self._trajectory) for end in ends)
 
-    def _poses_in(self, anchor: LogId) -> dict[KeyframeId, Float]:
-        """Poses of the far ends of closures, of robots in a frame, as far as they said them."""
-        found = {}
-        for end in self._far_ends:
-            neighbour = self._neighbours.get(end.log)
-            if neighbour is not None and neighbour.anchor == anchor and end.index in neighbour.poses:
-                found[end] = neighbour.poses[end.index]
-        return found
+    def _shared_with(self, other: LogId, pair: _Pair, anchor: LogId, now: float) -> SharedWith:
+        """What it shares with another; what that one said in another frame than this step's is not heard.
 
-    def _said(self) -> list[Separators]:
-        """This robot's separators and the weights that are its to decide, in as many messages as they need."""
-        state, origin = self._state, self._origin
-        known = [] if state is None else [index for index in self._separators if index < len(state.X)]
-        if state is None or origin is None or not known:
-            return []
-        weighed = [(pair, w) for pair, w in sorted(state.weights.items()) if pair.low.log != pair.high.log]
-        messages = []
-        for k in range(max(-(-len(known) // SEPARATORS_MAX), -(-len(weighed) // OFFERS_MAX))):
-            keyframes = known[k * SEPARATORS_MAX : (k + 1) * SEPARATORS_MAX]
-            part = weighed[k * OFFERS_MAX : (k + 1) * OFFERS_MAX]
-            messages.append(
-                Separators(
-                    self.anchor,
-                    self.iteration,
-                    state.epoch,
-                    Array.of(origin, "f8"),
-                    max(self._origin_iteration, 0),
-                    tuple(keyframes),
-                    Array.of(state.X[keyframes], "f8"),
-                    tuple(pair for pair, _ in part),
-                    Array.of(np.array([weight for _, weight in part])),
-                )
-            )
-        return messages
+        One that fell silent before both agreed pulls no more: of one that agreed the last word stands.
+        """
+        high = max(self._own, other)
+        heard = pair.heard if pair.heard is not None and pair.heard.anchor == anchor else None
+        return SharedWith(
+            pair.edition,
+            tuple(KeyframeId(high, index) for index in pair.keyframes),
+            None if pair.information is None else pair.information.numpy(),
+            None if heard is None else _told_by(heard),
+            forgotten=pair.said_s + SILENT_S <= now,
+        )
+
+    def _in_lower_frame(self) -> tuple[LogId, ToldPoses] | None:
+        """A neighbour in the lowest frame that is lower than the own one, and what it told; the freshest of several."""
+        lower = [
+            (pair.said.anchor, -pair.said.origin_step, other, pair.said)
+            for other, pair in self._pairs.items()
+            if pair.said is not None
+            and (pair.said.anchor < self.anchor or (self._is_back and pair.said.anchor == self.anchor))
+            and pair.said.edition == pair.edition
+            and 0 < len(pair.said) == len(pair.keyframes)
+        ]
+        if not lower:
+            return None
+        _, _, other, said = min(lower, key=lambda found: found[:3])
+        return other, _told_by(said)
+
+    def _begin_alone(self) -> None:
+        self.anchor, self._state, self._origin, self._origin_step = self._own, None, None, -1
+        self._is_back = True
+        self._has_news = True
+
+    def _said(self) -> list[Effect]:
+        """What neighbours in range are told; with the list of shared poses until they have it."""
+        return [
+            Unicast(other.robot, self._message(other, pair))
+            for other, pair in sorted(self._pairs.items())
+            if pair.told is not None and self._origin is not None and self._near(other.robot)
+        ]
+
+    def _message(self, other: LogId, pair: _Pair) -> SharedPoses:
+        told = pair.told
+        assert told is not None
+        assert self._origin is not None
+        has_list = pair.said is not None and pair.said.edition == pair.edition
+        listed = self._own < other and not has_list and pair.information is not None
+        return SharedPoses(
+            self.anchor,
+            self.number,
+            pose7(self._origin),
+            max(self._origin_step, 0),
+            pair.edition,
+            pair.keyframes if listed else (),
+            pair.information if listed and pair.information is not None else Array.of(np.zeros((0, 2))),
+            Array.of(told.base_m, "f8"),
+            Array.of(told.rows),
+            told.known,
+            told.edition,
+            Array.of(told.stiffness),
+        )
+
+    def _refuse(self, other: LogId, reason: str) -> Effect:
+        return Report(PeerRefused(peer=other.robot, reason=f"shared poses: {reason}"))
+
+
+def _told_by(message: SharedPoses) -> ToldPoses:
+    """What a message tells, as numbers."""
+    stiffness = message.stiffness.numpy()
+    return ToldPoses(message.base_m.numpy(), message.rows.numpy(), message.known, message.stiffness_edition, stiffness)
+
+
+def _used(
+    closures: Iterable[LoopClosure],
+    solution: GraphSolution,
+    T: Mapping[LogId, Float],
+    of: Iterable[LoopClosure] | None = None,
+) -> tuple[OwnedClosure, ...]:
+    """Closures that a solution uses, of some or all, between the logs that it placed."""
+    wanted = None if of is None else {id(closure) for closure in of}
+    found = []
+    for closure, result in zip(closures, solution.closures, strict=True):
+        ends = sorted((closure.query, closure.match))
+        placed = all(end.log in T and end.index < len(T[end.log]) for end in ends)
+        if result.state is not ClosureState.USED or result.weight <= 0.0 or not placed:
+            continue
+        if wanted is None or id(closure) in wanted:
+            low, high = ends
+            T_low_high = inverse(T[low.log][low.index]) @ T[high.log][high.index]
+            knows = closure.metric or closure.scale_initial is not None
+            found.append(OwnedClosure(closure, result.weight, None if knows else result.scale, T_low_high))
+    return tuple(found)
+
+
+def _named(owned: OwnedClosure) -> tuple[KeyframeId, KeyframeId]:
+    return owned.closure.query, owned.closure.match

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from flocc_agent.core.blocks import BlockProblem
+from flocc_agent.core.own_part import ConsensusProblem
 from flocc_agent.core.pose_graph import GraphSolution, PoseGraph
 from flocc_agent.core.reports import Fact
 from flocc_protocol.codec import Pose7
@@ -89,11 +89,19 @@ class Optimise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class IterateBlock:
-    """Do one iteration of the own block (distributed optimisation); answer BlockIterated or BlockIterationFailed."""
+class ChooseClosures:
+    """Solve one or two logs for themselves (distributed optimisation); answer ClosuresChosen or ChoiceFailed."""
 
     number: int
-    problem: BlockProblem
+    graph: PoseGraph
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepConsensus:
+    """Do one step of the own part (distributed optimisation); answer ConsensusStepped or ConsensusStepFailed."""
+
+    number: int
+    problem: ConsensusProblem
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +166,8 @@ Effect = (
     | FetchLatent
     | Register
     | Optimise
-    | IterateBlock
+    | ChooseClosures
+    | StepConsensus
     | Deliver
     | PersistRecord
     | PersistTerm

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from flocc_agent.core.blocks import BlockStep
 from flocc_agent.core.measurements import Measurement
+from flocc_agent.core.own_part import ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import CameraDoubted
@@ -124,16 +124,32 @@ class GraphOptimisationFailed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BlockIterated:
-    """An iteration of the own block ended."""
+class ClosuresChosen:
+    """One or two logs were solved for themselves."""
 
     number: int
-    step: BlockStep
+    solution: GraphSolution
 
 
 @dataclass(frozen=True, slots=True)
-class BlockIterationFailed:
-    """An iteration without a result; the block stands where it stood."""
+class ChoiceFailed:
+    """They could not be solved; what was chosen before stands."""
+
+    number: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsensusStepped:
+    """A step of the own part ended."""
+
+    number: int
+    step: ConsensusStep
+
+
+@dataclass(frozen=True, slots=True)
+class ConsensusStepFailed:
+    """A step without a result; the part stands where it stood."""
 
     number: int
     reason: str
@@ -168,8 +184,10 @@ Event = (
     | LatentMissing
     | GraphOptimised
     | GraphOptimisationFailed
-    | BlockIterated
-    | BlockIterationFailed
+    | ClosuresChosen
+    | ChoiceFailed
+    | ConsensusStepped
+    | ConsensusStepFailed
     | Measured
     | Leaving
 )

@@ -172,22 +172,24 @@ class DistributedParameters:
     __pydantic_config__ = _FORBID
 
     period_s: float = _inner(0.2)
-    """Shortest time between two iterations of a robot; shorter converges sooner and sends more."""
+    """Shortest time between two steps of a robot; shorter converges sooner and sends more."""
     wait_s: float = _inner(1.0)
-    """A robot waits this long for news of a neighbour before it iterates on old ones; longer rides out more loss."""
+    """A robot waits this long for news of a neighbour before it steps on old ones; longer rides out more loss."""
+    choose_s: float = _inner(5.0)
+    """Shortest time between two choices of the closures of one pair of robots."""
     repeat_s: float = _inner(0.5)
-    """First pause after which a robot at rest says its separators again; doubles up to `repeat_max_s`."""
+    """First pause after which a robot at rest tells its shared poses again; doubles up to `repeat_max_s`."""
     repeat_max_s: float = _inner(16.0)
     """Longest pause between repetitions, for robots that come into range later."""
     timeout_s: float = _inner(60.0)
-    """An iteration without a result by then is given up."""
+    """A step or a choice without a result by then is given up."""
     tolerance: float = _inner(1e-3)
-    """A block whose poses moved less (metres, or entries of a rotation) rests until it hears something new."""
+    """A part whose poses moved less (metres, or entries of a rotation) rests until it hears something new."""
 
     def __post_init__(self) -> None:
         _require(0 < self.period_s <= self.wait_s, "period_s must be in (0, wait_s]")
         _require(0 < self.repeat_s <= self.repeat_max_s, "repeat_s must be in (0, repeat_max_s]")
-        _require(self.timeout_s > 0, "timeout_s must be positive")
+        _require(self.timeout_s > 0 and self.choose_s > 0, "timeout_s and choose_s must be positive")
         _require(self.tolerance > 0, "tolerance must be positive")
 
 

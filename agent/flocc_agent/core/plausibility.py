@@ -186,6 +186,15 @@ class Doubts:
             self._held = replace(self._held, correction=placed.own, why=why)
         return why
 
+    def speaks_against(self, placed: Placed) -> str | None:
+        """What speaks against a correction that this robot made itself, None where nothing does."""
+        if self._graph is None or self._says_the_same(placed.own):
+            return None
+        why = contradiction(placed, self._before, self._graph)
+        if why is None:
+            self._checked = placed.own
+        return why
+
     def given_up(self, now: float) -> str | None:
         """Refuse what was held back for long enough; what is to be told of it, None where nothing is.
 

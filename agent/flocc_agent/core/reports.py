@@ -385,30 +385,30 @@ class SolutionIgnored:
     round: int
 
 
-@fact("block")
-class BlockMoved:
-    """Where this robot's own block stands, in distributed optimisation.
+@fact("part")
+class PartMoved:
+    """Where this robot's own part stands, in distributed optimisation.
 
     Attributes:
-        iteration: Iterations that it made.
+        step: Steps that it made.
         anchor: Log whose frame its poses are in.
-        neighbours: Robots that share a closure with it.
-        separators: Own keyframes that closures tie to other robots.
-        cost: Of its block, None before the first step.
+        neighbours: Robots with which it agrees on poses in that frame.
+        shared_poses: Poses that it shares with others.
+        cost: Of what it owns, None before the first step.
         moved: Largest change of a number of a pose in the last step: metres, or entries of a rotation.
-        closures_rejected: Closures of its own decision that it threw out.
-        weights_final: Whether the robust weights have settled.
-        keyframes: In its block.
+        gap: Largest difference from where neighbours have the shared poses.
+        closures_used: Closures that it owns and uses.
+        keyframes: In its part.
     """
 
-    iteration: int
+    step: int
     anchor: LogId
     neighbours: int
-    separators: int
+    shared_poses: int
     cost: float | None
     moved: float | None
-    closures_rejected: int
-    weights_final: bool
+    gap: float | None
+    closures_used: int
     keyframes: int
 
 

@@ -14,14 +14,16 @@ from flocc_agent.core.closure_rows import ROWS_OF_A_PIECE
 from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
-from flocc_agent.core.distributed_optimisation import ITERATIONS_AFTER_RESTART, DistributedOptimisation
+from flocc_agent.core.distributed_optimisation import STEPS_AFTER_RESTART, DistributedOptimisation
 from flocc_agent.core.effects import Broadcast, DropLog, Effect, Encode, Optimise, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
     LATENT_FALSE,
     LATENT_UNKNOWN,
-    BlockIterated,
-    BlockIterationFailed,
+    ChoiceFailed,
+    ClosuresChosen,
+    ConsensusStepFailed,
+    ConsensusStepped,
     Event,
     GraphOptimisationFailed,
     GraphOptimised,
@@ -68,6 +70,7 @@ from flocc_agent.core.reports import (
     LatentLost,
     LogGivenUp,
     NeighbourDown,
+    PeerRefused,
     RoundFailed,
     SolutionIgnored,
 )
@@ -96,7 +99,7 @@ from flocc_protocol.messages import (
     LogDigest,
     RecordRequest,
     Records,
-    Separators,
+    SharedPoses,
 )
 from flocc_protocol.records import (
     ClosureRecord,
@@ -111,6 +114,7 @@ NOBODY = -1
 DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
 """How long a leader whose signed correction cannot be true is not followed: the first time, and at most."""
 OVERTAKEN_PERIOD_S = 1.0
+OTHER_MODE_MAX = 256
 GREETING_RATIO = 0.2
 """Least pause between heartbeats that greet new neighbours, against the usual one."""
 
@@ -234,6 +238,7 @@ class Robot:
         )
         self.rounds = Rounds(self.assembly, parameters.rounds, cold, held)
         self.distributed = self._distributed(restored.correction) if distributed else None
+        self._of_other_mode: set[LogId] = set()
         self._restore(restored, now)
 
     # The three entry points
@@ -344,10 +349,8 @@ class Robot:
             case GraphOptimisationFailed(term, round_number, reason):
                 self.rounds.on_failed(term, round_number, now)
                 return [Report(RoundFailed(term=term, round=round_number, reason=reason))]
-            case BlockIterated(number, step):
-                return [] if self.distributed is None else self.distributed.on_step(number, step, now)
-            case BlockIterationFailed(number, reason):
-                return [] if self.distributed is None else self.distributed.on_failed(number, reason, now)
+            case ClosuresChosen() | ChoiceFailed() | ConsensusStepped() | ConsensusStepFailed():
+                return [] if self.distributed is None else self._on_agreeing(self.distributed, event, now)
             case Measured(measurement, index):
                 return self._on_measured(measurement, index, now)
             case Leaving():
@@ -387,10 +390,8 @@ class Robot:
             case CandidateOffer():
                 self.closing.on_offer(message, now)
                 return []
-            case Separators():
-                if self.distributed is not None:
-                    self.distributed.on_separators(sender, message)
-                return []
+            case SharedPoses():
+                return self._on_shared_poses(sender, message, now)
 
     def _on_signed(self, sender: LogId, message: Records | CorrectionBatch, now: float) -> list[Effect]:
         """Take in what is signed, but for what of this sender failed lately."""
@@ -435,6 +436,10 @@ class Robot:
             return []
         if self._is_distrusted(message.term.leader, now):
             return self._overtaken(sender, message, now)
+        if self.distributed is not None and message.term.leader != message.log:
+            return self._other_mode(message.term.leader)
+        if self.distributed is not None and message.log == self.log:
+            self.distributed.on_own_correction(message.round)
         if not self.corrections.is_news(message, now):
             return []
         refused = self.corrections.refused(sender.robot, message) or self.election.on_applied(sender, message.term, now)
@@ -681,8 +686,38 @@ class Robot:
 
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
-        iteration = 0 if correction is None else correction.round + ITERATIONS_AFTER_RESTART
-        return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, iteration)
+        number = 0 if correction is None else correction.round + STEPS_AFTER_RESTART
+        near = self.neighbours.__contains__
+        return DistributedOptimisation(self.log, self.assembly, self._parameters.distributed, near, number)
+
+    def _on_agreeing(
+        self,
+        distributed: DistributedOptimisation,
+        event: ClosuresChosen | ChoiceFailed | ConsensusStepped | ConsensusStepFailed,
+        now: float,
+    ) -> list[Effect]:
+        match event:
+            case ClosuresChosen(number, solution):
+                return distributed.on_chosen(number, solution, now)
+            case ChoiceFailed(number, reason):
+                return distributed.on_choice_failed(number, reason, now)
+            case ConsensusStepped(number, step):
+                return distributed.on_step(number, step, now)
+            case ConsensusStepFailed(number, reason):
+                return distributed.on_failed(number, reason, now)
+
+    def _on_shared_poses(self, sender: LogId, message: SharedPoses, now: float) -> list[Effect]:
+        """Agree with a robot in distributed mode, where this one is; else the two have nothing to tell each other."""
+        if self.distributed is not None:
+            return self.distributed.on_shared_poses(sender, message, now)
+        return self._other_mode(sender)
+
+    def _other_mode(self, sender: LogId) -> list[Effect]:
+        """Name a robot that optimises in another mode, once."""
+        if sender in self._of_other_mode or len(self._of_other_mode) >= OTHER_MODE_MAX:
+            return []
+        self._of_other_mode.add(sender)
+        return [Report(PeerRefused(peer=sender.robot, reason="its backend.mode is another one"))]
 
     def _front_ends_differ(self, first: LogId, second: LogId) -> list[Effect]:
         """Tell, where it concerns this robot."""
@@ -782,12 +817,13 @@ class Robot:
         return [*effects, *self.rounds.tick(now)]
 
     def _optimise_together(self, distributed: DistributedOptimisation, now: float) -> list[Effect]:
-        """Iterate on the own block, and correct itself."""
+        """Step with the own part, and correct itself; what its own log contradicts is not applied."""
         effects = distributed.tick(now)
         component = distributed.component(now)
         if component is None:
             return effects
-        return [*effects, distributed.report(), *self.corrections.publish_own(component, distributed.iteration)]
+        published, why = self.corrections.publish_own(component, distributed.number)
+        return [*effects, distributed.report(), *published, *distributed.on_judged(why, now)]
 
 
 def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:

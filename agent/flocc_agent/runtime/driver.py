@@ -16,18 +16,19 @@ from numpy.typing import NDArray
 from flocc_agent.core.corrected import CorrectedLog, Correction, Corrector
 from flocc_agent.core.effects import (
     Broadcast,
+    ChooseClosures,
     Deliver,
     DropLog,
     Effect,
     Encode,
     FetchLatent,
-    IterateBlock,
     Optimise,
     PersistCorrection,
     PersistRecord,
     PersistTerm,
     Register,
     Report,
+    StepConsensus,
     Unicast,
 )
 from flocc_agent.core.events import (
@@ -379,7 +380,7 @@ class Driver:
                 self._sender.unicast(to, message)
             case Deliver(applied, frame_changed):
                 self._deliver(self._corrector.correction(applied, frame_changed, self._T_body_camera))
-            case Encode() | FetchLatent() | Register() | Optimise() | IterateBlock():
+            case Encode() | FetchLatent() | Register() | Optimise() | ChooseClosures() | StepConsensus():
                 self._start(effect)
             case _:
                 assert_never(effect)

@@ -14,12 +14,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockProblem, BlockStep
 from flocc_agent.core.claims import Claim
-from flocc_agent.core.effects import Encode, FetchLatent, IterateBlock, Optimise, Register
+from flocc_agent.core.effects import ChooseClosures, Encode, FetchLatent, Optimise, Register, StepConsensus
 from flocc_agent.core.events import (
-    BlockIterated,
-    BlockIterationFailed,
+    ChoiceFailed,
+    ClosuresChosen,
+    ConsensusStepFailed,
+    ConsensusStepped,
     Event,
     GraphOptimisationFailed,
     GraphOptimised,
@@ -31,6 +32,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.interfaces import Image, ImageWatch, OdometryPair, Perception
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
@@ -42,7 +44,7 @@ from flocc_protocol.ids import KeyframeId
 
 IMAGES_MAX = 8
 
-Job = Encode | FetchLatent | Register | Optimise | IterateBlock
+Job = Encode | FetchLatent | Register | Optimise | ChooseClosures | StepConsensus
 """An effect that takes time and is answered by an event."""
 
 
@@ -82,7 +84,7 @@ class Tools:
         perception: What images are seen with.
         watch: Looks at the robot's own images, one after the other.
         optimise: Pose graph and last solution to a solution; must be importable by a worker process.
-        iterate: One iteration of this robot's block, in distributed mode; importable like `optimise`.
+        step: One step of this robot's part, in distributed mode; importable like `optimise`.
         workers: Pools off the loop.
         store: Holds latents.
         transport: Fetches latents.
@@ -94,7 +96,7 @@ class Tools:
     perception: Perception
     watch: ImageWatch
     optimise: Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
-    iterate: Callable[[BlockProblem], BlockStep | OptimisationFailed]
+    step: Callable[[ConsensusProblem], ConsensusStep | OptimisationFailed]
     workers: Workers
     store: Store
     transport: Transport
@@ -114,8 +116,10 @@ def job_of(effect: Job, tools: Tools) -> Coroutine[Any, Any, Event]:
             return register(effect, tools)
         case Optimise():
             return optimise(effect, tools)
-        case IterateBlock():
-            return iterate(effect, tools)
+        case ChooseClosures():
+            return choose(effect, tools)
+        case StepConsensus():
+            return step(effect, tools)
 
 
 async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEncodingFailed:
@@ -224,10 +228,19 @@ async def check(messages: Sequence[Sequence[Claim]], tools: Tools) -> list[int]:
     return [len(claims) for claims in messages] if isinstance(result, WorkFailed) else result.value
 
 
-async def iterate(effect: IterateBlock, tools: Tools) -> BlockIterated | BlockIterationFailed:
-    """Iterate once on the own block in the solver's process."""
-    result = await tools.workers.run("optimise", tools.iterate, effect.problem)
-    step = result if isinstance(result, WorkFailed) else result.value
-    if isinstance(step, (WorkFailed, OptimisationFailed)):
-        return BlockIterationFailed(effect.number, step.reason)
-    return BlockIterated(effect.number, step)
+async def choose(effect: ChooseClosures, tools: Tools) -> ClosuresChosen | ChoiceFailed:
+    """Solve one or two logs for themselves in the solver's process."""
+    result = await tools.workers.run("optimise", tools.optimise, effect.graph, None)
+    solution = result if isinstance(result, WorkFailed) else result.value
+    if isinstance(solution, (WorkFailed, OptimisationFailed)):
+        return ChoiceFailed(effect.number, solution.reason)
+    return ClosuresChosen(effect.number, solution)
+
+
+async def step(effect: StepConsensus, tools: Tools) -> ConsensusStepped | ConsensusStepFailed:
+    """Do a step of the own part in the solver's process."""
+    result = await tools.workers.run("optimise", tools.step, effect.problem)
+    done = result if isinstance(result, WorkFailed) else result.value
+    if isinstance(done, (WorkFailed, OptimisationFailed)):
+        return ConsensusStepFailed(effect.number, done.reason)
+    return ConsensusStepped(effect.number, done)

@@ -67,7 +67,7 @@ PRIORITY = {
     keys.Kind.RECORDS.value: zenoh.Priority.DATA_HIGH,
     keys.Kind.RECORD_REQUEST.value: zenoh.Priority.DATA_HIGH,
     keys.Kind.CANDIDATES.value: zenoh.Priority.DATA,
-    keys.Kind.SEPARATORS.value: zenoh.Priority.DATA,
+    keys.Kind.SHARED_POSES.value: zenoh.Priority.DATA,
 }
 EXPRESS_PRIORITIES = (zenoh.Priority.REAL_TIME, zenoh.Priority.INTERACTIVE_HIGH)
 EXPRESS = frozenset(kind for kind, priority in PRIORITY.items() if priority in EXPRESS_PRIORITIES)

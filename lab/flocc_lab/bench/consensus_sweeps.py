@@ -1,8 +1,8 @@
-"""Consensus of robots (`flocc_lab.consensus`) on graphs of one robot that are cut among several, beside the optimum.
+"""Consensus (`flocc_agent.backend.consensus`) on graphs of one robot that are cut among several, beside the optimum.
 
 `python -m flocc_lab.bench.consensus_sweeps FILE... [--robots 5] [--sweeps 60] [--loss 0.3] [--seed 1]` prints a row of
 Markdown for each g2o file. In a sweep each robot in turn does one step and tells each of its neighbours; a message is
-lost with the given probability. Bytes are those of `SharedPoses.packed`, which is what the other side reads.
+lost with the given probability. Bytes are those of `ToldPoses`, which is what the other side reads.
 """
 
 import argparse
@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import align
+from flocc_agent.backend.consensus import ConsensusPart, Tidings
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import PoseGraph, Trajectory
-from flocc_lab.consensus import ConsensusPart, SharedPoses, part_of, solved_alone
+from flocc_lab.consensus_graphs import part_of_graph, solved_alone
 from flocc_lab.experiments.distributed import OPTIMA
-from flocc_lab.experiments.rbcd_run import cut_by_time, graph_cost
+from flocc_lab.rbcd.run import cut_by_time, graph_cost
 from flocc_launch.graph_files import read_g2o
 from flocc_protocol.ids import LogId
 
@@ -50,12 +51,12 @@ class Sweeps:
         for log, part in self.parts.items():
             part.step()
             for other in part.neighbours:
-                payload = part.tell(other).packed()
-                self.payload_bytes += len(payload)
+                told = part.tell(other).told()
+                self.payload_bytes += told.size_bytes
                 if self._rng.random() >= self._loss_ratio:
                     count = len(part.neighbours[other].index)
                     try:
-                        self.parts[other].hear(log, SharedPoses.unpacked(payload, count))
+                        self.parts[other].hear(log, Tidings.of(told, count))
                     except ValueError:
                         self.refused += 1
 
@@ -63,12 +64,12 @@ class Sweeps:
 def begun(graph: PoseGraph, config: BackendConfig) -> dict[LogId, ConsensusPart]:
     """Each robot solved alone, then placed in the frame of the lowest by the closures between them."""
     T_alone = {
-        log: solved_alone(part_of(graph, log, config, np.asarray(trajectory.T_odom_keyframe, dtype=float)))
+        log: solved_alone(part_of_graph(graph, log, config, np.asarray(trajectory.T_odom_keyframe, dtype=float)))
         for log, trajectory in sorted(graph.trajectories.items())
     }
     moved = {log: Trajectory(T, graph.trajectories[log].edge_covariances) for log, T in T_alone.items()}
     T_map_odom, _ = align(moved, dict(enumerate(graph.closures)), config.steepness)
-    return {log: part_of(graph, log, config, T_map_odom[log] @ T) for log, T in T_alone.items()}
+    return {log: part_of_graph(graph, log, config, T_map_odom[log] @ T) for log, T in T_alone.items()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """`flocc experiment distributed`: RBCD against the known optima of g2o sets, cut among robots, over links that lose.
 
-The machines are the agents' own (`rbcd_run`); each cell ends when the cost is within the limit of the listed
+The machines are those of `flocc_lab.rbcd`; each cell ends when the cost is within the limit of the listed
 optimum, or at the most iterations. Robots begin with their own odometry in their own frames.
 """
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from flocc_agent.config import BackendConfig, BackendMode, Formulation, Solver
-from flocc_agent.core.parameters import DistributedParameters
+from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import PoseGraph
 from flocc_lab.experiments.experiment import (
     Cell,
@@ -26,7 +25,8 @@ from flocc_lab.experiments.experiment import (
     judged,
 )
 from flocc_lab.experiments.plots import COLOURS
-from flocc_lab.experiments.rbcd_run import cut_by_time, graph_cost, optimise_together
+from flocc_lab.rbcd.machine import RbcdParameters
+from flocc_lab.rbcd.run import cut_by_time, graph_cost, optimise_together
 from flocc_launch.graph_files import read_g2o
 
 if TYPE_CHECKING:
@@ -55,8 +55,6 @@ class DistributedSettings(Settings):
     """Robots among which each set is cut by time; tinyGrid3D is cut among two."""
     losses: tuple[float, ...] = (0.0, 0.3)
     """Shares of messages that each receiver loses."""
-    rank: int = Field(5, ge=3, le=5)
-    """Dimensions to which rotations are relaxed."""
     iterations_max: int = Field(3000, ge=1)
     """A cell ends when the slowest robot has done so many."""
     limit_ratio: float = Field(1e-3, gt=0)
@@ -87,9 +85,9 @@ def measure(settings: DistributedSettings, cell: Cell, seed: int) -> Row:
         costs.append(graph_cost(graph, poses))  # type: ignore[arg-type]
         return costs[-1] <= optimum * (1.0 + settings.limit_ratio)
 
-    parameters = DistributedParameters(tolerance=TOLERANCE)
+    parameters = RbcdParameters(tolerance=TOLERANCE)
     run = optimise_together(
-        graph, config(settings), parameters, loss_ratio=loss_ratio, seed=seed,
+        graph, config(), parameters, loss_ratio=loss_ratio, seed=seed,
         iterations_max=settings.iterations_max, on_iteration=look,
     )  # fmt: skip
     return {
@@ -113,13 +111,11 @@ def cut(settings: DistributedSettings, name: str) -> PoseGraph:
     return cut_by_time(file.graph, 2 if name == "tinyGrid3D" else settings.robots)
 
 
-def config(settings: DistributedSettings) -> BackendConfig:
+def config() -> BackendConfig:
     """Plain least squares; one edge over a cut joins two parts."""
     return BackendConfig(
-        mode=BackendMode.DISTRIBUTED,
         formulation=Formulation.BASE,
         solver=Solver.LM,
-        rank=settings.rank,
         weight_by_probability=False,
         relative_tolerance=1e-9,
         closures_to_join_min=1,

@@ -11,8 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from flocc_agent.config import BackendConfig, BackendMode
-from flocc_agent.core.parameters import DistributedParameters
+from flocc_agent.config import BackendConfig
 from flocc_agent.core.pose_graph import OptimisationFailed, PoseGraph
 from flocc_lab.experiments.benchmarks import COSMO
 from flocc_lab.experiments.experiment import (
@@ -29,7 +28,6 @@ from flocc_lab.experiments.formulation_claims import MeasuredClaim, formulation_
 from flocc_lab.experiments.full_system_data import METHODS, PICTURES, FullSystemSettings, recordings_of, scenario_of
 from flocc_lab.experiments.overlap import require_overlap
 from flocc_lab.experiments.plots import COLOURS, MARKERS, label_logarithmic
-from flocc_lab.experiments.rbcd_run import optimise_together
 from flocc_lab.experiments.statistics import grouped, middle, values, with_spread
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
@@ -89,7 +87,7 @@ def measure(settings: FullSystemSettings, cell: Cell, seed: int) -> Row:
         "closures": report.closures.accepted,
         "merged_after_s": report.merged_after_s,
         "bytes": sum(report.bytes.values()),
-        **solved(scenario.backend, scenario.core.distributed, graph),
+        **solved(scenario.backend, graph),
     }
 
 
@@ -104,16 +102,11 @@ def simulated_with_graph(scenario: Scenario, seed: int, recordings: dict[str, Pa
         return finish(out), core.assembly.graph()
 
 
-def solved(config: BackendConfig, parameters: DistributedParameters, graph: PoseGraph) -> Row:
-    """Time of one cold solve; of rbcd the time of all robots together over their number."""
-    began_s = time.process_time()
-    if config.mode is BackendMode.DISTRIBUTED:
-        together = optimise_together(graph, config, parameters, iterations_max=300)
-        cpu_s = (time.process_time() - began_s) / max(len(together.iterations), 1)
-        iterations = max(together.iterations.values(), default=0)
-        return {"solve_cpu_s": cpu_s, "iterations": iterations, "closures_rejected": together.rejected}
+def solved(config: BackendConfig, graph: PoseGraph) -> Row:
+    """Time of one cold solve."""
     from flocc_agent.backend.optimiser import optimise
 
+    began_s = time.process_time()
     solution = optimise(graph, config)
     cpu_s = time.process_time() - began_s
     if isinstance(solution, OptimisationFailed):
@@ -142,7 +135,7 @@ def summarise(_settings: FullSystemSettings, rows: Sequence[Row]) -> Summary:
     ]
     notes = [
         "metric: closures keep their scale, as of a stereo camera or a lidar; flocc: their scale is removed.",
-        "solve_cpu_s: CPU time of one cold solve of the final graph; of rbcd per robot.",
+        "solve_cpu_s: CPU time of one cold solve of the final graph.",
     ]
     return Summary(table, findings(rows), notes)
 
@@ -215,7 +208,7 @@ FULL_SYSTEM: Experiment[FullSystemSettings] = Experiment(
     settings=FullSystemSettings,
     quick={
         "sources": ["tracks"],
-        "methods": [DEFAULT, "flocc smoothed lm", "metric swarm-slam", "metric rbcd gnc"],
+        "methods": [DEFAULT, "flocc smoothed lm", "metric swarm-slam", "metric distributed"],
         "walk_m": 25.0,
     },
     cells=cells,

@@ -74,7 +74,7 @@ METHODS: dict[str, Method] = {
     "metric lm": Method(Formulation.BASE, Solver.LM, metric=True),
     "metric pcm lm": Method(Formulation.BASE, Solver.LM, metric=True, pairwise_consistency=True),
     "metric swarm-slam": Method(Formulation.BASE, Solver.GNC_TLS, metric=True, order="spectral"),
-    "metric rbcd gnc": Method(Formulation.BASE, Solver.GNC_TLS, metric=True, mode=BackendMode.DISTRIBUTED),
+    "metric distributed": Method(Formulation.BASE, Solver.GNC_TLS, metric=True, mode=BackendMode.DISTRIBUTED),
 }
 """Swarm-SLAM: metric closures, spectral order of candidates, GNC, the lowest robot optimises (all are of one class)."""
 
@@ -98,7 +98,7 @@ class FullSystemSettings(Settings):
     round_period_s: float = Field(100.0, gt=0, le=200)
     """Time between rounds on cosmo_bench, whose robots drive for a quarter of an hour; elsewhere the default."""
     iteration_period_s: float = Field(2.0, gt=0)
-    """Time between iterations of rbcd on cosmo_bench; elsewhere the default."""
+    """Time between steps of distributed mode on cosmo_bench; elsewhere the default."""
     keyframes_max: int = Field(100_000, ge=10)
     """Keyframes of each robot of cosmo_bench that are used."""
     walk_m: float = Field(60.0, gt=0)

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 
-from flocc_agent.config import KeyframeConfig
+from flocc_agent.config import BackendMode, KeyframeConfig
 from flocc_agent.perception.backends import build_perception
 from flocc_launch.datasets.drift import DriftSpec
 from flocc_launch.runs.run_folder import write_json
@@ -107,7 +107,7 @@ def _outcomes(seeds: list[int], processes: int, family: str) -> Iterator[SeedOut
         yield from map(run_one, seeds)
         return
     with ProcessPoolExecutor(processes) as pool:
-        yield from pool.map(run_one, seeds, chunksize=SEEDS_PER_TASK if family == "small" else 1)
+        yield from pool.map(run_one, seeds, chunksize=SEEDS_PER_TASK if family in ("small", "distributed") else 1)
 
 
 def run_seed(seed: int, family: str = "small") -> SeedOutcome:
@@ -147,7 +147,8 @@ def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> lis
     classes = {name: -1 if name in doubles else scenario.robot(name).compute_class for name in scenario.names()}
     told_twice = any(hardship.kind is HardshipKind.OLDER for hardship in hardships)
     honest = all(hardship.kind is not HardshipKind.LIAR for hardship in hardships)
-    return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes, honest)
+    distributed = scenario.backend.mode is BackendMode.DISTRIBUTED
+    return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes, honest, distributed)
 
 
 def is_noiseless(scenario: Scenario) -> bool:

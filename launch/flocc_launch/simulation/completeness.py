@@ -69,7 +69,7 @@ class Complete:
                 life = station.name, station.life
                 if self._captured[life] > self._recorded[life]:
                     yield f"{station.name} recorded {self._recorded[life]} of {self._captured[life]} keyframes"
-                if core(station).election.leading:
+                if core(station).election.leading and core(station).distributed is None:
                     yield from _unsolved(station)
             yield from self._unregistered(swarm, group)
 

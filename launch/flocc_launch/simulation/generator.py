@@ -4,7 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flocc_agent.config import KeyframeConfig, LinkOverrideConfig, PerceptionConfig, RadioConfig, SyntheticConfig
+from flocc_agent.config import (
+    BackendConfig,
+    BackendMode,
+    KeyframeConfig,
+    LinkOverrideConfig,
+    PerceptionConfig,
+    RadioConfig,
+    SyntheticConfig,
+)
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
 from flocc_launch.scenarios.scenario import (
     Fault,
@@ -52,6 +60,7 @@ class Family:
         lengths_m: Lengths of walks.
         area_m: Edge of the area.
         flaps: The best-ranked robot may come and go.
+        distributed: Nobody solves for the others.
     """
 
     robots: tuple[int, int]
@@ -60,15 +69,19 @@ class Family:
     lengths_m: tuple[float, ...]
     area_m: float = 12.0
     flaps: bool = False
+    distributed: bool = False
 
 
 FAMILIES = {
     "small": Family((2, ROBOTS_MAX), FAULTS_END_S, FAULTS_MAX, LENGTHS_M),
+    "distributed": Family((2, ROBOTS_MAX), FAULTS_END_S, FAULTS_MAX, LENGTHS_M, distributed=True),
     "large": Family((20, 20), 540.0, 40, (40.0,), area_m=24.0, flaps=True),
     "hour": Family((20, 20), 3540.0, 80, (40.0,), area_m=24.0, flaps=True),
 }
-"""`flocc simulate --seeds N --family NAME`: small swarms for half a minute, large ones for ten minutes or an hour."""
+"""`flocc simulate --seeds N --family NAME`: small swarms for half a minute, with a leader or distributed, large ones
+for ten minutes or an hour."""
 SMALL = FAMILIES["small"]
+DISTRIBUTED = BackendConfig(mode=BackendMode.DISTRIBUTED)
 FLAPS, FLAP_S = 6, 7.0
 
 
@@ -99,6 +112,7 @@ def drawn_scenario(seed: int, family: Family = SMALL) -> Scenario:
         perception=PerceptionConfig(
             method="synthetic", synthetic=NOISELESS if _draws(seed, 2, NOISELESS_RATIO) else NOISY
         ),
+        backend=DISTRIBUTED if family.distributed else BackendConfig(),
         faults=_faults(rng, names, family),
         sensors=SENSORS if _draws(seed, 1, SENSING_RATIO) else None,
     )

@@ -30,7 +30,7 @@ from flocc_agent.core.plausibility import UNTIED
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.prospects import UNLIKELY
 from flocc_agent.core.reports import NeighbourDown, NeighbourUp, PeerRefused
-from flocc_launch.simulation import liveness
+from flocc_launch.simulation import agreed, liveness
 from flocc_launch.simulation.completeness import Complete
 from flocc_launch.simulation.costs import Balanced, Cheap
 from flocc_launch.simulation.invariants import Invariant, Step, core
@@ -49,7 +49,9 @@ APART_S = FAR_TAKEOVERS * TAKEOVER_S + 10.0
 """So long after two robots lost or found each other a pair may be taken over, and its latents be fetched."""
 
 
-def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], honest: bool = True) -> list[Invariant]:
+def all_invariants(
+    separated: bool, noiseless: bool, classes: dict[str, int], honest: bool = True, distributed: bool = False
+) -> list[Invariant]:
     """DESIGN.md, section 5, that memory is bounded, and that what comes out is right, complete and cheap.
 
     Args:
@@ -57,6 +59,7 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], ho
         noiseless: Odometry and registrations are without noise, so that the truth can be asked for.
         classes: Compute class by robot name.
         honest: Nobody lies on purpose.
+        distributed: Nobody solves for the others.
     """
     complete = Complete()
     sent = frozenset({Broadcast, Unicast})
@@ -65,15 +68,15 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], ho
         Invariant("agreement", lacking=liveness.without_one_leader),
         Invariant("led", step=Led().step, lacking=badly_led),
         Invariant("fencing", step=Fencing().step, wants=frozenset({Deliver})),
-        Invariant("one claim", step=OneClaim().step, wants=sent | {Optimise}),
-        Invariant("no starvation", lacking=liveness.uncorrected),
+        Invariant("one claim", step=OneClaim(distributed).step, wants=sent | {Optimise}),
+        Invariant("no starvation", lacking=agreed.uncorrected if distributed else liveness.uncorrected),
         Invariant(
             "registered once",
             step=Once(separated).step,
             lacking=liveness.unregistered,
             wants=frozenset({PersistRecord, Report, Register}),
         ),
-        Invariant("one frame", lacking=liveness.in_other_frames),
+        Invariant("one frame", lacking=agreed.in_other_frames if distributed else liveness.in_other_frames),
         Invariant("nothing lost", step=Published().step, lacking=liveness.not_everywhere),
         Invariant("believed", step=doubted_in_error if honest else None, wants=frozenset({Report, Optimise})),
         Invariant("bounded", step=Bounded().step),
@@ -89,7 +92,7 @@ def all_invariants(separated: bool, noiseless: bool, classes: dict[str, int], ho
         Invariant(
             "right",
             step=Right().step,
-            lacking=untrue if noiseless else unlike_the_solution,
+            lacking=untrue if noiseless else agreed.apart if distributed else unlike_the_solution,
             wants=frozenset({GraphOptimised, PairRegistered, Register, Deliver}),
         ),
     ]
@@ -142,8 +145,12 @@ class Fencing:
 
 @dataclass(slots=True)
 class OneClaim:
-    """A term is claimed by the leader that it names, once, and nobody else speaks with it."""
+    """A term is claimed by the leader that it names, once, and nobody else speaks with it.
 
+    In distributed mode a robot corrects its own log, and claims nothing for that.
+    """
+
+    distributed: bool = False
     _claims: dict[Term, tuple[str, int]] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
@@ -160,7 +167,8 @@ class OneClaim:
                 case Optimise(term=term) if term.leader != station.log:
                     yield f"{station.name} optimises in {term}"
                 case Broadcast(CorrectionBatch(corrections)):
-                    for term in {correction.term for correction in corrections} - self._claims.keys():
+                    own = {c.term for c in corrections if self.distributed and c.log == c.term.leader == station.log}
+                    for term in {correction.term for correction in corrections} - self._claims.keys() - own:
                         yield f"{station.name} corrects in {term}, which nobody claimed"
 
 

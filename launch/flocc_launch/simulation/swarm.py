@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flocc_agent.backend import build_iterator
+from flocc_agent.backend import build_stepper
 from flocc_agent.config import BackendMode
 from flocc_agent.core.effects import Effect, Report
 from flocc_agent.core.events import Event, Leaving
@@ -208,7 +208,7 @@ class Swarm:
             VirtualWorkers(
                 self._equipment.eyes,
                 self._equipment.optimiser,
-                build_iterator(self.scenario.backend),
+                build_stepper(self.scenario.backend),
                 self._equipment.times,
                 rng,
                 playback.hidden,

@@ -10,18 +10,19 @@ from typing import assert_never
 
 from flocc_agent.core.effects import (
     Broadcast,
+    ChooseClosures,
     Deliver,
     DropLog,
     Effect,
     Encode,
     FetchLatent,
-    IterateBlock,
     Optimise,
     PersistCorrection,
     PersistRecord,
     PersistTerm,
     Register,
     Report,
+    StepConsensus,
     Unicast,
 )
 from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Measured, MessageReceived
@@ -318,8 +319,10 @@ class Station:
                 self.later(self.workers.registered_at_s(now_s), lambda: self.workers.register(effect, self.disk))
             case Optimise():
                 self.later(self.workers.optimised_at_s(now_s), lambda: self.workers.optimise(effect))
-            case IterateBlock():
-                self.later(self.workers.iterated_at_s(now_s), lambda: self.workers.iterate(effect))
+            case ChooseClosures():
+                self.later(self.workers.optimised_at_s(now_s), lambda: self.workers.choose(effect))
+            case StepConsensus():
+                self.later(self.workers.stepped_at_s(now_s), lambda: self.workers.step(effect))
             case PersistTerm(counter):
                 self.disk.term_counter = max(self.disk.term_counter, counter)
             case DropLog(log):

@@ -12,11 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockProblem, BlockStep
-from flocc_agent.core.effects import IterateBlock, Optimise, Register
+from flocc_agent.core.effects import ChooseClosures, Optimise, Register, StepConsensus
 from flocc_agent.core.events import (
-    BlockIterated,
-    BlockIterationFailed,
+    ChoiceFailed,
+    ClosuresChosen,
+    ConsensusStepFailed,
+    ConsensusStepped,
     Event,
     GraphOptimisationFailed,
     GraphOptimised,
@@ -26,6 +27,7 @@ from flocc_agent.core.events import (
     PairRegistered,
 )
 from flocc_agent.core.interfaces import KeyframeLook, OdometryPair
+from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
@@ -42,7 +44,7 @@ logger = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Optimiser = Callable[[PoseGraph, GraphSolution | None], GraphSolution | OptimisationFailed]
-Iterator = Callable[[BlockProblem], BlockStep | OptimisationFailed]
+ConsensusStepper = Callable[[ConsensusProblem], ConsensusStep | OptimisationFailed]
 
 
 class CaptureWatch(Protocol):
@@ -76,7 +78,7 @@ class WorkTimes:
     encode_s: float = 0.1
     register_s: float = 0.25
     optimise_s: float = 0.15
-    iterate_s: float = 0.05
+    step_s: float = 0.05
 
 
 class VirtualWorkers:
@@ -91,7 +93,7 @@ class VirtualWorkers:
         self,
         eyes: Eyes,
         optimiser: Optimiser,
-        iterator: Iterator,
+        stepper: ConsensusStepper,
         times: WorkTimes,
         rng: np.random.Generator,
         hidden: Mask | None = None,
@@ -102,7 +104,7 @@ class VirtualWorkers:
         self._hidden = hidden
         self._watch = eyes.watch(hidden)
         self._optimiser = optimiser
-        self._iterator = iterator
+        self._stepper = stepper
         self._times = times
         self._rng = rng
         self._encoder_free_s = 0.0
@@ -121,9 +123,9 @@ class VirtualWorkers:
         """When an optimisation that starts now is done."""
         return now_s + self._lasts("optimise", self._times.optimise_s)
 
-    def iterated_at_s(self, now_s: float) -> float:
-        """When an iteration of the own block that starts now is done."""
-        return now_s + self._lasts("iterate", self._times.iterate_s)
+    def stepped_at_s(self, now_s: float) -> float:
+        """When a step of the own part that starts now is done."""
+        return now_s + self._lasts("step", self._times.step_s)
 
     def restart(self) -> None:
         """Forget the queue, and what the camera was like."""
@@ -171,12 +173,23 @@ class VirtualWorkers:
             return GraphOptimisationFailed(job.term, job.round, solution.reason)
         return GraphOptimised(job.term, job.round, replace(solution, solve_s=0.0, timings_s={}))
 
-    def iterate(self, job: IterateBlock) -> Event:
-        """Do one iteration of a robot's block."""
-        step = self._iterator(job.problem)
-        if isinstance(step, OptimisationFailed):
-            return BlockIterationFailed(job.number, step.reason)
-        return BlockIterated(job.number, step)
+    def choose(self, job: ChooseClosures) -> Event:
+        """Solve one or two logs for themselves."""
+        try:
+            solution = self._optimiser(job.graph, None)
+        except Exception as error:  # as in the real workers, a failure is an event
+            logger.error("choice %d failed", job.number, exc_info=True)
+            return ChoiceFailed(job.number, str(error).strip().split("\n")[0])
+        if isinstance(solution, OptimisationFailed):
+            return ChoiceFailed(job.number, solution.reason)
+        return ClosuresChosen(job.number, replace(solution, solve_s=0.0, timings_s={}))
+
+    def step(self, job: StepConsensus) -> Event:
+        """Do one step of a robot's part."""
+        done = self._stepper(job.problem)
+        if isinstance(done, OptimisationFailed):
+            return ConsensusStepFailed(job.number, done.reason)
+        return ConsensusStepped(job.number, done)
 
     def _lasts(self, stage: str, typical_s: float) -> float:
         lasts_s = self.slowness * typical_s * float(self._rng.uniform(0.5, 1.5))

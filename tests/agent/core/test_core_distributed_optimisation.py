@@ -1,190 +1,378 @@
-"""The machine of a distributed optimisation: what it says, when it iterates, and into which frame it moves."""
+"""The machine of distributed optimisation: what it has solved, what it tells whom, and into which frame it moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.core.blocks import BlockState, BlockStep
-from flocc_agent.core.distributed_optimisation import DistributedOptimisation
-from flocc_agent.core.effects import Broadcast, Effect, IterateBlock, Report
+from flocc_agent.core.distributed_optimisation import DELIVER_PERIOD_S, VAIN_STEPS_MAX, DistributedOptimisation
+from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
+from flocc_agent.core.own_part import ConsensusState, ConsensusStep, ToldPoses
 from flocc_agent.core.parameters import DistributedParameters
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
-from flocc_agent.core.reports import RoundFailed
+from flocc_agent.core.plausibility import HELD_BACK_S
+from flocc_agent.core.pose_graph import (
+    ClosureResult,
+    ClosureState,
+    Component,
+    GraphSolution,
+    LoopClosure,
+    PoseGraph,
+    Trajectory,
+)
+from flocc_agent.core.reports import PeerRefused, RoundFailed
+from flocc_agent.geometry import pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import CandidatePair, Separators
+from flocc_protocol.messages import SHARED_MAX, SharedPoses
 
 Float = NDArray[np.float64]
 
 A, B, C = LogId("a"), LogId("b"), LogId("c")
-PARAMETERS = DistributedParameters(period_s=0.2, wait_s=1.0, repeat_s=0.5, repeat_max_s=2.0, timeout_s=10.0)
+PARAMETERS = DistributedParameters(
+    period_s=0.2, wait_s=1.0, choose_s=5.0, repeat_s=0.5, repeat_max_s=2.0, timeout_s=10.0
+)
+SEEN = ((KeyframeId(B, 1), KeyframeId(A, 2)), (KeyframeId(C, 0), KeyframeId(B, 3)))
+"""b/1 saw a/2, c/0 saw b/3: a owns the first, b the second."""
 
 
 @dataclass
 class Source:
-    """Logs that a test writes."""
+    """Logs that a test writes, four keyframes each."""
 
-    whole: PoseGraph
+    seen: tuple[tuple[KeyframeId, KeyframeId], ...] = SEEN
     revision: int = 1
+    length: int = 4
 
     @property
     def keyframes(self) -> int:
-        return sum(map(len, self.whole.trajectories.values()))
+        return 3 * self.length
 
     def graph(self) -> PoseGraph:
-        return self.whole
+        trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], self.length, axis=0)) for log in (A, B, C)}
+        return PoseGraph(trajectories, tuple(LoopClosure(query, match, np.eye(4)) for query, match in self.seen))
 
 
-def three_robots() -> Source:
-    """b/1 saw a/2, c/0 saw b/3, four keyframes each."""
-    trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], 4, axis=0)) for log in (A, B, C)}
-    seen = [(KeyframeId(B, 1), KeyframeId(A, 2)), (KeyframeId(C, 0), KeyframeId(B, 3))]
-    return Source(PoseGraph(trajectories, [LoopClosure(query, match, np.eye(4)) for query, match in seen]))
+@dataclass
+class Bench:
+    """A machine of robot b, and what it wants."""
+
+    source: Source = field(default_factory=Source)
+    near: set[str] = field(default_factory=lambda: {"a", "c"})
+
+    def __post_init__(self) -> None:
+        self.b = DistributedOptimisation(B, self.source, PARAMETERS, self.near.__contains__)
+
+    def turn(
+        self, now: float, state: ClosureState = ClosureState.USED, parted: bool = False, **changes: Any
+    ) -> tuple[list[Effect], list[StepConsensus]]:
+        """A tick whose work is answered at once; what came of it, and the steps that it asked for."""
+        effects = self.b.tick(now)
+        for choice in choices(effects):
+            effects += self.b.on_chosen(choice.number, solution(choice.graph, state, parted), now)
+        asked = jobs(effects)
+        for job in asked:
+            effects += self.b.on_step(job.number, step(job, **changes), now)
+        return effects, asked
+
+    def shares(self) -> "Bench":
+        """After it has chosen what it shares with c, and told c so."""
+        self.turn(0.0)
+        effects, _ = self.turn(0.2)
+        assert set(told(effects)) == {"c"}
+        return self
 
 
-def machine(own: LogId = B) -> DistributedOptimisation:
-    return DistributedOptimisation(own, three_robots(), PARAMETERS)
+def solution(graph: PoseGraph, state: ClosureState = ClosureState.USED, parted: bool = False) -> GraphSolution:
+    """Everything where it was, in one component or in one of each log."""
+    logs = tuple(graph.trajectories)
+    groups = [(log,) for log in logs] if parted else [logs]
+    components = tuple(
+        Component(
+            group,
+            {log: np.asarray(graph.trajectories[log].T_odom_keyframe) for log in group},
+            {log: np.eye(4) for log in group},
+            {},
+        )
+        for group in groups
+    )
+    closures = [
+        ClosureResult(c.query, c.match, state, float(state is ClosureState.USED), 2.0, 0.0) for c in graph.closures
+    ]
+    return GraphSolution(components, tuple(closures))
 
 
-def lifted(shift_m: float = 0.0) -> Float:
-    pose = np.eye(4, 3)
-    pose[3] = shift_m
-    return pose
+def step(job: StepConsensus, moved: float = 0.0, gap: float = 0.0, **changes: Any) -> ConsensusStep:
+    problem = job.problem
+    told = {other: ToldPoses(np.zeros(3), rows(len(shared.keyframes))) for other, shared in problem.shared.items()}
+    information = {
+        other: np.ones((len(shared.keyframes), 2)) for other, shared in problem.shared.items() if problem.log < other
+    }
+    T = np.repeat(np.eye(4)[None], len(problem.trajectory), axis=0)
+    done = ConsensusStep(ConsensusState(), T, np.eye(4), told, information, moved, gap, 1.0)
+    return replace(done, **changes)
 
 
-def said(anchor: LogId, iteration: int, keyframe: int, shift_m: float = 0.0, epoch: int = 0) -> Separators:
-    poses, origin = Array.of(lifted(shift_m)[None], "f8"), Array.of(lifted(), "f8")
-    return Separators(anchor, iteration, epoch, origin, iteration, (keyframe,), poses, (), Array.of(np.zeros(0)))
+def rows(count: int, shift_m: float = 0.0) -> Float:
+    made = np.zeros((count, 13))
+    made[:, 0], made[:, 3] = shift_m, 1.0
+    return made
 
 
-def step(moved: float = 0.0, aligned: bool = False, finished: bool = True) -> BlockStep:
-    X = np.repeat(np.eye(4, 3)[None], 4, axis=0)
-    T = np.repeat(np.eye(4)[None], 4, axis=0)
-    weights = {CandidatePair(KeyframeId(B, 3), KeyframeId(C, 0)): 0.25}
-    return BlockStep(BlockState(X, X, weights=weights), T, lifted(), moved, 1.0, aligned, finished, 0)
+def said(
+    anchor: LogId,
+    number: int,
+    edition: int = 1,
+    keyframes: tuple[int, ...] = (),
+    shift_m: float = 0.0,
+    count: int = 1,
+    origin_step: int = 0,
+) -> SharedPoses:
+    information = Array.of(np.ones((len(keyframes), 2)))
+    origin, none = pose7(np.eye(4)), Array.of(np.zeros(0))
+    base_m, told = Array.of(np.zeros(3), "f8"), Array.of(rows(count, shift_m))
+    return SharedPoses(anchor, number, origin, origin_step, edition, keyframes, information, base_m, told, 0, 0, none)
 
 
-def jobs(effects: list[Effect]) -> list[IterateBlock]:
-    return [effect for effect in effects if isinstance(effect, IterateBlock)]
+def jobs(effects: list[Effect]) -> list[StepConsensus]:
+    return [effect for effect in effects if isinstance(effect, StepConsensus)]
 
 
-def messages(effects: list[Effect]) -> list[Separators]:
-    found = [effect.message for effect in effects if isinstance(effect, Broadcast)]
-    return [message for message in found if isinstance(message, Separators)]
+def choices(effects: list[Effect]) -> list[ChooseClosures]:
+    return [effect for effect in effects if isinstance(effect, ChooseClosures)]
 
 
-def test_only_separators_and_the_weights_that_are_its_own_to_decide_are_said() -> None:
-    b = machine()
-    (job,) = jobs(b.tick(0.0))
-    (message,) = messages(b.on_step(job.number, step(), 0.1))
-    assert message.keyframes == (1, 3)
-    assert message.pairs == (CandidatePair(KeyframeId(B, 3), KeyframeId(C, 0)),)
-    assert message.weights.numpy().tolist() == [0.25]
+def told(effects: list[Effect]) -> dict[str, SharedPoses]:
+    return {e.to: e.message for e in effects if isinstance(e, Unicast) and isinstance(e.message, SharedPoses)}
 
 
-def test_a_block_is_asked_about_its_own_closures_with_what_others_said_in_its_frame() -> None:
-    b = machine()
-    b.on_separators(C, said(B, 3, 0, shift_m=7.0))
-    (job,) = jobs(b.tick(0.0))
-    assert [str(end) for end in job.problem.others] == ["c/0"]
-    assert job.problem.others[KeyframeId(C, 0)][3, 0] == 7.0
-    assert {c.query.log for c in job.problem.closures} == {B, C}
-    assert job.problem.anchored
+def reasons(effects: list[Effect]) -> list[str]:
+    return [e.fact.reason for e in effects if isinstance(e, Report) and isinstance(e.fact, PeerRefused | RoundFailed)]
+
+
+def test_the_lower_robot_has_both_logs_solved_and_tells_the_list_until_the_other_has_it() -> None:
+    bench = Bench()
+    effects, _ = bench.turn(0.0)
+    (choice,) = choices(effects)
+    assert set(choice.graph.trajectories) == {B, C}
+    assert [c.query for c in choice.graph.closures] == [KeyframeId(C, 0)]
+    effects, (job,) = bench.turn(0.2)
+    assert job.problem.shared[C].keyframes == (KeyframeId(C, 0),)
+    assert [each.closure.query for each in job.problem.owned] == [KeyframeId(C, 0)]
+    first = told(effects)["c"]
+    assert first.keyframes == (0,)
+    assert first.information.numpy().tolist() == [[1.0, 1.0]]
+    bench.b.on_shared_poses(C, said(C, 3, edition=first.edition), 0.3)
+    effects, _ = bench.turn(1.5)
+    assert told(effects)["c"].keyframes == ()
+
+
+def test_an_unknown_scale_begins_where_it_was_found() -> None:
+    bench = Bench().shares()
+    bench.b._has_news = True
+    _, (job,) = bench.turn(1.0)
+    assert [each.scale for each in job.problem.owned] == [2.0]
+
+
+@pytest.mark.parametrize(("state", "parted"), [(ClosureState.REJECTED, False), (ClosureState.USED, True)])
+def test_what_the_solver_rejects_or_leaves_apart_is_not_shared(state: ClosureState, parted: bool) -> None:
+    bench = Bench()
+    bench.turn(0.0, state, parted)
+    effects, asked = bench.turn(0.2)
+    assert told(effects) == {}
+    assert all(job.problem.owned == () and job.problem.shared == {} for job in asked)
+
+
+def test_nobody_out_of_range_is_told_anything() -> None:
+    bench = Bench(near={"a"})
+    bench.turn(0.0)
+    effects, asked = bench.turn(0.2)
+    assert len(asked) == 1
+    assert told(effects) == {}
+
+
+def test_the_higher_robot_takes_the_list_that_its_own_closures_bear_out() -> None:
+    bench = Bench()
+    bench.turn(0.0)
+    for wrong in (said(B, 1, 7, (2,)), said(B, 1, 7, (9,)), said(B, 1, 7)):
+        bench.b.on_shared_poses(A, wrong, 0.1)
+        _, asked = bench.turn(0.2)
+        assert all(A not in job.problem.shared for job in asked)
+    bench.b.on_shared_poses(A, said(B, 2, 7, (1,)), 0.3)
+    effects, (job,) = bench.turn(0.5)
+    assert job.problem.shared[A].keyframes == (KeyframeId(B, 1),)
+    assert job.problem.shared[A].told is not None
+    assert told(effects)["a"].edition == 7
+    assert told(effects)["a"].keyframes == ()
+
+
+def test_an_older_list_and_what_is_told_of_another_one_count_for_nothing() -> None:
+    bench = Bench().shares()
+    bench.b.on_shared_poses(A, said(B, 2, 7, (1,)), 0.3)
+    bench.turn(0.5)
+    bench.b.on_shared_poses(A, said(B, 3, 6, (1,), shift_m=5.0), 0.6)
+    edition = told(bench.b._said())["c"].edition
+    bench.b.on_shared_poses(C, said(B, 3, edition + 1, shift_m=5.0), 0.6)
+    bench.b._has_news = True
+    _, (job,) = bench.turn(2.0)
+    assert [shared.told for shared in job.problem.shared.values()] == [None, None]
+    assert job.problem.shared[A].edition == 7
 
 
 def test_it_moves_into_the_frame_of_a_lower_anchor_and_never_back() -> None:
-    b = machine()
-    b.on_separators(A, said(A, 3, 2))
-    (job,) = jobs(b.tick(0.0))
-    assert list(job.problem.align_to) == [KeyframeId(A, 2)]
-    b.on_step(job.number, step(aligned=True), 0.1)
-    assert b.anchor == A
-    b.on_separators(C, said(C, 3, 0))
-    (later,) = jobs(b.tick(0.3))
-    assert later.problem.align_to == {}
-    assert not later.problem.anchored
+    bench = Bench().shares()
+    bench.b.on_shared_poses(A, said(A, 2, 7, (1,), origin_step=4), 0.3)
+    _, (job,) = bench.turn(0.5, aligned=True)
+    assert job.problem.move_to is not None
+    assert job.problem.move_to[0] == A
+    assert bench.b.anchor == A
+    edition = told(bench.b._said())["c"].edition
+    bench.b.on_shared_poses(C, said(C, 9, edition), 0.6)
+    _, (job,) = bench.turn(1.6)
+    assert job.problem.move_to is None
+    assert job.problem.shared[C].told is None
+    assert not job.problem.anchored
 
 
-def test_a_robot_that_could_not_be_aligned_stays_in_its_own_frame() -> None:
-    b = machine()
-    b.on_separators(A, said(A, 3, 2))
-    (job,) = jobs(b.tick(0.0))
-    b.on_step(job.number, step(aligned=False), 0.1)
-    assert b.anchor == B
+def test_a_robot_whose_last_shared_closure_is_taken_back_is_in_its_own_frame_again() -> None:
+    bench = Bench(Source(seen=(SEEN[0],)))
+    bench.turn(0.0)
+    bench.b.on_shared_poses(A, said(A, 2, 7, (1,)), 0.3)
+    bench.turn(0.5, aligned=True)
+    assert bench.b.anchor == A
+    bench.b._pairs[A].keyframes = ()
+    bench.b._has_news = True
+    bench.turn(2.0)
+    assert bench.b.anchor == B
 
 
-def test_it_waits_for_news_of_every_neighbour_but_not_for_ever() -> None:
-    b = machine()
-    b.on_separators(C, said(B, 3, 0))
-    (job,) = jobs(b.tick(0.0))
-    b.on_step(job.number, step(moved=1.0), 0.1)
-    assert jobs(b.tick(0.3)) == []
-    assert jobs(b.tick(1.0))  # wait_s is over, with the old pose
-    again = machine()
-    again.on_separators(C, said(B, 3, 0))
-    (job,) = jobs(again.tick(0.0))
-    again.on_step(job.number, step(moved=1.0), 0.1)
-    again.on_separators(C, said(B, 4, 0, shift_m=1.0))
-    assert jobs(again.tick(0.3))
+def test_a_pair_is_chosen_anew_when_its_closures_change_but_not_at_once() -> None:
+    bench = Bench().shares()
+    edition = told(bench.b._said())["c"].edition
+    bench.source.seen += ((KeyframeId(C, 2), KeyframeId(B, 0)),)
+    bench.source.revision += 1
+    assert not choices(bench.turn(1.0)[0])
+    effects, _ = bench.turn(PARAMETERS.choose_s)
+    assert len(choices(effects)) == 1
+    effects, _ = bench.turn(PARAMETERS.choose_s + 0.2)
+    assert told(effects)["c"].keyframes == (0, 2)
+    assert told(effects)["c"].edition > edition
 
 
-def test_old_and_repeated_messages_begin_nothing() -> None:
-    b = machine()
-    b.on_separators(C, said(B, 3, 0))
-    (job,) = jobs(b.tick(0.0))
-    b.on_step(job.number, step(), 0.1)
-    b.on_separators(C, said(B, 3, 0))
-    b.on_separators(C, said(B, 2, 0, shift_m=9.0))
-    assert jobs(b.tick(5.0)) == []
-    assert b.is_settled
+def test_a_failed_or_overdue_choice_is_made_again_after_a_growing_pause() -> None:
+    bench = Bench()
+    (choice,) = choices(bench.b.tick(0.0))
+    assert reasons(bench.b.on_choice_failed(choice.number, "singular", 0.0)) == ["singular"]
+    assert not choices(bench.b.tick(9.0))
+    (again,) = choices(bench.b.tick(10.0))
+    assert bench.b.on_chosen(choice.number, solution(choice.graph), 10.0) == []
+    assert "it took too long" in reasons(bench.b.tick(20.0))
+    assert bench.b.on_chosen(again.number, solution(again.graph), 20.0) == []
 
 
-def test_separators_are_repeated_at_a_rate_that_falls_to_a_bound() -> None:
-    b = machine()
-    (job,) = jobs(b.tick(0.0))
-    b.on_step(job.number, step(), 0.0)
-    times = []
-    now = 0.0
-    for _ in range(5):
-        b.component(now)
-        now = b.deadline()
-        if messages(b.tick(now)):
-            times.append(now)
-    assert np.allclose(np.diff([0.0, *times]), [0.5, 1.0, 2.0, 2.0, 2.0])
+def test_more_than_the_maximum_are_not_shared() -> None:
+    length = SHARED_MAX + 50
+    seen = tuple((KeyframeId(C, k), KeyframeId(B, k)) for k in range(length))
+    bench = Bench(Source(seen=seen, length=length))
+    bench.turn(0.0)
+    _, (job,) = bench.turn(0.2)
+    assert len(job.problem.shared[C].keyframes) == SHARED_MAX
+    assert len(job.problem.owned) == SHARED_MAX
+    assert {max(each.closure.query, each.closure.match) for each in job.problem.owned} == set(
+        job.problem.shared[C].keyframes
+    )
 
 
-def test_weights_are_taken_only_from_the_robot_that_decides_them() -> None:
-    b = machine()
-    pair = CandidatePair(KeyframeId(A, 2), KeyframeId(B, 1))
-    one = Array.of(np.ones(1))
-    poses, origin = Array.of(lifted()[None], "f8"), Array.of(lifted(), "f8")
-    b.on_separators(C, Separators(B, 1, 0, origin, 1, (0,), poses, (pair,), one))
-    assert jobs(b.tick(0.0))[0].problem.heard == {}
-    b.on_separators(A, Separators(A, 1, 0, origin, 1, (2,), poses, (pair,), one))
-    b.on_step(1, step(), 0.1)
-    assert jobs(b.tick(0.3))[0].problem.heard == {pair: 1.0}
+def test_it_waits_for_news_of_neighbours_in_range_but_not_for_ever() -> None:
+    bench = Bench().shares()
+    edition = told(bench.b._said())["c"].edition
+    bench.b.on_shared_poses(C, said(B, 3, edition), 0.2)
+    bench.turn(0.4, moved=1.0)
+    assert not bench.turn(0.7)[1]
+    assert bench.turn(1.5)[1]
+    bench.b.on_shared_poses(C, said(B, 4, edition, shift_m=1.0), 1.6)
+    assert bench.turn(1.8)[1]
 
 
-def test_an_overdue_or_failed_iteration_is_tried_again_after_a_growing_pause() -> None:
-    b = machine()
-    (job,) = jobs(b.tick(0.0))
-    effects = b.tick(10.0)
-    assert [type(effect.fact) for effect in effects if isinstance(effect, Report)] == [RoundFailed]
-    assert b.on_step(job.number, step(), 10.1) == []
-    (second,) = jobs(b.tick(10.4))
-    b.on_failed(second.number, "singular", 11.0)
-    assert jobs(b.tick(11.5)) == []
-    assert jobs(b.tick(11.8))
+def test_at_rest_it_repeats_itself_at_a_rate_that_falls_to_a_bound() -> None:
+    bench = Bench().shares()
+    times: list[float] = []
+    now = 0.2
+    while len(times) < 5:
+        bench.b.component(now)
+        now = bench.b.deadline()
+        effects, asked = bench.turn(now)
+        assert not asked
+        times += [now] if told(effects) else []
+    assert np.allclose(np.diff([0.2, *times]), [0.5, 1.0, 2.0, 2.0, 2.0])
+
+
+def test_two_that_come_no_nearer_to_each_other_rest_all_the_same() -> None:
+    bench = Bench().shares()
+    edition = told(bench.b._said())["c"].edition
+    now, steps = 1.0, 0
+    for number in range(3 * VAIN_STEPS_MAX):
+        now += 0.5
+        bench.b.on_shared_poses(C, said(B, 10 + number, edition, shift_m=1.0), now)
+        steps += len(bench.turn(now, gap=1.0)[1])
+    assert VAIN_STEPS_MAX - 2 <= steps <= VAIN_STEPS_MAX + 2
+
+
+def test_who_tells_what_cannot_be_is_named() -> None:
+    bench = Bench().shares()
+    bench.b._has_news = True
+    effects, _ = bench.turn(1.0, refused={C: "no stiffness"})
+    assert reasons(effects) == ["shared poses: no stiffness"]
+
+
+def test_what_its_own_log_contradicts_for_long_makes_it_go_on_alone() -> None:
+    bench = Bench().shares()
+    bench.b.on_shared_poses(A, said(A, 2, 7, (1,)), 0.3)
+    bench.turn(0.5, aligned=True)
+    assert bench.b.on_judged("torn", 1.0) == []
+    assert bench.b.on_judged(None, 2.0) == []
+    assert bench.b.on_judged("torn", 3.0) == []
+    assert bench.b.on_judged("torn", 2.9 + HELD_BACK_S) == []
+    effects = bench.b.on_judged("torn", 3.0 + HELD_BACK_S)
+    assert reasons(effects) == ["shared poses: torn: it goes on alone"]
+    assert bench.b.anchor == B
+    bench.b.on_shared_poses(A, said(A, 5, 8, (1,)), 14.0)
+    _, (job,) = bench.turn(15.0)
+    assert A not in job.problem.shared
+    assert job.problem.state is None
+
+
+def test_an_overdue_or_failed_step_is_tried_again_after_a_growing_pause() -> None:
+    bench = Bench(Source(seen=()))
+    (job,) = jobs(bench.b.tick(0.0))
+    assert reasons(bench.b.tick(10.0)) == ["it took too long"]
+    assert bench.b.on_step(job.number, step(job), 10.1) == []
+    (second,) = jobs(bench.b.tick(10.4))
+    bench.b.on_failed(second.number, "singular", 11.0)
+    assert jobs(bench.b.tick(11.5)) == []
+    assert jobs(bench.b.tick(11.8))
 
 
 def test_corrections_come_at_most_once_per_period_and_name_the_anchor() -> None:
-    b = machine()
-    b.on_separators(A, said(A, 3, 2))
-    (job,) = jobs(b.tick(0.0))
-    b.on_step(job.number, step(aligned=True), 0.1)
-    component = b.component(0.1)
+    bench = Bench().shares()
+    bench.b.on_shared_poses(A, said(A, 2, 7, (1,)), 0.3)
+    bench.turn(0.5, aligned=True)
+    component = bench.b.component(0.5)
     assert component is not None
     assert component.anchor == A
     assert list(component.T_map_keyframe) == [B]
-    assert b.component(0.2) is None
+    bench.b._has_news = True
+    bench.turn(2.0)
+    assert bench.b.component(0.4 + DELIVER_PERIOD_S) is None
+    assert bench.b.component(0.5 + DELIVER_PERIOD_S) is not None
+
+
+def test_old_and_repeated_messages_begin_nothing() -> None:
+    bench = Bench().shares()
+    edition = told(bench.b._said())["c"].edition
+    bench.b.on_shared_poses(C, said(B, 3, edition), 0.3)
+    bench.turn(0.5)
+    bench.b.on_shared_poses(C, said(B, 3, edition), 0.6)
+    bench.b.on_shared_poses(C, said(B, 2, edition, shift_m=9.0), 0.6)
+    assert not bench.turn(5.0)[1]

@@ -33,7 +33,7 @@ OLD_LINES = """\
 {"t": 1.7, "robot": "r1", "event": "optimisation_failed", "term": "1:r1", "round": 2, "reason": "singular"}
 {"t": 1.8, "robot": "r1", "event": "round_timeout", "term": "1:r1", "round": 2}
 {"t": 1.9, "robot": "r1", "event": "stale_solution", "term": "1:r1", "round": 2}
-{"t": 2.0, "robot": "r1", "event": "block", "iteration": 3, "anchor": "r1", "neighbours": 2, "separators": 5, "cost": null, "moved": null, "closures_rejected": 0, "weights_final": false, "keyframes": 9}
+{"t": 2.0, "robot": "r1", "event": "part", "step": 3, "anchor": "r1", "neighbours": 2, "shared_poses": 5, "cost": null, "moved": null, "gap": null, "closures_used": 0, "keyframes": 9}
 {"t": 1.659717, "robot": "r1", "event": "correction", "term": 1, "leader": "r1", "round": 1, "map_frame": "map/r1", "frame_changed": false, "T_map_odom": [1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]}
 {"t": 1.0, "robot": "r1", "event": "bytes", "sent": {"heartbeat": 82}, "received": {"records": 64}, "loss": {"r2": 0.1}, "queues": {"inbox": 2}}
 {"t": 33.1, "robot": "r1", "event": "account", "since_s": 0.0, "sent_to": {"r2": {"answer": 16}}, "received_from": {}, "lost_from": {}, "repeated_from": {}, "stages": {"encode": {"counts": [0, 4], "total_s": 0.4, "max_s": 0.2}}}

@@ -1,7 +1,6 @@
-"""A pose graph optimised by all its robots together, on virtual time: the agents' own machines, links that lose.
+"""A pose graph optimised by all its robots together with RBCD, on virtual time: machines, and links that lose.
 
-Nothing of the optimisation is here, only who hears what and when. It is `backend.mode = "distributed"` without
-everything else that an agent does, so that a graph from a file can be given to it.
+Nothing of the optimisation is here, only who hears what and when.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,18 +10,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.block import isotropic_weights, iterate_block
-from flocc_agent.backend.rbcd import lifted, squared_residuals
 from flocc_agent.config import BackendConfig
-from flocc_agent.core.blocks import BlockStep
-from flocc_agent.core.distributed_optimisation import DistributedOptimisation
-from flocc_agent.core.effects import Broadcast, Effect, IterateBlock
-from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.pose_graph import LoopClosure, PoseGraph, Trajectory
 from flocc_agent.geometry import between, inverse
+from flocc_lab.rbcd.block import isotropic_weights, iterate_block
+from flocc_lab.rbcd.block_descent import lifted, squared_residuals
+from flocc_lab.rbcd.blocks import BlockStep
+from flocc_lab.rbcd.machine import Effect, IterateBlock, RbcdMachine, RbcdParameters
+from flocc_lab.rbcd.separators import Separators, decoded, encoded
 from flocc_launch.simulation.agenda import Agenda
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.messages import Envelope, Message, Separators, decode, encode
 
 Float = NDArray[np.float64]
 
@@ -87,7 +84,7 @@ class DistributedRun:
 def optimise_together(
     graph: PoseGraph,
     config: BackendConfig,
-    parameters: DistributedParameters,
+    parameters: RbcdParameters,
     *,
     loss_ratio: float = 0.0,
     seed: int = 0,
@@ -112,10 +109,10 @@ class _Air:
     """Machines and what is between them."""
 
     def __init__(
-        self, graph: PoseGraph, config: BackendConfig, parameters: DistributedParameters, loss_ratio: float, seed: int
+        self, graph: PoseGraph, config: BackendConfig, parameters: RbcdParameters, loss_ratio: float, seed: int
     ) -> None:
         source = WholeGraph(graph)
-        self._machines = {log: DistributedOptimisation(log, source, parameters) for log in sorted(graph.trajectories)}
+        self._machines = {log: RbcdMachine(log, source, parameters) for log in sorted(graph.trajectories)}
         self._config = config
         self._loss_ratio = loss_ratio
         self._rng = np.random.default_rng(seed)
@@ -160,14 +157,12 @@ class _Air:
     def _carry_out(self, log: LogId, effects: list[Effect]) -> None:
         for effect in effects:
             match effect:
-                case Broadcast(message):
-                    self._send(log, message)
+                case Separators():
+                    self._send(log, effect)
                 case IterateBlock(number, problem):
                     step = iterate_block(self._config, problem)
                     assert isinstance(step, BlockStep), f"{log}: {step}"
                     self._agenda.at(self._agenda.now_s + ITERATION_S, partial(self._iterated, log, number, step))
-                case _:
-                    pass
 
     def _iterated(self, log: LogId, number: int, step: BlockStep) -> None:
         self._run.T_map_keyframe[log] = step.T_map_keyframe
@@ -175,18 +170,17 @@ class _Air:
         self._carry_out(log, self._machines[log].on_step(number, step, self._agenda.now_s))
         self._wake(log)
 
-    def _send(self, log: LogId, message: Message) -> None:
+    def _send(self, log: LogId, message: Separators) -> None:
         """Through the real codec, to everybody who does not lose it."""
-        payload = encode(Envelope(log, message))
+        payload = encoded(log, message)
         self._run.traffic.messages += 1
         self._run.traffic.payload_bytes += len(payload)
         for other in self._machines:
             if other != log and self._rng.random() >= self._loss_ratio:
-                self._agenda.at(self._agenda.now_s + LATENCY_S, partial(self._hear, other, decode(payload)))
+                self._agenda.at(self._agenda.now_s + LATENCY_S, partial(self._hear, other, log, decoded(payload)))
 
-    def _hear(self, log: LogId, envelope: Envelope) -> None:
-        assert isinstance(envelope.message, Separators)
-        self._machines[log].on_separators(envelope.sender, envelope.message)
+    def _hear(self, log: LogId, sender: LogId, message: Separators) -> None:
+        self._machines[log].on_separators(sender, message)
         self._wake(log)
 
 

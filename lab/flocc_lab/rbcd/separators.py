@@ -1,4 +1,4 @@
-"""Separators: what robots tell each other in distributed optimisation."""
+"""Separators: what robots tell each other in RBCD."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,15 @@ from flocc_protocol.codec import (
     COORDINATE_MAX,
     COUNT,
     LOG_ID,
+    MESSAGE_BYTES_MAX,
     QUATERNION_NORM_TOLERANCE,
-    Kinds,
+    from_bytes,
+    packed,
     sequence,
     struct,
 )
 from flocc_protocol.ids import LogId
+from flocc_protocol.messages import PROTOCOL_VERSION
 
 SEPARATORS_MAX = 200
 RANK_MIN, RANK_MAX = 3, 5
@@ -74,20 +77,26 @@ def _check_lifted(poses: NDArray[np.float64]) -> None:
         raise ValueError("separators lie within the map and have orthonormal frames")
 
 
-CODECS: Kinds = {
-    "separators": (
-        Separators,
-        struct(
-            Separators,
-            anchor=LOG_ID,
-            iteration=COUNT,
-            epoch=COUNT,
-            origin=ARRAY,
-            origin_iteration=COUNT,
-            keyframes=sequence(COUNT, SEPARATORS_MAX),
-            poses=ARRAY,
-            pairs=sequence(PAIR, OFFERS_MAX),
-            weights=ARRAY,
-        ),
-    )
-}
+FIELDS = struct(
+    Separators,
+    anchor=LOG_ID,
+    iteration=COUNT,
+    epoch=COUNT,
+    origin=ARRAY,
+    origin_iteration=COUNT,
+    keyframes=sequence(COUNT, SEPARATORS_MAX),
+    poses=ARRAY,
+    pairs=sequence(PAIR, OFFERS_MAX),
+    weights=ARRAY,
+)
+
+
+def encoded(sender: LogId, message: Separators) -> bytes:
+    """As it would travel: what a message of the wire has around it, too."""
+    return packed([PROTOCOL_VERSION, "separators", LOG_ID.pack(sender), FIELDS.pack(message)])
+
+
+def decoded(data: bytes) -> Separators:
+    """What `encoded` wrote."""
+    _, _, _, fields = from_bytes(data, MESSAGE_BYTES_MAX)
+    return FIELDS.unpack(fields)

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.sparse import coo_array, csc_array
 
 from flocc_agent.geometry import adjoints, inverse, poses_from_tq, quaternions
+from flocc_protocol.shared_poses import KNOTS_MAX, stiffness_numbers
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-KNOTS_MAX = 16
 _LOWER_6 = np.tril_indices(6)
 
 
@@ -38,28 +39,26 @@ class SharedStiffness:
     ties: Float
     tied: Float
 
-    def packed(self) -> bytes:
-        """As it would travel, in single precision."""
+    def packed(self) -> Float:
+        """Its numbers (N,)."""
         ties = self.ties[:, _LOWER_6[0], _LOWER_6[1]]
-        rows = [self.knots[np.tril_indices(len(self.knots))], ties.ravel(), self.tied.ravel()]
-        return np.concatenate(rows).astype("<f4").tobytes()
+        return np.concatenate([self.knots[np.tril_indices(len(self.knots))], ties.ravel(), self.tied.ravel()])
 
     @staticmethod
-    def size(count: int) -> int:
-        """Bytes of so many poses, packed."""
-        knots = min(count, KNOTS_MAX)
-        return 4 * (3 * knots * (6 * knots + 1) + 28 * (count - knots))
+    def unpacked(numbers: Float, count: int) -> "SharedStiffness":
+        """Read what `packed` wrote of so many poses.
 
-    @staticmethod
-    def unpacked(payload: bytes, count: int) -> "SharedStiffness":
-        """Read what `packed` wrote of so many poses; `payload` has the right length."""
-        values = np.frombuffer(payload, "<f4").astype(float)
+        Raises:
+            ValueError: It is not of so many poses.
+        """
+        if numbers.shape != (stiffness_numbers(count),):
+            raise ValueError(f"{len(numbers)} numbers are not the stiffness of {count} poses")
         M = min(count, KNOTS_MAX)
         knots, ties = np.zeros((6 * M, 6 * M)), np.zeros((count - M, 6, 6))
-        whole, end = 3 * M * (6 * M + 1), len(values) - 7 * (count - M)
-        knots[np.tril_indices(6 * M)] = values[:whole]
-        ties[:, _LOWER_6[0], _LOWER_6[1]] = values[whole:end].reshape(-1, 21)
-        return SharedStiffness(knots, ties, values[end:].reshape(-1, 7))
+        whole, end = 3 * M * (6 * M + 1), len(numbers) - 7 * (count - M)
+        knots[np.tril_indices(6 * M)] = numbers[:whole]
+        ties[:, _LOWER_6[0], _LOWER_6[1]] = numbers[whole:end].reshape(-1, 21)
+        return SharedStiffness(knots, ties, numbers[end:].reshape(-1, 7))
 
     def check(self, count: int) -> None:
         """Refuse what is of another size, not finite or not positive definite.
@@ -75,17 +74,17 @@ class SharedStiffness:
         if not finite or not np.all(diagonals > 0) or not np.all(np.linalg.norm(self.tied[:, 3:], axis=1) > 0.5):
             raise ValueError("the stiffness of shared poses is not positive definite")
 
-    def matrix(self) -> Float:
+    def matrix(self) -> csc_array:
         """Information (6S, 6S) of all of them; mostly zero where S is large."""
         count = len(self.knots) // 6 + len(self.ties)
         knots, others, nearest = _knots(count)
-        information = np.zeros((6 * count, 6 * count))
         rows = rows_of(knots)
-        information[np.ix_(rows, rows)] = self.knots @ self.knots.T
-        for k, q, L, difference in zip(others, nearest, self.ties, _tie_jacobians(self.tied), strict=True):
-            both = rows_of(np.array([q, k]))
-            information[np.ix_(both, both)] += difference.T @ L @ L.T @ difference
-        return information
+        both = (6 * np.stack([nearest, others], axis=1)[:, :, None] + np.arange(6)).reshape(len(others), 12)
+        factors = np.swapaxes(_tie_jacobians(self.tied), 1, 2) @ self.ties
+        values = np.concatenate([(self.knots @ self.knots.T).ravel(), (factors @ np.swapaxes(factors, 1, 2)).ravel()])
+        i = np.concatenate([np.repeat(rows, len(rows)), np.repeat(both, 12, axis=1).ravel()])
+        j = np.concatenate([np.tile(rows, len(rows)), np.tile(both, (1, 12)).ravel()])
+        return csc_array(coo_array((values, (i, j)), shape=(6 * count, 6 * count)))
 
 
 def stiffness_of(covariance: Float, T: Float) -> SharedStiffness:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.backend import rbcd
-from flocc_agent.backend.block import iterate_block
-from flocc_agent.backend.rbcd import Block, Links
-from flocc_agent.config import BackendConfig, BackendMode, Formulation, Solver
-from flocc_agent.core.blocks import BlockProblem, BlockStep
+from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed, Trajectory
 from flocc_agent.geometry import inverse, pose, se3_exp, so3_exp
+from flocc_lab.rbcd import block_descent
+from flocc_lab.rbcd.block import iterate_block
+from flocc_lab.rbcd.block_descent import Block, Links
+from flocc_lab.rbcd.blocks import BlockProblem, BlockStep
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
@@ -25,7 +25,7 @@ def random_poses(rng: np.random.Generator, count: int) -> Float:
 
 def random_lifted(rng: np.random.Generator, count: int) -> Float:
     X = rng.normal(size=(count, 4, RANK))
-    X[:, :3] = rbcd.orthonormal(X[:, :3])
+    X[:, :3] = block_descent.orthonormal(X[:, :3])
     return X
 
 
@@ -44,16 +44,16 @@ def test_the_quadratic_form_is_half_the_sum_of_the_edges_costs() -> None:
     block, links, X = random_block(np.random.default_rng(1))
     X_i = np.where((links.i >= 0)[:, None, None], X[links.i], links.fixed)
     X_j = np.where((links.j >= 0)[:, None, None], X[links.j], links.fixed)
-    costs = rbcd.squared_residuals(X_i, X_j, links.T, links.kappa, links.tau)
+    costs = block_descent.squared_residuals(X_i, X_j, links.T, links.kappa, links.tau)
     assert block.cost(X) == pytest.approx(0.5 * costs.sum())
 
 
 def test_gradient_and_hessian_agree_with_differences_along_the_manifold() -> None:
     rng = np.random.default_rng(2)
     block, _, X = random_block(rng)
-    V = rbcd.projected(X, rng.normal(size=X.shape))
+    V = block_descent.projected(X, rng.normal(size=X.shape))
     step = 1e-4
-    costs = [block.cost(rbcd.retracted(X, s * step * V)) for s in (-1.0, 0.0, 1.0)]
+    costs = [block.cost(block_descent.retracted(X, s * step * V)) for s in (-1.0, 0.0, 1.0)]
     assert (costs[2] - costs[0]) / (2 * step) == pytest.approx(np.sum(block.gradient(X) * V), rel=1e-5)
     second = (costs[2] - 2 * costs[1] + costs[0]) / step**2
     assert second == pytest.approx(np.sum(block.hessian(X, block.curvature(X), V) * V), rel=1e-4)
@@ -62,7 +62,7 @@ def test_gradient_and_hessian_agree_with_differences_along_the_manifold() -> Non
 def test_a_descent_ends_where_the_gradient_is_gone_and_every_frame_is_orthonormal() -> None:
     block, _, X = random_block(np.random.default_rng(3))
     before = np.linalg.norm(block.gradient(X))
-    found = rbcd.descend(block, X, 50, 30, 1e-14)
+    found = block_descent.descend(block, X, 50, 30, 1e-14)
     assert found.gradient_norm < 1e-5 * before
     assert np.allclose(found.X[:, :3] @ np.swapaxes(found.X[:, :3], 1, 2), np.eye(3))
     assert block.cost(X) > found.cost == pytest.approx(block.cost(found.X))
@@ -71,12 +71,12 @@ def test_a_descent_ends_where_the_gradient_is_gone_and_every_frame_is_orthonorma
 def test_rounding_undoes_lifting_wherever_the_frame_lies() -> None:
     rng = np.random.default_rng(4)
     T, origin = random_poses(rng, 5), random_lifted(rng, 1)[0]
-    assert np.allclose(rbcd.rounded(rbcd.composed(origin, T), origin), T)
-    assert np.allclose(rbcd.rounded(rbcd.lifted(T, RANK), np.eye(4, RANK)), T)
+    assert np.allclose(block_descent.rounded(block_descent.composed(origin, T), origin), T)
+    assert np.allclose(block_descent.rounded(block_descent.lifted(T, RANK), np.eye(4, RANK)), T)
 
 
 def config(solver: Solver = Solver.LM) -> BackendConfig:
-    return BackendConfig(mode=BackendMode.DISTRIBUTED, formulation=Formulation.BASE, solver=solver)
+    return BackendConfig(formulation=Formulation.BASE, solver=solver)
 
 
 def looped(outliers: int = 0) -> BlockProblem:

@@ -1,6 +1,6 @@
 """One robot's block of a distributed optimisation: what its worker is asked, and what comes back.
 
-A lifted pose is (4, r): the three rows of a relaxed rotation, transposed, then the position (`backend/rbcd.py`).
+A lifted pose is (4, r): the three rows of a relaxed rotation, transposed, then the position (`block_descent.py`).
 """
 
 from collections.abc import Mapping

@@ -11,8 +11,8 @@ dual variable biases. What is different is the penalty, and with it the form of 
   dual of ADMM: the receiver minimises `f(x) + force . d + penalty(x, T)` with d from T to x. At rest all d are zero and
   forces are opposite, whatever the penalty is; a message that is lost costs time only, the newest one counts.
 - The penalty is the geometric mean of how stiff both robots hold the shared poses (`shared_stiffness`), told in short
-  after a few steps, in editions: both sides use the newest one that both have told. While they differ, time is lost,
-  not the place of rest.
+  after a few steps, in editions: either side uses the newest one that both have told, and none before that. While
+  penalties differ, robots drive each other away: with a penalty of one side alone they came apart for good.
 - What is heard replaces only a part of what was heard before (`RELAXATION`): the rest keeps its pull at the same poses.
   One half is ADMM, a whole one need not come to rest.
 
@@ -26,23 +26,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from flocc_agent.backend.descent import LENGTHS
-from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residuals, state_of, taken
-from flocc_agent.backend.problem import closure_edges, concatenate, initial_scale, odometry_edges
+from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residuals, state_of
+from flocc_agent.backend.problem import closure_edges, concatenate, odometry_edges
+from flocc_agent.backend.shared_stiffness import SharedStiffness, geometric_mean, rows_of, stiffness_of
 from flocc_agent.config import BackendConfig
-from flocc_agent.core.pose_graph import LoopClosure, PoseGraph
+from flocc_agent.core.own_part import ToldPoses
+from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import inverse, poses_from_tq, quaternions
-from flocc_lab.shared_stiffness import SharedStiffness, geometric_mean, rows_of, stiffness_of
 from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.shared_poses import STIFFNESS_EDITIONS
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-HEAD_BYTES, POSE_BYTES = 26, 52
 STIFFNESS_AFTER = (5, 12)
 """After which steps a robot says how stiff it holds its shared poses: first by a guess of its other neighbours, then by
 what they said; dense graphs are at rest before the second."""
@@ -56,12 +56,10 @@ ANCHORING_UNKNOWN = 0.3
 """Part of it that is the penalty while nothing is known of the neighbour's stiffness."""
 TETHER_RATIO = 1e-9
 """Of the mean stiffness, on every pose: a graph that floats has no unique step."""
-ALONE_STEPS_MAX = 20
-ALONE_TOLERANCE_RATIO = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SharedPoses:
+class Tidings:
     """What one robot tells another of the poses that both have.
 
     Attributes:
@@ -78,31 +76,29 @@ class SharedPoses:
     edition: int = 0
     stiffness: SharedStiffness | None = None
 
-    def packed(self) -> bytes:
-        """As it would travel: the first position in double, all else in single precision."""
+    def told(self) -> ToldPoses:
+        """As it travels: the first position in double, all else in single precision."""
         origin = self.T[0, :3, 3]
         rows = np.concatenate([self.T[:, :3, 3] - origin, quaternions(self.T[:, :3, :3]), self.force], axis=1)
-        stiffness = b"" if self.stiffness is None else self.stiffness.packed()
-        head = origin.astype("<f8").tobytes() + bytes((self.known, self.edition))
-        return head + rows.astype("<f4").tobytes() + stiffness
+        stiffness = np.zeros(0) if self.stiffness is None else self.stiffness.packed()
+        return ToldPoses(origin, _single(rows), self.known, self.edition, _single(stiffness))
 
     @staticmethod
-    def unpacked(payload: bytes, count: int) -> "SharedPoses":
-        """Read what `packed` wrote of so many poses.
+    def of(told: ToldPoses, count: int) -> "Tidings":
+        """Read what is told of so many poses.
 
         Raises:
-            ValueError: It has another length, is not finite, or holds a quaternion without direction.
+            ValueError: It is of another number, not finite, or holds a quaternion without direction.
         """
-        end = HEAD_BYTES + POSE_BYTES * count
-        if count < 1 or len(payload) not in (end, end + SharedStiffness.size(count)):
-            raise ValueError(f"{len(payload)} bytes are not {count} shared poses")
-        rows = np.frombuffer(payload[HEAD_BYTES:end], "<f4").astype(float).reshape(count, 13)
+        rows = np.asarray(told.rows, dtype=float)
+        if rows.shape != (count, 13):
+            raise ValueError(f"rows of the shape {rows.shape} are not {count} shared poses")
         T = poses_from_tq(rows[:, :7])
-        T[:, :3, 3] += np.frombuffer(payload[:24], "<f8")
-        stiffness = SharedStiffness.unpacked(payload[end:], count) if len(payload) > end else None
-        told = SharedPoses(T, rows[:, 7:], payload[24], payload[25], stiffness)
-        told.check(count)
-        return told
+        T[:, :3, 3] += told.base_m
+        stiffness = SharedStiffness.unpacked(told.stiffness, count) if len(told.stiffness) else None
+        read = Tidings(T, rows[:, 7:], told.known, told.edition, stiffness)
+        read.check(count)
+        return read
 
     def check(self, count: int) -> None:
         """Refuse what is not finite, of another size, or no stiffness.
@@ -114,7 +110,7 @@ class SharedPoses:
             raise ValueError(f"{len(self.T)} poses and {len(self.force)} forces are not {count} shared poses")
         if not (np.all(np.isfinite(self.T)) and np.all(np.isfinite(self.force))):
             raise ValueError("shared poses or forces are not finite")
-        editions = len(STIFFNESS_AFTER)
+        editions = STIFFNESS_EDITIONS
         if max(self.known, self.edition) > editions or (self.edition > 0) != (self.stiffness is not None):
             raise ValueError(f"edition {self.edition} of the stiffness of shared poses is not one of {editions}")
         if self.stiffness is not None:
@@ -127,53 +123,64 @@ class PairedRobot:
 
     Attributes:
         lower: Whether the robot itself is the lower of both.
+        keyframes: The poses that both have.
         index: (S,) the shared poses among its own and its copies.
         closures: (S, 6, 6) information of the closures at each, diagonal.
-        penalty: (6S, 6S) information by which they are held to T.
+        penalty: (6S, 6S) sparse information by which they are held to T.
         T: (S, 4, 4) where the neighbour said that it has them; None before it was heard.
         force: (6S,) what it asks for there besides the penalty.
         ours: Own stiffness by edition.
         theirs: The neighbour's by edition.
         known: Newest own edition that the neighbour has.
+        steps: Own steps since both share these poses.
+        edition: Of the list of these poses.
+        stiffened: Edition of both stiffnesses of which the penalty is made; 0 for none.
     """
 
     lower: bool
+    keyframes: tuple[KeyframeId, ...]
     index: Int
     closures: Float
-    penalty: Float
+    penalty: csc_array
     T: Float | None = None
     force: Float = field(default_factory=lambda: np.zeros(0))
     ours: dict[int, SharedStiffness] = field(default_factory=dict)
     theirs: dict[int, SharedStiffness] = field(default_factory=dict)
     known: int = 0
+    steps: int = 0
+    edition: int = 0
+    stiffened: int = 0
 
     def pull(self, T: Float) -> Float:
         """Gradient (6S,) where the shared poses are at `T`."""
-        return self.force + self.penalty @ self._apart(T)
+        return np.asarray(self.force + self.penalty @ self._apart(T))
 
     def merit(self, T: Float) -> float:
         """What `pull` is the gradient of."""
         apart = self._apart(T)
         return float(self.force @ apart + 0.5 * apart @ self.penalty @ apart)
 
-    def hear(self, told: SharedPoses) -> None:
+    def hear(self, told: Tidings) -> None:
         """Take a part of what the neighbour said in the place of what it said before."""
         force = told.force.ravel()
         if self.T is not None:
             force = RELAXATION * force + (1.0 - RELAXATION) * self.pull(told.T)
-        self.T, self.force, self.known = told.T, force, max(self.known, told.known)
+        self.T, self.force, self.known = told.T, force, told.known
         if told.stiffness is not None:
             self.theirs[told.edition] = told.stiffness
 
-    def stiffen(self) -> None:
-        """Choose the penalty by what is known of one or both stiffnesses."""
+    def stiffen(self, T: Float) -> None:
+        """Choose the penalty by what both said of their stiffness; the pull at `T`, where the poses are, stays."""
         common = max(self.ours.keys() & self.theirs.keys(), default=None)
-        if common is not None:
-            both = (self.ours[common], self.theirs[common])
-            stiffness = geometric_mean(*(both if self.lower else both[::-1]))
-        else:
-            stiffness = next(iter((self.theirs or self.ours).values()))
-        self.penalty = stiffness.matrix() + ANCHORING * block_diag(*self.closures)
+        if common is None or common == self.stiffened:
+            return
+        pull = None if self.T is None else self.pull(T)
+        both = (self.ours[common], self.theirs[common])
+        stiffness = geometric_mean(*(both if self.lower else both[::-1]))
+        self.penalty = csc_array(stiffness.matrix() + _diagonal(ANCHORING, self.closures))
+        self.stiffened = common
+        if pull is not None:
+            self.force = pull - self.penalty @ self._apart(T)
 
     def _apart(self, T: Float) -> Float:
         """Tangents (6S,) from where the neighbour has the shared poses to `T`."""
@@ -202,7 +209,6 @@ class ConsensusPart:
     neighbours: dict[LogId, PairedRobot]
     state: State
     weights: Float
-    steps: int = 0
 
     @property
     def T(self) -> Float:
@@ -217,25 +223,27 @@ class ConsensusPart:
             np.add.at(gradient, rows_of(neighbour.index), neighbour.pull(T[neighbour.index]))
         delta = -_factor(H).solve(gradient)
         if np.all(np.isfinite(delta)):
-            self.state = self._shortened(delta, self._merit(self.state))
-        self.steps += 1
-        if self.steps in STIFFNESS_AFTER:
-            edition = STIFFNESS_AFTER.index(self.steps) + 1
-            told = {other: self._stiffness(other) for other in self.neighbours}
-            for other, stiffness in told.items():
-                self.neighbours[other].ours[edition] = stiffness
-                self.neighbours[other].stiffen()
+            self.state = self._shortened(delta, self.merit(self.state))
+        told: dict[LogId, SharedStiffness] = {}
+        for other, neighbour in self.neighbours.items():
+            neighbour.steps += 1
+            if neighbour.steps in STIFFNESS_AFTER:
+                told[other] = self._stiffness(other)
+        for other, stiffness in told.items():
+            neighbour = self.neighbours[other]
+            neighbour.ours[STIFFNESS_AFTER.index(neighbour.steps) + 1] = stiffness
+            neighbour.stiffen(self.state.poses()[neighbour.index])
 
-    def tell(self, other: LogId) -> SharedPoses:
+    def tell(self, other: LogId) -> Tidings:
         """What a neighbour hears after this step."""
         neighbour = self.neighbours[other]
         T = self.state.poses()[neighbour.index]
         force = np.zeros((len(T), 6)) if neighbour.T is None else -neighbour.pull(T).reshape(-1, 6)
         newest = max(neighbour.ours, default=0)
         edition = newest if newest > neighbour.known else 0
-        return SharedPoses(T, force, max(neighbour.theirs, default=0), edition, neighbour.ours.get(edition))
+        return Tidings(T, force, max(neighbour.theirs, default=0), edition, neighbour.ours.get(edition))
 
-    def hear(self, other: LogId, told: SharedPoses) -> None:
+    def hear(self, other: LogId, told: Tidings) -> None:
         """Take what a neighbour said.
 
         Raises:
@@ -245,7 +253,7 @@ class ConsensusPart:
         told.check(len(neighbour.index))
         neighbour.hear(told)
         if told.stiffness is not None:
-            neighbour.stiffen()
+            neighbour.stiffen(self.state.poses()[neighbour.index])
 
     def _heard(self) -> list[PairedRobot]:
         return [neighbour for neighbour in self.neighbours.values() if neighbour.T is not None]
@@ -261,19 +269,25 @@ class ConsensusPart:
         units[rows, np.arange(len(rows))] = 1.0
         return stiffness_of(_factor(H).solve(units)[rows], self.state.poses()[neighbour.index])
 
-    def _merit(self, state: State) -> float:
+    def merit(self, state: State | None = None) -> float:
+        """What a step lowers: the own cost, and what neighbours ask for; where it stands, or elsewhere."""
+        state = state or self.state
+        T = state.poses()
+        return self.own_cost(state) + sum(neighbour.merit(T[neighbour.index]) for neighbour in self._heard())
+
+    def own_cost(self, state: State | None = None) -> float:
+        """Half the sum of the weighted squares of what the robot owns, and of the prior on scales."""
+        state = state or self.state
         at = residuals(self.edges, state, hold=False)
         prior = np.sum(((state.scale - 1.0) / self.config.scale_prior_unknown_sigma_ratio) ** 2)
-        T = state.poses()
-        told = sum(neighbour.merit(T[neighbour.index]) for neighbour in self._heard())
-        return 0.5 * (float(self.weights @ at.squared()) + float(prior)) + told
+        return 0.5 * (float(self.weights @ at.squared()) + float(prior))
 
     def _shortened(self, delta: Float, before: float) -> State:
         """The first shortened step that does not lead up, or the least bad of them."""
         best, best_cost = self.state, np.inf
         for length in LENGTHS:
             there = self.state.retract(length * delta)
-            cost = self._merit(there)
+            cost = self.merit(there)
             if cost < best_cost:
                 best, best_cost = there, cost
             if cost <= before + 1e-12 * abs(before):
@@ -287,76 +301,79 @@ class ConsensusPart:
         H, gradient = _normal_equations(self.edges, at, self.weights, self.state, sigma)
         for neighbour in self._heard():
             if neighbour is not without:
-                block, rows = coo_array(neighbour.penalty), rows_of(neighbour.index)
+                block, rows = neighbour.penalty.tocoo(), rows_of(neighbour.index)
                 H = H + coo_array((block.data, (rows[block.row], rows[block.col])), shape=H.shape)
         return csc_array(H), gradient
 
 
-def shared_poses(graph: PoseGraph, log: LogId) -> dict[LogId, list[KeyframeId]]:
-    """Keyframes that a robot shares, by the other robot: those of the higher robot at their closures, sorted."""
-    found: dict[LogId, set[KeyframeId]] = {}
-    for closure in graph.closures:
-        low, high = sorted((closure.query, closure.match))
-        if low.log != high.log and log in (low.log, high.log):
-            found.setdefault(low.log if log == high.log else high.log, set()).add(high)
-    return {other: sorted(keyframes) for other, keyframes in sorted(found.items())}
+@dataclass(frozen=True, slots=True, eq=False)
+class PartBeginning:
+    """Where a robot's part begins.
 
-
-def part_of(graph: PoseGraph, log: LogId, config: BackendConfig, T: Float) -> ConsensusPart:
-    """Begin a robot's part of a graph.
-
-    Args:
-        graph: Odometry and closures; only the robot's own odometry and closures of its own are read.
-        log: The robot.
-        config: Formulation and noise model.
-        T: (N, 4, 4) where its keyframes begin, in the common frame.
+    Attributes:
+        T: (N, 4, 4) its keyframes, in the common frame.
+        copies: Higher robots' keyframes, likewise; those that are not here begin where the first closure sees them.
+        scale: (L,) metres per network unit at which each closure begins.
+        weights: (L,) of each closure.
     """
-    trajectory = graph.trajectories[log]
-    owned = [c for c in graph.closures if min(c.query.log, c.match.log) == log]
+
+    T: Float
+    copies: Mapping[KeyframeId, Float]
+    scale: Float
+    weights: Float
+
+
+def part_of(
+    log: LogId,
+    config: BackendConfig,
+    trajectory: Trajectory,
+    owned: Sequence[LoopClosure],
+    begins: PartBeginning,
+    neighbours: Mapping[LogId, PairedRobot],
+) -> ConsensusPart:
+    """Put a robot's part together; places of the shared poses in `neighbours` are set here."""
     copies = sorted({end for c in owned for end in (c.query, c.match) if end.log != log})
     at = {KeyframeId(log, k): k for k in range(len(trajectory))}
     at |= {keyframe: len(trajectory) + k for k, keyframe in enumerate(copies)}
-    scale = np.array([initial_scale(c, config) for c in owned])
-    edges, clusters = closure_edges(owned, dict.fromkeys(graph.trajectories, 0), scale, config)
+    zero = dict.fromkeys({end.log for c in owned for end in (c.query, c.match)}, 0)
+    edges, clusters = closure_edges(owned, zero, begins.scale, config)
     if owned:
         ends = np.array([(at[c.query], at[c.match]) for c in owned])
         edges = replace(edges, i=ends[:, 0], j=ends[:, 1])
     odometry = odometry_edges(trajectory, 0, config)
-    state = state_of(_with_copies(T, owned, at, scale, len(copies)), clusters)
-    informations = _information_by_keyframe(graph.closures, config)
-    neighbours = {}
-    for other, keyframes in shared_poses(graph, log).items():
-        information = np.array([informations[k] for k in keyframes])
-        unknown = ANCHORING_UNKNOWN * block_diag(*information)
-        neighbours[other] = PairedRobot(log < other, np.array([at[k] for k in keyframes]), information, unknown)
+    state = state_of(_with_copies(begins, owned, at, copies), clusters)
+    for neighbour in neighbours.values():
+        neighbour.index = np.array([at[keyframe] for keyframe in neighbour.keyframes], dtype=np.int64)
     whole = concatenate([odometry, edges])
-    return ConsensusPart(log, config, len(trajectory), whole, neighbours, state, np.ones(len(whole)))
+    weights = np.concatenate([np.ones(len(odometry)), begins.weights])
+    return ConsensusPart(log, config, len(trajectory), whole, dict(neighbours), state, weights)
 
 
-def solved_alone(part: ConsensusPart) -> Float:
-    """Poses (N, 4, 4) of a robot by its odometry and the closures within it; nothing else is known yet."""
-    own = np.flatnonzero((part.edges.i < part.own) & (part.edges.j < part.own))
-    alone = replace(
-        part,
-        edges=taken(part.edges, own),
-        neighbours={},
-        state=state_of(part.T, len(part.state.scale)),
-        weights=np.ones(len(own)),
-    )
-    cost = np.inf
-    for _ in range(ALONE_STEPS_MAX):
-        alone.step()
-        before, cost = cost, alone._merit(alone.state)
-        if before - cost <= ALONE_TOLERANCE_RATIO * cost:
-            break
-    return alone.T
+def paired(lower: bool, keyframes: Sequence[KeyframeId], information: Float, edition: int = 0) -> PairedRobot:
+    """A robot of which nothing was heard yet.
+
+    Args:
+        lower: Whether the robot itself is the lower of both.
+        keyframes: The poses that both have.
+        information: (S, 2) of the closures at each, of rotation and translation.
+        edition: Of that list.
+    """
+    closures = np.repeat(information, 3, axis=1)[:, :, None] * np.eye(6)
+    unplaced = np.zeros(len(keyframes), dtype=np.int64)
+    penalty = _diagonal(ANCHORING_UNKNOWN, closures)
+    return PairedRobot(lower, tuple(keyframes), unplaced, closures, penalty, edition=edition)
 
 
-def _with_copies(T: Float, owned: list[LoopClosure], at: Mapping[KeyframeId, int], scale: Float, count: int) -> Float:
-    """Own poses, then copies of others' where the first closure sees them."""
-    poses = np.concatenate([T, np.tile(np.eye(4), (count, 1, 1))])
-    seen = np.arange(len(poses)) < len(T)
-    for closure, metres in zip(owned, scale.tolist(), strict=True):
+def _with_copies(
+    begins: PartBeginning, owned: Sequence[LoopClosure], at: Mapping[KeyframeId, int], copies: Sequence[KeyframeId]
+) -> Float:
+    """Own poses, then copies of others'."""
+    poses = np.concatenate([begins.T, np.tile(np.eye(4), (len(copies), 1, 1))])
+    seen = np.arange(len(poses)) < len(begins.T)
+    for keyframe in copies:
+        if keyframe in begins.copies:
+            poses[at[keyframe]], seen[at[keyframe]] = begins.copies[keyframe], True
+    for closure, metres in zip(owned, begins.scale.tolist(), strict=True):
         T_query_match = np.array(closure.T_query_match_unscaled, dtype=float)
         T_query_match[:3, 3] *= metres
         i, j = at[closure.query], at[closure.match]
@@ -367,19 +384,29 @@ def _with_copies(T: Float, owned: list[LoopClosure], at: Mapping[KeyframeId, int
     return poses
 
 
-def _information_by_keyframe(closures: Sequence[LoopClosure], config: BackendConfig) -> dict[KeyframeId, Float]:
-    """Isotropic information (6, 6) of the closures between robots at each keyframe of a higher robot."""
-    between = [c for c in closures if c.query.log != c.match.log]
-    zero = {end.log: 0 for c in between for end in (c.query, c.match)}
-    edges, _ = closure_edges(between, zero, np.array([initial_scale(c, config) for c in between]), config)
+def information_by_keyframe(
+    closures: Sequence[LoopClosure], scale: Float, config: BackendConfig
+) -> dict[KeyframeId, Float]:
+    """Isotropic information (2,), of rotation and translation, of closures between robots at each higher keyframe."""
+    zero = dict.fromkeys({end.log for c in closures for end in (c.query, c.match)}, 0)
+    edges, _ = closure_edges(closures, zero, scale, config)
     L = edges.sqrt_information_wide
     diagonal = np.einsum("eab,eab->eb", L, L)
     found: dict[KeyframeId, Float] = {}
-    for closure, own in zip(between, diagonal, strict=True):
-        isotropic = np.diag(np.repeat([own[:3].mean(), own[3:].mean()], 3))
+    for closure, own in zip(closures, diagonal, strict=True):
         high = max(closure.query, closure.match)
-        found[high] = found.get(high, np.zeros((6, 6))) + isotropic
+        found[high] = found.get(high, np.zeros(2)) + np.array([own[:3].mean(), own[3:].mean()])
     return found
+
+
+def _diagonal(ratio: float, closures: Float) -> csc_array:
+    """Information (6S, 6S) that is a part of that of closures (S, 6, 6), diagonal each."""
+    return csc_array(diags_array(ratio * np.einsum("sbb->sb", closures).ravel()))
+
+
+def _single(values: Float) -> Float:
+    """Rounded as single precision does."""
+    return np.asarray(values, dtype=np.float32)
 
 
 def _differences(T: Float, there: Float) -> Float:
@@ -434,6 +461,6 @@ def _block(a: Int, A: Float, b: Int, B: Float, weights: Float) -> tuple[Int, Int
 
 def _factor(H: csc_array) -> SuperLU:
     """Factors of a symmetric matrix, held a little where it floats."""
-    tether = TETHER_RATIO * float(H.diagonal().mean())
+    tether = TETHER_RATIO * (float(H.diagonal().mean()) or 1.0)
     held = csc_array(H + diags_array(np.full(H.shape[0], tether)))
     return splu(held, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

@@ -14,24 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from flocc_agent.backend import rbcd
 from flocc_agent.backend.alignment import Rays, align_pair, travelled_m
 from flocc_agent.backend.graduated import gnc_finished, gnc_weights, initial_control
 from flocc_agent.backend.measured import measured_odometry
 from flocc_agent.backend.problem import closure_covariances, diagonal_covariance, initial_scale
-from flocc_agent.backend.rbcd import Block, Links
 from flocc_agent.backend.screening import first_not_rigid
 from flocc_agent.config import BackendConfig, Solver
-from flocc_agent.core.blocks import BlockProblem, BlockState, BlockStep, decides
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed
 from flocc_agent.core.registration import closure_probability
 from flocc_agent.geometry import inverse
+from flocc_lab.rbcd import block_descent
+from flocc_lab.rbcd.block_descent import Block, Links
+from flocc_lab.rbcd.blocks import BlockProblem, BlockState, BlockStep, decides
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+RANK = 5
+"""Dimensions to which rotations are relaxed."""
 STAGE_ITERATIONS = 5
 """Iterations between two decisions on robust weights."""
 REST_ITERATIONS = 20
@@ -78,14 +80,14 @@ class MeasuredClosures:
         """Squared residuals (E,) without robust weights."""
         X_i = np.where((self.i >= 0)[:, None, None], X[np.maximum(self.i, 0)], self.fixed)
         X_j = np.where((self.j >= 0)[:, None, None], X[np.maximum(self.j, 0)], self.fixed)
-        return rbcd.squared_residuals(X_i, X_j, self.T, self.kappa, self.tau)
+        return block_descent.squared_residuals(X_i, X_j, self.T, self.kappa, self.tau)
 
 
 def iterate_block(config: BackendConfig, problem: BlockProblem) -> BlockStep | OptimisationFailed:
     """Do one iteration of a block.
 
     Args:
-        config: Noise model, solver (lm or gnc-tls), rank of the relaxation.
+        config: Noise model, solver (lm or gnc-tls).
         problem: The block, and what others said.
 
     Returns:
@@ -114,17 +116,17 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     weights = _weights_of(config, problem, measured, state)
     links = _links(config, problem, measured, weights)
     block = Block(len(state.X), links)
-    descended = rbcd.descend(block, state.X, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
+    descended = block_descent.descend(block, state.X, STEPS, INNER_STEPS, config.relative_tolerance * 1e-4)
     together = bool(np.any((weights > 0) & ((measured.i < 0) | (measured.j < 0))))
     X = descended.X
     if together:
-        X = rbcd.retracted(state.X, TOGETHER_RATIO * (descended.X - state.X))
+        X = block_descent.retracted(state.X, TOGETHER_RATIO * (descended.X - state.X))
     moved_most = float(np.abs(X - state.X_before).max())
     decided = sum(weight == 0.0 for weight in state.weights.values())
     next_state = _extrapolated(state, X, together)
     finished = state.control is None and not state.has_unjudged
     origin = _origin(problem, next_state.X, aligned)
-    T_map_keyframe = rbcd.rounded(X, _origin(problem, X, aligned))
+    T_map_keyframe = block_descent.rounded(X, _origin(problem, X, aligned))
     return BlockStep(next_state, T_map_keyframe, origin, moved_most, descended.cost, aligned, finished, decided)
 
 
@@ -132,21 +134,21 @@ def _origin(problem: BlockProblem, X: Float, aligned: bool) -> Float:
     """Where the map frame lies (4, r): at the anchor's first keyframe, less its odometry; else as heard."""
     if problem.origin is not None and (aligned or not problem.anchored):
         return problem.origin
-    return rbcd.composed(X[0], inverse(np.asarray(problem.trajectory.T_odom_keyframe[0], dtype=float)))
+    return block_descent.composed(X[0], inverse(np.asarray(problem.trajectory.T_odom_keyframe[0], dtype=float)))
 
 
 def _first_state(config: BackendConfig, problem: BlockProblem) -> BlockState:
     """The robot alone: its odometry, and the closures within it, in its own frame."""
-    X = _tilted(rbcd.lifted(np.asarray(problem.trajectory.T_odom_keyframe, dtype=float), config.rank))
+    X = _tilted(block_descent.lifted(np.asarray(problem.trajectory.T_odom_keyframe, dtype=float), RANK))
     own = tuple(c for c in problem.closures if c.query.log == c.match.log)
     state = BlockState(X, X)
     if not own:
         return state
     alone = replace(problem, closures=own, others={}, align_to={})
-    measured = _measured(config, alone, config.rank)
+    measured = _measured(config, alone, RANK)
     weights = np.ones(len(own)) if config.solver is Solver.LM else np.zeros(len(own))
     block = Block(len(X), _links(config, alone, measured, weights))
-    X = rbcd.descend(block, X, FIRST_STEPS, INNER_STEPS, config.relative_tolerance).X
+    X = block_descent.descend(block, X, FIRST_STEPS, INNER_STEPS, config.relative_tolerance).X
     return BlockState(X, X)
 
 
@@ -154,7 +156,7 @@ def _tilted(X: Float) -> Float:
     """Tilt frames (n, 4, r) a little out of their three dimensions; otherwise no step would ever leave them."""
     out = X.copy()
     out[:, :3] += TILT * np.random.default_rng(0).normal(size=out[:, :3].shape)
-    out[:, :3] = rbcd.orthonormal(out[:, :3])
+    out[:, :3] = block_descent.orthonormal(out[:, :3])
     return out if X.shape[2] > 3 else X
 
 
@@ -175,11 +177,11 @@ def _aligned(config: BackendConfig, problem: BlockProblem, state: BlockState) ->
     """Move the whole block into the frame of others, by the pose that the most closures agree with; None if too few."""
     closures = [c for c in problem.closures if c.query in problem.align_to or c.match in problem.align_to]
     assert problem.origin is not None, "poses are aligned to a frame whose origin was heard"
-    T_own = rbcd.rounded(state.X, state.X[0])
+    T_own = block_descent.rounded(state.X, state.X[0])
     pair = align_pair(_rays(config, problem, closures, T_own))
     if len(pair.agreeing) < config.closures_to_join_min:
         return None
-    X = _tilted(rbcd.composed(problem.origin, pair.T_a_b @ T_own))
+    X = _tilted(block_descent.composed(problem.origin, pair.T_a_b @ T_own))
     kept = {p: w for p, w in state.weights.items() if p.low.log == p.high.log}
     return BlockState(X, X, weights=kept, epoch=state.epoch)
 
@@ -190,7 +192,7 @@ def _rays(config: BackendConfig, problem: BlockProblem, closures: Sequence[LoopC
     far = [c.match if c.query.log == problem.log else c.query for c in closures]
     near = [c.query if c.query.log == problem.log else c.match for c in closures]
     assert problem.origin is not None
-    T_far = rbcd.rounded(np.array([problem.align_to[keyframe] for keyframe in far]), problem.origin)
+    T_far = block_descent.rounded(np.array([problem.align_to[keyframe] for keyframe in far]), problem.origin)
     T_hat = np.array([np.asarray(c.T_query_match_unscaled, dtype=float) for c in closures])
     flipped = np.array([c.query.log == problem.log for c in closures])
     T_hat[flipped] = inverse(T_hat[flipped])
@@ -231,7 +233,7 @@ def _without_others(config: BackendConfig, closures: tuple[LoopClosure, ...], lo
     j = np.array([c.match.index if c.match.log == log else -1 for c in closures], dtype=np.int64)
     own = np.array([decides(c) == log for c in closures], dtype=bool)
     pairs = tuple(CandidatePair.of(c.query, c.match) for c in closures)
-    return MeasuredClosures(pairs, i, j, T, kappa, tau, np.zeros((E, 4, config.rank)), known, own)
+    return MeasuredClosures(pairs, i, j, T, kappa, tau, np.zeros((E, 4, RANK)), known, own)
 
 
 def _usable(others: Mapping[KeyframeId, Float], keyframe: KeyframeId, rank: int) -> bool:
@@ -337,4 +339,6 @@ def _extrapolated(state: BlockState, X: Float, together: bool) -> BlockState:
     step = X - state.X_before
     age = 0 if not together or np.sum((state.X - X) * step) > 0 else state.age
     momentum = min(age / (age + 3.0), MOMENTUM_MAX)
-    return replace(state, X=rbcd.retracted(X, momentum * step), X_before=X, age=age + 1, in_stage=state.in_stage + 1)
+    return replace(
+        state, X=block_descent.retracted(X, momentum * step), X_before=X, age=age + 1, in_stage=state.in_stage + 1
+    )

@@ -1,0 +1,1 @@
+"""Riemannian block-coordinate descent (DPGO, Kimera-Multi): the baseline of distributed optimisation, offline only."""
