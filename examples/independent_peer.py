@@ -20,7 +20,7 @@ import msgpack
 import numpy as np
 import zenoh
 
-VERSION = 4
+VERSION = 5
 HEARTBEAT_S = 0.5
 BATCH_RECORDS = 30
 Log = tuple[str, int]

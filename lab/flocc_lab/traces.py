@@ -70,7 +70,7 @@ from flocc_agent.core.reports import (
 from flocc_agent.geometry import pose
 from flocc_agent.radio import LinkOverride, LinkParameters, Partition, RadioParameters
 from flocc_launch.scenarios.scenario import RobotScenario, Scenario, TracksScenario
-from flocc_launch.simulation.rigid_alignment import Alignment
+from flocc_launch.simulation.rigid_alignment import align
 from flocc_launch.simulation.swarm import Equipment, Swarm
 from flocc_launch.simulation.virtual_playback import Capture, Playback
 from flocc_launch.simulation.virtual_robot import Station
@@ -270,7 +270,7 @@ def _scenario(classes: dict[str, int]) -> Scenario:
 
 
 def _equipment() -> Equipment:
-    return Equipment(PlaceEyes(), Alignment())
+    return Equipment(PlaceEyes(), align)
 
 
 def _places() -> Playback:

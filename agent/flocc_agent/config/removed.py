@@ -20,7 +20,7 @@ REMOVED: dict[str, str] = {
     "core.loop_closing.candidates_max": "always 4000",
     "core.loop_closing.wants_max": "always 8",
     "core.loop_closing.relays_max": "always 16",
-    "core.loop_closing.closures_enough": "always 3",
+    "core.loop_closing.closures_enough": "always 0",
     "core.rounds.period_per_keyframe_s": "always 0.001; core.rounds.period_s is the key for slower rounds",
     "core.rounds.timeout_s": "always 60.0",
     "core.rounds.keyframes_per_round": "always 20",

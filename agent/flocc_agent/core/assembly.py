@@ -17,6 +17,7 @@ from flocc_agent.core.closure_rows import ClosureTable, Tie
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
+from flocc_agent.core.parameters import KEYFRAMES_HELD
 from flocc_agent.core.pose_graph import MeasuredFactor, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.saved_map import SavedMap
@@ -121,7 +122,11 @@ class GraphAssembly:
     """
 
     def __init__(
-        self, saved: SavedMap | None = None, cold: ColdPieces | None = None, cold_closures: ColdPieces | None = None
+        self,
+        saved: SavedMap | None = None,
+        cold: ColdPieces | None = None,
+        cold_closures: ColdPieces | None = None,
+        closures_built_max: int = KEYFRAMES_HELD,
     ) -> None:
         """Start with nothing.
 
@@ -129,6 +134,7 @@ class GraphAssembly:
             saved: The opened map, where there is one.
             cold: Where pieces of old odometry go; None: all stay in memory.
             cold_closures: Where those of old closures go.
+            closures_built_max: Closures that are kept between two looks at the graph.
         """
         self._cold = cold
         self._cold_closures = cold_closures
@@ -136,7 +142,7 @@ class GraphAssembly:
         self.revision = 0
         self._saved = saved
         self._odometry: dict[LogId, _Odometry] = {}
-        self._closures = ClosureTable(cold_closures)
+        self._closures = ClosureTable(cold_closures, closures_built_max)
         self._reads_all = True
         self._early: dict[KeyframeId, int] = {}
         self._measured = MeasuredRecords()
@@ -150,7 +156,7 @@ class GraphAssembly:
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
         pieces = {"warm_odometry_pieces": self._cold, "warm_closure_pieces": self._cold_closures}
-        return {name: cold.size() for name, cold in pieces.items() if cold is not None}
+        return {name: cold.size() for name, cold in pieces.items() if cold is not None} | self._closures.sizes()
 
     def add(self, new: NewRecord) -> None:
         """Take in one record; records of a log come in their order, those of different logs in any."""

@@ -1,7 +1,8 @@
 """All closures that a robot knows: one of each pair, those of a log, and the graph's.
 
 Every robot takes in every closure, and it is looked at now and then: what a closure says is a row of bytes, of which
-old ones leave memory; 12 bytes of its pair and 4 for each of its logs remain.
+old ones leave memory; 12 bytes of its pair and 4 for each of its logs remain. Who leads looks at all of them in each
+round, and keeps as many as it built.
 """
 
 import math
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.known_sets import pair_number, place_of
+from flocc_agent.core.parameters import KEYFRAMES_HELD
 from flocc_agent.core.pose_graph import LoopClosure
 from flocc_agent.geometry import inverse, poses_from_tq, symmetric
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
@@ -74,8 +76,16 @@ def tie_of(log: LogId, query: KeyframeId, match: KeyframeId, length_m: float) ->
 class ClosureTable:
     """Closures by their pairs and by their logs."""
 
-    def __init__(self, cold: ColdPieces | None = None) -> None:
-        """Start with none; with a cold storage, old rows leave memory."""
+    def __init__(self, cold: ColdPieces | None = None, built_max: int = KEYFRAMES_HELD) -> None:
+        """Start with none.
+
+        Args:
+            cold: Where old rows go; None: they stay in memory.
+            built_max: Closures of the graph that are kept from one look at it to the next.
+        """
+        self._built_max = built_max
+        self._built: dict[int, LoopClosure] = {}
+        """By their rows, which say the same for ever."""
         self._logs: list[LogId] = []
         self._numbers: dict[LogId, int] = {}
         self._rows = RowPieces(ROW.itemsize, ROWS_OF_A_PIECE, cold)
@@ -89,6 +99,10 @@ class ClosureTable:
 
     def __len__(self) -> int:
         return self._count
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Tables with their maximum."""
+        return {"built_closures": (len(self._built), self._built_max)}
 
     def add(self, log: LogId, number: int, closure: ClosureRecord) -> bool:
         """Take in the closure of a log's record; False where another registration of its pair counts.
@@ -109,6 +123,7 @@ class ClosureTable:
                 return False
             for each in set(key):
                 self._of_log[each].remove(held)
+            self._built.pop(held, None)
             rows[at] = len(self._rows)
         else:
             numbers.insert(at, packed)
@@ -189,9 +204,15 @@ class ClosureTable:
         chosen = self._in_order(counts)
         if not len(chosen):
             return []
-        rows = np.frombuffer(self._rows.all(), dtype=ROW)[chosen]
-        built = list(self._built(rows))
-        return [c for c in built if c.query not in unread and c.match not in unread] if unread else built
+        numbers = chosen.tolist()
+        new = [row for row in numbers if row not in self._built]
+        if new:
+            rows = np.frombuffer(self._rows.all(), dtype=ROW)
+            room = max(self._built_max - len(self._built), 0)
+            self._built.update(zip(new[:room], self._build(rows[new[:room]]), strict=True))
+            others = dict(zip(new[room:], self._build(rows[new[room:]]), strict=True))
+        found = [self._built.get(row) or others[row] for row in numbers]
+        return [c for c in found if c.query not in unread and c.match not in unread] if unread else found
 
     def _in_order(self, counts: Callable[[LogId], int]) -> NDArray[np.intp]:
         """Rows of pairs whose keyframes are below the counts of their logs, in the order of the pairs."""
@@ -209,7 +230,7 @@ class ClosureTable:
         low_logs, lows, high_logs, highs, rows_of_all = map(np.concatenate, zip(*columns, strict=True))
         return np.asarray(rows_of_all[np.lexsort((highs, high_logs, lows, low_logs))], dtype=np.intp)
 
-    def _built(self, rows: Rows) -> Iterable[LoopClosure]:
+    def _build(self, rows: Rows) -> Iterable[LoopClosure]:
         poses, covariances = poses_from_tq(rows["T"]), symmetric(rows["covariance"])
         columns = (rows[name].tolist() for name in ("query_log", "query", "match_log", "match", "match_ratio"))
         scales, has_scale, has = (rows[name].tolist() for name in ("scale", "has_scale", "has_covariance"))

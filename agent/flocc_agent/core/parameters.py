@@ -128,8 +128,9 @@ class LoopClosingParameters:
     """Pairs registered at one time; more than workers only fills their queue."""
     candidates_max: int = _inner(4000)
     """Open candidates; the least similar ones are dropped beyond this."""
-    closures_enough: int = _inner(3)
-    """Of the same stretches of two ways no more pairs are registered once so many closures agree; 0: all are."""
+    closures_enough: int = _inner(0)
+    """Of the same stretches of two ways no more pairs are registered once so many closures agree; 0: all are. Off: it
+    saves few bytes and no time, and costs accuracy where it saves most (docs/scaling.md)."""
 
     def __post_init__(self) -> None:
         _require(self.match_ratio_threshold >= 0, "match_ratio_threshold must not be negative")

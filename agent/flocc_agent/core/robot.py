@@ -199,7 +199,7 @@ class Robot:
         self._answers = AnswerBudget()
         self._muted = Muted()
         cold_closures = None if cold is None else ColdPieces(cold, max(1, held // ROWS_OF_A_PIECE))
-        self.assembly = GraphAssembly(restored.saved, cold_odometry, cold_closures)
+        self.assembly = GraphAssembly(restored.saved, cold_odometry, cold_closures, held)
         closed = restored.closed()
         self.recognition = PlaceRecognition(log, parameters.place_recognition, closed, held)
         spectral = SpectralOrder() if parameters.place_recognition.candidate_order == "spectral" else None

@@ -25,7 +25,6 @@ from flocc_agent.backend.optimiser import optimise
 from flocc_agent.config import BackendConfig
 from flocc_agent.core.assembly import GraphAssembly
 from flocc_agent.core.gossip import NewRecord
-from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.pose_graph import GraphSolution, LoopClosure, PoseGraph
 from flocc_agent.core.spared import Spared
 from flocc_agent.geometry import pose7, pose7s
@@ -45,7 +44,8 @@ from flocc_protocol.ids import LogId
 from flocc_protocol.messages import CandidatePair
 from flocc_protocol.records import ClosureRecord, KeyframeRecord, Record
 
-ENOUGH = LoopClosingParameters().closures_enough
+ENOUGH = 3
+"""As many as the campaign's robots need."""
 
 
 class _Replay:

@@ -23,7 +23,7 @@ from flocc_launch.simulation.fault_schedule import schedule
 from flocc_launch.simulation.generator import FAMILIES, ROBOTS_MAX, calm_s, drawn_scenario
 from flocc_launch.simulation.hardships import Hardship, HardshipKind, drawn_hardships, endure
 from flocc_launch.simulation.invariants import Invariant, InvariantWatch, Violation
-from flocc_launch.simulation.rigid_alignment import Alignment
+from flocc_launch.simulation.rigid_alignment import align
 from flocc_launch.simulation.safety import all_invariants
 from flocc_launch.simulation.simulate import playbacks_of
 from flocc_launch.simulation.swarm import Equipment, Swarm
@@ -160,7 +160,7 @@ def is_noiseless(scenario: Scenario) -> bool:
 def prepared(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> Swarm:
     """A swarm with quick stand-ins for perception and back end, and its faults to come."""
     eyes = ImageEyes(build_perception(scenario.perception, scenario.seed), scenario.perception, None)
-    swarm = Swarm(scenario, _playbacks(scenario), Equipment(eyes, Alignment()), scenario.seed)
+    swarm = Swarm(scenario, _playbacks(scenario), Equipment(eyes, align), scenario.seed)
     endure(swarm, hardships)
     schedule(swarm, scenario.faults)
     return swarm

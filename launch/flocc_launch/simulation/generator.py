@@ -13,7 +13,7 @@ from flocc_agent.config import (
     RadioConfig,
     SyntheticConfig,
 )
-from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
+from flocc_agent.core.parameters import CoreParameters, LoopClosingParameters, PlaceRecognitionParameters
 from flocc_launch.scenarios.scenario import (
     Fault,
     FaultKind,
@@ -26,6 +26,8 @@ from flocc_launch.scenarios.scenario import (
 FAULTS_END_S = 30.0
 ROBOTS_MAX = 5
 FAULTS_MAX = 6
+CLOSURES_ENOUGH = 3
+"""By default no pair is spared; here it is, so that what it needs is checked."""
 WALKS = 8
 LENGTHS_M = (8.0, 14.0, 20.0)
 """Few walks, so that a process draws each once; faults differ from seed to seed."""
@@ -107,7 +109,10 @@ def drawn_scenario(seed: int, family: Family = SMALL) -> Scenario:
         ),
         robots={name: _robot(rng) for name in names},
         radio=_radio(rng, names),
-        core=CoreParameters(place_recognition=PlaceRecognitionParameters(similarity_threshold=0.5)),
+        core=CoreParameters(
+            place_recognition=PlaceRecognitionParameters(similarity_threshold=0.5),
+            loop_closing=LoopClosingParameters(closures_enough=CLOSURES_ENOUGH),
+        ),
         keyframes=KeyframeConfig(distance_m=1.5, rotation_rad=1.2),
         perception=PerceptionConfig(
             method="synthetic", synthetic=NOISELESS if _draws(seed, 2, NOISELESS_RATIO) else NOISY

@@ -26,31 +26,19 @@ COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2])
 """What it says of every log, since it does not estimate any: 0.6 degrees, 0.1 m."""
 
 
-class Alignment:
-    """The optimiser of one swarm; remembers of each closure what is the same in every round."""
-
-    def __init__(self) -> None:
-        self._known: dict[LoopClosure, tuple[tuple[LogId, LogId], ClosureResult]] = {}
-
-    def __call__(self, graph: PoseGraph, _initial: GraphSolution | None = None) -> GraphSolution:
-        """Place every log in its component's map frame; trusts the closures it comes across first."""
-        known = [self._known.get(closure) or self._look_at(closure) for closure in graph.closures]
-        bridges = {logs: closure for (logs, _), closure in zip(reversed(known), reversed(graph.closures), strict=True)}
-        groups = components_of(list(graph.trajectories), list(bridges.values()))
-        components = tuple(_component(logs, graph, bridges) for logs in groups)
-        return GraphSolution(components, tuple([used for _, used in known]))
-
-    def _look_at(self, closure: LoopClosure) -> tuple[tuple[LogId, LogId], ClosureResult]:
-        """Which logs a closure joins, and that it is used."""
-        low, high = sorted((closure.query.log, closure.match.log))
-        used = ClosureResult(closure.query, closure.match, ClosureState.USED, 1.0, closure.scale_initial, 0.0)
-        known = self._known[closure] = (low, high), used
-        return known
+def align(graph: PoseGraph, _initial: GraphSolution | None = None) -> GraphSolution:
+    """Place every log in its component's map frame; trusts the closures it comes across first."""
+    bridges: dict[tuple[LogId, LogId], LoopClosure] = {}
+    for closure in reversed(graph.closures):
+        one, other = closure.query.log, closure.match.log
+        bridges[(one, other) if one < other else (other, one)] = closure
+    groups = components_of(list(graph.trajectories), list(bridges.values()))
+    components = tuple(_component(logs, graph, bridges) for logs in groups)
+    return GraphSolution(components, tuple(_used(closure) for closure in graph.closures))
 
 
-def align(graph: PoseGraph) -> GraphSolution:
-    """One alignment alone."""
-    return Alignment()(graph)
+def _used(closure: LoopClosure) -> ClosureResult:
+    return ClosureResult(closure.query, closure.match, ClosureState.USED, 1.0, closure.scale_initial, 0.0)
 
 
 def _component(

@@ -33,7 +33,7 @@ from flocc_launch.scenarios.sensors import sense
 from flocc_launch.scenarios.walks import walks
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
-from flocc_launch.simulation.rigid_alignment import Alignment
+from flocc_launch.simulation.rigid_alignment import align
 from flocc_launch.simulation.stored_stations import write_store
 from flocc_launch.simulation.swarm import Equipment, Swarm
 from flocc_launch.simulation.virtual_playback import Playback, nothing, of_recording, of_walk
@@ -97,7 +97,7 @@ def swarm_of(
     opened = None if use is None else opened_for(use, scenario, perception)
     eyes = ImageEyes(perception, scenario.perception, cache)
     given = scenario.simulation
-    optimiser = Alignment() if given.optimiser == "quick" else build_optimiser(scenario.backend)
+    optimiser = align if given.optimiser == "quick" else build_optimiser(scenario.backend)
     times = WorkTimes(given.encode_s, given.register_s, given.optimise_s)
     fixed = use is not None and use.fixed
     swarm = Swarm(scenario, playbacks, Equipment(eyes, optimiser, times, opened, fixed, lives), seed)
