@@ -13,6 +13,7 @@ from tests.protocol.wire_examples import BOB, ENCODED, ENVELOPES, MESSAGES
 from tests.protocol.wire_mutations import flip, noise, rearrange, replace_node
 
 from flocc_agent.core import peer_budgets, pulls
+from flocc_agent.core import robot as robot_of_core
 from flocc_agent.core.effects import (
     Broadcast,
     Effect,
@@ -239,6 +240,7 @@ def test_strangers_cannot_grow_a_robot_without_bound(monkeypatch: pytest.MonkeyP
     """Every message comes from a robot that was never heard of, or speaks of logs that nobody knows."""
     monkeypatch.setattr(pulls.remember, "__defaults__", (16,))
     monkeypatch.setattr(peer_budgets, "PEERS_MAX", 16)
+    monkeypatch.setattr(robot_of_core, "OTHER_MODE_MAX", 16)
     robot = Robot(LogId("alice"), 0, 0, SMALL, 0.0)
     carol = [Envelope(LogId("carol"), message) for message in (*MESSAGES, Records((RecordBatch(BOB, 3, 0, ENCODED),)))]
     examples = [encode(envelope) for envelope in (*ENVELOPES, *carol)]

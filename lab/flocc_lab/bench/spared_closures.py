@@ -140,7 +140,7 @@ def of_scenario(name: str, scenario: Scenario) -> dict[str, Any]:
 def walk_scenario(seed: int) -> Scenario:
     """Five robots that walk through a town, with wrong closures among theirs."""
     fields = {
-        "name": f"walk {seed}",
+        "name": f"walk-{seed}",
         "seed": seed,
         "tracks": {"robots": 5, "seed": seed, "area_m": 60.0, "length_m": 150.0},
         "keyframes": {"distance_m": 1.0, "rotation_rad": 0.7},

@@ -73,7 +73,7 @@ def test_rejected_closures_leave_the_solution_as_if_they_were_not_there() -> Non
     alone = solved(without, replace_solver(config, Solver.LM))
     for of_all, of_used in zip(with_them.components, alone.components, strict=True):
         for log, T in of_all.T_map_keyframe.items():
-            assert np.allclose(T, of_used.T_map_keyframe[log], atol=1e-4)
+            assert np.allclose(T, of_used.T_map_keyframe[log], atol=2e-3)  # chains are exact to this
 
 
 def test_a_far_off_rejected_closure_does_not_pull(monkeypatch: pytest.MonkeyPatch) -> None:
