@@ -63,7 +63,9 @@ def test_a_step_that_overshoots_is_shortened_before_it_is_damped() -> None:
     assert once.cost < objective.cost(state, weights, hold=False)
 
 
-def test_rejected_closures_leave_the_solution_as_if_they_were_not_there() -> None:
+def test_rejected_closures_leave_the_solution_as_if_they_were_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all keyframes: chains of other closures are other chains, exact to a thousandth of the cost only."""
+    monkeypatch.setattr("flocc_agent.backend.chains.CHAINED_POSES_MIN", 10_000)
     drawn = member(7)
     config = BackendConfig(weight_by_probability=False, relative_tolerance=1e-12)
     with_them = solved(drawn.graph, config)
@@ -73,7 +75,7 @@ def test_rejected_closures_leave_the_solution_as_if_they_were_not_there() -> Non
     alone = solved(without, replace_solver(config, Solver.LM))
     for of_all, of_used in zip(with_them.components, alone.components, strict=True):
         for log, T in of_all.T_map_keyframe.items():
-            assert np.allclose(T, of_used.T_map_keyframe[log], atol=2e-3)  # chains are exact to this
+            assert np.allclose(T, of_used.T_map_keyframe[log], atol=1e-4)
 
 
 def test_a_far_off_rejected_closure_does_not_pull(monkeypatch: pytest.MonkeyPatch) -> None:
