@@ -206,11 +206,12 @@ class ClosureTable:
             return []
         numbers = chosen.tolist()
         new = [row for row in numbers if row not in self._built]
+        others: dict[int, LoopClosure] = {}
         if new:
             rows = np.frombuffer(self._rows.all(), dtype=ROW)
             room = max(self._built_max - len(self._built), 0)
             self._built.update(zip(new[:room], self._build(rows[new[:room]]), strict=True))
-            others = dict(zip(new[room:], self._build(rows[new[room:]]), strict=True))
+            others.update(zip(new[room:], self._build(rows[new[room:]]), strict=True))
         found = [self._built.get(row) or others[row] for row in numbers]
         return [c for c in found if c.query not in unread and c.match not in unread] if unread else found
 

@@ -23,8 +23,6 @@ from flocc_protocol.messages import OFFERS_MAX, CandidatePair
 
 Float = NDArray[np.float64]
 
-ITERATIONS_AFTER_RESTART = 1000
-"""A restarted robot counts on from its last correction and this: above whatever it said before."""
 DELIVER_PERIOD_S = 2.0
 """Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
