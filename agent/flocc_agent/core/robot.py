@@ -37,6 +37,7 @@ from flocc_agent.core.events import (
     Measured,
     MessageReceived,
     PairRegistered,
+    Withdrawn,
 )
 from flocc_agent.core.giving_up import LOOK_PERIOD_S, expendable
 from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
@@ -62,6 +63,7 @@ from flocc_agent.core.prospects import UNLIKELY
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
     ClosureRejected,
+    ClosureWithdrawn,
     EncodingFailed,
     FrontEndsDiffer,
     KeyframeTaken,
@@ -107,6 +109,7 @@ from flocc_protocol.records import (
     LatentRecord,
     Record,
     RejectionRecord,
+    WithdrawalRecord,
 )
 
 NOBODY = -1
@@ -160,6 +163,7 @@ class _Pending:
     encoded: bool = False
     descriptor: Array | None = None
     sha256: bytes = b""
+    withdrawn: Withdrawn | None = None
 
 
 class Robot:
@@ -327,14 +331,14 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor, doubts, sha256):
+            case KeyframeEncoded(keyframe, descriptor, doubts, sha256, withdrawn):
                 self.closing.on_held(keyframe)
-                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256)]
-            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256, withdrawn)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts, withdrawn):
                 reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
-                return [*reports, *self._on_encoded(keyframe, None, now)]
+                return [*reports, *self._on_encoded(keyframe, None, now, withdrawn=withdrawn)]
             case LatentFetched(keyframe, holder):
-                self.closing.on_held(keyframe)
+                self.closing.on_fetched(keyframe, now)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
             case LatentFetchFailed(keyframe, holder, reason):
                 return self._on_fetch_failed(keyframe, holder, reason, now)
@@ -536,7 +540,12 @@ class Robot:
         return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(
-        self, keyframe: KeyframeId, descriptor: Array | None, now: float, sha256: bytes = b""
+        self,
+        keyframe: KeyframeId,
+        descriptor: Array | None,
+        now: float,
+        sha256: bytes = b"",
+        withdrawn: Withdrawn | None = None,
     ) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
 
@@ -545,6 +554,7 @@ class Robot:
         for pending in self._pending:
             if pending.index == keyframe.index:
                 pending.encoded, pending.descriptor, pending.sha256 = True, descriptor, sha256
+                pending.withdrawn = withdrawn
         effects: list[Effect] = []
         while self._pending and self._pending[0].encoded:
             ready = self._pending.pop(0)
@@ -553,8 +563,21 @@ class Robot:
             effects.append(_keyframe_report(self.log, record))
             if self._has_keys and ready.sha256:
                 effects += self._append(LatentRecord(ready.index, ready.sha256), now)
+            if ready.withdrawn is not None:
+                effects += self._withdraw(ready.index, ready.withdrawn, now)
             for measurement in self._waiting.pop(ready.index, ()):
                 effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
+        return effects
+
+    def _withdraw(self, end: int, withdrawn: Withdrawn, now: float) -> list[Effect]:
+        """Take the keyframes before one back, after the log said what their latents are now, where it says so."""
+        effects: list[Effect] = []
+        for index, sha256 in enumerate(withdrawn.sha256, end - len(withdrawn.sha256)):
+            if self._has_keys and sha256:
+                effects += self._append(LatentRecord(index, sha256), now)
+        first = max(end - withdrawn.count, 0)
+        if first < end:
+            effects += self._append(WithdrawalRecord(self.log, first, end, withdrawn.is_final), now)
         return effects
 
     def _on_measured(self, measurement: Measurement, index: int, now: float) -> list[Effect]:
@@ -586,7 +609,7 @@ class Robot:
         A pair that another robot's record resolved in the meantime needs no second one.
         """
         roles = self.closing.roles(pair)
-        if roles is None:
+        if roles is None or self.closing.is_outdated(pair):
             return []
         record = judged(*roles, result, self._parameters.loop_closing)
         return [*self._append(record, now), Report(told(record, self.log))]
@@ -610,16 +633,23 @@ class Robot:
         return self.gossip.logs[log].records[number]
 
     def _append(self, record: Record, now: float) -> list[Effect]:
+        """Append a record to the own log; before a judgement, what it knows of withdrawn keyframes."""
+        said: list[Effect] = []
+        if isinstance(record, ClosureRecord | RejectionRecord):
+            pair = CandidatePair.of(record.query, record.match)
+            for known in self.assembly.withdrawals.unsaid(self.log, pair):
+                said += self._append(known, now)
         new, effects, batch = self.gossip.append(record)
-        return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
+        return [*said, *effects, Broadcast(Records((batch,))), *self._take([new], now)]
 
     def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
         """Let everything that is derived from the logs know of new records; places are recognised at the end."""
         described: list[tuple[KeyframeId, Array]] = []
         effects: list[Effect] = []
         filled: list[tuple[LogId, int]] = []
+        uncounted: list[CandidatePair] = []
         for new in new_records:
-            self.assembly.add(new)
+            uncounted += self.assembly.add(new)
             if (new.number + 1) % BLOCK_RECORDS == 0:
                 filled.append((new.log, new.number))
             match new.record:
@@ -628,6 +658,8 @@ class Robot:
                     keyframe = KeyframeId(new.log, index)
                     if descriptor is not None and self._may_match(keyframe):
                         described.append((keyframe, descriptor))
+                case WithdrawalRecord(log, first, end) if log == new.log:
+                    self.closing.on_withdrawal(log, first, end)
                 case LatentRecord(index):
                     self.closing.latents.names.add(KeyframeId(new.log, index), new.number)
                 case ClosureRecord(query, match):
@@ -638,10 +670,22 @@ class Robot:
                         effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     pass  # what was measured, and what a later version says, concerns the graph only
+        for pair in uncounted:
+            effects += self._uncounted(pair, now)
         effects += self._recognise(described, now) if described else []
         for log, number in filled:
             self._lend_rows(log, number // BLOCK_RECORDS)
         return effects
+
+    def _uncounted(self, pair: CandidatePair, now: float) -> list[Effect]:
+        """A closure does not count: its pair is registered once more, where latents were made anew."""
+        withdrawals = self.assembly.withdrawals
+        again = withdrawals.asks_again(pair)
+        if again:
+            self.closing.on_withdrawn(pair, now)
+        own = (end for end in (pair.low, pair.high) if end.log == self.log)
+        is_own = any(withdrawals.is_withdrawn(end) for end in own)
+        return [Report(ClosureWithdrawn(query=pair.low, match=pair.high, again=again))] if is_own else []
 
     def _make_room(self, wanting: LogId, now: float) -> list[Effect]:
         """Give up a log that nothing refers to, where one is asked for that has no room."""
@@ -738,7 +782,9 @@ class Robot:
             for block in range(len(copy) // BLOCK_RECORDS):
                 self._lend_rows(log, block)
         for keyframe in restored.latents:
-            self.closing.on_held(keyframe)
+            is_old = keyframe.log not in self._closed | {self.log} and self.assembly.withdrawals.is_withdrawn(keyframe)
+            if not is_old:  # else nobody knows whether it is from before its owner made it anew
+                self.closing.on_held(keyframe)
         self.corrections.restore(restored.correction, restored.frame_changed)
 
     def _restore_log(self, log: LogId, records: Iterable[bytes]) -> Iterable[NewRecord]:
