@@ -56,7 +56,12 @@ def info(
     from flocc_launch.datasets.commands import info_lines, infos
 
     if json_out:
-        facts([asdict(found) for found in infos(source, format_name, trajectory_format)])
+        known: list[dict[str, object]] = []
+        try:
+            known.extend(asdict(found) for found in infos(source, format_name, trajectory_format))
+        finally:
+            if known:
+                facts(known)
         return
     for number, found in enumerate(infos(source, format_name, trajectory_format)):
         if number:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from flocc_agent.core.log_copy import EncodedRecords
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.restored import Restored
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.persistence import COPIES_PERIOD_S, joined_logs
 from flocc_protocol.ids import KeyframeId, LogId
