@@ -260,6 +260,7 @@ class KeyframeLook:
         fault: Why it was not.
         doubts: What is odd about the camera, told for the first time.
         hidden: (H, W) what moves with the camera, where that is told with this keyframe: the latents before show it.
+        withdrawn: So many keyframes before this one showed what is not the scene, as this one tells.
     """
 
     descriptor: Array | None
@@ -267,6 +268,7 @@ class KeyframeLook:
     fault: str = ""
     doubts: tuple[CameraDoubted, ...] = ()
     hidden: NDArray[np.bool_] | None = None
+    withdrawn: int = 0
 
 
 class ImageWatch(Protocol):
