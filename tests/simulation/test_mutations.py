@@ -172,7 +172,7 @@ def test_a_robot_that_sends_before_it_writes_loses_what_it_published(monkeypatch
 
 
 def test_a_table_without_a_maximum_breaks_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def hoard(self: LoopClosing, peer: str, wants: Any, now: float) -> None:  # noqa: ARG001
+    def hoard(self: LoopClosing, peer: str, wants: Any, now: float) -> None:
         self.latents._relayed.update({KeyframeId(self._own, k): Relayed(now, False) for k in range(99)})
 
     monkeypatch.setattr(LoopClosing, "on_wants", hoard)

@@ -29,8 +29,8 @@ WISHED_AGAIN_S = 2.5
 RELAYS_MAX = 16
 """Latents kept for others at one time: the wants of two robots."""
 OFFERED_S = 20.0
-"""A latent that is here for others is told of for so long after somebody wished for it, after it came, and after one who
-wished came into range. Who lacks it still wishes again."""
+"""A latent that is here for others is told of for so long after somebody wished for it, after it came, and after one
+who wished came into range. Who lacks it still wishes again."""
 WISHERS_MAX = 16
 """Robots of which it is remembered that they wished for one latent."""
 FALSE_MAX = 64

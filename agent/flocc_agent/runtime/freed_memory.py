@@ -12,7 +12,6 @@ import os
 import sys
 from collections.abc import Callable
 
-
 ARENA_MAX = -8
 """mallopt(3): how many heaps there may be."""
 

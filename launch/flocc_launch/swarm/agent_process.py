@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.runtime.event_lines import Reported, line_of
-from flocc_agent.runtime.freed_memory import have_one_heap
 from flocc_agent.runtime.facts import AgentStopped, JourneyEnded
+from flocc_agent.runtime.freed_memory import have_one_heap
 from flocc_agent.runtime.robot_result import RobotResult, write_result
 from flocc_agent.runtime.status import AgentStatus
 from flocc_launch.setup.world_faults import sentence_of
