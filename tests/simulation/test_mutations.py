@@ -18,7 +18,8 @@ from flocc_agent.core.offers import Offers
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.pulls import Pulls
-from flocc_agent.core.robot import Restored, Robot
+from flocc_agent.core.restored import Restored
+from flocc_agent.core.robot import Robot
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.simulation.campaign import run_checked
 from flocc_launch.simulation.disk import Disk

@@ -217,12 +217,12 @@ class LatentNames:
         self._numbers: dict[LogId, array[int]] = {}
 
     def add(self, keyframe: KeyframeId, number: int) -> None:
-        """A record says it; the first one of a keyframe counts, which comes after its keyframe's record."""
+        """A record says it, after its keyframe's; the last one of a keyframe counts, whose latent was made anew."""
         numbers = self._numbers.setdefault(keyframe.log, array("I"))
         if keyframe.index > number:
             return
         numbers.extend([0] * (keyframe.index + 1 - len(numbers)))
-        numbers[keyframe.index] = numbers[keyframe.index] or number
+        numbers[keyframe.index] = number
 
     def forget(self, log: LogId) -> None:
         """A log is held no more."""
@@ -248,6 +248,7 @@ class Latents:
         self._relayed: dict[KeyframeId, Relayed] = {}
         self._wished_s: dict[KeyframeId, float] = {}
         self._lost_until_s: dict[KeyframeId, float] = {}
+        self._outdated: dict[KeyframeId, None] = {}
 
     def __contains__(self, keyframe: object) -> bool:
         return keyframe in self._held
@@ -259,6 +260,7 @@ class Latents:
             "wished for": (len(self._wished_s), PAUSED_MAX),
             "lost": (len(self._lost_until_s), RELAYS_MAX),
             "fetches": (len(self._fetches), PAUSED_MAX + self._parameters.fetches_max),
+            "outdated fetches": (len(self._outdated), PAUSED_MAX),
         }
 
     def add(self, keyframe: KeyframeId) -> None:
@@ -275,8 +277,22 @@ class Latents:
         if keyframe in self._relayed:
             self._relayed[keyframe].is_here = False
 
+    def on_withdrawn(self, keyframe: KeyframeId) -> None:
+        """A latent was made anew by its owner: it is fetched again, and what a fetch under way brings is old."""
+        self._held.discard(keyframe)
+        fetch = self._fetches.get(keyframe)
+        if fetch is not None and fetch.in_flight_until_s is not None:
+            remember(self._outdated, keyframe, None, PAUSED_MAX)
+
+    def is_outdated(self, keyframe: KeyframeId) -> bool:
+        """Whether what a fetch brought was made anew meanwhile; told once."""
+        is_old = keyframe in self._outdated
+        self._outdated.pop(keyframe, None)
+        return is_old
+
     def on_failed(self, keyframe: KeyframeId, now: float) -> None:
         """Wait before the next try, longer each time."""
+        self._outdated.pop(keyframe, None)
         fetch = self._fetches.get(keyframe)
         if fetch is not None:
             fetch.in_flight_until_s = None

@@ -98,6 +98,8 @@ class LoopClosing:
         self._changed = True
         self._due_s = float("inf")
         self._ticked_s = float("inf")
+        self._outdated: set[CandidatePair] = set()
+        """Registrations under way with latents that were made anew since."""
 
     @property
     def load(self) -> int:
@@ -152,12 +154,38 @@ class LoopClosing:
         work = self._work.get(pair)
         return (work.query, work.match) if work else None
 
+    def is_outdated(self, pair: CandidatePair) -> bool:
+        """Whether a registration that ended is to be done again: a latent was made anew meanwhile. Told once."""
+        if pair not in self._outdated:
+            return False
+        self._outdated.discard(pair)
+        self._work.stop(pair)
+        self._changed = True
+        return True
+
+    def on_withdrawal(self, log: LogId, first: int, end: int) -> None:
+        """Latents of a stretch of a log were made anew."""
+        for keyframe in (KeyframeId(log, index) for index in range(first, end)):
+            pairs = {pair for pair in self._work.using(keyframe) if keyframe in (pair.low, pair.high)}
+            self._outdated |= pairs & self._work.under_way
+            if log != self._own and log not in self._closed:
+                self.latents.on_withdrawn(keyframe)
+                self._work.on_evicted(keyframe)
+        self._chosen, self._changed = None, True
+
+    def on_withdrawn(self, pair: CandidatePair, now: float) -> None:
+        """The closure of a pair does not count: it is registered once more."""
+        self._resolved.discard(pair)
+        if not self._knows(pair) and self._concerns(pair):
+            self._assign(Candidate(pair, 0.0), now)
+
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
         self._prospects.on_resolved(pair)
         self._spared.remove(pair)
         self._undecided.pop(pair, None)
+        self._outdated.discard(pair)
         if pair in self._work or pair in self._offers:
             self._work.remove(pair)
             self._offers.remove(pair)
@@ -225,6 +253,13 @@ class LoopClosing:
 
     # Latents
 
+    def on_fetched(self, keyframe: KeyframeId, now: float) -> None:
+        """A fetch brought a latent; an old one is fetched again."""
+        if self.latents.is_outdated(keyframe):
+            self.on_fetch_failed(keyframe, now)
+        else:
+            self.on_held(keyframe)
+
     def on_held(self, keyframe: KeyframeId) -> None:
         """A latent is in this robot's store."""
         self.latents.add(keyframe)
@@ -234,6 +269,7 @@ class LoopClosing:
     def on_latent_missing(self, pair: CandidatePair, keyframe: KeyframeId) -> list[CandidatePair]:
         """The store evicted a latent; another robot's is fetched again, an own one is lost. Pairs to reject."""
         self.latents.remove(keyframe)
+        self._outdated.discard(pair)
         self._work.on_evicted(keyframe)
         self._work.stop(pair)
         self._changed = True
@@ -450,6 +486,7 @@ class LoopClosing:
         """Forget what gave no answer, so that it is tried again."""
         self.latents.give_up(now)
         for pair in self._work.overdue(now):
+            self._outdated.discard(pair)
             self._work.stop(pair)
 
     def _using(self, keyframe: KeyframeId) -> list[CandidatePair]:

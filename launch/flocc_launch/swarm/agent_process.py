@@ -299,7 +299,7 @@ def _page(config: AgentConfig, where: str | None, clock_s: Callable[[], float]) 
 
 def recover_result(config: AgentConfig) -> None:
     """Write the result of an agent that was killed, from what its store holds."""
-    from flocc_agent.agent import stored_result
+    from flocc_agent.composition import stored_result
 
     if config.folder is not None and (config.folder / "store").exists():
         write_result(config.folder, stored_result(config))
