@@ -279,7 +279,7 @@ class Latents:
 
     def on_withdrawn(self, keyframe: KeyframeId) -> None:
         """A latent was made anew by its owner: it is fetched again, and what a fetch under way brings is old."""
-        self._held.discard(keyframe)
+        self.remove(keyframe)
         fetch = self._fetches.get(keyframe)
         if fetch is not None and fetch.in_flight_until_s is not None:
             remember(self._outdated, keyframe, None, PAUSED_MAX)

@@ -401,8 +401,11 @@ def test_what_is_held_for_a_robot_is_told_until_it_must_have_heard_and_again_whe
     assert (latents.holds(300.0), latents.holds(300.0 + OFFERED_S)) == ((wanted,), ())
     latents.on_wants("r4", [wanted], 400.0)
     assert latents.holds(400.0) == (wanted,)
-    latents.remove(wanted)
-    assert latents.holds(400.1) == ()
+    for takes_away in (latents.remove, latents.on_withdrawn):
+        latents.add(wanted)
+        assert latents.holds(400.0) == (wanted,)
+        takes_away(wanted)
+        assert latents.holds(400.1) == ()
 
 
 def test_a_wish_is_told_now_and_then_and_all_of_them_to_whoever_comes_into_range() -> None:
