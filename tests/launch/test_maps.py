@@ -775,6 +775,9 @@ def test_commands_say_what_they_did(
     code, text = said(capsys, monkeypatch, "map", "info", out)
     assert code == 0
     assert "frame map/r1 logs 2 keyframes" in text
+    known = json.loads(said(capsys, monkeypatch, "map", "info", out, "--json")[1])
+    assert [entry["log"] for entry in known["logs"]] == ["r1", "r2"]
+    assert 0.0 < known["positions_sigma_m"][0] <= known["positions_sigma_m"][1] < 1.0
     assert said(capsys, monkeypatch, "map", "export", out, "--out", str(tmp_path / "files"))[0] == 0
     code, text = said(capsys, monkeypatch, "map", "prune", out, "--out", str(tmp_path / "small"))
     assert code == 0
