@@ -29,6 +29,7 @@ from flocc_launch.dashboard.status_table import NO_ANSWER
 from flocc_launch.doctor import Finding, Severity, cameras, diagnose, installation, network_check
 from flocc_launch.doctor.live import diagnose_live
 from flocc_launch.runs.run_folder import RunFolder
+from flocc_launch.setup import cache
 
 PAGE = Path(__file__).parents[2] / "docs/doctor.md"
 KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
@@ -228,7 +229,7 @@ def of_a_machine(each: Row, path: Path, patch: pytest.MonkeyPatch) -> list[Findi
             return installation.surroundings(path)
         case "cache":
             patch.setenv("FLOCC_CACHE", str(path / "cache"))
-            patch.setattr(installation, "can_be_written", lambda _: well)
+            patch.setattr(cache, "can_be_written", lambda _: well)
             return installation.surroundings(path)
         case "locale":
             patch.setattr(locale, "getpreferredencoding", lambda _: "ANSI_X3.4-1968")
