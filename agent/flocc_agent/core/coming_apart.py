@@ -19,7 +19,7 @@ Good teams had at most 3 in a row, shrinking; broken ones (`ANCHORING_FLOATING` 
 SHRUNK_RATIO = 0.5
 NEAR_M, DRIFTED_RATIO = 2.0, 0.1
 """How far two robots may be apart, and against both ways: several times what odometry drifts. Good teams were at most
-0.6 of it apart."""
+1.5 of it apart, and that for three contacts."""
 SILENT_S = 30.0
 """After so long without a word of a neighbour it does not matter how far it was."""
 
