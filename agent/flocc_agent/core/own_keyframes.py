@@ -6,6 +6,7 @@ Records are appended in the order of capture, whatever order the encoder ends in
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from flocc_agent.core.events import Withdrawn
 from flocc_agent.core.measurements import WAITING_MAX, Measurement
 from flocc_protocol.arrays import Array
 from flocc_protocol.codec import Pose7
@@ -21,6 +22,7 @@ class OwnKeyframe:
     is_encoded: bool = False
     descriptor: Array | None = None
     sha256: bytes = b""
+    withdrawn: Withdrawn | None = None
 
 
 class OwnKeyframes:
@@ -41,11 +43,12 @@ class OwnKeyframes:
         """A keyframe goes to the encoder."""
         self._pending.append(OwnKeyframe(index, stamp_s, T_odom_camera))
 
-    def encoded(self, index: int, descriptor: Array | None, sha256: bytes) -> None:
+    def encoded(self, index: int, descriptor: Array | None, sha256: bytes, withdrawn: Withdrawn | None = None) -> None:
         """The encoder is done with a keyframe, with or without a descriptor."""
         for pending in self._pending:
             if pending.index == index:
                 pending.is_encoded, pending.descriptor, pending.sha256 = True, descriptor, sha256
+                pending.withdrawn = withdrawn
 
     def ready(self) -> Iterator[OwnKeyframe]:
         """Those whose records are due, in the order of capture; each is taken out as it comes."""

@@ -12,13 +12,13 @@ from flocc_agent.core.gossip import Gossip, NewRecord
 from flocc_agent.core.log_copy import BLOCK_RECORDS
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.place_recognition import PlaceRecognition
-from flocc_agent.core.reports import FrontEndsDiffer
+from flocc_agent.core.reports import ClosureWithdrawn, FrontEndsDiffer
 from flocc_agent.core.restored import Restored
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, LatentRecord, RejectionRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, LatentRecord, RejectionRecord, WithdrawalRecord
 
 
 class RecordIntake:
@@ -49,8 +49,9 @@ class RecordIntake:
         described: list[tuple[KeyframeId, Array]] = []
         effects: list[Effect] = []
         filled: list[tuple[LogId, int]] = []
+        uncounted: list[CandidatePair] = []
         for new in new_records:
-            self._assembly.add(new)
+            uncounted += self._assembly.add(new)
             if (new.number + 1) % BLOCK_RECORDS == 0:
                 filled.append((new.log, new.number))
             match new.record:
@@ -59,6 +60,8 @@ class RecordIntake:
                     keyframe = KeyframeId(new.log, index)
                     if descriptor is not None and self._may_match(keyframe):
                         described.append((keyframe, descriptor))
+                case WithdrawalRecord(log, first, end) if log == new.log:
+                    self._closing.on_withdrawal(log, first, end)
                 case LatentRecord(index):
                     self._closing.latents.names.add(KeyframeId(new.log, index), new.number)
                 case ClosureRecord(query, match):
@@ -69,10 +72,22 @@ class RecordIntake:
                         effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     pass  # what was measured, and what a later version says, concerns the graph only
+        for pair in uncounted:
+            effects += self._uncounted(pair, now)
         effects += self._recognise(described, now) if described else []
         for log, number in filled:
             self._lend_rows(log, number // BLOCK_RECORDS)
         return effects
+
+    def _uncounted(self, pair: CandidatePair, now: float) -> list[Effect]:
+        """A closure does not count: its pair is registered once more, where latents were made anew."""
+        withdrawals = self._assembly.withdrawals
+        again = withdrawals.asks_again(pair)
+        if again:
+            self._closing.on_withdrawn(pair, now)
+        own = (end for end in (pair.low, pair.high) if end.log == self._own)
+        is_own = any(withdrawals.is_withdrawn(end) for end in own)
+        return [Report(ClosureWithdrawn(query=pair.low, match=pair.high, again=again))] if is_own else []
 
     def given_up_for(self, wanting: LogId, now: float) -> LogId | None:
         """Forget a log that nothing refers to, for one that has no room; None where there is none, or just was."""

@@ -139,6 +139,21 @@ class ClosureAccepted:
     probability: float | None = None
 
 
+@fact("closure_withdrawn")
+class ClosureWithdrawn:
+    """A closure does not count: a robot took one of its keyframes back, as `CameraDoubted` says why.
+
+    Attributes:
+        query: As registered.
+        match: The other one.
+        again: Whether the pair is registered once more, with what was made anew.
+    """
+
+    query: KeyframeId
+    match: KeyframeId
+    again: bool
+
+
 @fact("closure_rejected")
 class ClosureRejected:
     """A candidate was not made a closure; counts and ratio as in `ClosureAccepted`, None where there was no pair."""

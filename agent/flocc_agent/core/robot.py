@@ -37,6 +37,7 @@ from flocc_agent.core.events import (
     Measured,
     MessageReceived,
     PairRegistered,
+    Withdrawn,
 )
 from flocc_agent.core.gossip import Gossip, Sealer
 from flocc_agent.core.in_map import InMap
@@ -101,10 +102,12 @@ from flocc_protocol.messages import (
     SharedPoses,
 )
 from flocc_protocol.records import (
+    ClosureRecord,
     KeyframeRecord,
     LatentRecord,
     Record,
     RejectionRecord,
+    WithdrawalRecord,
 )
 
 NOBODY = -1
@@ -270,14 +273,14 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor, doubts, sha256):
+            case KeyframeEncoded(keyframe, descriptor, doubts, sha256, withdrawn):
                 self.closing.on_held(keyframe)
-                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256)]
-            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256, withdrawn)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts, withdrawn):
                 reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
-                return [*reports, *self._on_encoded(keyframe, None, now)]
+                return [*reports, *self._on_encoded(keyframe, None, now, withdrawn=withdrawn)]
             case LatentFetched(keyframe, holder):
-                self.closing.on_held(keyframe)
+                self.closing.on_fetched(keyframe, now)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
             case LatentFetchFailed(keyframe, holder, reason):
                 return self._on_fetch_failed(keyframe, holder, reason, now)
@@ -368,7 +371,7 @@ class Robot:
         compute_class = self.election.class_of(sender.robot, heartbeat.compute_class)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else compute_class
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
-        self.closing.on_wants(heartbeat.wants, now)
+        self.closing.on_wants(sender.robot, heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
             effects += self._reject_lost([pair], keyframe, now)
         return effects
@@ -469,13 +472,18 @@ class Robot:
         return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(
-        self, keyframe: KeyframeId, descriptor: Array | None, now: float, sha256: bytes = b""
+        self,
+        keyframe: KeyframeId,
+        descriptor: Array | None,
+        now: float,
+        sha256: bytes = b"",
+        withdrawn: Withdrawn | None = None,
     ) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
 
         A keyframe that failed to encode has a record all the same, with its odometry: measurements need no more.
         """
-        self._own_keyframes.encoded(keyframe.index, descriptor, sha256)
+        self._own_keyframes.encoded(keyframe.index, descriptor, sha256, withdrawn)
         effects: list[Effect] = []
         for ready in self._own_keyframes.ready():
             record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
@@ -483,8 +491,21 @@ class Robot:
             effects.append(_keyframe_report(self.log, record))
             if self._has_keys and ready.sha256:
                 effects += self._append(LatentRecord(ready.index, ready.sha256), now)
+            if ready.withdrawn is not None:
+                effects += self._withdraw(ready.index, ready.withdrawn, now)
             for measurement in self._own_keyframes.take_measured(ready.index):
                 effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
+        return effects
+
+    def _withdraw(self, end: int, withdrawn: Withdrawn, now: float) -> list[Effect]:
+        """Take the keyframes before one back, after the log said what their latents are now, where it says so."""
+        effects: list[Effect] = []
+        for index, sha256 in enumerate(withdrawn.sha256, end - len(withdrawn.sha256)):
+            if self._has_keys and sha256:
+                effects += self._append(LatentRecord(index, sha256), now)
+        first = max(end - withdrawn.count, 0)
+        if first < end:
+            effects += self._append(WithdrawalRecord(self.log, first, end, withdrawn.is_final), now)
         return effects
 
     def _on_measured(self, measurement: Measurement, index: int, now: float) -> list[Effect]:
@@ -514,7 +535,7 @@ class Robot:
         A pair that another robot's record resolved in the meantime needs no second one.
         """
         roles = self.closing.roles(pair)
-        if roles is None:
+        if roles is None or self.closing.is_outdated(pair):
             return []
         record = judged(*roles, result, self._parameters.loop_closing)
         return [*self._append(record, now), Report(told(record, self.log))]
@@ -538,8 +559,14 @@ class Robot:
         return self.gossip.logs[log].records[number]
 
     def _append(self, record: Record, now: float) -> list[Effect]:
+        """Append a record to the own log; before a judgement, what it knows of withdrawn keyframes."""
+        said: list[Effect] = []
+        if isinstance(record, ClosureRecord | RejectionRecord):
+            pair = CandidatePair.of(record.query, record.match)
+            for known in self.assembly.withdrawals.unsaid(self.log, pair):
+                said += self._append(known, now)
         new, effects, batch = self.gossip.append(record)
-        return [*effects, Broadcast(Records((batch,))), *self._intake.take([new], now)]
+        return [*said, *effects, Broadcast(Records((batch,))), *self._intake.take([new], now)]
 
     def _make_room(self, wanting: LogId, now: float) -> list[Effect]:
         """Give up a log that nothing refers to, where one is asked for that has no room."""
@@ -588,7 +615,11 @@ class Robot:
         """Know again what the disk holds."""
         self._intake.restore(restored.records, now)
         for keyframe in restored.latents:
-            self.closing.on_held(keyframe)
+            is_old = keyframe.log not in restored.closed() | {self.log} and self.assembly.withdrawals.is_withdrawn(
+                keyframe
+            )
+            if not is_old:  # else nobody knows whether it is from before its owner made it anew
+                self.closing.on_held(keyframe)
         self.corrections.restore(restored.correction, restored.frame_changed)
 
     # Time
@@ -611,7 +642,7 @@ class Robot:
                     digests=self.gossip.state(),
                     versions=self.corrections.state(),
                     wants=self.closing.wants(now),
-                    holds=self.closing.holds(),
+                    holds=self.closing.holds(now),
                     lost=self.closing.lost(now),
                 )
             )
