@@ -1,58 +1,45 @@
-"""The composition root: names the concrete perception back-ends, the optimiser and the runtime.
-
-Everything heavy that may not be needed (GTSAM, torch, the chosen perception) is imported where it is used.
-"""
+"""`Agent`: one robot's agent, for the robot's own program. What it is made of stands in `composition.py`."""
 
 import asyncio
 import json
 import logging
 import os
 import signal
+import threading
 import time
-import zlib
 from collections.abc import AsyncIterator, Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend import build_optimiser, build_stepper
-from flocc_agent.config import AgentConfig, BackendMode, RadioConfig, Ros2Config
+from flocc_agent.composition import Sight, compose, recording_of
+from flocc_agent.config import AgentConfig, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
-from flocc_agent.core.interfaces import Camera, Image, ImageWatch, Perception
+from flocc_agent.core.interfaces import Camera, Image, Perception
 from flocc_agent.core.measurements import BadMeasurement, Fix, Measurement, StartPose
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import inverse
-from flocc_agent.perception.backends import build_perception
 from flocc_agent.radio import Radio
-from flocc_agent.runtime.certificate_faults import certificate_faults
 from flocc_agent.runtime.chaos import BadOrder, disturbed, read_order
 from flocc_agent.runtime.driver import Driver
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.evidence import evidence_of
 from flocc_agent.runtime.facts import JourneyEnded, KilledByOrder
 from flocc_agent.runtime.given_keyframes import BadKeyframe as BadKeyframe
-from flocc_agent.runtime.jobs import Tools
-from flocc_agent.runtime.kept_for_maps import keep_back_end, keep_camera, keep_front_end, keep_map, lens_of
 from flocc_agent.runtime.keyframes import KeyframeSelector
-from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
-from flocc_agent.runtime.network_faults import found_by, lacks_name, network_faults
+from flocc_agent.runtime.network_watch import look_at_network, say_how_others_are_found
 from flocc_agent.runtime.new_journeys import began_anew, last_body
-from flocc_agent.runtime.page_file import PageFile
-from flocc_agent.runtime.persistence import restore
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
 from flocc_agent.runtime.recording import Recording
-from flocc_agent.runtime.reporting import Reporter, result_of
 from flocc_agent.runtime.robot_result import RobotResult, write_result
-from flocc_agent.runtime.security import RecordSealer
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
 from flocc_agent.runtime.workers import Workers
-from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.keys import Admin
@@ -62,9 +49,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SILENCE_S = 60.0
-"""How often an agent looks whether it hears anybody."""
-
 Float = NDArray[np.float64]
 
 KILL_AFTER_S = 0.2
@@ -73,6 +57,10 @@ KILL_AFTER_S = 0.2
 
 class JourneyError(FloccError):
     """Another journey cannot begin here."""
+
+
+class NotRunning(FloccError, RuntimeError):
+    """The agent was not started, has stopped or failed, or is spoken to from another thread than its own."""
 
 
 class Agent:
@@ -104,7 +92,8 @@ class Agent:
             config: Everything that can be turned.
             camera: Intrinsics of the images; None where a recording brings its own.
             T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
-            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
+            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block. What it raises is
+                logged, and the agent goes on.
             clock_s: Seconds since the start of the run; None counts from now.
             perception: What it sees with; None builds what `config.perception` names.
             map_fixed: The map of `config.map` does not move, whatever is measured in it.
@@ -118,13 +107,13 @@ class Agent:
         """
         started_s = time.monotonic()
         self.config = config
-        self._on_report = on_report or (lambda _: None)
+        self._on_report = _guarded(on_report, config.name)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._perception = perception
         self._map_fixed = map_fixed
         self._new_journey = new_journey
         self._ros_args = tuple(ros_args)
-        self._recording = _recording(config)
+        self._recording = recording_of(config)
         self._camera = self._recording.camera if self._recording else camera
         given = np.eye(4) if T_body_camera is None else _mounting(T_body_camera, config.name)
         self._T_body_camera = self._recording.T_body_camera if self._recording else given
@@ -143,6 +132,8 @@ class Agent:
         self._workers: Workers | None = None
         self._before: Float | None = None
         self._renewal = asyncio.Lock()
+        self._entered = False
+        self._thread = 0
 
     @property
     def log(self) -> LogId:
@@ -150,9 +141,16 @@ class Agent:
         return self._started.robot.log
 
     async def __aenter__(self) -> "Agent":
-        """Open the store and the network, restore what the disk holds, start the loop and the playback."""
+        """Open the store and the network, restore what the disk holds, start the loop and the playback.
+
+        Raises:
+            RuntimeError: It runs already.
+        """
+        if self._entered:
+            raise RuntimeError(f"robot {self.config.name}: this agent runs already; one Agent is one robot")
+        self._entered, self._thread = True, threading.get_ident()
         try:
-            self._say_how_others_are_found()
+            say_how_others_are_found(self.config)
             self._driver = await asyncio.to_thread(self._compose)
             if self.config.metrics.port is not None:
                 self._metrics = MetricsServer(self.config.metrics, self.config.name, lambda: self._started.look())
@@ -160,7 +158,9 @@ class Agent:
         except BaseException:
             await self._close()
             raise
-        self._looking = asyncio.create_task(self._look_at_network())
+        self._looking = asyncio.create_task(
+            look_at_network(self.config, lambda: self._started.robot.neighbours.names())
+        )
         if self._recording is not None:
             self._playing = asyncio.create_task(self._play(self._recording))
         if self._ros2 is not None:
@@ -195,7 +195,9 @@ class Agent:
 
         Raises:
             JourneyError: There is no folder to keep the earlier journey in, or frames do not come from this program.
+            NotRunning: The agent has not started, or has ended.
         """
+        self._require_running()
         if self.config.folder is None or self._recording is not None or self._ros2 is not None:
             reason = "has no folder (the key 'folder') that keeps what it did so far"
             fed = "is fed by a recording or by ROS 2, which begin journeys themselves"
@@ -226,27 +228,6 @@ class Agent:
         logger.warning("robot %s: its odometry began anew while it was off", self.config.name)
         return True
 
-    def _say_how_others_are_found(self) -> None:
-        """A robot that nobody can find is no mere information: a program without logging shows warnings alone."""
-        transport, swarm = self.config.transport, self.config.swarm
-        level = logging.WARNING if lacks_name(transport, swarm) and not transport.roster else logging.INFO
-        logger.log(level, "robot %s: %s", self.config.name, found_by(transport, swarm))
-
-    async def _look_at_network(self) -> None:
-        """Say once what of the configured network is not there, and when nobody is heard; the agent goes on trying."""
-        for fault in await asyncio.to_thread(network_faults, self.config.transport, self.config.name):
-            logger.warning("%s: %s", self.config.name, fault)
-        is_silent = False
-        while True:
-            await asyncio.sleep(SILENCE_S)
-            was_silent, is_silent = is_silent, not self._started.robot.neighbours.names()
-            if is_silent and not was_silent:
-                logger.warning("%s: hears nobody; 'flocc doctor' looks at the network", self.config.name)
-                if lacks_name(self.config.transport, self.config.swarm):
-                    self._say_how_others_are_found()
-                for fault in await asyncio.to_thread(lambda: [*certificate_faults(self.config.transport.tls)]):
-                    logger.warning("%s: %s", self.config.name, fault)
-
     async def add_keyframe(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Give the agent a keyframe; waits while too many wait for the encoder.
 
@@ -258,6 +239,7 @@ class Agent:
         Raises:
             BadKeyframe: The pose is not finite and rigid, over 10000 km from the origin, faster than 1 km/s or not
                 newer than the one before; the image does not fit the camera, or there is no camera.
+            NotRunning: The agent has not started, or has ended.
         """
         self._check(T_odom_body, stamp_s)
         await self._journey_of(T_odom_body)
@@ -273,6 +255,7 @@ class Agent:
 
         Raises:
             BadKeyframe: As `add_keyframe`, of every frame.
+            NotRunning: The agent has not started, or has ended.
         """
         self._check(T_odom_body, stamp_s)
         await self._journey_of(T_odom_body)
@@ -286,6 +269,7 @@ class Agent:
 
     def _check(self, T_odom_body: Float, stamp_s: float) -> None:
         """Refuse a pose that cannot be; what is measured next then belongs to no keyframe."""
+        self._require_running()
         self._kept = False
         if self._camera is None:
             raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
@@ -330,7 +314,11 @@ class Agent:
 
         Raises:
             BadMeasurement: No keyframe has that stamp, the last frame did not become one, or no log may hold it.
+            NotRunning: The agent has not started, or has ended.
         """
+        self._require_running()
+        if not isinstance(measurement, Measurement):
+            raise self._named(BadMeasurement(f"{type(measurement).__name__} is no measurement"))
         try:
             in_camera = measurement.in_camera(self._T_body_camera)
             if stamp_s is None and not self._kept and not isinstance(measurement, StartPose):
@@ -349,8 +337,11 @@ class Agent:
         while self._started is not lived:
             lived = self._started
             queue = lived.subscribe()
-            while (correction := await queue.get()) is not None:
-                yield correction
+            try:
+                while (correction := await queue.get()) is not None:
+                    yield correction
+            finally:
+                lived.unsubscribe(queue)
             await self._while_journey_begins()
 
     async def _while_journey_begins(self) -> None:
@@ -422,90 +413,52 @@ class Agent:
     @property
     def _started(self) -> Driver:
         if self._driver is None:
-            raise RuntimeError("the agent is not running; use it in 'async with'")
+            raise NotRunning("the agent is not running; use it in 'async with'")
         return self._driver
 
+    def _require_running(self) -> None:
+        """Refuse what nobody would take in any more.
+
+        Raises:
+            NotRunning: The agent has not started, or has ended; or this is not its loop's thread.
+        """
+        driver, name = self._started, self.config.name
+        if threading.get_ident() != self._thread:
+            hint = "use asyncio.run_coroutine_threadsafe, or the loop's call_soon_threadsafe"
+            raise NotRunning(f"robot {name}: its agent runs on another thread; {hint}")
+        if self._renewal.locked():
+            return
+        if self._run is not None and self._run.done() and not self._run.cancelled():
+            error = self._run.exception()
+            if error is not None:
+                raise NotRunning(f"robot {name}: its agent has failed: {error}") from error
+        if driver.is_stopping:
+            raise NotRunning(f"robot {name}: its agent has stopped, and takes nothing more")
+
     def _compose(self) -> Driver:
-        """Name every concrete class."""
-        config = self.config
-        opened = None if config.map is None else MapFolder.open(config.map)
-        perception = self._perception or build_perception(config.perception, config.seed)
-        self._store = _open_store(config)
-        if self._new_journey:
-            self._store.begin_journey()
-        keep_front_end(self._store, self._method, config.perception, perception)
-        keep_back_end(self._store, config.backend)
-        if self._camera is not None:
-            keep_camera(self._store, self._camera, self._T_body_camera)
-        if opened is not None:
-            self._use_map(opened, perception)
-        self._workers = Workers()
-        self._radio = Radio(
-            config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())])
+        """Make everything that this agent is of, and keep what is reached later."""
+        if self.config.ros2 is not None and self._ros2 is None:
+            self._ros2 = self._adapter(self.config.ros2)
+        answers: dict[Admin, Callable[[bytes], bytes]] = {Admin.STATUS: self._answer_status}
+        if self.config.transport.chaos:
+            answers[Admin.CHAOS] = self._disturb
+        sight = Sight(
+            self._perception,
+            self._camera,
+            self._T_body_camera,
+            None if self._recording is None else self._recording.hidden,
         )
-        if config.ros2 is not None:
-            self._ros2 = self._adapter(config.ros2)
-        sealer = _sealer(config)
-        restored = restore(self._store, sealer, opened, self._map_fixed)
-        log = self._store.identity.log
-        boot = int.from_bytes(os.urandom(6))
-        distributed = config.backend.mode is BackendMode.DISTRIBUTED
-        core_parameters = config.core.under(config.bandwidth_bytes_s)
-        core = Robot(
-            log,
-            _compute_class(config, sealer),
-            boot,
-            core_parameters,
-            self._clock_s(),
-            restored,
-            sealer,
-            distributed,
-            None if sealer is None else sealer.compute_classes,
-            PageFile(config.folder, config.store.record_bytes_max),
-        )
-        transport = ZenohTransport(
-            config.swarm, config.name, config.transport, self._radio, self._clock_s, config.bandwidth_bytes_s
-        )
-        transport.serve_admin(Admin.STATUS, self._answer_status)
-        if config.transport.chaos:
-            transport.serve_admin(Admin.CHAOS, self._disturb)
-        tools = Tools(
-            perception,
-            self._camera_watch(),
-            build_optimiser(config.backend),
-            build_stepper(config.backend),
-            self._workers,
-            self._store,
-            transport,
+        parts = compose(
+            self.config,
+            sight,
             self._clock_s,
-            sealer=sealer,
+            self._on_report,
+            answers,
+            map_fixed=self._map_fixed,
+            new_journey=self._new_journey,
         )
-        return Driver(
-            core, tools, Reporter(config.name, self._T_body_camera, config.backend.steepness), self._on_report
-        )
-
-    def _camera_watch(self) -> ImageWatch:
-        """What looks at this robot's images."""
-        from flocc_agent.perception.watch.camera_watch import CameraWatch
-
-        hidden = None if self._recording is None else self._recording.hidden
-        return CameraWatch(hidden, self.config.perception.odometry_up)
-
-    @property
-    def _method(self) -> str | None:
-        """What the front end is called; a program's own has no name."""
-        return self.config.perception.method if self._perception is None else None
-
-    def _use_map(self, opened: MapFolder, perception: Perception) -> None:
-        """Serve a map's latents, if this robot's own can be compared with them."""
-        assert self._store is not None
-        opened.check_front_end(self._method, perception.encoder.model)
-        if self._camera is not None:
-            warning = opened.other_lens(lens_of(self._camera))
-            if warning is not None:
-                logger.warning("robot %s: %s", self.config.name, warning)
-        self._store.open_map(opened)
-        keep_map(self._store, opened, self._map_fixed)
+        self._store, self._workers, self._radio = parts.store, parts.workers, parts.radio
+        return parts.driver
 
     def _answer_status(self, _: bytes) -> bytes:
         """Tell an operator the status, and what he may want to know of maps that have not merged."""
@@ -606,10 +559,24 @@ class Agent:
             self._radio.update_position(self.config.name, position_m)
 
     async def _close(self) -> None:
+        self._entered = False
         if self._metrics is not None:
             await self._metrics.close()
         if self._store is not None:
             self._store.close()
+
+
+def _guarded(on_report: Callable[[Reported[Fact]], None] | None, robot: str) -> Callable[[Reported[Fact]], None]:
+    """What a program does with facts, whose errors are its own and end no agent."""
+
+    def told(reported: Reported[Fact]) -> None:
+        try:
+            if on_report is not None:
+                on_report(reported)
+        except Exception:
+            logger.exception("robot %s: on_report failed; the agent goes on", robot)
+
+    return told
 
 
 def _mounting(T_body_camera: Float, robot: str) -> Float:
@@ -624,56 +591,3 @@ def _mounting(T_body_camera: Float, robot: str) -> Float:
     if fault is not None:
         raise BadKeyframe(f"robot {robot}: T_body_camera: {fault}")
     return np.asarray(T_body_camera, dtype=float)
-
-
-def stored_result(config: AgentConfig) -> RobotResult:
-    """What a robot knew when it was killed (`result.json`), from its store."""
-    recording = _recording(config)
-    T_body_camera = np.eye(4) if recording is None else recording.T_body_camera
-    store = _open_store(config)
-    try:
-        sealer = _sealer(config)
-        opened = None if config.map is None else MapFolder.open(config.map)
-        restored = restore(store, sealer, opened)
-        robot = Robot(store.identity.log, config.compute_class, 0, config.core, 0.0, restored, sealer)
-    finally:
-        store.close()
-    return result_of(robot, T_body_camera)
-
-
-def _sealer(config: AgentConfig) -> RecordSealer | None:
-    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
-
-
-def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:
-    """The configured one, but where the swarm's list of members says what this robot has."""
-    if sealer is None or sealer.compute_classes is None:
-        return config.compute_class
-    listed = sealer.compute_classes.get(config.name, 0)
-    if listed != config.compute_class:
-        logger.warning(
-            "compute_class %d of the configuration does not count: the list of members says %d",
-            config.compute_class,
-            listed,
-        )
-    return listed
-
-
-def _open_store(config: AgentConfig) -> Store:
-    return Store.open(
-        None if config.folder is None else config.folder / "store",
-        config.name,
-        config.store,
-        incarnation=_drawn_incarnation() if config.incarnation is None else config.incarnation,
-        incarnation_after_loss=_drawn_incarnation(),
-    )
-
-
-def _recording(config: AgentConfig) -> Recording | None:
-    path = config.source.recording
-    return None if path is None else Recording.open(path)
-
-
-def _drawn_incarnation() -> int:
-    """A number that no earlier life of this robot had: the wall clock, in milliseconds."""
-    return time.time_ns() // 1_000_000

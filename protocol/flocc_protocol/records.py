@@ -19,11 +19,13 @@ from flocc_protocol.codec import (
     COORDINATE_MAX,
     COUNT,
     KEYFRAME_ID,
+    LOG_ID,
     POSE,
     Codec,
     Pose7,
     Reader,
     blob,
+    boolean,
     from_bytes,
     listed,
     optional,
@@ -33,7 +35,7 @@ from flocc_protocol.codec import (
     text,
 )
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.ids import KeyframeId, checked_name
+from flocc_protocol.ids import KeyframeId, LogId, checked_name
 
 RECORD_BYTES_MAX = 8 * 1024
 SIGNATURE_BYTES = 64
@@ -44,6 +46,8 @@ REASON_LENGTH_MAX = 80
 UPPER_TRIANGLE = 21
 TAG_LENGTH_MAX = 64
 NAME_LENGTH_MAX = 32
+WITHDRAWN_MAX = 1024
+"""Keyframes that one record takes back."""
 ALTITUDE_MAX_M = 1e5
 SCALE_INITIAL_MIN, SCALE_INITIAL_MAX = 1e-9, 1e9
 
@@ -251,6 +255,30 @@ class LatentRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class WithdrawalRecord:
+    """Keyframes whose latents showed what is not the scene: what was judged of these before does not count.
+
+    In the log that it names, its robot takes them back. In another one, that robot says that what it judges from here
+    on is of the latents that were made anew.
+
+    Attributes:
+        log: Of the keyframes.
+        first: The first of them.
+        end: The first one after them.
+        is_final: No latent will be better, so that nothing of them counts.
+    """
+
+    log: LogId
+    first: int
+    end: int
+    is_final: bool
+
+    def __post_init__(self) -> None:
+        if not 0 < self.end - self.first <= WITHDRAWN_MAX:
+            raise ValueError(f"a withdrawal is of 1 to {WITHDRAWN_MAX} keyframes, not of {self.first} to {self.end}")
+
+
+@dataclass(frozen=True, slots=True)
 class UnknownRecord:
     """A record of a later version: its code and all its bytes, the code among them.
 
@@ -273,8 +301,18 @@ MeasurementRecord = (
     | MetricClosureRecord
     | OdometryCovarianceRecord
 )
-Record = KeyframeRecord | ClosureRecord | RejectionRecord | MeasurementRecord | LatentRecord | UnknownRecord
+Record = (
+    KeyframeRecord
+    | ClosureRecord
+    | RejectionRecord
+    | MeasurementRecord
+    | LatentRecord
+    | WithdrawalRecord
+    | UnknownRecord
+)
 KEYFRAME_CODE = 1
+JUDGEMENT_CODES = (2, 3)
+"""Of closures and rejections."""
 CODE_MAX = 127
 """A code is one byte of msgpack, the second one of a record."""
 PAIR_HEADER = 0x92
@@ -325,6 +363,7 @@ _BY_CODE: dict[int, Codec[Any]] = {
     10: struct(MetricClosureRecord, query=KEYFRAME_ID, match=KEYFRAME_ID, T_query_match=POSE, covariance=ARRAY),
     11: struct(OdometryCovarianceRecord, index=COUNT, covariance=ARRAY),
     12: struct(LatentRecord, index=COUNT, sha256=blob(2 * SHA256_BYTES)),
+    13: struct(WithdrawalRecord, log=LOG_ID, first=COUNT, end=COUNT, is_final=boolean()),
 }
 _CODES: dict[type[Record], int] = {
     KeyframeRecord: 1,
@@ -339,6 +378,7 @@ _CODES: dict[type[Record], int] = {
     MetricClosureRecord: 10,
     OdometryCovarianceRecord: 11,
     LatentRecord: 12,
+    WithdrawalRecord: 13,
 }
 _FIELDS = {_CODES[kind]: len(fields(kind)) for kind in _CODES}
 

@@ -3,8 +3,9 @@
 import contextlib
 import math
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -63,11 +64,15 @@ def test_a_multicast_address_that_is_none_is_refused(address: str) -> None:
         TransportConfig(multicast_address=address)
 
 
-def leaves(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Every key of a section and of those within it."""
+def annotations(section: type[BaseModel]) -> Iterator[tuple[str, Any]]:
     for name, field in section.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
+        yield name, field.annotation
+
+
+def leaves(section: type[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every key of a section and of those within it, the core's plain dataclasses among them."""
+    for name, inner in get_type_hints(section).items() if is_dataclass(section) else annotations(section):
+        if is_dataclass(inner) or (isinstance(inner, type) and issubclass(inner, BaseModel)):
             yield from leaves(inner, (*path, name))
         else:
             yield (*path, name)

@@ -40,6 +40,13 @@ def test_a_change_counts_instead_of_the_file_and_beside_it(tmp_path: Path) -> No
         ("radio.los_ratio=0.3", "the key 'radio.los_ratio' does not exist"),
         ("radio.loss_ratio=3", "radio.loss_ratio: Input should be less than or equal to 1"),
         ("swarm.name=x", "swarm.name: swarm is no table"),
+        ("core.loop_closing.fetch_timeout_s=-1", "fetch_timeout_s must be positive"),
+        ("core.loop_closing.correspondences_min=-1", "correspondences_min must not be negative"),
+        ("core.election.leader_timeout_s=nan", "leader_timeout_s: Input should be a finite number"),
+        ("keyframes.distance_m=true", "keyframes.distance_m: must be a number, neither true nor false"),
+        ("core.rounds.period_s=true", "core.rounds.period_s: must be a number, neither true nor false"),
+        ("radio.overrides=[{loss_ratio=true}]", "radio.overrides.0.loss_ratio: must be a number"),
+        ("radio.overrides.loss_ratio=0.1", r"radio.overrides: is a list of tables, .* \[\[radio.overrides\]\]"),
     ],
 )
 def test_a_change_that_cannot_be_says_why(tmp_path: Path, change: str, said: str) -> None:

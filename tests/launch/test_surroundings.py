@@ -90,6 +90,9 @@ def test_no_place_at_all_names_the_variable(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(cache, "can_be_written", lambda _: False)
     with pytest.raises(CacheError, match="name a folder with FLOCC_CACHE"):
         cache_folder()
+    monkeypatch.setenv("FLOCC_CACHE", "/somewhere")
+    with pytest.raises(CacheError, match="/somewhere: cannot be written; FLOCC_CACHE names"):
+        cache_folder()
 
 
 def test_doctor_finds_a_folder_and_a_cache_that_cannot_be_written(

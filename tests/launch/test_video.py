@@ -101,7 +101,8 @@ def test_a_video_is_launched_and_one_that_is_none_is_refused(
         split(video, tmp_path / "parts")
     (tmp_path / "team").mkdir()
     (tmp_path / "team" / "broken.mp4").write_bytes(b"no video")
-    assert list(infos(tmp_path / "team")) == []
+    with pytest.raises(DatasetError, match="team: 1 of 1 robots cannot be used: broken"):
+        list(infos(tmp_path / "team"))
     assert "broken.mp4: cannot be read as a video; write it as MP4" in caplog.text
 
 

@@ -52,6 +52,7 @@ from flocc_protocol.records import (
     SEALED_RECORD_BYTES_MAX,
     SIGNATURE_BYTES,
     TAG_LENGTH_MAX,
+    WITHDRAWN_MAX,
     ClosureRecord,
     FixRecord,
     GeodeticFixRecord,
@@ -65,6 +66,7 @@ from flocc_protocol.records import (
     RobotBearingRecord,
     RobotSightingRecord,
     TagSightingRecord,
+    WithdrawalRecord,
     encode_record,
 )
 from flocc_protocol.shared_poses import stiffness_numbers
@@ -132,7 +134,10 @@ RECORDS: tuple[Record, ...] = (
     MetricClosureRecord(KeyframeId(ALICE, 4), KeyframeId(BOB, 1), IDENTITY, Array.of(np.arange(21.0), "f8")),
     OdometryCovarianceRecord(7, Array.of(np.arange(21.0), "f8")),
     LatentRecord(7, bytes(range(32))),
+    WithdrawalRecord(BOB, 3, 7, False),
 )
+IN_BATCH = 13
+"""Records of the example of a batch, which stays as it was when later kinds came."""
 ENCODED = tuple(encode_record(record) for record in RECORDS)
 
 CORRECTIONS = (
@@ -169,7 +174,7 @@ MESSAGES: tuple[Message, ...] = (
     Answer(8),
     Coordinator(ADVERT),
     Handover(TERM),
-    Records((RecordBatch(ALICE, 12, 0x1234, ENCODED[:-1]), RecordBatch(BOB, 0, 0, ENCODED[:1]))),
+    Records((RecordBatch(ALICE, 12, 0x1234, ENCODED[:IN_BATCH]), RecordBatch(BOB, 0, 0, ENCODED[:1]))),
     RecordRequest((LogPosition(ALICE, 12), LogPosition(BOB, 41))),
     CorrectionBatch(CORRECTIONS),
     CorrectionRequest((ALICE, BOB)),
@@ -328,6 +333,11 @@ records: st.SearchStrategy[Record] = st.one_of(
     ),
     st.builds(OdometryCovarianceRecord, _counts, arrays((21,))),
     st.builds(LatentRecord, _counts, st.sampled_from([32, 64]).flatmap(lambda n: st.binary(min_size=n, max_size=n))),
+    st.integers(1, INDEX_MAX).flatmap(
+        lambda end: st.builds(
+            WithdrawalRecord, log_ids, st.integers(max(0, end - WITHDRAWN_MAX), end - 1), st.just(end), st.booleans()
+        )
+    ),
 )
 
 

@@ -31,6 +31,7 @@ from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.plausibility import Doubts
 from flocc_agent.core.prospects import Prospect, Prospects
 from flocc_agent.core.pulls import Pulls
+from flocc_agent.core.record_intake import RecordIntake
 from flocc_agent.core.reports import LogForked
 from flocc_agent.core.robot import Robot
 from flocc_agent.core.rounds import Rounds
@@ -222,7 +223,7 @@ def _storms(original: Callable[..., Any]) -> Callable[..., Any]:
 def _beats_ten_times(original: Callable[..., Any]) -> Callable[..., Any]:
     def broken(self: Robot, now: float) -> Any:
         effects = original(self, now)
-        self._heartbeat_due_s = now + 0.1 * self._parameters.neighbours.heartbeat_period_s
+        self._beat.due_s = now + 0.1 * self._parameters.neighbours.heartbeat_period_s
         return effects
 
     return broken
@@ -252,7 +253,7 @@ def _refetches(original: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _restores_all_but_the_newest(original: Callable[..., Any]) -> Callable[..., Any]:
-    def broken(self: Robot, log: Any, records: Any) -> Any:
+    def broken(self: RecordIntake, log: Any, records: Any) -> Any:
         return original(self, log, list(records)[:-1])
 
     return broken
@@ -385,7 +386,7 @@ MUTANTS = (
     Mutant("pulls without pause", Pulls, "_may_ask", _keeps_no_pause),
     Mutant("nobody asks for what it lacks", Pulls, "ask", always([])),
     Mutant("requests are not answered", Gossip, "on_request", always([])),
-    Mutant("the newest records are forgotten at a restart", Robot, "_restore_log", _restores_all_but_the_newest),
+    Mutant("the newest records are forgotten at a restart", RecordIntake, "_restore_log", _restores_all_but_the_newest),
     # loop closing
     Mutant("pairs are not handed to stronger robots", Reach, "stronger", always(None)),
     Mutant("stronger robots have no room for pairs", Reach, "room", always(0)),

@@ -222,18 +222,23 @@ def test_a_solution_that_leaves_the_map_is_not_published(value: float) -> None:
     assert leader.corrections.applied is applied
 
 
-def items_held(value: object) -> int:
-    """Number of entries in all containers that an object's state reaches; an identifier or a digest is one thing."""
-    if isinstance(value, tuple) and type(value) is not tuple:
+def items_held(value: object, seen: set[int] | None = None) -> int:
+    """Number of entries in all containers that an object's state reaches; an identifier or a digest is one thing.
+
+    What several machines refer to counts once.
+    """
+    seen = set() if seen is None else seen
+    if (isinstance(value, tuple) and type(value) is not tuple) or id(value) in seen:
         return 0
     if isinstance(value, dict):
-        return sum(1 + items_held(entry) for entry in value.values())
+        return sum(1 + items_held(entry, seen) for entry in value.values())
     if isinstance(value, list | tuple | set | frozenset | deque):
-        return sum(1 + items_held(entry) for entry in value)
+        return sum(1 + items_held(entry, seen) for entry in value)
     if not type(value).__module__.startswith("flocc_agent.core"):
         return 0
+    seen.add(id(value))
     slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ()) if name in dir(value)]
-    return sum(items_held(getattr(value, name)) for name in [*getattr(value, "__dict__", ()), *slots])
+    return sum(items_held(getattr(value, name), seen) for name in [*getattr(value, "__dict__", ()), *slots])
 
 
 def test_strangers_cannot_grow_a_robot_without_bound(monkeypatch: pytest.MonkeyPatch) -> None:

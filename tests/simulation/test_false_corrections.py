@@ -14,12 +14,13 @@ from tests.agent.core.virtual_time import EveryoneSigns
 
 from flocc_agent.core import plausibility
 from flocc_agent.core.correction_evidence import Placed
+from flocc_agent.core.distrust import DISTRUSTED_FIRST_S
 from flocc_agent.core.effects import Deliver, Effect
 from flocc_agent.core.events import Event
 from flocc_agent.core.knots import corrected
 from flocc_agent.core.plausibility import BENT, HELD_BACK_S, UNTIED
 from flocc_agent.core.reports import LeaderFollowed, PeerRefused
-from flocc_agent.core.robot import DISTRUSTED_FIRST_S, Robot
+from flocc_agent.core.robot import Robot
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation import virtual_robot
 from flocc_launch.simulation.campaign import prepared

@@ -3,7 +3,8 @@
 from tests.agent.core.virtual_time import Robots
 
 from flocc_agent.core.reports import LogForked, PeerRefused
-from flocc_agent.core.robot import Restored, Robot
+from flocc_agent.core.restored import Restored
+from flocc_agent.core.robot import Robot
 from flocc_protocol.codec import to_bytes
 from flocc_protocol.ids import LogId
 from flocc_protocol.records import ClosureRecord, Record, UnknownRecord, encode_record

@@ -9,7 +9,7 @@ import json
 import re
 import tomllib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -66,11 +66,29 @@ def validated(model: type[M], fields: Mapping[str, object], source: str, folder:
     """
     refuse_removed(fields, source)
     try:
-        return model.model_validate(fields, context={"folder": folder})
+        found = model.model_validate(fields, context={"folder": folder})
     except (ValidationError, FloccError) as error:
         raise ConfigError(
             first_error(error, source, model) if isinstance(error, ValidationError) else f"{source}: {error}"
         ) from error
+    key = next(_truths_taken_for_numbers(fields, found), None)
+    if key is not None:
+        raise ConfigError(f"{source}: {key}: must be a number, neither true nor false")
+    return found
+
+
+def _truths_taken_for_numbers(fields: Mapping[str, object], found: object) -> Iterator[str]:
+    """Keys whose value is true or false, which became 1 or 0: pydantic is lenient there, also in plain dataclasses."""
+    for key, given in fields.items():
+        taken = getattr(found, key, None)
+        if isinstance(given, bool) and isinstance(taken, int | float) and not isinstance(taken, bool):
+            yield key
+        elif isinstance(given, Mapping):
+            yield from (f"{key}.{below}" for below in _truths_taken_for_numbers(given, taken))
+        elif isinstance(given, list) and isinstance(taken, tuple):
+            for k, (table, made) in enumerate(zip(given, taken, strict=False)):
+                if isinstance(table, Mapping):
+                    yield from (f"{key}.{k}.{below}" for below in _truths_taken_for_numbers(table, made))
 
 
 def first_error(error: ValidationError, source: str, model: type[BaseModel]) -> str:
@@ -81,6 +99,8 @@ def first_error(error: ValidationError, source: str, model: type[BaseModel]) -> 
         return f"{source}: the key '{key}' does not exist{_meant(model, complaint['loc'])}"
     if complaint["type"] in ("missing", "missing_argument"):
         return f"{source}: the key '{key}' is missing"
+    if complaint["type"] == "tuple_type" and isinstance(complaint["input"], Mapping):
+        return f"{source}: {key}: is a list of tables, each of which begins with [[{key}]] in a file"
     return f"{source}: {key}: {complaint['msg'].removeprefix('Value error, ')}"
 
 

@@ -22,6 +22,7 @@ from flocc_agent.core.pose_graph import MeasuredFactor, PoseGraph, Trajectory, g
 from flocc_agent.core.pulls import remember
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.core.spared import AGREE_LENGTHS, AGREE_RATIO, AGREE_STEPS, Foretold
+from flocc_agent.core.withdrawals import Withdrawals
 from flocc_agent.geometry import between, inverse, pose7, pose_from_tq, poses_from_tq
 from flocc_protocol.codec import Pose7
 from flocc_protocol.ids import KeyframeId, LogId
@@ -32,6 +33,7 @@ from flocc_protocol.records import (
     LatentRecord,
     RejectionRecord,
     UnknownRecord,
+    WithdrawalRecord,
 )
 
 Float = NDArray[np.float64]
@@ -119,6 +121,7 @@ class GraphAssembly:
     Attributes:
         keyframes: Number of keyframes of all logs but those of an opened map, which are solved already.
         revision: Grows when a solution is out of date: a new log, closure or fix, or a keyframe that one waited for.
+        withdrawals: Which keyframes were taken back; closures of them do not count.
     """
 
     def __init__(
@@ -142,7 +145,8 @@ class GraphAssembly:
         self.revision = 0
         self._saved = saved
         self._odometry: dict[LogId, _Odometry] = {}
-        self._closures = ClosureTable(cold_closures, closures_built_max)
+        self.withdrawals = Withdrawals()
+        self._closures = ClosureTable(cold_closures, closures_built_max, self.withdrawals.rank)
         self._reads_all = True
         self._early: dict[KeyframeId, int] = {}
         self._measured = MeasuredRecords()
@@ -156,23 +160,33 @@ class GraphAssembly:
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
         pieces = {"warm_odometry_pieces": self._cold, "warm_closure_pieces": self._cold_closures}
-        return {name: cold.size() for name, cold in pieces.items() if cold is not None} | self._closures.sizes()
+        warm = {name: cold.size() for name, cold in pieces.items() if cold is not None}
+        return warm | self._closures.sizes() | self.withdrawals.sizes()
 
-    def add(self, new: NewRecord) -> None:
-        """Take in one record; records of a log come in their order, those of different logs in any."""
+    def add(self, new: NewRecord) -> list[CandidatePair]:
+        """Take in one record; records of a log come in their order, those of different logs in any.
+
+        Returns:
+            Pairs of which a closure is known that does not count, or no more.
+        """
         record = new.record
         match record:
             case KeyframeRecord():
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
-                self._add_closure(new, record)
-            case RejectionRecord() | LatentRecord():
+                return self._add_closure(new, record)
+            case RejectionRecord(query, match):
+                self.withdrawals.on_judged(new.log, new.number, CandidatePair.of(query, match))
+            case WithdrawalRecord():
+                return self._withdraw(new, record)
+            case LatentRecord():
                 pass
             case UnknownRecord():
                 self._reads_all = False
             case _:
                 self.revision += 1
                 self._await(self._measured.add(new, record))
+        return []
 
     def odometry_pair(self, keyframe: KeyframeId) -> tuple[KeyframeId, Pose7] | None:
         """The keyframe's neighbour in its log that has a latent, and `T_neighbour_query`.
@@ -286,10 +300,24 @@ class GraphAssembly:
         awaited |= self._measured.awaited(log.robot, record.stamp_s)
         self.revision += awaited or len(odometry) == 1
 
-    def _add_closure(self, new: NewRecord, record: ClosureRecord) -> None:
+    def _add_closure(self, new: NewRecord, record: ClosureRecord) -> list[CandidatePair]:
+        """A closure, for the graph where it counts; else its pair."""
+        pair = CandidatePair.of(record.query, record.match)
+        self.withdrawals.on_judged(new.log, new.number, pair)
+        if not self.withdrawals.counts(new.log, new.number, pair):
+            return [pair]
         if self._closures.add(new.log, new.number, record):
             self.revision += 1
             self._await((record.query, record.match))
+        return []
+
+    def _withdraw(self, new: NewRecord, record: WithdrawalRecord) -> list[CandidatePair]:
+        """A robot took keyframes back: the pairs of closures that leave the graph."""
+        if not self.withdrawals.add(new.log, new.number, record):
+            return []
+        gone = self._closures.take_out(record.log, record.first, record.end, self.withdrawals.counts)
+        self.revision += bool(gone)
+        return gone
 
     def _await(self, keyframes: Iterable[KeyframeId]) -> None:
         """A solution will be out of date when one of these comes."""

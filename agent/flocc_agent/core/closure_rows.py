@@ -51,6 +51,8 @@ WHERE = Struct("<8I3d")
 """Of a row: what comes before the rotation."""
 SCALE_AT = ROW.fields["scale"][1] if ROW.fields is not None else 0
 COUNT_MAX = 2**16 - 1
+Rank = Callable[[LogId, int, CandidatePair], int]
+Counts = Callable[[LogId, int, CandidatePair], bool]
 NO_COVARIANCE = (0.0,) * UPPER_TRIANGLE
 
 
@@ -76,13 +78,17 @@ def tie_of(log: LogId, query: KeyframeId, match: KeyframeId, length_m: float) ->
 class ClosureTable:
     """Closures by their pairs and by their logs."""
 
-    def __init__(self, cold: ColdPieces | None = None, built_max: int = KEYFRAMES_HELD) -> None:
+    def __init__(
+        self, cold: ColdPieces | None = None, built_max: int = KEYFRAMES_HELD, rank: Rank = lambda _log, _n, _pair: 0
+    ) -> None:
         """Start with none.
 
         Args:
             cold: Where old rows go; None: they stay in memory.
             built_max: Closures of the graph that are kept from one look at it to the next.
+            rank: Of the record that says a closure, its log and number: the highest of a pair counts.
         """
+        self._rank = rank
         self._built_max = built_max
         self._built: dict[int, LoopClosure] = {}
         """By their rows, which say the same for ever."""
@@ -107,7 +113,8 @@ class ClosureTable:
     def add(self, log: LogId, number: int, closure: ClosureRecord) -> bool:
         """Take in the closure of a log's record; False where another registration of its pair counts.
 
-        Of several registrations of one pair the one in the lowest log counts, on every robot.
+        Of several registrations of one pair the one in the lowest log counts, on every robot, of those that knew most
+        of withdrawn keyframes.
         """
         pair = CandidatePair.of(closure.query, closure.match)
         key = (pair.low.log, pair.high.log)
@@ -119,7 +126,7 @@ class ClosureTable:
         at, is_there = place_of(numbers, packed)
         if is_there:
             held = rows[at]
-            if (log, number) >= self._registered(held):
+            if self._order(log, number, pair) >= self._order(*self._registered(held), pair):
                 return False
             for each in set(key):
                 self._of_log[each].remove(held)
@@ -139,6 +146,39 @@ class ClosureTable:
         self._rows.append(self._packed(log, number, closure))
         return True
 
+    def take_out(self, log: LogId, first: int, end: int, counts: Counts) -> list[CandidatePair]:
+        """Closures of a stretch of a log whose records count no more leave; their pairs."""
+        of_log = [logs for logs in self._of_pair if log in logs]
+        gone = [pair for logs in of_log for pair in self._of_stretch(logs, log, first, end)]
+        gone = [pair for pair in gone if not counts(*self._registered(self._row(pair)), pair)]
+        for pair in gone:
+            self._remove(pair)
+        return sorted(gone)
+
+    def _of_stretch(self, logs: tuple[LogId, LogId], log: LogId, first: int, end: int) -> list[CandidatePair]:
+        numbers, _ = self._of_pair[logs]
+        pairs = (_pair_of(logs, number) for number in numbers)
+        ends = ((pair, (pair.low, pair.high)) for pair in pairs)
+        return [pair for pair, both in ends if any(k.log == log and first <= k.index < end for k in both)]
+
+    def _remove(self, pair: CandidatePair) -> None:
+        logs = pair.low.log, pair.high.log
+        numbers, rows = self._of_pair[logs]
+        at, _ = place_of(numbers, pair_number(pair))
+        row = rows.pop(at)
+        del numbers[at]
+        if not numbers:
+            del self._of_pair[logs]
+        for each in set(logs):
+            self._of_log[each].remove(row)
+        self._built.pop(row, None)
+        self._count -= 1
+        for keyframe in (pair.low, pair.high):
+            self._ends[keyframe.log][keyframe.index] -= 1
+
+    def _order(self, log: LogId, number: int, pair: CandidatePair) -> tuple[int, LogId, int]:
+        return -self._rank(log, number, pair), log, number
+
     def ties(self, log: LogId, ties_max: int) -> Sequence[Tie]:
         """The newest ones of a log, the newest first."""
         rows = self._of_log.get(log)
@@ -152,11 +192,11 @@ class ClosureTable:
         numbers, rows = of_pair
         found: list[CandidatePair] = []
         for k in range(bisect_left(numbers, max(pair.low.index - reach, 0) * (INDEX_MAX + 1)), len(numbers)):
-            low, high = divmod(numbers[k], INDEX_MAX + 1)
-            if low > pair.low.index + reach:
+            other = _pair_of((pair.low.log, pair.high.log), numbers[k])
+            if other.low.index > pair.low.index + reach:
                 break
-            if abs(high - pair.high.index) <= reach and self._tie(pair.low.log, rows[k]).length_m > 0.0:
-                found.append(CandidatePair(KeyframeId(pair.low.log, low), KeyframeId(pair.high.log, high)))
+            if abs(other.high.index - pair.high.index) <= reach and self._tie(pair.low.log, rows[k]).length_m > 0.0:
+                found.append(other)
         return found
 
     def ends(self, log: LogId, first: int, end: int) -> int:
@@ -281,3 +321,9 @@ class ClosureTable:
             number = self._numbers[log] = len(self._logs)
             self._logs.append(log)
         return number
+
+
+def _pair_of(logs: tuple[LogId, LogId], number: int) -> CandidatePair:
+    """The pair of two logs that a number stands for."""
+    low, high = divmod(number, INDEX_MAX + 1)
+    return CandidatePair(KeyframeId(logs[0], low), KeyframeId(logs[1], high))

@@ -34,6 +34,22 @@ class KeyframeCaptured:
 
 
 @dataclass(frozen=True, slots=True)
+class Withdrawn:
+    """Keyframes before one that showed what is not the scene, as its image told.
+
+    Attributes:
+        count: How many.
+        sha256: Of the latents that were made anew, as `KeyframeEncoded` has it, the earliest first; empty where there
+            are none, or nobody asks for them.
+        is_final: No latent can be better.
+    """
+
+    count: int
+    sha256: tuple[bytes, ...] = ()
+    is_final: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class KeyframeEncoded:
     """The latent is stored and the descriptor computed.
 
@@ -42,12 +58,14 @@ class KeyframeEncoded:
         descriptor: For place recognition.
         doubts: What its image says against the camera, told for the first time.
         sha256: Of the latent as it is sent, 32 bytes for each form; empty where nobody asks for it.
+        withdrawn: Keyframes before it that showed what is not the scene, where this image told so.
     """
 
     keyframe: KeyframeId
     descriptor: Array
     doubts: tuple[CameraDoubted, ...] = ()
     sha256: bytes = b""
+    withdrawn: Withdrawn | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +76,13 @@ class KeyframeEncodingFailed:
         keyframe: Which.
         reason: Why.
         doubts: What its image says against the camera, told for the first time.
+        withdrawn: As of `KeyframeEncoded`.
     """
 
     keyframe: KeyframeId
     reason: str
     doubts: tuple[CameraDoubted, ...] = ()
+    withdrawn: Withdrawn | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ from flocc_protocol.records import (
     RobotSightingRecord,
     TagSightingRecord,
     UnknownRecord,
+    WithdrawalRecord,
 )
 
 Float = NDArray[np.float64]
@@ -152,7 +153,7 @@ def factor_of(log: LogId, record: object, tracks: Tracks) -> Made:
 def made_at(log: LogId, record: Record) -> KeyframeId | None:
     """The keyframe of its log at which a measurement was made; None where the record names its keyframes itself."""
     match record:
-        case ClosureRecord() | RejectionRecord() | MetricClosureRecord() | UnknownRecord():
+        case ClosureRecord() | RejectionRecord() | MetricClosureRecord() | WithdrawalRecord() | UnknownRecord():
             return None
         case _:
             return KeyframeId(log, record.index)

@@ -21,9 +21,12 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.cold_storage import ColdPieces
 from flocc_protocol.records import (
+    JUDGEMENT_CODES,
     KEYFRAME_CODE,
+    ClosureRecord,
     KeyframeRecord,
     Record,
+    RejectionRecord,
     UnknownRecord,
     chain,
     decode_record,
@@ -271,6 +274,14 @@ class LogCopy:
         """The records that are no keyframes; keyframes are not even decoded."""
         others = (data for data in self.encoded if data[CODE_AT] != KEYFRAME_CODE)
         return (kept(decoded(data[: len(data) - self._seal_bytes])) for data in others)
+
+    def judgements(self) -> Iterator[tuple[int, ClosureRecord | RejectionRecord]]:
+        """Closures and rejections with the numbers of their records; others are not decoded."""
+        for number, data in enumerate(self.encoded):
+            if data[CODE_AT] in JUDGEMENT_CODES:
+                record = kept(decoded(data[: len(data) - self._seal_bytes]))
+                if isinstance(record, ClosureRecord | RejectionRecord):
+                    yield number, record
 
     @property
     def checksum(self) -> int:

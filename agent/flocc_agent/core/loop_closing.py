@@ -14,13 +14,13 @@ Nor are their keyframes queries, so that of their latents only the matching one 
 """
 
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
 from flocc_agent.core.front_ends import FrontEnds
 from flocc_agent.core.known_sets import PairSet
-from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
+from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach, WishesTold
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
@@ -93,10 +93,13 @@ class LoopClosing:
         self._undecided: dict[CandidatePair, Candidate] = {}
         self._listens_until_s = listens_until_s
         self._wanted: tuple[KeyframeId, ...] = ()
+        self._wishes_told = WishesTold()
         self._turn = -1
         self._changed = True
         self._due_s = float("inf")
         self._ticked_s = float("inf")
+        self._outdated: set[CandidatePair] = set()
+        """Registrations under way with latents that were made anew since."""
 
     @property
     def load(self) -> int:
@@ -151,12 +154,38 @@ class LoopClosing:
         work = self._work.get(pair)
         return (work.query, work.match) if work else None
 
+    def is_outdated(self, pair: CandidatePair) -> bool:
+        """Whether a registration that ended is to be done again: a latent was made anew meanwhile. Told once."""
+        if pair not in self._outdated:
+            return False
+        self._outdated.discard(pair)
+        self._work.stop(pair)
+        self._changed = True
+        return True
+
+    def on_withdrawal(self, log: LogId, first: int, end: int) -> None:
+        """Latents of a stretch of a log were made anew."""
+        for keyframe in (KeyframeId(log, index) for index in range(first, end)):
+            pairs = {pair for pair in self._work.using(keyframe) if keyframe in (pair.low, pair.high)}
+            self._outdated |= pairs & self._work.under_way
+            if log != self._own and log not in self._closed:
+                self.latents.on_withdrawn(keyframe)
+                self._work.on_evicted(keyframe)
+        self._chosen, self._changed = None, True
+
+    def on_withdrawn(self, pair: CandidatePair, now: float) -> None:
+        """The closure of a pair does not count: it is registered once more."""
+        self._resolved.discard(pair)
+        if not self._knows(pair) and self._concerns(pair):
+            self._assign(Candidate(pair, 0.0), now)
+
     def on_resolved(self, pair: CandidatePair) -> None:
         """A record of this pair is in a log: nobody needs to register it."""
         self._resolved.add(pair)
         self._prospects.on_resolved(pair)
         self._spared.remove(pair)
         self._undecided.pop(pair, None)
+        self._outdated.discard(pair)
         if pair in self._work or pair in self._offers:
             self._work.remove(pair)
             self._offers.remove(pair)
@@ -224,6 +253,13 @@ class LoopClosing:
 
     # Latents
 
+    def on_fetched(self, keyframe: KeyframeId, now: float) -> None:
+        """A fetch brought a latent; an old one is fetched again."""
+        if self.latents.is_outdated(keyframe):
+            self.on_fetch_failed(keyframe, now)
+        else:
+            self.on_held(keyframe)
+
     def on_held(self, keyframe: KeyframeId) -> None:
         """A latent is in this robot's store."""
         self.latents.add(keyframe)
@@ -233,6 +269,7 @@ class LoopClosing:
     def on_latent_missing(self, pair: CandidatePair, keyframe: KeyframeId) -> list[CandidatePair]:
         """The store evicted a latent; another robot's is fetched again, an own one is lost. Pairs to reject."""
         self.latents.remove(keyframe)
+        self._outdated.discard(pair)
         self._work.on_evicted(keyframe)
         self._work.stop(pair)
         self._changed = True
@@ -264,12 +301,16 @@ class LoopClosing:
         self._reach.on_false(holder, keyframe)
         self._chosen = None
 
-    def on_wants(self, wants: Iterable[KeyframeId], now: float) -> None:
+    def on_wants(self, peer: str, wants: Sequence[KeyframeId], now: float) -> None:
         """Latents that a neighbour cannot reach."""
-        self._changed |= self.latents.on_wants(wants, now)
+        if wants:
+            self._changed |= self.latents.on_wants(peer, wants, now)
 
     def wants(self, now: float) -> tuple[KeyframeId, ...]:
-        """Latents this robot needs, or relays, and cannot reach; looked for anew when some were got."""
+        """Latents this robot needs, or relays, and cannot reach, as far as that is to be told now.
+
+        They are looked for anew when some were got.
+        """
         turn = int(now // WANTS_TURN_S)
         still = tuple(k for k in self._wanted if self.latents.is_out_of_reach(k, self._reach))
         if turn != self._turn or len(still) < WANTS_MAX:
@@ -277,11 +318,11 @@ class LoopClosing:
             self._turn = turn
             still = self.latents.wants(self._out_of_reach(), self._reach, now, still)
         self._wanted = still
-        return still
+        return self._wishes_told.due(still, now)
 
-    def holds(self) -> tuple[KeyframeId, ...]:
-        """Latents of others that this robot holds because somebody wanted them."""
-        return self.latents.holds()
+    def holds(self, now: float) -> tuple[KeyframeId, ...]:
+        """Latents of others that this robot holds because somebody wanted them, as far as that is to be told now."""
+        return self.latents.holds(now)
 
     def lost(self, now: float) -> tuple[KeyframeId, ...]:
         """Latents that neighbours want and that exist no more."""
@@ -293,6 +334,7 @@ class LoopClosing:
         """A robot in range said how it is; one that comes into range is tried at once."""
         if name not in self._reach:
             self.latents.on_reached(name)
+            self._wishes_told.on_reached()
         if self._reach.update(name, peer):
             self._offers.on_peer(name)
             self._chosen, self._changed = None, True
@@ -363,6 +405,8 @@ class LoopClosing:
 
     def _spare_beside(self, closure: CandidatePair) -> None:
         """Spare pairs beside a new closure that nobody began to register here."""
+        if not self._parameters.closures_enough:
+            return
         for similarity, pair in self._work.beside(closure):
             if self._spares(Candidate(pair, -similarity)):
                 self._work.remove(pair)
@@ -442,6 +486,7 @@ class LoopClosing:
         """Forget what gave no answer, so that it is tried again."""
         self.latents.give_up(now)
         for pair in self._work.overdue(now):
+            self._outdated.discard(pair)
             self._work.stop(pair)
 
     def _using(self, keyframe: KeyframeId) -> list[CandidatePair]:

@@ -7,7 +7,7 @@ What is `_inner` a program may give, a test above all, but no file: it is no key
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-_FORBID: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
+_CHECKED: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
 KEYFRAMES_HELD = 20_000
 CROWD = 32
@@ -28,7 +28,7 @@ def _require(condition: bool, sentence: str) -> None:
 class NeighbourParameters:
     """Who is in range, by heartbeat."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     heartbeat_period_s: float = _inner(0.5)
     """Time between heartbeats with few robots in range; shorter notices a lost robot sooner and costs more bytes."""
@@ -55,7 +55,7 @@ class NeighbourParameters:
 class ElectionParameters:
     """The bully election."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     startup_s: float = _inner(1.5)
     """A robot listens this long after its start before it asks for an election."""
@@ -73,7 +73,7 @@ class ElectionParameters:
 class GossipParameters:
     """Replication of logs."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     logs_max: int = _inner(512)
     """Logs that are kept; further ones are refused and counted."""
@@ -86,7 +86,7 @@ class GossipParameters:
 class PlaceRecognitionParameters:
     """Candidates from descriptors (Sec. III-A)."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     similarity_threshold: float = 0.1
     """A best match of lower cosine similarity is no candidate; the paper's 0.1 is permissive."""
@@ -114,7 +114,7 @@ class PlaceRecognitionParameters:
 class LoopClosingParameters:
     """Candidates to closures (Sec. III-B)."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     match_ratio_threshold: float = 0.3
     """R_thr: a registration with a lower match ratio, Eq. (1), is refused; not where perception judges itself."""
@@ -134,8 +134,11 @@ class LoopClosingParameters:
 
     def __post_init__(self) -> None:
         _require(self.match_ratio_threshold >= 0, "match_ratio_threshold must not be negative")
+        _require(self.correspondences_min >= 0, "correspondences_min must not be negative")
+        _require(self.fetch_timeout_s > 0, "fetch_timeout_s must be positive")
         _require(self.fetches_max >= 1, "fetches_max must be at least 1")
         _require(self.registrations_max >= 1, "registrations_max must be at least 1")
+        _require(self.candidates_max >= 1, "candidates_max must be at least 1")
         _require(self.closures_enough >= 0, "closures_enough must not be negative")
 
 
@@ -143,7 +146,7 @@ class LoopClosingParameters:
 class MemoryParameters:
     """What a robot holds in memory."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     keyframes_held: int = KEYFRAMES_HELD
     """Keyframes of all robots held in memory in full; of older ones the records are on disk, and one descriptor stands
@@ -157,7 +160,7 @@ class MemoryParameters:
 class RoundParameters:
     """The leader's optimisation rounds."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     period_s: float = 2.0
     """Shortest time between two rounds."""
@@ -170,7 +173,7 @@ class RoundParameters:
 class DistributedParameters:
     """Distributed optimisation, where `backend.mode` chooses it: for experiments, no key of a file."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     period_s: float = _inner(0.2)
     """Shortest time between two steps of a robot; shorter converges sooner and sends more."""
@@ -198,7 +201,7 @@ class DistributedParameters:
 class CoreParameters:
     """All parameters of the core."""
 
-    __pydantic_config__ = _FORBID
+    __pydantic_config__ = _CHECKED
 
     neighbours: NeighbourParameters = field(default_factory=NeighbourParameters)
     election: ElectionParameters = field(default_factory=ElectionParameters)

@@ -80,6 +80,7 @@ class EncodingFailed:
     reason: str
 
 
+CAME_APART = "they come apart instead of agreeing on the poses that they share, and go back to where they agreed"
 WITHHELD = "the camera's axes are not those of its odometry, so closures would misplace the robot"
 """Why such a camera's keyframes are not encoded."""
 
@@ -137,6 +138,21 @@ class ClosureAccepted:
     by: str | None = None
     scale_initial: float | None = None
     probability: float | None = None
+
+
+@fact("closure_withdrawn")
+class ClosureWithdrawn:
+    """A closure does not count: a robot took one of its keyframes back, as `CameraDoubted` says why.
+
+    Attributes:
+        query: As registered.
+        match: The other one.
+        again: Whether the pair is registered once more, with what was made anew.
+    """
+
+    query: KeyframeId
+    match: KeyframeId
+    again: bool
 
 
 @fact("closure_rejected")

@@ -4,8 +4,7 @@ The driver calls `handle` for each event and `tick` when `deadline` is due; both
 order. Same seed and same events give the same effects, on virtual time and on a robot.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 
 from flocc_agent.core.assembly import POSES_OF_A_PIECE, GraphAssembly
 from flocc_agent.core.candidate_order import SpectralOrder
@@ -15,6 +14,7 @@ from flocc_agent.core.cold_storage import ColdPieces, ColdStorage
 from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import STEPS_AFTER_RESTART, DistributedOptimisation
+from flocc_agent.core.distrust import Distrust
 from flocc_agent.core.effects import Broadcast, DropLog, Effect, Encode, Optimise, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
@@ -37,9 +37,9 @@ from flocc_agent.core.events import (
     Measured,
     MessageReceived,
     PairRegistered,
+    Withdrawn,
 )
-from flocc_agent.core.giving_up import LOOK_PERIOD_S, expendable
-from flocc_agent.core.gossip import Gossip, NewRecord, Sealer
+from flocc_agent.core.gossip import Gossip, Sealer
 from flocc_agent.core.in_map import InMap
 from flocc_agent.core.judgement import judged, told
 from flocc_agent.core.latents import Peer
@@ -55,15 +55,17 @@ from flocc_agent.core.measurements import (
     record_of,
 )
 from flocc_agent.core.neighbours import Neighbours
+from flocc_agent.core.own_heartbeat import OwnHeartbeat
+from flocc_agent.core.own_keyframes import OwnKeyframes
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.peer_budgets import AnswerBudget, Muted
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.prospects import UNLIKELY
+from flocc_agent.core.record_intake import RecordIntake
 from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
     ClosureRejected,
     EncodingFailed,
-    FrontEndsDiffer,
     KeyframeTaken,
     LatentArrived,
     LatentFailed,
@@ -74,12 +76,10 @@ from flocc_agent.core.reports import (
     RoundFailed,
     SolutionIgnored,
 )
+from flocc_agent.core.restored import Restored
 from flocc_agent.core.rounds import Rounds, solution_report
-from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.core.spared import TOLD
 from flocc_protocol.arrays import Array
-from flocc_protocol.codec import Pose7
-from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import (
     Answer,
@@ -107,59 +107,12 @@ from flocc_protocol.records import (
     LatentRecord,
     Record,
     RejectionRecord,
+    WithdrawalRecord,
 )
 
 NOBODY = -1
 """Compute class, as loop closing sees it, of a name under which two robots run: both would register what it gets."""
-DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
-"""How long a leader whose signed correction cannot be true is not followed: the first time, and at most."""
-OVERTAKEN_PERIOD_S = 1.0
 OTHER_MODE_MAX = 256
-GREETING_RATIO = 0.2
-"""Least pause between heartbeats that greet new neighbours, against the usual one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Restored:
-    """What a robot finds on its disk when it starts.
-
-    Attributes:
-        records: (log, encoded records in order) of every log, the own one included.
-        latents: Keyframes whose latents are stored.
-        term_counter: Highest term counter the robot claimed.
-        correction: The correction it applied last.
-        frame_changed: That correction changed the map frame, and nobody knows whether consumers heard of it.
-        saved: The map that it opens; its logs are among the records, its latents among the latents.
-        journeys: Earlier logs of its own that it goes on from.
-    """
-
-    records: tuple[tuple[LogId, tuple[bytes, ...]], ...] = ()
-    latents: tuple[KeyframeId, ...] = ()
-    term_counter: int = 0
-    correction: LogCorrection | None = None
-    frame_changed: bool = False
-    saved: SavedMap | None = None
-    journeys: frozenset[LogId] = frozenset()
-
-    def closed(self) -> frozenset[LogId]:
-        """Logs that nobody writes any more, and whose latents are on this robot's disk."""
-        return self.journeys if self.saved is None else self.journeys | self.saved.closed
-
-    def counter_max(self) -> int:
-        """Highest term counter that the robot knew of: a term it claims must be above what it applied."""
-        return max(self.term_counter, self.correction.term.counter if self.correction else 0)
-
-
-@dataclass(slots=True)
-class _Pending:
-    """A keyframe between capture and its record; records are appended in the order of capture."""
-
-    index: int
-    stamp_s: float
-    T_odom_camera: Pose7
-    encoded: bool = False
-    descriptor: Array | None = None
-    sha256: bytes = b""
 
 
 class Robot:
@@ -183,13 +136,8 @@ class Robot:
         self._compute_class = compute_class
         self._boot = boot
         self._parameters = parameters
-        self._sequence = 0
-        self._heartbeat_due_s = now
-        self._heartbeat_s = float("-inf")
-        self._pending: list[_Pending] = []
-        self._waiting: dict[int, list[Measurement]] = {}
-        self._served = frozenset(restored.latents if restored.saved is not None else ())
-        self._partnered: set[tuple[KeyframeId, LogId]] = set()
+        self._beat = OwnHeartbeat(now)
+        self._own_keyframes = OwnKeyframes()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         held = parameters.memory.keyframes_held
         cold_records = None if cold is None else ColdPieces(cold, max(1, held // BLOCK_RECORDS))
@@ -218,6 +166,7 @@ class Robot:
             self.assembly,
         )
         self.closing.latents.names.record_at = self._record_at
+        self._intake = RecordIntake(log, self.gossip, self.assembly, self.recognition, self.closing, restored)
         self.in_map = None if restored.saved is None else InMap(restored.saved, now)
         self.corrections = Corrections(
             log,
@@ -229,10 +178,7 @@ class Robot:
             evidence=self.assembly,
         )
         self._has_keys = sealer is not None
-        self._overtaken_s = float("-inf")
-        self._looked_for_room_s = float("-inf")
-        self._closed = closed
-        self._distrusted = Muted(DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S)
+        self._distrust = Distrust()
         self.election = LeaderElection(
             log, compute_class, restored.counter_max(), parameters.election, now, compute_classes
         )
@@ -255,7 +201,7 @@ class Robot:
         """Time passed."""
         effects = self._lose_silent(now)
         effects += self.election.tick(now)
-        if self._heartbeat_due_s <= now:
+        if self._beat.due_s <= now:
             effects += self._heartbeat(now)
         return self._placed(effects + self._settle(now), now)
 
@@ -276,7 +222,7 @@ class Robot:
                 return [claim for batch in heard for claim in self.gossip.claims(batch)]
             case CorrectionBatch(corrections):
                 heard_of = [c for c in corrections if not self._muted.is_muted(peer, c.term.leader.robot, now)]
-                trusted = [c for c in heard_of if not self._is_distrusted(c.term.leader, now)]
+                trusted = [c for c in heard_of if not self._distrust.holds(c.term.leader, now)]
                 found = [self.corrections.claim(correction, now) for correction in trusted]
                 return [claim for claim in found if claim is not None]
             case _:
@@ -285,7 +231,7 @@ class Robot:
     def deadline(self) -> float:
         """When `tick` is due next, in seconds of the driver's clock."""
         return min(
-            self._heartbeat_due_s,
+            self._beat.due_s,
             self.neighbours.deadline(),
             self.election.deadline(),
             self.closing.deadline(),
@@ -294,7 +240,7 @@ class Robot:
 
     def keyframes_given(self) -> int:
         """Own keyframes that were captured, recorded or not: the next one's number."""
-        return self.gossip.logs[self.log].keyframes + len(self._pending)
+        return self.gossip.logs[self.log].keyframes + len(self._own_keyframes)
 
     @property
     def closures_enough(self) -> int:
@@ -306,7 +252,7 @@ class Robot:
         neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
         return {
             "neighbours": neighbours,
-            "measurements": (sum(map(len, self._waiting.values())), WAITING_MAX * max(len(self._pending), 1)),
+            **self._own_keyframes.sizes(),
             **self.gossip.sizes(),
             **self.comparisons.sizes(),
             **self.closing.sizes(),
@@ -315,7 +261,7 @@ class Robot:
             **self._answers.sizes(),
             **self._muted.sizes("muted"),
             **self.assembly.sizes(),
-            **self._distrusted.sizes("distrusted"),
+            **self._distrust.sizes(),
             **({} if self.distributed is None else self.distributed.sizes()),
         }
 
@@ -327,14 +273,14 @@ class Robot:
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
                 return self._on_captured(event)
-            case KeyframeEncoded(keyframe, descriptor, doubts, sha256):
+            case KeyframeEncoded(keyframe, descriptor, doubts, sha256, withdrawn):
                 self.closing.on_held(keyframe)
-                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256)]
-            case KeyframeEncodingFailed(keyframe, reason, doubts):
+                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256, withdrawn)]
+            case KeyframeEncodingFailed(keyframe, reason, doubts, withdrawn):
                 reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
-                return [*reports, *self._on_encoded(keyframe, None, now)]
+                return [*reports, *self._on_encoded(keyframe, None, now, withdrawn=withdrawn)]
             case LatentFetched(keyframe, holder):
-                self.closing.on_held(keyframe)
+                self.closing.on_fetched(keyframe, now)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
             case LatentFetchFailed(keyframe, holder, reason):
                 return self._on_fetch_failed(keyframe, holder, reason, now)
@@ -360,7 +306,7 @@ class Robot:
         sender, message = envelope.sender, envelope.message
         if sender.robot == self.log.robot and not isinstance(message, Heartbeat):
             return []
-        if isinstance(message, Election | Answer | Coordinator | Handover) and self._is_distrusted(sender, now):
+        if isinstance(message, Election | Answer | Coordinator | Handover) and self._distrust.holds(sender, now):
             return []
         match message:
             case Heartbeat():
@@ -400,7 +346,7 @@ class Robot:
             batches = tuple([b for b in message.batches if not muted.is_muted(peer, b.log.robot, now)])
             heard = message if len(batches) == len(message.batches) else Records(batches)
             new, effects = self.gossip.on_records(sender, heard, now)
-            effects += self._take(new, now)
+            effects += self._intake.take(new, now)
         else:
             taken = [c for c in message.corrections if not muted.is_muted(peer, c.term.leader.robot, now)]
             effects = [effect for correction in taken for effect in self._on_correction(sender, correction, now)]
@@ -420,12 +366,12 @@ class Robot:
             self._greet(heartbeat, now)
         if self.in_map is not None:
             effects += self.in_map.on_heartbeat(sender)
-        effects += self.election.on_heartbeat(sender, self._believed(heartbeat, now), now)
+        effects += self.election.on_heartbeat(sender, self._distrust.believed(heartbeat, now), now)
         effects += self._compare(sender, heartbeat, now)
         compute_class = self.election.class_of(sender.robot, heartbeat.compute_class)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else compute_class
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
-        self.closing.on_wants(heartbeat.wants, now)
+        self.closing.on_wants(sender.robot, heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
             effects += self._reject_lost([pair], keyframe, now)
         return effects
@@ -434,7 +380,7 @@ class Robot:
         """Take a correction that its leader made; one of an absurd term would fence out every leader to come."""
         if message.log in self.gossip.given_up:
             return []
-        if self._is_distrusted(message.term.leader, now):
+        if self._distrust.holds(message.term.leader, now):
             return self._overtaken(sender, message, now)
         if self.distributed is not None and message.term.leader != message.log:
             return self._other_mode(message.term.leader)
@@ -453,31 +399,21 @@ class Robot:
             effects.append(Optimise(self._own_term, 0, self.assembly.graph(), None))
         if self._has_keys:
             for leader in sorted(doubts.doubted):
-                self._distrusted.on_failed(leader.robot, leader.robot, now)
+                self._distrust.on_lie(leader, now)
                 self.corrections.forget(leader.robot)
                 effects += self.election.on_distrusted(leader.robot, now)
             for leader in sorted(doubts.confirmed):
-                self._distrusted.forgive(leader.robot, leader.robot)
+                self._distrust.on_confirmed(leader)
         doubts.doubted.clear()
         doubts.confirmed.clear()
         return effects
 
-    def _believed(self, heartbeat: Heartbeat, now: float) -> Heartbeat:
-        """A heartbeat as the election hears it: without a leader that is not followed."""
-        advert = heartbeat.leader
-        distrusted = advert is not None and self._is_distrusted(advert.term.leader, now)
-        return replace(heartbeat, leader=None) if distrusted else heartbeat
-
     def _overtaken(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
         """Lead above the terms of a robot that is not followed, now and then: others may have applied what it said."""
-        if not self.election.leading or now < self._overtaken_s + OVERTAKEN_PERIOD_S:
+        if not self.election.leading or not self._distrust.may_overtake(now):
             return []
-        self._overtaken_s = now
         refused = self.corrections.refused(sender.robot, message)
         return refused or self.election.on_applied(sender, message.term, now)
-
-    def _is_distrusted(self, leader: LogId, now: float) -> bool:
-        return self._distrusted.is_muted(leader.robot, leader.robot, now)
 
     def _compare(self, sender: LogId, heartbeat: Heartbeat, now: float) -> list[Effect]:
         """Ask a neighbour for what it has more of, and for what changed in its tables where they are others."""
@@ -494,7 +430,7 @@ class Robot:
         versions = tuple(
             each
             for each in message.versions
-            if each.log not in self.gossip.given_up and not self._is_distrusted(each.term.leader, now)
+            if each.log not in self.gossip.given_up and not self._distrust.holds(each.term.leader, now)
         )
         helped = self.gossip.has_news(message.digests) or self.corrections.has_news(versions)
         self.comparisons.on_digests(sender.robot, message, helped, now)
@@ -532,29 +468,44 @@ class Robot:
 
     def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
         index = self.keyframes_given()
-        self._pending.append(_Pending(index, event.stamp_s, event.T_odom_camera))
+        self._own_keyframes.captured(index, event.stamp_s, event.T_odom_camera)
         return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
 
     def _on_encoded(
-        self, keyframe: KeyframeId, descriptor: Array | None, now: float, sha256: bytes = b""
+        self,
+        keyframe: KeyframeId,
+        descriptor: Array | None,
+        now: float,
+        sha256: bytes = b"",
+        withdrawn: Withdrawn | None = None,
     ) -> list[Effect]:
         """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
 
         A keyframe that failed to encode has a record all the same, with its odometry: measurements need no more.
         """
-        for pending in self._pending:
-            if pending.index == keyframe.index:
-                pending.encoded, pending.descriptor, pending.sha256 = True, descriptor, sha256
+        self._own_keyframes.encoded(keyframe.index, descriptor, sha256, withdrawn)
         effects: list[Effect] = []
-        while self._pending and self._pending[0].encoded:
-            ready = self._pending.pop(0)
+        for ready in self._own_keyframes.ready():
             record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
             effects += self._append(record, now)
             effects.append(_keyframe_report(self.log, record))
             if self._has_keys and ready.sha256:
                 effects += self._append(LatentRecord(ready.index, ready.sha256), now)
-            for measurement in self._waiting.pop(ready.index, ()):
+            if ready.withdrawn is not None:
+                effects += self._withdraw(ready.index, ready.withdrawn, now)
+            for measurement in self._own_keyframes.take_measured(ready.index):
                 effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
+        return effects
+
+    def _withdraw(self, end: int, withdrawn: Withdrawn, now: float) -> list[Effect]:
+        """Take the keyframes before one back, after the log said what their latents are now, where it says so."""
+        effects: list[Effect] = []
+        for index, sha256 in enumerate(withdrawn.sha256, end - len(withdrawn.sha256)):
+            if self._has_keys and sha256:
+                effects += self._append(LatentRecord(index, sha256), now)
+        first = max(end - withdrawn.count, 0)
+        if first < end:
+            effects += self._append(WithdrawalRecord(self.log, first, end, withdrawn.is_final), now)
         return effects
 
     def _on_measured(self, measurement: Measurement, index: int, now: float) -> list[Effect]:
@@ -565,11 +516,9 @@ class Robot:
             return self._append_measurement(measurement, keyframe, now)
         if keyframe.index >= max(self.keyframes_given(), 1):
             return [measurement_refused(measurement, keyframe, "there is no such keyframe")]
-        waiting = self._waiting.setdefault(keyframe.index, [])
-        if len(waiting) >= WAITING_MAX:
-            return [measurement_refused(measurement, keyframe, f"{WAITING_MAX} others wait for this keyframe")]
-        waiting.append(measurement)
-        return []
+        if self._own_keyframes.keep(measurement, keyframe.index):
+            return []
+        return [measurement_refused(measurement, keyframe, f"{WAITING_MAX} others wait for this keyframe")]
 
     def _append_measurement(self, measurement: Measurement, keyframe: KeyframeId, now: float) -> list[Effect]:
         try:
@@ -586,7 +535,7 @@ class Robot:
         A pair that another robot's record resolved in the meantime needs no second one.
         """
         roles = self.closing.roles(pair)
-        if roles is None:
+        if roles is None or self.closing.is_outdated(pair):
             return []
         record = judged(*roles, result, self._parameters.loop_closing)
         return [*self._append(record, now), Report(told(record, self.log))]
@@ -610,79 +559,22 @@ class Robot:
         return self.gossip.logs[log].records[number]
 
     def _append(self, record: Record, now: float) -> list[Effect]:
+        """Append a record to the own log; before a judgement, what it knows of withdrawn keyframes."""
+        said: list[Effect] = []
+        if isinstance(record, ClosureRecord | RejectionRecord):
+            pair = CandidatePair.of(record.query, record.match)
+            for known in self.assembly.withdrawals.unsaid(self.log, pair):
+                said += self._append(known, now)
         new, effects, batch = self.gossip.append(record)
-        return [*effects, Broadcast(Records((batch,))), *self._take([new], now)]
-
-    def _take(self, new_records: Iterable[NewRecord], now: float) -> list[Effect]:
-        """Let everything that is derived from the logs know of new records; places are recognised at the end."""
-        described: list[tuple[KeyframeId, Array]] = []
-        effects: list[Effect] = []
-        filled: list[tuple[LogId, int]] = []
-        for new in new_records:
-            self.assembly.add(new)
-            if (new.number + 1) % BLOCK_RECORDS == 0:
-                filled.append((new.log, new.number))
-            match new.record:
-                case KeyframeRecord(index, _, _, descriptor):
-                    self.closing.on_keyframe(new.log)
-                    keyframe = KeyframeId(new.log, index)
-                    if descriptor is not None and self._may_match(keyframe):
-                        described.append((keyframe, descriptor))
-                case LatentRecord(index):
-                    self.closing.latents.names.add(KeyframeId(new.log, index), new.number)
-                case ClosureRecord(query, match):
-                    self.closing.on_closure(CandidatePair.of(query, match), now)
-                case RejectionRecord(query, match, reason, _, odometry_correspondences):
-                    was_seen = odometry_correspondences > 0
-                    if self.closing.on_rejection(CandidatePair.of(query, match), reason, was_seen):
-                        effects += self._front_ends_differ(query.log, match.log)
-                case _:
-                    pass  # what was measured, and what a later version says, concerns the graph only
-        effects += self._recognise(described, now) if described else []
-        for log, number in filled:
-            self._lend_rows(log, number // BLOCK_RECORDS)
-        return effects
+        return [*said, *effects, Broadcast(Records((batch,))), *self._intake.take([new], now)]
 
     def _make_room(self, wanting: LogId, now: float) -> list[Effect]:
         """Give up a log that nothing refers to, where one is asked for that has no room."""
-        if now < self._looked_for_room_s + LOOK_PERIOD_S:
-            return []
-        self._looked_for_room_s = now
-        kept = self.assembly.tied() | self._closed | {self.log}
-        log = expendable(
-            self.gossip.logs,
-            wanting,
-            lambda each: each not in kept and not self.closing.is_written(each),
-            lambda each: self.gossip.silent_s(each, now),
-        )
+        log = self._intake.given_up_for(wanting, now)
         if log is None:
             return []
-        self.gossip.forget(log)
-        self.assembly.forget(log)
-        self.recognition.forget(log)
-        self.closing.forget(log)
         self.corrections.forget_log(log)
         return [DropLog(log), Report(LogGivenUp(log=log))]
-
-    def _lend_rows(self, log: LogId, block: int) -> None:
-        """Descriptors of a full block are held once, by the log."""
-        self.recognition.lend(log, *self.gossip.logs[log].descriptors(block))
-
-    def _may_match(self, keyframe: KeyframeId) -> bool:
-        """Whether a keyframe can be registered; of a pruned map not all have a latent."""
-        saved = None if self.in_map is None else self.in_map.saved
-        return saved is None or keyframe.log not in saved.closed or keyframe in self._served
-
-    def _recognise(self, keyframes: list[tuple[KeyframeId, Array]], now: float) -> list[Effect]:
-        """Look for keyframes' candidates; after a restart not where both already had a partner in the other's log."""
-        found = self.recognition.on_keyframes(keyframes)
-        if self._partnered:
-            found = [(k, c) for k, c in found if not self._had_partners(k, c.pair.other(k))]
-        return self.closing.on_candidates([candidate for _, candidate in found], now) if found else []
-
-    def _had_partners(self, one: KeyframeId, other: KeyframeId) -> bool:
-        """Whether each of two keyframes was registered with one of the other's log; else their pair waits still."""
-        return (one, other.log) in self._partnered and (other, one.log) in self._partnered
 
     def _distributed(self, correction: LogCorrection | None) -> DistributedOptimisation:
         """This robot's part of a distributed optimisation; after a restart it counts on above what it said before."""
@@ -719,52 +611,27 @@ class Robot:
         self._of_other_mode.add(sender)
         return [Report(PeerRefused(peer=sender.robot, reason="its backend.mode is another one"))]
 
-    def _front_ends_differ(self, first: LogId, second: LogId) -> list[Effect]:
-        """Tell, where it concerns this robot."""
-        others = [log.robot for log in (first, second) if log != self.log]
-        return [Report(FrontEndsDiffer(peer=others[0]))] if len(others) == 1 else []
-
     def _restore(self, restored: Restored, now: float) -> None:
-        """Resolved pairs first, so that no pair of the past is found again, nor another one in its place."""
-        news = [new for log, records in restored.records for new in self._restore_log(log, records)]
-        self._take([new for new in news if not isinstance(new.record, KeyframeRecord)], now)
-        for new in news:
-            if isinstance(new.record, ClosureRecord | RejectionRecord):
-                query, match = new.record.query, new.record.match
-                self._partnered |= {(query, match.log), (match, query.log)}
-        self._take([new for new in news if isinstance(new.record, KeyframeRecord)], now)
-        self._partnered.clear()
-        for log, copy in self.gossip.logs.items():
-            for block in range(len(copy) // BLOCK_RECORDS):
-                self._lend_rows(log, block)
+        """Know again what the disk holds."""
+        self._intake.restore(restored.records, now)
         for keyframe in restored.latents:
-            self.closing.on_held(keyframe)
+            is_old = keyframe.log not in restored.closed() | {self.log} and self.assembly.withdrawals.is_withdrawn(
+                keyframe
+            )
+            if not is_old:  # else nobody knows whether it is from before its owner made it anew
+                self.closing.on_held(keyframe)
         self.corrections.restore(restored.correction, restored.frame_changed)
-
-    def _restore_log(self, log: LogId, records: Iterable[bytes]) -> Iterable[NewRecord]:
-        """A log as it is on the disk, up to a record that nobody would take any more; others have the rest."""
-        try:
-            for data in records:
-                yield self.gossip.restore(log, data)
-        except DecodeError:
-            if log == self.log:
-                raise  # whoever reads the disk checks the own log before: its numbers must not be used twice
 
     # Time
 
     def _heartbeat(self, now: float) -> list[Effect]:
-        """Say who is here; a late tick does not make up for heartbeats it missed."""
-        period = self._parameters.neighbours.period_s(len(self.neighbours))
-        self._heartbeat_due_s += period
-        if self._heartbeat_due_s <= now:
-            self._heartbeat_due_s = now + period
-        self._heartbeat_s = now
-        self._sequence += 1
+        """Say who is here."""
+        self._beat.beat(self._parameters.neighbours.period_s(len(self.neighbours)), now)
         own = self.gossip.logs[self.log]
         return [
             Broadcast(
                 Heartbeat(
-                    sequence=self._sequence,
+                    sequence=self._beat.sequence,
                     boot=self._boot,
                     compute_class=self._compute_class,
                     leader=self.election.advert(),
@@ -775,7 +642,7 @@ class Robot:
                     digests=self.gossip.state(),
                     versions=self.corrections.state(),
                     wants=self.closing.wants(now),
-                    holds=self.closing.holds(),
+                    holds=self.closing.holds(now),
                     lost=self.closing.lost(now),
                 )
             )
@@ -786,8 +653,7 @@ class Robot:
         term = self.election.term
         if term is None or heartbeat.leader is None or heartbeat.leader.term.leader != term.leader:
             self.rounds.hurry(now)
-        pause_s = GREETING_RATIO * self._parameters.neighbours.heartbeat_period_s
-        self._heartbeat_due_s = min(self._heartbeat_due_s, max(now, self._heartbeat_s + pause_s))
+        self._beat.greet(self._parameters.neighbours.heartbeat_period_s, now)
 
     def _lose_silent(self, now: float) -> list[Effect]:
         gone = self.neighbours.tick(now)

@@ -7,7 +7,7 @@ thousands that wait for latents out of reach.
 import heapq
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence, Set
 from dataclasses import dataclass, field
 
 from flocc_agent.core.known_sets import is_beside
@@ -181,6 +181,11 @@ class WorkTable:
     def registering(self) -> int:
         """Registrations under way."""
         return len(self._registering)
+
+    @property
+    def under_way(self) -> Set[CandidatePair]:
+        """The pairs whose registrations are."""
+        return self._registering.keys()
 
     def start_next(self, until_s: float, chosen: Sequence[CandidatePair] = ()) -> Work | None:
         """Start a pair that is ready, if one is: the first of those chosen, or where none is the most similar."""

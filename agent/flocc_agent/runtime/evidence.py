@@ -7,7 +7,7 @@ from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import ClosureState, GraphSolution
 from flocc_agent.core.registration import match_ratio
 from flocc_agent.core.robot import Robot
-from flocc_agent.runtime.reporting import best_similarities
+from flocc_agent.runtime.reporting import best_similarities, counted
 from flocc_agent.runtime.status import MergeStatus, PairStatus, SolverStatus
 from flocc_protocol.records import ClosureRecord, RejectionRecord
 
@@ -70,8 +70,8 @@ def pairs_of(robot: Robot) -> dict[tuple[str, str], PairEvidence]:
 
 
 def judgements(robot: Robot) -> Iterator[ClosureRecord | RejectionRecord]:
-    """Every judgement in all logs, closures first: what anybody accepted is accepted."""
-    records = [record for _, copy in sorted(robot.gossip.logs.items()) for record in copy.other_records()]
+    """Every judgement in all logs that counts, closures first: what anybody accepted is accepted."""
+    records = list(counted(robot))
     yield from (record for record in records if isinstance(record, ClosureRecord))
     yield from (record for record in records if isinstance(record, RejectionRecord))
 

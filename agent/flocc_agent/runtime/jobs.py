@@ -30,8 +30,9 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
     PairRegistered,
+    Withdrawn,
 )
-from flocc_agent.core.interfaces import Image, ImageWatch, OdometryPair, Perception
+from flocc_agent.core.interfaces import Image, ImageWatch, KeyframeLook, OdometryPair, Perception
 from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import RegistrationFailed, RegistrationFailure
@@ -130,13 +131,23 @@ async def encode(effect: Encode, tools: Tools) -> KeyframeEncoded | KeyframeEnco
     if isinstance(result, WorkFailed):
         return KeyframeEncodingFailed(effect.keyframe, result.reason)
     looked = result.value
+    withdrawn = await asyncio.to_thread(_withdrawn, effect.keyframe, looked, tools) if looked.withdrawn else None
     if looked.descriptor is None or looked.latent is None:
-        return KeyframeEncodingFailed(effect.keyframe, looked.fault, looked.doubts)
-    if looked.hidden is not None and tools.sealer is None:
-        await asyncio.to_thread(hide_in_earlier, effect.keyframe, looked.hidden, tools.perception.without, tools.store)
+        return KeyframeEncodingFailed(effect.keyframe, looked.fault, looked.doubts, withdrawn)
     await asyncio.to_thread(tools.store.put_latent, effect.keyframe, looked.latent)
-    sha256 = await asyncio.to_thread(_sent_forms, looked.latent, tools.perception) if tools.sealer is not None else b""
-    return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts, sha256)
+    sha256 = await asyncio.to_thread(_sent_forms, looked.latent, tools)
+    return KeyframeEncoded(effect.keyframe, looked.descriptor, looked.doubts, sha256, withdrawn)
+
+
+def _withdrawn(keyframe: KeyframeId, looked: KeyframeLook, tools: Tools) -> Withdrawn | None:
+    """Make latents anew, and tell what they are now."""
+    made_anew = hide_in_earlier(keyframe, looked, tools.perception.without, tools.store)
+    return withdrawn_by(looked, tuple(_sent_forms(latent, tools) for latent in made_anew))
+
+
+def withdrawn_by(looked: KeyframeLook, sha256: tuple[bytes, ...] = ()) -> Withdrawn | None:
+    """What a look takes back: for good where no latent could be made anew."""
+    return Withdrawn(looked.withdrawn, sha256, is_final=looked.hidden is None) if looked.withdrawn else None
 
 
 class KeepsLatents(Protocol):
@@ -147,39 +158,57 @@ class KeepsLatents(Protocol):
         ...
 
     def replace_latent(self, keyframe: KeyframeId, latent: bytes, /) -> None:
-        """Keep another latent in the place of one that is there."""
+        """Keep another latent in the place of one that is there, where one is."""
+        ...
+
+    def put_latent(self, keyframe: KeyframeId, latent: bytes, /) -> None:
+        """Keep a latent, where there is none."""
         ...
 
 
-EARLIER_MAX = 64
-"""Keyframes whose latents lose what turns out to move with the camera: it is found among the first few, mostly."""
+def keep_fetched(keyframe: KeyframeId, latent: bytes, store: KeepsLatents) -> None:
+    """Keep what a fetch brought, also where an older one is, from before its owner made it anew."""
+    store.replace_latent(keyframe, latent)
+    store.put_latent(keyframe, latent)
 
 
 def hide_in_earlier(
     keyframe: KeyframeId,
-    hidden: NDArray[np.bool_],
+    looked: KeyframeLook,
     without: Callable[[bytes, NDArray[np.bool_]], bytes],
     store: KeepsLatents,
-) -> None:
+) -> list[bytes]:
     """Take what moves with the camera out of the latents that were encoded before it was known.
-
-    Where a robot's log says what its latents are, they stay: another one would be refused as false.
 
     Args:
         keyframe: With which it became known.
-        hidden: (H, W) of the camera's picture.
+        looked: Its look, which says what that is, and how many keyframes show it.
         without: Takes what is hidden out of a latent.
         store: Where they are.
+
+    Returns:
+        The latents as they are now, of all keyframes that are withdrawn; b"" where there is none.
     """
-    for index in range(max(0, keyframe.index - EARLIER_MAX), keyframe.index):
+    if looked.hidden is None:
+        return []
+    made: list[bytes] = []
+    for index in range(max(0, keyframe.index - looked.withdrawn), keyframe.index):
         earlier = KeyframeId(keyframe.log, index)
         latent = store.latent(earlier)
+        made.append(b"" if latent is None else without(latent, looked.hidden))
         if latent is not None:
-            store.replace_latent(earlier, without(latent, hidden))
+            store.replace_latent(earlier, made[-1])
+    return made
 
 
-def _sent_forms(latent: bytes, perception: Perception) -> bytes:
-    """Hashes of what is sent of a latent: itself, and where there is one the picture in its place."""
+def _sent_forms(latent: bytes, tools: Tools) -> bytes:
+    """Hashes of what is sent of a latent: itself, and where there is one the picture in its place.
+
+    Empty where there is none, or where the swarm has no keys.
+    """
+    if not latent or tools.sealer is None:
+        return b""
+    perception = tools.perception
     forms = dict.fromkeys(perception.part(latent, encode_bytes) for encode_bytes in (None, 0))
     return b"".join(hashlib.sha256(form).digest() for form in forms)
 
@@ -194,7 +223,7 @@ async def fetch(effect: FetchLatent, tools: Tools) -> LatentFetched | LatentFetc
     if effect.named is not None and not effect.named.names(hashlib.sha256(answer.latent).digest()):
         return LatentFetchFailed(keyframe, holder, FetchProblem.WRONG_HASH.value)
     tools.workers.stages.observe("fetch", tools.clock_s() - began_s)
-    await asyncio.to_thread(tools.store.put_latent, keyframe, answer.latent)
+    await asyncio.to_thread(keep_fetched, keyframe, answer.latent, tools.store)
     return LatentFetched(keyframe, holder)
 
 

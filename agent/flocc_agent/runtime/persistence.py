@@ -7,7 +7,7 @@ from typing import assert_never
 
 from flocc_agent.core.effects import DropLog, PersistCorrection, PersistRecord, PersistTerm
 from flocc_agent.core.gossip import Sealer
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.restored import Restored
 from flocc_agent.runtime.map_folder import BadMap, MapFolder, longer_copy
 from flocc_agent.runtime.store import Store, StoredRecord
 from flocc_agent.runtime.stored_correction import correction_in, stored

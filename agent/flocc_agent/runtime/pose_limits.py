@@ -3,6 +3,8 @@
 What cannot be is refused where it comes in; behind this gate every pose fits a record.
 """
 
+from numbers import Real
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,8 @@ class PoseGate:
         """
         if (fault := pose_fault(T_odom_body)) is not None:
             return fault
+        if not isinstance(stamp_s, Real):
+            return f"its stamp is no number of seconds but {type(stamp_s).__name__}"
         if not abs(stamp_s) <= STAMP_MAX_S:
             return f"its stamp is not within {STAMP_MAX_S:g} s"
         if self._last is None:

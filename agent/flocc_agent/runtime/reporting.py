@@ -3,6 +3,7 @@
 The core knows camera poses only; users know the body. Both speak of the body.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.robot_result import ClosureKnown, KeyframeResult, RobotResult
 from flocc_protocol.codec import Pose7
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord
 
 Float = NDArray[np.float64]
 
@@ -112,14 +113,22 @@ def best_similarities(robot: Robot) -> dict[str, float]:
     return {name: round(best, 4) for name, best in sorted(robot.recognition.best_similarities.items())}
 
 
+def counted(robot: Robot) -> Iterator[ClosureRecord | RejectionRecord]:
+    """Judgements of all logs, the lowest log's first, without those of keyframes that were taken back since."""
+    counts = robot.assembly.withdrawals.counts
+    for log, copy in sorted(robot.gossip.logs.items()):
+        for number, record in copy.judgements():
+            if counts(log, number, CandidatePair.of(record.query, record.match)):
+                yield record
+
+
 def closures_known(robot: Robot, solution: GraphSolution | None) -> list[ClosureKnown]:
-    """Every closure in a robot's logs, each pair once, with the scale of the last solution it made."""
+    """Every closure in a robot's logs that counts, each pair once, with the scale of the last solution it made."""
     scales = {} if solution is None else {CandidatePair.of(c.query, c.match): c.scale for c in solution.closures}
     found: dict[CandidatePair, ClosureRecord] = {}
-    for _, copy in sorted(robot.gossip.logs.items()):
-        for record in copy.other_records():
-            if isinstance(record, ClosureRecord):
-                found.setdefault(CandidatePair.of(record.query, record.match), record)
+    for record in counted(robot):
+        if isinstance(record, ClosureRecord):
+            found.setdefault(CandidatePair.of(record.query, record.match), record)
     return [
         ClosureKnown(
             query=str(record.query),

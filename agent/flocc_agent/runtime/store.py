@@ -231,7 +231,7 @@ class Store:
                 self._evict_oldest()
 
     def replace_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
-        """Keep a smaller latent in the place of one that is there."""
+        """Keep another latent in the place of one that is there."""
         row = (hashlib.sha256(latent).digest(), len(latent), latent, str(keyframe))
         with self._lock:
             known = self._latents.read("SELECT bytes FROM latents WHERE keyframe = ?", (str(keyframe),))

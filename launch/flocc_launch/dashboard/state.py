@@ -12,6 +12,7 @@ from flocc_agent.core.reports import (
     CandidateFound,
     ClosureAccepted,
     ClosureRejected,
+    ClosureWithdrawn,
     CorrectionApplied,
     Fact,
     KeyframeTaken,
@@ -124,6 +125,9 @@ class SwarmState:
         apply_to(robot, event.fact)
         if isinstance(event.fact, ClosureAccepted) and len(self.closures) < CLOSURES_MAX:
             self.closures[event.fact.query, event.fact.match] = event.fact.probability
+        if isinstance(event.fact, ClosureWithdrawn):
+            for ends in ((event.fact.query, event.fact.match), (event.fact.match, event.fact.query)):
+                self.closures.pop(ends, None)
         if is_of(event, RoundSolved):
             self.optimised = event
         said = None if isinstance(event.fact, COUNTED_ONLY) else sentence_of(event)

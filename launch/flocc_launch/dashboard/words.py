@@ -3,6 +3,7 @@
 from flocc_agent.core.reports import (
     ClosureAccepted,
     ClosureRejected,
+    ClosureWithdrawn,
     CorrectionApplied,
     EncodingFailed,
     Fact,
@@ -34,6 +35,8 @@ def sentence_of(event: Reported[Fact]) -> str | None:
             return f"no longer hears {fact.peer}"
         case ClosureAccepted():
             return f"closure {fact.query} – {fact.match}, match ratio {fact.ratio:.2f}"
+        case ClosureWithdrawn():
+            return f"took back closure {fact.query} – {fact.match}{', registers it again' if fact.again else ''}"
         case ClosureRejected():
             return f"rejected {fact.query} – {fact.match}: {fact.reason}"
         case CorrectionApplied():

@@ -274,20 +274,24 @@ def infos(path: Path, format_name: str | None = None, form: str | None = None) -
     """Look at what a path holds: one data set, bag or video, or those of a team in a folder.
 
     Raises:
-        DatasetError: Nothing that is known is there.
+        DatasetError: Nothing that is known is there; or, after all others of a team, some of it cannot be used.
     """
     team = team_folder(path) if format_name is None else {}
     if not team:
         yield info(path, format_name, form)
         return
-    for entry in team.values():
+    unusable = []
+    for robot, entry in team.items():
         try:
             yield info(entry, None, form)
         except FloccError as error:
             logger.warning("%s", error)
+            unusable.append(robot)
     others = not_taken(path, team)
     if others:
         logger.warning("%s: not taken, because they are no data set, bag or video: %s", path, ", ".join(others[:12]))
+    if unusable:
+        raise DatasetError(f"{path}: {len(unusable)} of {len(team)} robots cannot be used: {', '.join(unusable[:12])}")
 
 
 def clock(path: Path, odometry: Path | None = None, camera: Path | None = None, form: str | None = None) -> ClockFit:

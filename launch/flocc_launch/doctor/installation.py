@@ -15,7 +15,7 @@ from flocc_agent.extras import to_install
 from flocc_agent.perception.backends import OWN, PerceptionError, check_perception, methods
 from flocc_launch.doctor.finding import Finding, Severity, good
 from flocc_launch.doctor.network_check import configured_network, discovery, ports
-from flocc_launch.setup.cache import CacheError, cache_folder, can_be_written
+from flocc_launch.setup.cache import CacheError, cache_folder
 from flocc_protocol.errors import FloccError
 
 DISK_FREE_BYTES_MIN = 2_000_000_000
@@ -164,13 +164,10 @@ def surroundings(folder: Path) -> list[Finding]:
     try:
         cache = cache_folder()
     except CacheError as error:
-        found.append(Finding("cache", Severity.BLOCKS, f"{str(error).rstrip('.')}.", "Set FLOCC_CACHE to a folder."))
+        advice = "Set FLOCC_CACHE to a folder that can be written."
+        found.append(Finding("cache", Severity.BLOCKS, f"{str(error).rstrip('.')}.", advice))
     else:
-        if not can_be_written(cache):
-            advice = "Set FLOCC_CACHE to a folder that can be written."
-            found.append(Finding("cache", Severity.BLOCKS, f"The cache {cache} cannot be written.", advice))
-        else:
-            found.append(good("cache", f"Generated data is kept in {cache}."))
+        found.append(good("cache", f"Generated data is kept in {cache}."))
     if locale.getpreferredencoding(False).lower().replace("-", "") != "utf8":
         sentence = f"The locale's encoding is {locale.getpreferredencoding(False)}; flocc reads and writes UTF-8."
         found.append(Finding("locale", Severity.NOTE, sentence, "Set LC_ALL=C.UTF-8 for names with umlauts."))

@@ -3,10 +3,13 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected, Fact
+from flocc_agent.core.reports import CandidateFound, ClosureAccepted, ClosureRejected, ClosureWithdrawn, Fact
 from flocc_agent.runtime.event_lines import Reported
 from flocc_agent.runtime.robot_result import RobotResult
 from flocc_protocol.ids import KeyframeId
+
+PairFact = CandidateFound | ClosureAccepted | ClosureRejected | ClosureWithdrawn
+WITHDRAWN = "its robot took back a keyframe that showed what is not the scene"
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +22,7 @@ class Pair:
         similarity: Best cosine similarity that a robot found, None where none was reported.
         ratio: Match ratio of Eq. (1), None where registration gave none.
         probability: Of Eq. (2), for accepted pairs.
-        accepted: Whether some robot accepted it.
+        accepted: Whether some robot accepted it, and it counts.
         reason: Why it was rejected last, None where it was not.
         at_s: When it was accepted or rejected first, None where neither.
         used: Whether the last solution used it; None where it is not known (no scales are estimated).
@@ -50,7 +53,7 @@ def pairs_of(events: Iterable[Reported[Fact]], results: Iterable[RobotResult]) -
     """Every pair that any robot found, registered or holds in its logs at the end; sorted."""
     pairs: dict[tuple[KeyframeId, KeyframeId], Pair] = {}
     for event in events:
-        if isinstance(event.fact, CandidateFound | ClosureAccepted | ClosureRejected):
+        if isinstance(event.fact, PairFact):
             query, match = event.fact.query, event.fact.match
             key = (min(query, match), max(query, match))
             pairs[key] = updated(pairs.get(key, Pair(query, match)), event.fact, event.t)
@@ -65,10 +68,12 @@ def pairs_of(events: Iterable[Reported[Fact]], results: Iterable[RobotResult]) -
     return [pairs[key] for key in sorted(pairs)]
 
 
-def updated(pair: Pair, fact: CandidateFound | ClosureAccepted | ClosureRejected, t: float) -> Pair:
-    """The pair after one more fact; an acceptance stands whatever comes later."""
+def updated(pair: Pair, fact: PairFact, t: float) -> Pair:
+    """The pair after one more fact; an acceptance stands until a robot takes its keyframe back."""
     if isinstance(fact, CandidateFound):
         return replace(pair, similarity=max(fact.similarity, pair.similarity or -1.0))
+    if isinstance(fact, ClosureWithdrawn):
+        return replace(pair, accepted=False, reason=WITHDRAWN)
     if pair.accepted:
         return pair
     if isinstance(fact, ClosureRejected):

@@ -24,6 +24,7 @@ from flocc_protocol.records import (
     Record,
     RejectionRecord,
     UnknownRecord,
+    WithdrawalRecord,
 )
 
 ROBOTS_MAX = 256
@@ -44,7 +45,7 @@ class Heard:
 
     def record(self, log: LogId, record: Record, t: float) -> Reported[Fact] | None:
         """What a log's next record tells of; None where people need not know."""
-        if isinstance(record, MeasurementRecord | LatentRecord | UnknownRecord):
+        if isinstance(record, MeasurementRecord | LatentRecord | WithdrawalRecord | UnknownRecord):
             return None
         match record:
             case KeyframeRecord(index, stamp_s, T_odom_camera):

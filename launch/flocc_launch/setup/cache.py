@@ -20,6 +20,8 @@ def cache_folder() -> Path:
     """
     given = os.environ.get("FLOCC_CACHE")
     if given:
+        if not can_be_written(Path(given)):
+            raise CacheError(f"{given}: cannot be written; FLOCC_CACHE names this folder for what flocc generates")
         return Path(given)
     usual = next((folder for folder in _usual_caches() if can_be_written(folder)), None)
     if usual is not None:

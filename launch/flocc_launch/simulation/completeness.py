@@ -136,8 +136,7 @@ def _all_copies(swarm: Swarm, group: list[Station]) -> list[LogCopy]:
 
 def resolved_pairs(logs: Iterable[LogCopy]) -> set[CandidatePair]:
     """Pairs of which some log has a record."""
-    records = (record for copy in logs for record in copy.other_records())
-    return {CandidatePair.of(r.query, r.match) for r in records if isinstance(r, ClosureRecord | RejectionRecord)}
+    return {CandidatePair.of(record.query, record.match) for copy in logs for _, record in copy.judgements()}
 
 
 def closures_by_logs(logs: Iterable[LogCopy]) -> dict[tuple[LogId, LogId], set[CandidatePair]]:

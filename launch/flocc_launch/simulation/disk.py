@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from flocc_agent.core.log_copy import EncodedRecords
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.restored import Restored
 from flocc_agent.runtime.map_folder import MapFolder
 from flocc_agent.runtime.persistence import COPIES_PERIOD_S, joined_logs
 from flocc_protocol.ids import KeyframeId, LogId
@@ -87,9 +87,10 @@ class Disk:
             self.latent_bytes -= len(self.latents.pop(oldest))
 
     def replace_latent(self, keyframe: KeyframeId, latent: bytes) -> None:
-        """Keep another latent in the place of one that is there."""
-        self.latent_bytes += len(latent) - len(self.latents[keyframe])
-        self.latents[keyframe] = latent
+        """Keep another latent in the place of one that is there, where one is."""
+        if keyframe in self.latents:
+            self.latent_bytes += len(latent) - len(self.latents[keyframe])
+            self.latents[keyframe] = latent
 
     def latent(self, keyframe: KeyframeId) -> bytes | None:
         """A latent of its own, or of the map."""

@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-CACHE_FORM = b"5"
+CACHE_FORM = b"6"
 """Changes with what a file of the cache holds."""
 
 
@@ -111,17 +111,17 @@ def _packed_look(looked: KeyframeLook) -> list[Any]:
     descriptor = None if d is None else [d.dtype, list(d.shape), d.data, d.scale]
     doubts = [[d.doubt, d.amount, d.where, d.pairs, d.withheld] for d in looked.doubts]
     hidden = None if looked.hidden is None else [list(looked.hidden.shape), np.packbits(looked.hidden).tobytes()]
-    return [descriptor, looked.latent, looked.fault, doubts, hidden]
+    return [descriptor, looked.latent, looked.fault, doubts, hidden, looked.withdrawn]
 
 
 def _looked(packed: list[Any]) -> KeyframeLook:
-    descriptor, latent, fault, doubts, hidden = packed
+    descriptor, latent, fault, doubts, hidden, withdrawn = packed
     array = None if descriptor is None else Array(descriptor[0], tuple(descriptor[1]), *descriptor[2:])
     told = tuple(
         CameraDoubted(doubt=doubt, amount=amount, where=where, pairs=n, withheld=withheld)
         for doubt, amount, where, n, withheld in doubts
     )
-    return KeyframeLook(array, latent, fault, told, None if hidden is None else _mask(*hidden))
+    return KeyframeLook(array, latent, fault, told, None if hidden is None else _mask(*hidden), withdrawn)
 
 
 def _mask(shape: list[int], data: bytes) -> Mask:

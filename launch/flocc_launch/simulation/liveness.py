@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from flocc_agent.core.pose_graph import components_of, map_frame
+from flocc_agent.runtime.reporting import counted
 from flocc_launch.simulation.invariants import core, groups, names
 from flocc_launch.simulation.swarm import Swarm
 from flocc_launch.simulation.virtual_robot import Station
@@ -80,7 +81,7 @@ def _unused_closures(leader: Station) -> Iterator[str]:
     known = set() if leader.solution is None else {CandidatePair.of(c.query, c.match) for c in leader.solution.closures}
     logs = core(leader).gossip.logs
     keyframes = {log: copy.keyframes for log, copy in logs.items()}
-    for record in (record for copy in logs.values() for record in copy.other_records()):
+    for record in counted(core(leader)):
         if not isinstance(record, ClosureRecord) or CandidatePair.of(record.query, record.match) in known:
             continue
         if all(end.index < keyframes.get(end.log, 0) for end in (record.query, record.match)):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from flocc_agent.budget import Budget
 from flocc_agent.core.effects import FetchLatent
 from flocc_agent.core.events import LATENT_UNKNOWN, Event, LatentFetched, LatentFetchFailed
+from flocc_agent.runtime.jobs import keep_fetched
 from flocc_launch.simulation.agenda import Agenda
 from flocc_launch.simulation.virtual_network import Network
 from flocc_launch.simulation.virtual_robot import Station
@@ -138,7 +139,7 @@ class _FetchUnderWay:
             self.ask()
             return
         fetcher._arrived.pop((self._asker.name, keyframe), None)
-        self._asker.disk.put_latent(keyframe, latent)
+        keep_fetched(keyframe, latent, self._asker.disk)
         self._asker.workers.stages.observe("fetch", fetcher._agenda.now_s - self._began_s)
         self._finish(LatentFetched(keyframe, self._job.holder))
 

@@ -31,7 +31,7 @@ from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep
 from flocc_agent.core.pose_graph import GraphSolution, OptimisationFailed, PoseGraph
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.geometry import pose_from_tq
-from flocc_agent.runtime.jobs import hide_in_earlier
+from flocc_agent.runtime.jobs import hide_in_earlier, withdrawn_by
 from flocc_agent.stages import StageTimes
 from flocc_launch.simulation.disk import Disk
 from flocc_launch.simulation.virtual_playback import Capture
@@ -138,12 +138,12 @@ class VirtualWorkers:
             looked = self._watch.look(capture, pose_from_tq(np.array(T_odom_camera)))
         except FloccError as error:
             return KeyframeEncodingFailed(keyframe, str(error))
+        hide_in_earlier(keyframe, looked, self._eyes.without, disk)
+        withdrawn = withdrawn_by(looked)
         if looked.descriptor is None or looked.latent is None:
-            return KeyframeEncodingFailed(keyframe, looked.fault, looked.doubts)
-        if looked.hidden is not None:
-            hide_in_earlier(keyframe, looked.hidden, self._eyes.without, disk)
+            return KeyframeEncodingFailed(keyframe, looked.fault, looked.doubts, withdrawn)
         disk.put_latent(keyframe, looked.latent)
-        return KeyframeEncoded(keyframe, looked.descriptor, looked.doubts)
+        return KeyframeEncoded(keyframe, looked.descriptor, looked.doubts, withdrawn=withdrawn)
 
     def register(self, job: Register, disk: Disk) -> Event:
         """Register a pair, or say which latent is missing."""

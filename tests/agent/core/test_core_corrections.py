@@ -18,7 +18,8 @@ from flocc_agent.core.peer_budgets import MUTED_FIRST_S
 from flocc_agent.core.pose_graph import Component, GraphSolution
 from flocc_agent.core.pulls import REMEMBERED_MAX
 from flocc_agent.core.reports import CorrectionApplied, PeerRefused
-from flocc_agent.core.robot import Restored, Robot
+from flocc_agent.core.restored import Restored
+from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import Float, pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.errors import DecodeError

@@ -21,7 +21,7 @@ from flocc_agent.core.election import (
 from flocc_agent.core.events import Leaving, MessageReceived
 from flocc_agent.core.parameters import CoreParameters, ElectionParameters
 from flocc_agent.core.reports import PeerRefused
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.restored import Restored
 from flocc_protocol.ids import TERM_COUNTER_MAX, LogId, Term
 from flocc_protocol.messages import Answer, Coordinator, Election, Envelope, Handover, Heartbeat, LeaderAdvert
 

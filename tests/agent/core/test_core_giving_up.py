@@ -9,7 +9,8 @@ from flocc_agent.core.giving_up import LOOK_PERIOD_S, SILENT_S
 from flocc_agent.core.gossip import LIVES_MAX, Gossip
 from flocc_agent.core.parameters import CoreParameters, GossipParameters
 from flocc_agent.core.reports import LogGivenUp
-from flocc_agent.core.robot import Restored, Robot
+from flocc_agent.core.restored import Restored
+from flocc_agent.core.robot import Robot
 from flocc_protocol.arrays import Array
 from flocc_protocol.digests import Digests, LogDigest
 from flocc_protocol.heartbeats import Heartbeat

@@ -58,12 +58,12 @@ def test_without_keys_no_record_is_spent_on_it(monkeypatch: pytest.MonkeyPatch) 
     )
 
 
-def test_the_first_record_of_a_keyframe_counts_and_absurd_ones_take_no_memory() -> None:
+def test_the_last_record_of_a_keyframe_counts_and_absurd_ones_take_no_memory() -> None:
     names, one = LatentNames(), keyframe("r1/2")
     records = {3: LatentRecord(2, b"a" * 32), 4: LatentRecord(2, b"b" * 32), 5: LatentRecord(2**30, b"c" * 32)}
     names.record_at = lambda log, number: records[number]
     for number, record in records.items():
         names.add(KeyframeId(one.log, record.index), number)
-    assert names.of(one) == records[3]
+    assert names.of(one) == records[4]
     assert names.of(KeyframeId(one.log, 2**30)) is None
     assert names.of(keyframe("r1/1")) is None

@@ -11,7 +11,7 @@ from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.parameters import CoreParameters, NeighbourParameters
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.reports import LogForked, NameTaken, NeighbourDown, NeighbourRestarted, NeighbourUp, PeerRefused
-from flocc_agent.core.robot import Restored
+from flocc_agent.core.restored import Restored
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidateOffer, CandidatePair, Envelope, Heartbeat, Records

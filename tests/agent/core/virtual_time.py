@@ -29,7 +29,8 @@ from flocc_agent.core.events import (
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import map_frame
 from flocc_agent.core.registration import Registration
-from flocc_agent.core.robot import Restored, Robot
+from flocc_agent.core.restored import Restored
+from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose, pose7
 from flocc_launch.simulation.rigid_alignment import align
 from flocc_protocol.arrays import Array

@@ -349,6 +349,10 @@ def test_an_overlay_is_told_once_and_left_out_from_then_on() -> None:
     assert isinstance(doubts[0], CameraDoubted)
     assert doubts[0].where == "bottom"
     assert 0.25 < doubts[0].amount < 0.45
+    assert [(look.withdrawn, look.hidden is None) for look in looks] == [
+        (k, False) if looks[k].doubts else (0, True)
+        for k in range(10)  # all keyframes before it show it
+    ]
     assert looks[-1].latent is not None
     from flocc_agent.perception.classical.encoder import decode_features
 

@@ -7,12 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from flocc_agent.config import ClassicalConfig, PerceptionConfig, StoreConfig
-from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.core.events import Withdrawn
+from flocc_agent.core.interfaces import Camera, Image, KeyframeLook
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.perception.classical import ClassicalEncoder
 from flocc_agent.perception.classical.encoder import decode_features
 from flocc_agent.perception.multiview.picture import distorted, undistorted
-from flocc_agent.runtime.jobs import EARLIER_MAX, hide_in_earlier
+from flocc_agent.runtime.jobs import hide_in_earlier, keep_fetched, withdrawn_by
 from flocc_agent.runtime.store import Store
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -57,9 +58,16 @@ def test_earlier_latents_of_the_same_log_lose_what_is_hidden(tmp_path: Path) -> 
     for index, latent in kept.items():
         store.put_latent(KeyframeId(LOG, index), latent)
     store.put_latent(KeyframeId(LogId("r2"), 1), b"of another")
-    hide_in_earlier(KeyframeId(LOG, 69), right_half(), lambda latent, _: latent[:2], store)
+    looked = KeyframeLook(None, None, hidden=right_half(), withdrawn=64)
+    made_anew = hide_in_earlier(KeyframeId(LOG, 69), looked, lambda latent, _: latent[:2], store)
     left = {index: store.latent(KeyframeId(LOG, index)) for index in kept}
-    assert EARLIER_MAX == 64
+    assert made_anew == [b"5 ", *[b""] * 63]
+    assert withdrawn_by(looked, ()) == Withdrawn(64)
+    assert hide_in_earlier(KeyframeId(LOG, 69), KeyframeLook(None, None), lambda latent, _: latent, store) == []
     assert left == {0: kept[0], 1: kept[1], 5: b"5 ", 70: kept[70]}
     assert store.latent(KeyframeId(LogId("r2"), 1)) == b"of another"
+    keep_fetched(KeyframeId(LogId("r2"), 1), b"made anew by the other", store)
+    keep_fetched(KeyframeId(LogId("r2"), 2), b"new", store)
+    assert store.latent(KeyframeId(LogId("r2"), 1)) == b"made anew by the other"
+    assert store.latent(KeyframeId(LogId("r2"), 2)) == b"new"
     store.close()

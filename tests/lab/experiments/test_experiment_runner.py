@@ -128,7 +128,9 @@ def test_ctrl_c_ends_the_cells_that_run_in_other_processes(tmp_path: Path) -> No
     code = (
         "from pathlib import Path; from tests.lab.experiments.toy_experiment import *;"
         "from flocc_lab.experiments.runner import run_experiment\n"
+        "import signal\n"
         "if __name__ == '__main__':\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # whatever started the tests may ignore it
         "    try: run_experiment(TOY, ToySettings(waits_at=2), 5, Path(__import__('sys').argv[1]), 2)\n"
         "    except Exception as error: print(error)\n"
     )

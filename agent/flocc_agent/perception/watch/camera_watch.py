@@ -39,6 +39,8 @@ JUDGED_AT = (5, 6, 7, 8, 10, 12, 15, 18, 20, 25, 30)
 """Numbers of pairs at which the camera is judged."""
 EVERY_LATER = 4
 """Of later pairs every fourth is looked at, and every fourth of these is judged."""
+WITHDRAWN_MAX = PAIRS_MAX * EVERY_LATER
+"""Keyframes that a verdict takes back: those whose pairs it rests on."""
 REPEATS_TOLD = (2, 10, 50, 250)
 """A single repeated picture is a hiccup."""
 OVERLAY_MIN_RATIO = 0.004
@@ -78,6 +80,7 @@ class CameraWatch:
         self._repeats = 0
         self._told: list[CameraDoubted] = []
         self._withheld = False
+        self._looked = 0
 
     def look(self, perception: Perception, image: Image, T_odom_camera: Float) -> KeyframeLook:
         """Describe and encode the next keyframe's image as far as it shows the scene, and tell what is odd about it.
@@ -88,6 +91,8 @@ class CameraWatch:
             T_odom_camera: (4, 4) by odometry, metres.
         """
         doubts = []
+        earlier, was_withheld = min(self._looked, WITHDRAWN_MAX), self._withheld
+        self._looked += 1
         if isinstance(perception.registrar, SeesFlow):
             with stage("watch"):
                 repeats = self._look_at(image, T_odom_camera)
@@ -105,8 +110,9 @@ class CameraWatch:
             with stage("watch"):
                 doubts += self._motion(perception.registrar, latent, T_odom_camera)
         if self._withheld:
-            return KeyframeLook(None, None, WITHHELD, tuple(doubts))
-        return KeyframeLook(descriptor, latent, "", tuple(doubts), image.hidden if told else None)
+            return KeyframeLook(None, None, WITHHELD, tuple(doubts), withdrawn=0 if was_withheld else earlier)
+        hidden = image.hidden if told else None
+        return KeyframeLook(descriptor, latent, "", tuple(doubts), hidden, 0 if hidden is None else earlier)
 
     def _look_at(self, image: Image, T_odom_camera: Float) -> bool:
         """Take the picture in; whether it repeats an earlier one."""
