@@ -115,7 +115,7 @@ def cut_off(rng: Rng, folder: Path) -> Trap:
                 ("/cam", {"data": base64.b64encode(pixels).decode(), "format": "png"}),
             ):
                 writer.add_message(channels[topic], ns, json.dumps({**head, **told}).encode(), ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     whole = path.read_bytes()
     share = float(rng.choice([0.5, 0.7, 0.9, 0.99, 1.0]))
     path.write_bytes(whole[: round(share * len(whole))])

@@ -35,7 +35,7 @@ from flocc_protocol.errors import FloccError
 
 POSES = (8, 120)
 SURFACES = ("as it is", "BOM", "UTF-16", "CRLF", "old Mac", "tabs", "semicolons", "decimal commas", "comments", "blank")
-UNITLESS = ("OKVIS", "LaMAR", "ZED")
+UNITLESS = ("OKVIS", "LaMAR", "ZED", "Kimera")
 """Forms whose header names no unit: stamps say it themselves where they count from 1970."""
 FAULTS = ("nan", "word", "short", "zero quaternion", "duplicate", "step back")
 
