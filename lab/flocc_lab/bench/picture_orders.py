@@ -45,7 +45,7 @@ BETTER_TRIED = np.arange(1.25, 6.01, 0.25)
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class OrderWindow:
     """What pictures of one window say of a trajectory that was read in one of three orders.
 
     Attributes:
@@ -74,7 +74,7 @@ class Window:
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
+class OrdersSeen:
     """A recording's windows.
 
     Attributes:
@@ -85,7 +85,7 @@ class Looked:
     """
 
     name: str
-    windows: tuple[Window, ...]
+    windows: tuple[OrderWindow, ...]
     silent: int
     doubts: tuple[str, ...]
 
@@ -95,13 +95,13 @@ class Looked:
         return false, sum(w.is_wrong(*thresholds) for w in self.windows if w.places)
 
 
-def windows_of(source: Source, limit: int) -> Looked:
+def windows_of(source: Source, limit: int) -> OrdersSeen:
     """Windows from all over a recording, in each of three orders."""
     trajectory = source.odometry or source.truth
     assert trajectory is not None
     starts = range(0, max(len(source.images) - WINDOW // 2, 1), WINDOW)
     chosen = [starts[k] for k in np.unique(np.linspace(0, len(starts) - 1, min(limit, len(starts))).astype(int))]
-    windows, silent, doubts = list[Window](), 0, list[str]()
+    windows, silent, doubts = list[OrderWindow](), 0, list[str]()
     for start in chosen:
         part = replace(source, images=source.images[start : start + WINDOW])
         pairs = posed_pairs(part, trajectory) or []
@@ -112,10 +112,10 @@ def windows_of(source: Source, limit: int) -> Looked:
         verdict = verdict_of(pairs)
         if verdict is not None and verdict.camera is not None:
             doubts.append(verdict.camera.fault.value)
-    return Looked(source.path.name, tuple(windows), silent, tuple(doubts))
+    return OrdersSeen(source.path.name, tuple(windows), silent, tuple(doubts))
 
 
-def _window(pairs: Sequence[PosedPair], places: int) -> Window:
+def _window(pairs: Sequence[PosedPair], places: int) -> OrderWindow:
     seen = [WatchedPair(pair.flow).motion(1.0, False) for pair in pairs]
 
     def left(moved: int) -> Float:
@@ -124,10 +124,10 @@ def _window(pairs: Sequence[PosedPair], places: int) -> Window:
         ]
         return least_costs(motions_of(seen, given))
 
-    return Window(places, left(places), {order: left(places + order) for order in ORDERS})
+    return OrderWindow(places, left(places), {order: left(places + order) for order in ORDERS})
 
 
-def chosen_on(looked: Sequence[Looked]) -> tuple[float, float]:
+def chosen_on(looked: Sequence[OrdersSeen]) -> tuple[float, float]:
     """The middle of the thresholds with the fewest false words, and of those with the fewest misses."""
     tried = [(float(a), float(b)) for a, b in product(WRONG_TRIED, BETTER_TRIED)]
     costs = [tuple(np.sum([each.wrong(pair) for each in looked], axis=0).tolist()) for pair in tried]
@@ -135,7 +135,7 @@ def chosen_on(looked: Sequence[Looked]) -> tuple[float, float]:
     return float(np.median(best[:, 0])), float(np.median(best[:, 1]))
 
 
-def told(looked: Sequence[Looked]) -> dict[str, object]:
+def told(looked: Sequence[OrdersSeen]) -> dict[str, object]:
     """A row for each recording: how it fares with flocc's thresholds, and with those chosen without it."""
     rows: dict[str, object] = {}
     for each in looked:
