@@ -63,7 +63,7 @@ def plots(rng: np.random.Generator) -> list[Plot]:
 
 
 def alike(seed: int) -> list[tuple[int, Plot]]:
-    """Plots of a town whose blocks all follow one plan, each with the number of its house's kind; fronts are in line."""
+    """Plots of a town whose blocks follow one plan, each with the number of its house's kind; fronts are in line."""
     blocks = [(column, row) for column in range(COLUMNS) for row in range(ROWS) if (column, row) != SQUARE]
     found = [
         (kind, plot)
