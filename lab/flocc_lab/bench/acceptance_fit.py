@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.core.registration import match_ratio
+from flocc_agent.perception.classical import sift_registrar as classical_registrar
+from flocc_agent.perception.learned import acceptance_by_model
 from flocc_agent.perception.multiview.acceptance import (
     NEVER,
     RATIO_CORRESPONDENCES_MIN,
@@ -20,8 +22,6 @@ from flocc_agent.perception.multiview.acceptance import (
     Needed,
     OdometryNeighbour,
 )
-from flocc_agent.perception.classical import sift_registrar as classical_registrar
-from flocc_agent.perception.learned import acceptance_by_model
 from flocc_lab.bench.acceptance_rows import ANGLES_DEG, AcceptanceRow
 
 ALONE = (15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, NEVER)
