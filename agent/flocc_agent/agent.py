@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import signal
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Eyes, compose, recording_of
+from flocc_agent.composition import Sight, compose, recording_of
 from flocc_agent.config import AgentConfig, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Camera, Image, Perception
@@ -58,6 +59,10 @@ class JourneyError(FloccError):
     """Another journey cannot begin here."""
 
 
+class NotRunning(FloccError, RuntimeError):
+    """The agent was not started, has stopped or failed, or is spoken to from another thread than its own."""
+
+
 class Agent:
     """One robot's agent, for the robot's own program.
 
@@ -87,7 +92,8 @@ class Agent:
             config: Everything that can be turned.
             camera: Intrinsics of the images; None where a recording brings its own.
             T_body_camera: (4, 4) where the camera sits on the body; None is the identity.
-            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block.
+            on_report: Takes each fact that the agent tells (`core/reports.py`); must not block. What it raises is
+                logged, and the agent goes on.
             clock_s: Seconds since the start of the run; None counts from now.
             perception: What it sees with; None builds what `config.perception` names.
             map_fixed: The map of `config.map` does not move, whatever is measured in it.
@@ -101,7 +107,7 @@ class Agent:
         """
         started_s = time.monotonic()
         self.config = config
-        self._on_report = on_report or (lambda _: None)
+        self._on_report = _guarded(on_report, config.name)
         self._clock_s = clock_s or (lambda: time.monotonic() - started_s)
         self._perception = perception
         self._map_fixed = map_fixed
@@ -126,6 +132,8 @@ class Agent:
         self._workers: Workers | None = None
         self._before: Float | None = None
         self._renewal = asyncio.Lock()
+        self._entered = False
+        self._thread = 0
 
     @property
     def log(self) -> LogId:
@@ -133,7 +141,14 @@ class Agent:
         return self._started.robot.log
 
     async def __aenter__(self) -> "Agent":
-        """Open the store and the network, restore what the disk holds, start the loop and the playback."""
+        """Open the store and the network, restore what the disk holds, start the loop and the playback.
+
+        Raises:
+            RuntimeError: It runs already.
+        """
+        if self._entered:
+            raise RuntimeError(f"robot {self.config.name}: this agent runs already; one Agent is one robot")
+        self._entered, self._thread = True, threading.get_ident()
         try:
             say_how_others_are_found(self.config)
             self._driver = await asyncio.to_thread(self._compose)
@@ -180,7 +195,9 @@ class Agent:
 
         Raises:
             JourneyError: There is no folder to keep the earlier journey in, or frames do not come from this program.
+            NotRunning: The agent has not started, or has ended.
         """
+        self._require_running()
         if self.config.folder is None or self._recording is not None or self._ros2 is not None:
             reason = "has no folder (the key 'folder') that keeps what it did so far"
             fed = "is fed by a recording or by ROS 2, which begin journeys themselves"
@@ -222,6 +239,7 @@ class Agent:
         Raises:
             BadKeyframe: The pose is not finite and rigid, over 10000 km from the origin, faster than 1 km/s or not
                 newer than the one before; the image does not fit the camera, or there is no camera.
+            NotRunning: The agent has not started, or has ended.
         """
         self._check(T_odom_body, stamp_s)
         await self._journey_of(T_odom_body)
@@ -237,6 +255,7 @@ class Agent:
 
         Raises:
             BadKeyframe: As `add_keyframe`, of every frame.
+            NotRunning: The agent has not started, or has ended.
         """
         self._check(T_odom_body, stamp_s)
         await self._journey_of(T_odom_body)
@@ -250,6 +269,7 @@ class Agent:
 
     def _check(self, T_odom_body: Float, stamp_s: float) -> None:
         """Refuse a pose that cannot be; what is measured next then belongs to no keyframe."""
+        self._require_running()
         self._kept = False
         if self._camera is None:
             raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
@@ -294,7 +314,11 @@ class Agent:
 
         Raises:
             BadMeasurement: No keyframe has that stamp, the last frame did not become one, or no log may hold it.
+            NotRunning: The agent has not started, or has ended.
         """
+        self._require_running()
+        if not isinstance(measurement, Measurement):
+            raise self._named(BadMeasurement(f"{type(measurement).__name__} is no measurement"))
         try:
             in_camera = measurement.in_camera(self._T_body_camera)
             if stamp_s is None and not self._kept and not isinstance(measurement, StartPose):
@@ -313,8 +337,11 @@ class Agent:
         while self._started is not lived:
             lived = self._started
             queue = lived.subscribe()
-            while (correction := await queue.get()) is not None:
-                yield correction
+            try:
+                while (correction := await queue.get()) is not None:
+                    yield correction
+            finally:
+                lived.unsubscribe(queue)
             await self._while_journey_begins()
 
     async def _while_journey_begins(self) -> None:
@@ -386,8 +413,27 @@ class Agent:
     @property
     def _started(self) -> Driver:
         if self._driver is None:
-            raise RuntimeError("the agent is not running; use it in 'async with'")
+            raise NotRunning("the agent is not running; use it in 'async with'")
         return self._driver
+
+    def _require_running(self) -> None:
+        """Refuse what nobody would take in any more.
+
+        Raises:
+            NotRunning: The agent has not started, or has ended; or this is not its loop's thread.
+        """
+        driver, name = self._started, self.config.name
+        if threading.get_ident() != self._thread:
+            hint = "use asyncio.run_coroutine_threadsafe, or the loop's call_soon_threadsafe"
+            raise NotRunning(f"robot {name}: its agent runs on another thread; {hint}")
+        if self._renewal.locked():
+            return
+        if self._run is not None and self._run.done() and not self._run.cancelled():
+            error = self._run.exception()
+            if error is not None:
+                raise NotRunning(f"robot {name}: its agent has failed: {error}") from error
+        if driver.is_stopping:
+            raise NotRunning(f"robot {name}: its agent has stopped, and takes nothing more")
 
     def _compose(self) -> Driver:
         """Make everything that this agent is of, and keep what is reached later."""
@@ -396,7 +442,7 @@ class Agent:
         answers: dict[Admin, Callable[[bytes], bytes]] = {Admin.STATUS: self._answer_status}
         if self.config.transport.chaos:
             answers[Admin.CHAOS] = self._disturb
-        eyes = Eyes(
+        sight = Sight(
             self._perception,
             self._camera,
             self._T_body_camera,
@@ -404,7 +450,7 @@ class Agent:
         )
         parts = compose(
             self.config,
-            eyes,
+            sight,
             self._clock_s,
             self._on_report,
             answers,
@@ -513,10 +559,24 @@ class Agent:
             self._radio.update_position(self.config.name, position_m)
 
     async def _close(self) -> None:
+        self._entered = False
         if self._metrics is not None:
             await self._metrics.close()
         if self._store is not None:
             self._store.close()
+
+
+def _guarded(on_report: Callable[[Reported[Fact]], None] | None, robot: str) -> Callable[[Reported[Fact]], None]:
+    """What a program does with facts, whose errors are its own and end no agent."""
+
+    def told(reported: Reported[Fact]) -> None:
+        try:
+            if on_report is not None:
+                on_report(reported)
+        except Exception:
+            logger.exception("robot %s: on_report failed; the agent goes on", robot)
+
+    return told
 
 
 def _mounting(T_body_camera: Float, robot: str) -> Float:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.agent.runtime.loopback import loopback_configs, until
+from typer.testing import CliRunner
 
 from flocc_agent.config import TlsConfig, TransportConfig
 from flocc_agent.runtime.certificate_faults import certificate_faults
@@ -17,6 +18,7 @@ from flocc_agent.runtime.transport import FetchFailed, FetchProblem, TransportEr
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_session import Plane, open_session, session_settings
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
+from flocc_launch.commands.main import app
 from flocc_launch.setup.credentials import KeysError, make_keys
 from flocc_protocol.errors import DecodeError
 from flocc_protocol.ids import LogId
@@ -53,6 +55,16 @@ def test_admits_more_robots_without_touching_those_that_are_there(tmp_path: Path
     assert list(both) == ["operator", "r1", "r2"]
     lists = [json.loads((folder / "members.json").read_bytes()) for folder in both.values()]
     assert [sorted(content["robots"]) for content in lists] == [["r1", "r2"]] * 3
+
+
+def test_a_robot_has_a_name_of_its_own_and_a_class_of_one_digit(tmp_path: Path) -> None:
+    make_keys(tmp_path, SWARM, ["r1"])
+    for robots, operators in ((["authority"], ()), (["operator"], ()), (["r2"], ["r1"])):
+        with pytest.raises(KeysError, match=r"no robot can be named '(authority|operator|r1)' here"):
+            make_keys(tmp_path, SWARM, robots, operators)
+    told = CliRunner().invoke(app, ["keys", str(tmp_path), "r1=12"])
+    assert told.exit_code == 2
+    assert "a compute class is a number from 0 to 9" in told.output
 
 
 def test_the_list_of_members_says_compute_classes_once_one_is_given(tmp_path: Path) -> None:

@@ -144,7 +144,9 @@ def test_the_verdict_says_what_became_of_the_maps(tmp_path: Path) -> None:
 
 def test_the_verdict_does_not_hide_a_correction_that_did_not_help(tmp_path: Path) -> None:
     report = html_of(tmp_path)[1].model_copy(update={"ate_joint_m": 2.0})
-    assert verdict(report).endswith("The joint error is 2.00 m, not better than odometry alone (1.64 m).")
+    assert verdict(report).endswith(
+        "The joint error is 2.00 m: not less than odometry put at the true starts (1.64 m), which no robot knows."
+    )
     between = {"ate_joint_m": 1.0, "ate_joint_odometry_aligned_m": 0.9}
     assert verdict(report.model_copy(update=between)).endswith(
         "The joint error is 1.00 m: less than odometry from its true starts (1.64 m), "

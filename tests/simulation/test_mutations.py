@@ -10,7 +10,7 @@ from flocc_agent.core import corrections as corrections_module
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.effects import Broadcast, Deliver, Effect, Unicast
 from flocc_agent.core.election import LeaderElection
-from flocc_agent.core.latents import Latents
+from flocc_agent.core.latents import Relayed
 from flocc_agent.core.log_copy import EncodedRecords
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
@@ -173,11 +173,10 @@ def test_a_robot_that_sends_before_it_writes_loses_what_it_published(monkeypatch
 
 
 def test_a_table_without_a_maximum_breaks_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def hoard(self: Latents, wants: Any, now: float) -> bool:
-        self._relayed.update({KeyframeId(self._own, k): now for k in range(99)})
-        return True
+    def hoard(self: LoopClosing, peer: str, wants: Any, now: float) -> None:
+        self.latents._relayed.update({KeyframeId(self._own, k): Relayed(now, False) for k in range(99)})
 
-    monkeypatch.setattr(Latents, "on_wants", hoard)
+    monkeypatch.setattr(LoopClosing, "on_wants", hoard)
     assert "bounded" in broken(scenario())
 
 

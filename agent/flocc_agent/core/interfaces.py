@@ -5,6 +5,7 @@ arrays. Only the back-end that wrote a latent reads it, and it refuses another m
 """
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -31,6 +32,10 @@ class Camera:
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if not all(isinstance(side, Integral) for side in (self.width, self.height)):
+            raise ValueError(f"camera size {self.width!r}x{self.height!r} must be two whole numbers")
+        if len(self.distortion) != 4:
+            raise ValueError(f"camera distortion must be k1, k2, p1, p2, not {len(self.distortion)} numbers")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"camera size {self.width}x{self.height} must be positive")
         values = np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
@@ -59,6 +64,8 @@ class Image:
     up: Float | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.pixels, np.ndarray):
+            raise ValueError(f"image is no array but {type(self.pixels).__name__}")
         expected = (self.camera.height, self.camera.width, 3)
         if self.hidden is not None and (self.hidden.shape != expected[:2] or self.hidden.dtype != np.bool_):
             raise ValueError(f"hidden is {self.hidden.shape} {self.hidden.dtype}, its camera says {expected[:2]} bool")

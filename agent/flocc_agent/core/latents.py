@@ -7,8 +7,8 @@ In a swarm with keys the owner's log says what a latent is, so that a relay cann
 
 from array import array
 from bisect import insort
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 from flocc_agent.core.effects import Effect, FetchLatent
@@ -24,8 +24,15 @@ LOST_S = 30.0
 WANTS_TURN_S = 10.0
 WANTS_MAX = 8
 """Latents out of reach that are asked of relays at one time; a message carries 16."""
+WISHED_AGAIN_S = 2.5
+"""A wish is told again after so long only, or to a new neighbour: relays remember it."""
 RELAYS_MAX = 16
 """Latents kept for others at one time: the wants of two robots."""
+OFFERED_S = 20.0
+"""A latent that is here for others is told of for so long after somebody wished for it, after it came, and after one
+who wished came into range. Who lacks it still wishes again."""
+WISHERS_MAX = 16
+"""Robots of which it is remembered that they wished for one latent."""
 FALSE_MAX = 64
 """Of so many latents it is remembered that one robot in range served something else in their place."""
 BACKLOG_MAX = 64
@@ -158,6 +165,50 @@ class _Fetch:
         return self.not_before_s if self.in_flight_until_s is None else self.in_flight_until_s
 
 
+@dataclass(slots=True)
+class Relayed:
+    """A latent that others wished for.
+
+    Attributes:
+        wished_s: When somebody did so last.
+        is_here: Whether it came.
+        offered_until_s: Until when it is told of; None: from the next heartbeat on for `OFFERED_S`.
+        wishers: Who wished for it.
+    """
+
+    wished_s: float
+    is_here: bool
+    offered_until_s: float | None = None
+    wishers: dict[str, None] = field(default_factory=dict)
+
+    def is_awaited(self, now: float) -> bool:
+        """Whether it came, and somebody wished for it just now."""
+        return self.is_here and now < self.wished_s + WANTS_TURN_S
+
+    def is_offered(self, now: float) -> bool:
+        """Whether a heartbeat tells of it."""
+        if self.is_here and self.offered_until_s is None:
+            self.offered_until_s = now + OFFERED_S
+        return self.is_here and self.offered_until_s is not None and now < self.offered_until_s
+
+
+class WishesTold:
+    """Which of a robot's wishes a heartbeat tells."""
+
+    def __init__(self) -> None:
+        self._told_s: dict[KeyframeId, float] = {}
+
+    def on_reached(self) -> None:
+        """A robot came into range, and heard none."""
+        self._told_s.clear()
+
+    def due(self, wishes: Sequence[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
+        """Those that were not told for a while."""
+        due = tuple(k for k in wishes if self._told_s.get(k, float("-inf")) + WISHED_AGAIN_S <= now)
+        self._told_s = {**{k: self._told_s[k] for k in wishes if k not in due}, **dict.fromkeys(due, now)}
+        return due
+
+
 class LatentNames:
     """Where the logs say what a keyframe's latent is, as numbers of records; 0 where they do not."""
 
@@ -194,7 +245,7 @@ class Latents:
         self._parameters = parameters
         self._held = KeyframeSet()
         self._fetches: dict[KeyframeId, _Fetch] = {}
-        self._relayed: dict[KeyframeId, float] = {}
+        self._relayed: dict[KeyframeId, Relayed] = {}
         self._wished_s: dict[KeyframeId, float] = {}
         self._lost_until_s: dict[KeyframeId, float] = {}
         self._outdated: dict[KeyframeId, None] = {}
@@ -216,14 +267,19 @@ class Latents:
         """A latent is in this robot's store."""
         self._held.add(keyframe)
         self._fetches.pop(keyframe, None)
+        relayed = self._relayed.get(keyframe)
+        if relayed is not None:
+            relayed.is_here, relayed.offered_until_s = True, None
 
     def remove(self, keyframe: KeyframeId) -> None:
         """The store evicted a latent."""
         self._held.discard(keyframe)
+        if keyframe in self._relayed:
+            self._relayed[keyframe].is_here = False
 
     def on_withdrawn(self, keyframe: KeyframeId) -> None:
         """A latent was made anew by its owner: it is fetched again, and what a fetch under way brings is old."""
-        self._held.discard(keyframe)
+        self.remove(keyframe)
         fetch = self._fetches.get(keyframe)
         if fetch is not None and fetch.in_flight_until_s is not None:
             remember(self._outdated, keyframe, None, PAUSED_MAX)
@@ -245,7 +301,10 @@ class Latents:
             fetch.not_before_s = now + fetch.pause_s
 
     def on_reached(self, name: str) -> None:
-        """A robot came into range: what it holds is tried at once."""
+        """A robot came into range: what it holds is tried at once, and it hears of what is here for it."""
+        for relayed in self._relayed.values():
+            if name in relayed.wishers:
+                relayed.offered_until_s = None
         for keyframe, fetch in self._fetches.items():
             if keyframe.log.robot == name and fetch.in_flight_until_s is None:
                 fetch.not_before_s, fetch.pause_s = float("-inf"), 0.0
@@ -268,7 +327,7 @@ class Latents:
             del self._lost_until_s[keyframe]
         return tuple(self._lost_until_s)
 
-    def on_wants(self, wants: Iterable[KeyframeId], now: float) -> bool:
+    def on_wants(self, peer: str, wants: Iterable[KeyframeId], now: float) -> bool:
         """Latents that a neighbour cannot reach: hold them for it, newest wish last. Whether one was new.
 
         What came is held for a while, however many others are wished for, until who wished for it heard of it.
@@ -278,17 +337,16 @@ class Latents:
             if keyframe in self._lost_until_s:
                 self._lost_until_s[keyframe] = now + LOST_S
             elif keyframe.log != self._own:
-                new |= keyframe not in self._relayed
-                self._relayed.pop(keyframe, None)
-                self._relayed[keyframe] = now
+                relayed = self._relayed.pop(keyframe, None)
+                if relayed is None:
+                    new, relayed = True, Relayed(now, keyframe in self._held)
+                relayed.wished_s, relayed.offered_until_s = now, None
+                remember(relayed.wishers, peer, None, WISHERS_MAX)
+                self._relayed[keyframe] = relayed
         while len(self._relayed) > RELAYS_MAX:
             oldest = next(iter(self._relayed))
-            del self._relayed[next((k for k in self._relayed if not self._is_awaited(k, now)), oldest)]
+            del self._relayed[next((k for k, each in self._relayed.items() if not each.is_awaited(now)), oldest)]
         return new
-
-    def _is_awaited(self, keyframe: KeyframeId, now: float) -> bool:
-        """Whether a latent came that a neighbour wished for just now."""
-        return keyframe in self._held and now < self._relayed[keyframe] + WANTS_TURN_S
 
     def wants(
         self, needed: Iterable[KeyframeId], reach: Reach, now: float, still: tuple[KeyframeId, ...] = ()
@@ -310,9 +368,9 @@ class Latents:
         """Whether a latent is not here and nobody in range can give it."""
         return keyframe not in self._held and keyframe.log != self._own and reach.holder(keyframe) is None
 
-    def holds(self) -> tuple[KeyframeId, ...]:
-        """Latents of others that this robot holds because somebody wanted them."""
-        return tuple(k for k in self._relayed if k in self._held)
+    def holds(self, now: float) -> tuple[KeyframeId, ...]:
+        """Latents of others that this robot holds because somebody wanted them, as far as that is to be told now."""
+        return tuple(k for k, relayed in self._relayed.items() if relayed.is_offered(now))
 
     def free(self) -> int:
         """How many more fetches may start."""
@@ -322,7 +380,8 @@ class Latents:
         """Start fetches, in the given order and relayed ones last, as many as may be in flight."""
         free = self.free()
         effects: list[Effect] = []
-        for keyframe in chain(needed, self._relayed) if free > 0 else ():
+        for_others = (k for k, relayed in self._relayed.items() if not relayed.is_here)
+        for keyframe in chain(needed, for_others) if free > 0 else ():
             if len(effects) >= free:
                 break
             holder = self._may_fetch(keyframe, reach, now)

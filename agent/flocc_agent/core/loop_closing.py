@@ -14,13 +14,13 @@ Nor are their keyframes queries, so that of their latents only the matching one 
 """
 
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
 from flocc_agent.core.front_ends import FrontEnds
 from flocc_agent.core.known_sets import PairSet
-from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach
+from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach, WishesTold
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
@@ -93,6 +93,7 @@ class LoopClosing:
         self._undecided: dict[CandidatePair, Candidate] = {}
         self._listens_until_s = listens_until_s
         self._wanted: tuple[KeyframeId, ...] = ()
+        self._wishes_told = WishesTold()
         self._turn = -1
         self._changed = True
         self._due_s = float("inf")
@@ -300,12 +301,16 @@ class LoopClosing:
         self._reach.on_false(holder, keyframe)
         self._chosen = None
 
-    def on_wants(self, wants: Iterable[KeyframeId], now: float) -> None:
+    def on_wants(self, peer: str, wants: Sequence[KeyframeId], now: float) -> None:
         """Latents that a neighbour cannot reach."""
-        self._changed |= self.latents.on_wants(wants, now)
+        if wants:
+            self._changed |= self.latents.on_wants(peer, wants, now)
 
     def wants(self, now: float) -> tuple[KeyframeId, ...]:
-        """Latents this robot needs, or relays, and cannot reach; looked for anew when some were got."""
+        """Latents this robot needs, or relays, and cannot reach, as far as that is to be told now.
+
+        They are looked for anew when some were got.
+        """
         turn = int(now // WANTS_TURN_S)
         still = tuple(k for k in self._wanted if self.latents.is_out_of_reach(k, self._reach))
         if turn != self._turn or len(still) < WANTS_MAX:
@@ -313,11 +318,11 @@ class LoopClosing:
             self._turn = turn
             still = self.latents.wants(self._out_of_reach(), self._reach, now, still)
         self._wanted = still
-        return still
+        return self._wishes_told.due(still, now)
 
-    def holds(self) -> tuple[KeyframeId, ...]:
-        """Latents of others that this robot holds because somebody wanted them."""
-        return self.latents.holds()
+    def holds(self, now: float) -> tuple[KeyframeId, ...]:
+        """Latents of others that this robot holds because somebody wanted them, as far as that is to be told now."""
+        return self.latents.holds(now)
 
     def lost(self, now: float) -> tuple[KeyframeId, ...]:
         """Latents that neighbours want and that exist no more."""
@@ -329,6 +334,7 @@ class LoopClosing:
         """A robot in range said how it is; one that comes into range is tried at once."""
         if name not in self._reach:
             self.latents.on_reached(name)
+            self._wishes_told.on_reached()
         if self._reach.update(name, peer):
             self._offers.on_peer(name)
             self._chosen, self._changed = None, True
@@ -399,6 +405,8 @@ class LoopClosing:
 
     def _spare_beside(self, closure: CandidatePair) -> None:
         """Spare pairs beside a new closure that nobody began to register here."""
+        if not self._parameters.closures_enough:
+            return
         for similarity, pair in self._work.beside(closure):
             if self._spares(Candidate(pair, -similarity)):
                 self._work.remove(pair)

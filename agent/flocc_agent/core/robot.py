@@ -371,7 +371,7 @@ class Robot:
         compute_class = self.election.class_of(sender.robot, heartbeat.compute_class)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else compute_class
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
-        self.closing.on_wants(heartbeat.wants, now)
+        self.closing.on_wants(sender.robot, heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
             effects += self._reject_lost([pair], keyframe, now)
         return effects
@@ -642,7 +642,7 @@ class Robot:
                     digests=self.gossip.state(),
                     versions=self.corrections.state(),
                     wants=self.closing.wants(now),
-                    holds=self.closing.holds(),
+                    holds=self.closing.holds(now),
                     lost=self.closing.lost(now),
                 )
             )

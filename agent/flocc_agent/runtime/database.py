@@ -22,6 +22,9 @@ BUSY_TIMEOUT_S = 5.0
 RETRY_S = 10.0
 """A full disk is tried again at the first write after so long."""
 WAL_BYTES_MAX = 16 * 1024 * 1024
+CACHE_KIB = 256
+"""Pages of a file that its connection holds: what is written is not read again before the next start, and SQLite's own
+2 MiB would fill with it in the first hours of a mission."""
 VERSION_MARK = 0x464C0000
 """`application_id` of a file is this plus its schema version."""
 MARKED_FROM = 2
@@ -253,6 +256,7 @@ def _connect(
     connection = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, check_same_thread=False)
     try:
         connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute(f"PRAGMA cache_size=-{CACHE_KIB}")
         connection.execute(f"PRAGMA journal_size_limit={WAL_BYTES_MAX}")
         verdict = "ok" if inspection is None else connection.execute("PRAGMA quick_check(1)").fetchone()[0]
         if verdict != "ok":

@@ -101,6 +101,7 @@ class Driver:
         self._signed = SignatureQueue(robot.claims, lambda claims: check(claims, tools), self._on_envelope)
         self._checking: asyncio.Task[None] | None = None
         self._stopping = False
+        self._closed = False
         self._subscribers: list[asyncio.Queue[Correction | None]] = []
         self._disk = DiskQueue(tools.store, tools.clock_s())
         self._sender = Sender(robot, tools.transport, tools.clock_s)
@@ -162,7 +163,18 @@ class Driver:
         self._subscribers.append(queue)
         if self.last_correction is not None:
             queue.put_nowait(self.last_correction)
+        if self._closed:
+            _put_newest(queue, None)
         return queue
+
+    def unsubscribe(self, queue: "asyncio.Queue[Correction | None]") -> None:
+        """A queue that nobody reads any more."""
+        self._subscribers.remove(queue)
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether it was asked to end, or has ended."""
+        return self._stopping or self._closed
 
     def put(self, event: Event) -> None:
         """Put an event into the inbox, on the loop's thread."""
@@ -275,6 +287,7 @@ class Driver:
                 await self._tools.transport.close()
             finally:
                 await self._tools.workers.close()
+                self._closed = True
                 for queue in self._subscribers:
                     _put_newest(queue, None)
 

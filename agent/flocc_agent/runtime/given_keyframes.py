@@ -3,7 +3,9 @@
 The core numbers keyframes in the order in which they are given, and so does this.
 """
 
+from array import array
 from bisect import bisect_left
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +45,14 @@ def checked_keyframe(T_odom_camera: Float, stamp_s: float) -> Pose7:
 
 
 class GivenKeyframes:
-    """Stamps of all keyframes of the own log, in their order."""
+    """Stamps of all keyframes of the own log, which may come in any order: 12 bytes for each."""
 
-    def __init__(self, stamps_s: list[float] | None = None) -> None:
-        self._stamps_s: list[float] = stamps_s or []
-        self._restored = len(self._stamps_s)
-        self._sorted: list[tuple[float, int]] = sorted((stamp_s, k) for k, stamp_s in enumerate(self._stamps_s))
+    def __init__(self, stamps_s: Iterable[float] = ()) -> None:
+        self._stamps_s = array("d")
+        self._order = array("I")
+        for stamp_s in stamps_s:
+            self.add(stamp_s)
+        self._restored = len(self)
 
     @classmethod
     def of(cls, robot: Robot) -> "GivenKeyframes":
@@ -65,17 +69,13 @@ class GivenKeyframes:
 
     def add(self, stamp_s: float) -> None:
         """The next keyframe was given."""
-        entry = (stamp_s, len(self._stamps_s))
+        number = len(self)
         self._stamps_s.append(stamp_s)
-        if not self._sorted or self._sorted[-1] <= entry:
-            self._sorted.append(entry)
+        newest = self._entry(self._order[-1]) if self._order else (float("-inf"), -1)
+        if newest <= (stamp_s, number):
+            self._order.append(number)
         else:
-            self._sorted.insert(bisect_left(self._sorted, entry), entry)
-
-    def between(self, after_s: float, until_s: float) -> list[float]:
-        """Stamps in (after, until], in order."""
-        first, end = (bisect_left(self._sorted, (stamp_s, len(self))) for stamp_s in (after_s, until_s))
-        return [stamp_s for stamp_s, _ in self._sorted[first:end]]
+            self._order.insert(bisect_left(self._order, (stamp_s, number), key=self._entry), number)
 
     def index_of(self, measurement: Measurement, stamp_s: float | None) -> int:
         """Number of the keyframe that a measurement belongs to: the last one, or the one with this stamp.
@@ -96,16 +96,19 @@ class GivenKeyframes:
         Raises:
             BadMeasurement: There is none.
         """
-        if not self._sorted:
+        if not self._order:
             raise BadMeasurement(f"{kind}: no keyframe was given yet that it could belong to")
-        if stamp_s < self._sorted[0][0] - STAMP_TOLERANCE_S:
-            raise BadMeasurement(
-                f"{kind} at {stamp_s} s: is older than the map, which begins at {self._sorted[0][0]} s"
-            )
+        oldest_s = self._stamps_s[self._order[0]]
+        if stamp_s < oldest_s - STAMP_TOLERANCE_S:
+            raise BadMeasurement(f"{kind} at {stamp_s} s: is older than the map, which begins at {oldest_s} s")
         first, end = (
-            bisect_left(self._sorted, (stamp_s + tolerance_s, index))
+            bisect_left(self._order, (stamp_s + tolerance_s, index), key=self._entry)
             for tolerance_s, index in ((-STAMP_TOLERANCE_S, -1), (STAMP_TOLERANCE_S, len(self)))
         )
         if first == end:
             raise BadMeasurement(f"{kind} at {stamp_s} s: no keyframe has this stamp")
-        return min(self._sorted[first:end], key=lambda entry: (abs(entry[0] - stamp_s), -entry[1]))[1]
+        return min(self._order[first:end], key=lambda number: (abs(self._stamps_s[number] - stamp_s), -number))
+
+    def _entry(self, number: int) -> tuple[float, int]:
+        """By what keyframes are in order."""
+        return self._stamps_s[number], number

@@ -3,6 +3,8 @@
 What cannot be is refused where it comes in; behind this gate every pose fits a record.
 """
 
+from numbers import Real
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,8 @@ class PoseGate:
         """
         if (fault := pose_fault(T_odom_body)) is not None:
             return fault
+        if not _is_number(stamp_s):
+            return f"its stamp is no number of seconds but {type(stamp_s).__name__}"
         if not abs(stamp_s) <= STAMP_MAX_S:
             return f"its stamp is not within {STAMP_MAX_S:g} s"
         if self._last is None:
@@ -190,3 +194,7 @@ def breaks(stamps_s: Float, T: Float) -> NDArray[np.bool_]:
     inner |= lonely(turned_rad, BREAK_MIN_RAD, TURN_MAX_RAD_S)
     found[2:-1] = inner[1:-1]
     return found
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real)

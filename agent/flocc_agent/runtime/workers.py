@@ -22,6 +22,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Generic, TypeVar
 
+from flocc_agent.runtime.freed_memory import give_back
 from flocc_agent.stages import StageTimes, Timed, timed
 
 logger = logging.getLogger(__name__)
@@ -33,6 +34,8 @@ PROCESS_KINDS = frozenset({"optimise"})
 LENGTH = struct.Struct(">Q")
 NICENESS = 5
 STOP_TIMEOUT_S = 2.0
+GIVE_BACK_S = 1.0
+"""So long after a task of a process whoever asked has taken what he wants of it, and the rest is given back."""
 PR_SET_PDEATHSIG = 1
 """prctl(2): the signal that this process gets when its parent dies."""
 
@@ -153,6 +156,7 @@ class WorkerProcess:
         self._turn = asyncio.Lock()
         self._process: asyncio.subprocess.Process | None = None
         self._idle: asyncio.TimerHandle | None = None
+        self._giving_back: asyncio.TimerHandle | None = None
         self._stopping: set[asyncio.Task[None]] = set()
         self._is_closed = False
 
@@ -184,6 +188,8 @@ class WorkerProcess:
                 await asyncio.shield(self._end())
                 raise
             self._idle = asyncio.get_running_loop().call_later(self._idle_s, self._rest)
+            if self._giving_back is None:
+                self._giving_back = asyncio.get_running_loop().call_later(GIVE_BACK_S, self._give_back)
             return await self._read(answer)
 
     async def _exchange(self, request: bytes) -> bytes:
@@ -206,6 +212,11 @@ class WorkerProcess:
         logger.error("a task of kind %s %s", self._kind, how)
         return WorkFailed(how)
 
+    def _give_back(self) -> None:
+        """What tasks needed here, on their way there and back, is free by now."""
+        self._giving_back = None
+        asyncio.get_running_loop().run_in_executor(None, give_back)
+
     def _rest(self) -> None:
         """Give the memory back; the next task starts a new process."""
         if not self._turn.locked():
@@ -220,8 +231,9 @@ class WorkerProcess:
     async def stop(self) -> None:
         """End the process for good, also in the middle of a task."""
         self._is_closed = True
-        if self._idle is not None:
-            self._idle.cancel()
+        for timer in (self._idle, self._giving_back):
+            if timer is not None:
+                timer.cancel()
         await self._end(gently=not self._turn.locked())
         await asyncio.gather(*self._stopping)
 
@@ -276,6 +288,8 @@ def serve() -> None:
             answers.flush()
         except BrokenPipeError:
             os._exit(0)
+        del request, answer
+        give_back()
 
 
 def _end_with_the_agent() -> None:

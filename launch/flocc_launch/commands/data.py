@@ -269,7 +269,7 @@ def keys(
     from flocc_launch.setup.credentials import make_keys
 
     named = dict(robot.partition("=")[::2] for robot in robots)
-    bad = sorted(name for name, given in named.items() if given and given not in "0123456789")
+    bad = sorted(name for name, given in named.items() if given and given not in tuple("0123456789"))
     if bad:
         raise typer.BadParameter(f"{bad[0]}={named[bad[0]]}: a compute class is a number from 0 to 9")
     classes = {name: int(given) for name, given in named.items() if given}

@@ -259,8 +259,10 @@ def agent(
     import time
 
     from flocc_agent.config import AgentConfig, MetricsConfig
+    from flocc_agent.runtime.freed_memory import have_one_heap
     from flocc_launch.swarm.agent_process import Beginning, ToldOfMap, run_agent
 
+    have_one_heap()
     level = logging.DEBUG if verbose else logging.INFO
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(message)s")
     given: dict[str, Any] = {} if metrics is None else {"metrics": MetricsConfig.at(metrics)[0]}

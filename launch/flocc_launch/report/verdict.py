@@ -91,7 +91,10 @@ def error_sentence(report: RunReport) -> str:
         )
     if after < before:
         return f"The joint error{whose} fell from {number(before, 'm')} (odometry alone) to {number(after, 'm')}."
-    return f"The joint error{whose} is {number(after, 'm')}, not better than odometry alone ({number(before, 'm')})."
+    return (
+        f"The joint error{whose} is {number(after, 'm')}: not less than odometry put at the true starts "
+        f"({number(before, 'm')}), which no robot knows."
+    )
 
 
 def sentence(text: str) -> str:

@@ -74,12 +74,14 @@ def make_keys(
     """
     _check_installed()
     moment = now or datetime.now(UTC)
-    names = {checked_name(name): "robots" for name in robots} | {checked_name(name): "operators" for name in operators}
-    if AUTHORITY in names:
-        raise KeysError(f"{folder}: no robot can be named {AUTHORITY!r} here")
+    of_robots, of_operators = set(map(checked_name, robots)), set(map(checked_name, operators))
+    names = dict.fromkeys(of_robots, "robots") | dict.fromkeys(of_operators, "operators")
     try:
-        authority = _authority(folder / AUTHORITY, checked_name(swarm, "swarm name"), moment)
         members = _members(folder / AUTHORITY / MEMBERS, swarm)
+        known_robots, known_operators = of_robots | set(members["robots"]), of_operators | set(members["operators"])
+        for name in sorted(known_robots & {AUTHORITY, *known_operators}):
+            raise KeysError(f"{folder}: no robot can be named {name!r} here")
+        authority = _authority(folder / AUTHORITY, checked_name(swarm, "swarm name"), moment)
         for name, role in sorted(names.items()):
             public_key = _member_keys(folder / name, name, authority, list((addresses or {}).get(name, ())), moment)
             members[role][name] = public_key.hex()

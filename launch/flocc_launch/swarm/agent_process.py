@@ -24,6 +24,7 @@ from flocc_agent.config import AgentConfig, RadioConfig, validated
 from flocc_agent.core.reports import Fact, LogForked
 from flocc_agent.runtime.event_lines import Reported, line_of
 from flocc_agent.runtime.facts import AgentStopped, JourneyEnded
+from flocc_agent.runtime.freed_memory import have_one_heap
 from flocc_agent.runtime.robot_result import RobotResult, write_result
 from flocc_agent.runtime.status import AgentStatus
 from flocc_launch.setup.world_faults import sentence_of
@@ -357,6 +358,7 @@ def main() -> None:
     parser.add_argument("--epoch-s", type=float, required=True)
     parser.add_argument("--map-fixed", action="store_true")
     arguments = parser.parse_args()
+    have_one_heap()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     try:
         config = validated(AgentConfig, json.loads(arguments.config.read_text(encoding="utf-8")), str(arguments.config))

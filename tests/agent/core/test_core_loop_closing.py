@@ -16,7 +16,17 @@ from flocc_agent.core.events import (
     LatentFetchFailed,
     LatentMissing,
 )
-from flocc_agent.core.latents import BACKLOG_MAX, RELAYS_MAX, RETRY_S, WANTS_TURN_S, Latents, Peer, Reach
+from flocc_agent.core.latents import (
+    BACKLOG_MAX,
+    OFFERED_S,
+    RELAYS_MAX,
+    RETRY_S,
+    WANTS_TURN_S,
+    WISHED_AGAIN_S,
+    Latents,
+    Peer,
+    Reach,
+)
 from flocc_agent.core.loop_closing import REGISTRATION_TIMEOUT_S, LoopClosing, registrar_of
 from flocc_agent.core.offers import OFFER_PERIOD_S, TAKEOVER_S
 from flocc_agent.core.parameters import LoopClosingParameters
@@ -344,9 +354,9 @@ def test_a_latent_is_asked_of_its_owner_whatever_it_served() -> None:
 def test_what_neighbours_want_is_kept_up_to_a_maximum() -> None:
     latents = Latents(R1, PARAMETERS)
     for k in range(50):
-        latents.on_wants([keyframe(f"r3/{k}")], float(k))
+        latents.on_wants("r2", [keyframe(f"r3/{k}")], float(k))
         latents.add(keyframe(f"r3/{k}"))
-    assert latents.holds() == tuple(keyframe(f"r3/{k}") for k in range(50 - RELAYS_MAX, 50))
+    assert latents.holds(49.0) == tuple(keyframe(f"r3/{k}") for k in range(50 - RELAYS_MAX, 50))
 
 
 def test_wishes_have_their_turns_although_some_are_granted_meanwhile() -> None:
@@ -367,15 +377,51 @@ def test_what_is_wished_for_still_is_wished_for_until_its_turn_is_over() -> None
 
 def test_what_came_for_a_neighbour_is_held_however_many_others_are_wished_for() -> None:
     latents, came = Latents(R1, PARAMETERS), keyframe("r3/0")
-    latents.on_wants([came], 0.0)
+    latents.on_wants("r2", [came], 0.0)
     latents.add(came)
     for k in range(1, 100):
-        latents.on_wants([keyframe(f"r3/{k}")], 0.0)
-    assert latents.holds() == (came,)
+        latents.on_wants("r2", [keyframe(f"r3/{k}")], 0.0)
+    assert latents.holds(0.0) == (came,)
     assert latents.sizes()["relayed"] == (RELAYS_MAX, RELAYS_MAX)
     for k in range(1, 100):
-        latents.on_wants([keyframe(f"r3/{k}")], WANTS_TURN_S)
-    assert latents.holds() == ()
+        latents.on_wants("r2", [keyframe(f"r3/{k}")], WANTS_TURN_S)
+    assert latents.holds(WANTS_TURN_S) == ()
+
+
+def test_what_is_held_for_a_robot_is_told_until_it_must_have_heard_and_again_when_it_comes_back() -> None:
+    latents, wanted = Latents(R1, PARAMETERS), keyframe("r3/0")
+    latents.on_wants("r2", [wanted], 0.0)
+    assert latents.holds(100.0) == ()
+    latents.add(wanted)
+    told = {now: latents.holds(now) for now in (200.0, 200.0 + OFFERED_S - 0.1, 200.0 + OFFERED_S)}
+    assert list(told.values()) == [(wanted,), (wanted,), ()]
+    latents.on_reached("r4")
+    assert latents.holds(300.0) == ()
+    latents.on_reached("r2")
+    assert (latents.holds(300.0), latents.holds(300.0 + OFFERED_S)) == ((wanted,), ())
+    latents.on_wants("r4", [wanted], 400.0)
+    assert latents.holds(400.0) == (wanted,)
+    for takes_away in (latents.remove, latents.on_withdrawn):
+        latents.add(wanted)
+        assert latents.holds(400.0) == (wanted,)
+        takes_away(wanted)
+        assert latents.holds(400.1) == ()
+
+
+def test_a_wish_is_told_now_and_then_and_all_of_them_to_whoever_comes_into_range() -> None:
+    machine, pairs = closing(), pairs_of(R1, 2)
+    for pair in pairs:
+        found(machine, pair, 0.5)
+    machine.on_peer("r4", Peer(0))
+    first = machine.wants(0.0)
+    assert first == (KeyframeId(R2, 1),)
+    assert machine.wants(WISHED_AGAIN_S / 2) == ()
+    machine.on_peer("r4", Peer(0))
+    assert machine.wants(WISHED_AGAIN_S / 2) == ()
+    machine.on_peer("r5", Peer(0))
+    assert machine.wants(WISHED_AGAIN_S / 2) == first
+    assert machine.wants(WISHED_AGAIN_S) == ()
+    assert machine.wants(1.5 * WISHED_AGAIN_S) == first
 
 
 def handed(machine: LoopClosing, now: float) -> list[CandidatePair]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flocc_agent import Agent, AgentConfig
-from flocc_agent.agent import BadKeyframe
+from flocc_agent.agent import BadKeyframe, NotRunning
 from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.interfaces import Camera, Image, OdometryPair, Perception
@@ -68,6 +68,85 @@ async def test_what_cannot_be_used_is_refused_and_the_agent_goes_on() -> None:
             assert correction.map_frame == f"map/{agent.log}"
             assert not correction.frame_changed
             break
+
+
+async def test_what_is_no_number_and_no_picture_is_refused_with_a_sentence() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    wrong: Any
+    async with Agent(CONFIG, camera()) as agent:
+        for wrong in ("1.0", None, np.datetime64("2026-12-01")):
+            with pytest.raises(BadKeyframe, match="its stamp is no number of seconds but"):
+                await agent.add_frame(pixels, np.eye(4), wrong)
+        for wrong in (None, pixels.tolist()):
+            with pytest.raises(BadKeyframe, match="image is no array but"):
+                await agent.add_frame(wrong, np.eye(4), 1.0)
+        for wrong in (None, {"kind": "fix"}):
+            with pytest.raises(BadMeasurement, match=r"robot r1: .* is no measurement"):
+                agent.add_measurement(wrong)
+    for wrong in ({"width": "64"}, {"distortion": (0.1, 0.2, 0.3)}):
+        with pytest.raises(ValueError, match="camera"):
+            Camera(**{"width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.0, **wrong})
+
+
+async def test_nothing_is_taken_in_before_the_start_and_after_the_end() -> None:
+    pixels = pose_image(np.eye(4), "r1/0").pixels
+    agent = Agent(CONFIG, camera())
+
+    async def refused(why: str) -> None:
+        for frame in (agent.add_frame, agent.add_keyframe):
+            with pytest.raises(NotRunning, match=why):
+                await frame(pixels, at_m(3.0), 3.0)
+        with pytest.raises(NotRunning, match=why):
+            agent.add_fix(np.zeros(3), np.eye(3))
+        with pytest.raises(NotRunning, match=why):
+            await agent.begin_journey()
+
+    await refused("use it in 'async with'")
+    async with agent:
+        await agent.add_frame(pixels, np.eye(4), 1.0)
+        async for _ in agent.corrections():
+            break
+        with pytest.raises(NotRunning, match="runs on another thread"):
+            await asyncio.to_thread(lambda: asyncio.run(agent.add_frame(pixels, at_m(3.0), 3.0)))
+        agent.stop()
+        await refused("has stopped")
+        await agent.finished()
+        await refused("has stopped")
+    await refused("has stopped")
+    assert [correction.map_frame async for correction in agent.corrections()] == [f"map/{agent.log}"]
+
+
+async def test_one_agent_is_one_robot() -> None:
+    async with Agent(CONFIG, camera()) as agent:
+        with pytest.raises(RuntimeError, match="robot r1: this agent runs already"):
+            await agent.__aenter__()
+        assert agent.status().keyframes == 0
+    async with agent:  # one that was closed may begin again
+        await agent.add_frame(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 1.0)
+
+
+async def test_an_error_of_whoever_takes_facts_ends_no_agent(caplog: pytest.LogCaptureFixture) -> None:
+    def fails(_: Reported[Fact]) -> None:
+        raise KeyError("dashboard")
+
+    async with Agent(CONFIG, camera(), on_report=fails) as agent:
+        await agent.add_frame(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 1.0)
+        async for _ in agent.corrections():
+            break
+    assert "robot r1: on_report failed; the agent goes on" in caplog.text
+
+
+async def test_an_agent_that_failed_says_so_at_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    with pytest.raises(ZeroDivisionError):  # noqa: PT012
+        async with Agent(CONFIG, camera()) as agent:
+            monkeypatch.setattr(agent.robot, "tick", fails)
+            with pytest.raises(ZeroDivisionError):
+                await agent.finished()
+            with pytest.raises(NotRunning, match="its agent has failed: a bug"):
+                await agent.add_frame(pose_image(np.eye(4), "r1/0").pixels, np.eye(4), 1.0)
 
 
 async def test_the_status_tells_what_the_robot_doubts_of_its_camera() -> None:
