@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.agent.runtime.loopback import loopback_configs, until
+from tests.agent.runtime.loopback import free_ports, loopback_configs, until
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import LinkParameters, Partition, Radio, RadioParameters
@@ -21,7 +21,7 @@ from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, Tr
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.keys import Admin
+from flocc_protocol.keys import Admin, latent_key
 
 pytestmark = pytest.mark.swarm
 
@@ -141,6 +141,18 @@ async def test_says_why_a_latent_does_not_come() -> None:
                 FetchProblem.NO_ANSWER,
             )
         ]
+
+
+async def test_a_get_that_names_no_piece_is_answered_with_an_error() -> None:
+    async with swarm(ROBOTS[:2]) as (one, two):
+        two.held["r2/1"] = b"right"
+        assert await one.transport.fetch_latent("r2", "r2/1", 10.0) == Fetched(b"right")
+        session = one.transport._bulk._session
+        assert session is not None
+        key = latent_key("test", "r2", "r2/1")
+        for wrong in ("", "?offset=0", "?offset=-5;length=9", "?offset=abc;length=9", "?offset=0;length=9;asker=A B"):
+            replies = await asyncio.to_thread(lambda: list(session.get(key + wrong, timeout=10.0)))  # noqa: B023
+            assert [reply.err.payload.to_bytes() for reply in replies if reply.err] == [b"flocc: bad request"], wrong
 
 
 async def test_does_not_take_a_latent_that_is_larger_than_allowed() -> None:
@@ -346,13 +358,25 @@ async def test_an_operator_is_answered_by_everybody_or_by_one() -> None:
         assert await ask(configs["r1"], "test", Admin.CHAOS, b"", timeout_s=1.0) == {}
 
 
+async def test_an_operator_finds_everybody_by_scouting_whatever_the_identifiers_of_sessions() -> None:
+    """Sessions of robots dial by their identifiers, which are drawn: a few operators are tried."""
+    config = TransportConfig(interface="lo", multicast_address=f"224.0.0.224:{free_ports(1)[0]}")
+    members = [Member(name, config) for name in ROBOTS]
+    for member in members:
+        member.transport.serve_admin(Admin.STATUS, partial(greeting_of, member.robot))
+    async with members[0].transport, members[1].transport, members[2].transport:
+        await meet(members)
+        for _ in range(4):
+            assert sorted(await ask(config, "test", Admin.STATUS, timeout_s=1.5)) == list(ROBOTS)
+
+
 LEAVES = """
 import asyncio
 from flocc_agent.config import TransportConfig
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.keys import Admin
+from flocc_protocol.keys import Admin, latent_key
 async def main():
     async with ZenohTransport("test", "r1", TransportConfig(multicast=False)):
         raise SystemExit(3)
