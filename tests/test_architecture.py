@@ -8,6 +8,7 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
@@ -138,6 +139,12 @@ def test_the_agents_page_names_every_file_of_the_core_and_every_effect() -> None
     assert named - files == set(), "files that are no longer there"
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A module as Python reads it; many seconds for all of them."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def product_files() -> list[Path]:
     """Every module of the four source roots."""
     return [path for root in ("protocol", "agent", "launch", "lab") for path in sorted((ROOT / root).rglob("*.py"))]
@@ -166,7 +173,7 @@ def test_no_two_classes_have_one_name() -> None:
     classes = [
         (node.name, path)
         for path in product_files()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.ClassDef)
     ]
     assert places_of(classes, CLASSES_TWICE) == {}
@@ -180,7 +187,7 @@ SHELL_RATIO_MAX = 0.10
 def imported(path: Path) -> set[str]:
     """Top names of all that a module imports, also inside of functions."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.composition import Eyes, compose, recording_of
+from flocc_agent.composition import Sight, compose, recording_of
 from flocc_agent.config import AgentConfig, RadioConfig, Ros2Config
 from flocc_agent.core.corrected import Correction
 from flocc_agent.core.interfaces import Camera, Image, Perception
@@ -442,7 +442,7 @@ class Agent:
         answers: dict[Admin, Callable[[bytes], bytes]] = {Admin.STATUS: self._answer_status}
         if self.config.transport.chaos:
             answers[Admin.CHAOS] = self._disturb
-        eyes = Eyes(
+        sight = Sight(
             self._perception,
             self._camera,
             self._T_body_camera,
@@ -450,7 +450,7 @@ class Agent:
         )
         parts = compose(
             self.config,
-            eyes,
+            sight,
             self._clock_s,
             self._on_report,
             answers,

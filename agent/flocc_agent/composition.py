@@ -42,7 +42,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Eyes:
+class Sight:
     """What a robot sees with.
 
     Attributes:
@@ -76,7 +76,7 @@ class Parts:
 
 def compose(
     config: AgentConfig,
-    eyes: Eyes,
+    sight: Sight,
     clock_s: Callable[[], float],
     on_report: Callable[[Reported[Fact]], None],
     answers: Mapping[Admin, Callable[[bytes], bytes]],
@@ -88,7 +88,7 @@ def compose(
 
     Args:
         config: Everything that can be turned.
-        eyes: What the robot sees with.
+        sight: What the robot sees with.
         clock_s: Seconds since the start of the run.
         on_report: Takes each fact that the agent tells.
         answers: What operators ask for, and who answers.
@@ -99,14 +99,14 @@ def compose(
         FloccError: The map, the store or a checkpoint cannot be used.
     """
     opened = None if config.map is None else MapFolder.open(config.map)
-    perception = eyes.perception or build_perception(config.perception, config.seed)
+    perception = sight.perception or build_perception(config.perception, config.seed)
     store = _open_store(config)
     try:
         if new_journey:
             store.begin_journey()
-        _keep_for_maps(store, config, eyes, perception)
+        _keep_for_maps(store, config, sight, perception)
         if opened is not None:
-            _use_map(store, opened, config, eyes, perception, map_fixed)
+            _use_map(store, opened, config, sight, perception, map_fixed)
         workers = Workers()
         radio = Radio(config.radio.parameters(), np.random.default_rng([config.seed, zlib.crc32(config.name.encode())]))
         sealer = _sealer(config)
@@ -129,7 +129,7 @@ def compose(
             transport.serve_admin(asked, answer)
         tools = Tools(
             perception,
-            eyes.watch(config.perception.odometry_up),
+            sight.watch(config.perception.odometry_up),
             build_optimiser(config.backend),
             build_stepper(config.backend),
             workers,
@@ -141,34 +141,34 @@ def compose(
     except BaseException:
         store.close()
         raise
-    reporter = Reporter(config.name, eyes.T_body_camera, config.backend.steepness)
+    reporter = Reporter(config.name, sight.T_body_camera, config.backend.steepness)
     return Parts(Driver(core, tools, reporter, on_report), store, workers, radio)
 
 
-def _keep_for_maps(store: Store, config: AgentConfig, eyes: Eyes, perception: Perception) -> None:
+def _keep_for_maps(store: Store, config: AgentConfig, sight: Sight, perception: Perception) -> None:
     """Write down what a map that is made of this store will have to say of it."""
-    keep_front_end(store, _method(config, eyes), config.perception, perception)
+    keep_front_end(store, _method(config, sight), config.perception, perception)
     keep_back_end(store, config.backend)
-    if eyes.camera is not None:
-        keep_camera(store, eyes.camera, eyes.T_body_camera)
+    if sight.camera is not None:
+        keep_camera(store, sight.camera, sight.T_body_camera)
 
 
 def _use_map(
-    store: Store, opened: MapFolder, config: AgentConfig, eyes: Eyes, perception: Perception, map_fixed: bool
+    store: Store, opened: MapFolder, config: AgentConfig, sight: Sight, perception: Perception, map_fixed: bool
 ) -> None:
     """Serve a map's latents, if this robot's own can be compared with them."""
-    opened.check_front_end(_method(config, eyes), perception.encoder.model)
-    if eyes.camera is not None:
-        warning = opened.other_lens(lens_of(eyes.camera))
+    opened.check_front_end(_method(config, sight), perception.encoder.model)
+    if sight.camera is not None:
+        warning = opened.other_lens(lens_of(sight.camera))
         if warning is not None:
             logger.warning("robot %s: %s", config.name, warning)
     store.open_map(opened)
     keep_map(store, opened, map_fixed)
 
 
-def _method(config: AgentConfig, eyes: Eyes) -> str | None:
+def _method(config: AgentConfig, sight: Sight) -> str | None:
     """What the front end is called; a program's own has no name."""
-    return config.perception.method if eyes.perception is None else None
+    return config.perception.method if sight.perception is None else None
 
 
 def stored_result(config: AgentConfig) -> RobotResult:

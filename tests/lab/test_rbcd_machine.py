@@ -1,7 +1,5 @@
 """The machine of a distributed optimisation: what it says, when it iterates, and into which frame it moves."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,29 +14,14 @@ from flocc_protocol.messages import CandidatePair
 Float = NDArray[np.float64]
 
 A, B, C = LogId("a"), LogId("b"), LogId("c")
-PARAMETERS = RbcdParameters(period_s=0.2, wait_s=1.0, repeat_s=0.5, repeat_max_s=2.0, timeout_s=10.0)
+PARAMETERS = RbcdParameters(period_s=0.2, wait_s=1.0, repeat_s=0.5, repeat_max_s=2.0)
 
 
-@dataclass
-class Source:
-    """Logs that a test writes."""
-
-    whole: PoseGraph
-    revision: int = 1
-
-    @property
-    def keyframes(self) -> int:
-        return sum(map(len, self.whole.trajectories.values()))
-
-    def graph(self) -> PoseGraph:
-        return self.whole
-
-
-def three_robots() -> Source:
+def three_robots() -> PoseGraph:
     """b/1 saw a/2, c/0 saw b/3, four keyframes each."""
     trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], 4, axis=0)) for log in (A, B, C)}
     seen = [(KeyframeId(B, 1), KeyframeId(A, 2)), (KeyframeId(C, 0), KeyframeId(B, 3))]
-    return Source(PoseGraph(trajectories, [LoopClosure(query, match, np.eye(4)) for query, match in seen]))
+    return PoseGraph(trajectories, [LoopClosure(query, match, np.eye(4)) for query, match in seen])
 
 
 def machine(own: LogId = B) -> RbcdMachine:
@@ -60,7 +43,7 @@ def step(moved: float = 0.0, aligned: bool = False, finished: bool = True) -> Bl
     X = np.repeat(np.eye(4, 3)[None], 4, axis=0)
     T = np.repeat(np.eye(4)[None], 4, axis=0)
     weights = {CandidatePair(KeyframeId(B, 3), KeyframeId(C, 0)): 0.25}
-    return BlockStep(BlockState(X, X, weights=weights), T, lifted(), moved, 1.0, aligned, finished, 0)
+    return BlockStep(BlockState(X, X, weights=weights), T, lifted(), moved, aligned, finished, 0)
 
 
 def jobs(effects: list[Effect]) -> list[IterateBlock]:
@@ -144,7 +127,6 @@ def test_separators_are_repeated_at_a_rate_that_falls_to_a_bound() -> None:
     times = []
     now = 0.0
     for _ in range(5):
-        b.component(now)
         now = b.deadline()
         if messages(b.tick(now)):
             times.append(now)
@@ -161,26 +143,3 @@ def test_weights_are_taken_only_from_the_robot_that_decides_them() -> None:
     b.on_separators(A, Separators(A, 1, 0, origin, 1, (2,), poses, (pair,), one))
     b.on_step(1, step(), 0.1)
     assert jobs(b.tick(0.3))[0].problem.heard == {pair: 1.0}
-
-
-def test_an_overdue_or_failed_iteration_is_tried_again_after_a_growing_pause() -> None:
-    b = machine()
-    (job,) = jobs(b.tick(0.0))
-    assert jobs(b.tick(10.0)) == []
-    assert b.on_step(job.number, step(), 10.1) == []
-    (second,) = jobs(b.tick(10.4))
-    b.on_failed(second.number, 11.0)
-    assert jobs(b.tick(11.5)) == []
-    assert jobs(b.tick(11.8))
-
-
-def test_corrections_come_at_most_once_per_period_and_name_the_anchor() -> None:
-    b = machine()
-    b.on_separators(A, said(A, 3, 2))
-    (job,) = jobs(b.tick(0.0))
-    b.on_step(job.number, step(aligned=True), 0.1)
-    component = b.component(0.1)
-    assert component is not None
-    assert component.anchor == A
-    assert list(component.T_map_keyframe) == [B]
-    assert b.component(0.2) is None

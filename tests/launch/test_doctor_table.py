@@ -20,6 +20,7 @@ from tests.launch.test_ground_truth import lifted, truth_of
 from tests.launch.test_status import apart, pair, row
 
 from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.core.reports import CAME_APART
 from flocc_agent.geometry import pose_from_tq, so3_exp, tq_from_pose
 from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_agent.runtime.trajectory import write_tum
@@ -139,6 +140,7 @@ STORIES: dict[str, Callable[[], Story]] = {
     "weak-link": hanging,
     "solver-warning": lambda: warning("a scale collapsed"),
     "solver-refuses": refusing,
+    "came-apart": lambda: merged().say(15.0, "r2", "peer_refused", peer="r1", reason=f"shared poses: {CAME_APART}"),
     "encoding-failed": lambda: merged().say(15.0, "r2", "encoding_failed", keyframe="r2/3", reason="image is black"),
     "unsteady-leader": unsteady,
 }
@@ -173,6 +175,7 @@ SWARMS = {
     "no-leader": [row("r1", "r2", leader=None), row("r2", "r1", map_frame="map/r2")],
     "two-leaders": [row("r1", "r2"), row("r2", "r1", leader="r2", map_frame="map/r2")],
     "refused": [row("r1", "r2"), row("r2", "r1", refused={"refused unknown version": 3})],
+    "came-apart": [row("r1", "r2"), row("r2", "r1", refused={f"refused shared poses: {CAME_APART}": 1})],
     "no-descriptors": apart(logs={"r1": [9, 1]}, peer_logs={"r2": [9, 1]}),
     "low-similarity": apart(best_similarities={"r2": 0.41}),
     "registrations-rejected": apart(pairs=[pair(rejected=3, best_ratio=0.21)]),

@@ -155,6 +155,18 @@ def test_a_damaged_record_ends_its_log_there(first: Path, tmp_path: Path) -> Non
     assert len(gathered(run).logs[LogId("r2")]) == 5
 
 
+def test_a_map_is_replaced_by_a_later_state_of_itself_only(first: Path, tmp_path: Path) -> None:
+    found = gathered(first)
+    solved = solved_map("run", found.logs)
+    content = MapContent("one", found.logs, solved, found.front_end, {}, (), swarm="crew")
+    write_map(tmp_path / "map", content)
+    write_map(tmp_path / "map", replace(content, name="later"))
+    fewer = {log: records[:-1] for log, records in found.logs.items()}
+    with pytest.raises(BadMap, match=r"holds the map 'later' of swarm crew, whose log r1 this one does not have"):
+        write_map(tmp_path / "map", replace(content, logs=fewer))
+    assert MapFolder.open(tmp_path / "map").records == dict(found.logs)
+
+
 def test_a_kill_during_save_leaves_the_old_map_or_the_new_one(first: Path, block: Path, tmp_path: Path) -> None:
     """A child writes two maps over each other until it is killed, at another moment each time."""
     out = tmp_path / "map"
@@ -763,6 +775,9 @@ def test_commands_say_what_they_did(
     code, text = said(capsys, monkeypatch, "map", "info", out)
     assert code == 0
     assert "frame map/r1 logs 2 keyframes" in text
+    known = json.loads(said(capsys, monkeypatch, "map", "info", out, "--json")[1])
+    assert [entry["log"] for entry in known["logs"]] == ["r1", "r2"]
+    assert 0.0 < known["positions_sigma_m"][0] <= known["positions_sigma_m"][1] < 1.0
     assert said(capsys, monkeypatch, "map", "export", out, "--out", str(tmp_path / "files"))[0] == 0
     code, text = said(capsys, monkeypatch, "map", "prune", out, "--out", str(tmp_path / "small"))
     assert code == 0

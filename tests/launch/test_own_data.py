@@ -114,6 +114,19 @@ def test_robots_that_recorded_together_keep_their_distance_in_time(own: Path, tm
     assert starts_s == {"early": 0.0, "late": 2.0}
 
 
+def test_recordings_of_different_times_are_played_together_and_it_is_said(own: Path, tmp_path: Path) -> None:
+    team = tmp_path / "team"
+    for name in ("early", "late"):
+        shutil.copytree(own, team / name)
+    images = sorted((team / "early" / "images").iterdir())
+    for k, file in enumerate(images):
+        (team / ("late" if k < len(images) // 2 else "early") / "images" / file.name).unlink()
+    told: list[str] = []
+    scenario = read_scenario(str(team), {}, tell=told.append)
+    assert [robot.start_s for robot in scenario.robots.values()] == [0.0, 0.0]
+    assert "; late was recorded 5 s after the first, but they are played as if they began together" in told[0]
+
+
 def test_a_folder_of_bags_is_a_robot_each(tmp_path: Path) -> None:
     (tmp_path / "bags").mkdir()
     for name in ("husky", "jackal"):

@@ -4,9 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from flocc_agent.backend import consensus
 from flocc_agent.config import BackendConfig, BackendMode, Formulation
+from flocc_launch.doctor import diagnose
+from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.simulation.simulate import simulate
 
@@ -49,6 +53,31 @@ def test_a_robot_that_was_killed_comes_back_above_its_last_step(tmp_path: Path) 
     lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     rounds = [line["round"] for line in lines if line["event"] == "correction" and line["robot"] == "r2"]
     assert rounds == sorted(set(rounds))
+
+
+FARTHEST_M = 15.0
+"""Twice the side of the crowd's area: no correction moves a robot out of it."""
+CROWD = {
+    "tracks": {"robots": 4, "seed": 102, "area_m": 8.0, "length_m": 12.0},
+    "keyframes": {"distance_m": 1.5},
+    "radio": {"latency_s": 0.05, "jitter_s": 0.05},
+}
+
+
+@pytest.mark.parametrize("floating", [None, 1e-3])
+def test_robots_whose_exchange_leads_apart_notice_it_and_none_corrects_itself_by_that(
+    floating: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a thousandth of the closures' information robots that nothing holds are thrown about, else not."""
+    if floating is not None:
+        monkeypatch.setattr(consensus, "ANCHORING_FLOATING", floating)
+    simulate(scenario(**CROWD), tmp_path / "run", 1)
+    lines = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    apart = {(line["robot"], line["peer"]) for line in lines if line["event"] == "peer_refused"}
+    causes = {finding.cause for finding in diagnose(RunFolder(tmp_path / "run"))}
+    assert bool(apart) == ("came-apart" in causes) == (floating is not None)
+    corrected_m = [np.linalg.norm(line["T_map_odom"][:3]) for line in lines if line["event"] == "correction"]
+    assert max(corrected_m) < FARTHEST_M
 
 
 def test_what_distributed_mode_cannot_do_is_refused_with_a_sentence() -> None:

@@ -34,7 +34,7 @@ from flocc_agent.backend.edges import Edges, Residuals, State, jacobians, residu
 from flocc_agent.backend.problem import closure_edges, concatenate, odometry_edges
 from flocc_agent.backend.shared_stiffness import SharedStiffness, geometric_mean, rows_of, stiffness_of
 from flocc_agent.config import BackendConfig
-from flocc_agent.core.own_part import ToldPoses
+from flocc_agent.core.own_part import Apart, ToldPoses
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import inverse, poses_from_tq, quaternions
 from flocc_protocol.ids import KeyframeId, LogId
@@ -55,6 +55,9 @@ ANCHORING = 1e-4
 """Part of it that both sides add to their penalty; with more, long chains bend slowly."""
 ANCHORING_UNKNOWN = 0.3
 """Part of it that is the penalty while nothing is known of the neighbour's stiffness."""
+ALLOWED, ALLOWED_UNKNOWN = 4.0, 100.0
+"""Mean square of a disagreement, in units of the penalty, that two robots may have on their way to each other: where it
+is the mean of both stiffnesses, and so at most twice the inverse of both covariances together; and before that."""
 TETHER_RATIO = 1e-9
 """Of the mean stiffness, on every pose: a graph that floats has no unique step."""
 
@@ -161,6 +164,13 @@ class PairedRobot:
         apart = self._apart(T)
         return float(self.force @ apart + 0.5 * apart @ self.penalty @ apart)
 
+    def apart(self, T: Float) -> Apart:
+        """How far the neighbour is from shared poses at `T`."""
+        apart = self._apart(T)
+        mean = float(apart @ self.penalty @ apart) / max(len(apart), 1)
+        furthest_m = float(np.linalg.norm(apart.reshape(-1, 6)[:, 3:], axis=1).max(initial=0.0))
+        return Apart(furthest_m, mean / (ALLOWED if self.stiffened else ALLOWED_UNKNOWN))
+
     def hear(self, told: Tidings) -> None:
         """Take a part of what the neighbour said in the place of what it said before."""
         force = told.force.ravel()
@@ -255,6 +265,11 @@ class ConsensusPart:
         neighbour.hear(told)
         if told.stiffness is not None:
             neighbour.stiffen(self.state.poses()[neighbour.index])
+
+    def apart(self, other: LogId) -> Apart:
+        """How far a neighbour that was heard is."""
+        neighbour = self.neighbours[other]
+        return neighbour.apart(self.state.poses()[neighbour.index])
 
     def _heard(self) -> list[PairedRobot]:
         return [neighbour for neighbour in self.neighbours.values() if neighbour.T is not None]

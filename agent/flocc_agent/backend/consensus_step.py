@@ -95,11 +95,13 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
         state = state.moved(_motion(state, *problem.move_to))
     part = _part(config, problem, state, scale)
     refused = _heard(part, problem.shared)
-    before = part.T
+    heard = [other for other, shared in problem.shared.items() if shared.told is not None and other not in refused]
+    before, apart = part.T, {other: part.apart(other) for other in heard}
     part.step()
     after = _state_of(part, problem)
     origin = _origin(problem, after.T)
     poses = part.state.poses()
+    apart = {other: before_it.most(part.apart(other)) for other, before_it in apart.items()}
     gaps = [float(np.abs(poses[n.index] - n.T).max()) for n in part.neighbours.values() if n.T is not None]
     return ConsensusStep(
         after,
@@ -112,6 +114,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
         part.own_cost(),
         aligned,
         refused,
+        apart,
     )
 
 

@@ -4,7 +4,7 @@ Two halves of a symmetrical hall look the same. Four closures then say that a ro
 the other; one of the two is taken, and which of them depends on next to nothing.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from flocc_agent.backend.alignment import (
 from flocc_agent.backend.problem import Problem
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import angle_rad
-from flocc_protocol.ids import LogId
+from flocc_protocol.ids import KeyframeId, LogId
 
 Bool = NDArray[np.bool_]
 Float = NDArray[np.float64]
@@ -82,6 +82,34 @@ def tie_warnings(
         sentences.append(
             f"robots {a.robot} and {b.robot}: {len(followed)} closures agree on the place that was taken, and "
             f"{len(found.agreeing)} others on another one, {moved_m:.1f} m and {turned_deg:.0f} degrees away; "
-            "places that look the same do this, and nothing here tells which is right"
+            f"places that look the same do this{_or_jumped(problem, ends, followed, found.agreeing, closures)}, "
+            "and nothing here tells which is right"
         )
     return tuple(sentences)
+
+
+def _or_jumped(
+    problem: Problem,
+    ends: Mapping[int, tuple[KeyframeId, KeyframeId]],
+    followed: list[int],
+    others: Sequence[int],
+    closures: Mapping[int, LoopClosure],
+) -> str:
+    """What else it may be, where all keyframes of one place come before all of the other, in one robot's log.
+
+    Args:
+        problem: The component.
+        ends: Both keyframes of each closure that was not followed, by its index in the graph.
+        followed: Rows of those that were.
+        others: Those that agree on another place, by their index in the graph.
+        closures: All of them.
+    """
+    here = [closures[problem.closure_ids[n]] for n in followed]
+    for side in (0, 1):
+        there = [ends[k][side].index for k in others]
+        log = ends[others[0]][side].log
+        taken = [end.index for closure in here for end in (closure.query, closure.match) if end.log == log]
+        for early, late in ((taken, there), (there, taken)):
+            if max(early) < min(late):
+                return f", and so does odometry of robot {log.robot} that jumps between {max(early)} and {min(late)}"
+    return ""

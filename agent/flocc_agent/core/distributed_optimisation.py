@@ -9,7 +9,8 @@ A robot steps when it has news of every neighbour in range, or has waited long e
 range, where it has the shared poses. What is lost is said again, with pauses that double. Every robot starts in its own
 frame and moves into that of a neighbour whose anchor is lower, so that one frame survives: the lowest robot's. A robot
 gives corrections to itself only, with its step as the round; one that contradicts its own log is not given, and the
-robot begins again alone.
+robot begins again alone. Nor is one while neighbours are farther away than covariances allow (`coming_apart`); where
+that does not shrink, the robot goes back to where it last agreed, and does not hear those for a while.
 """
 
 from collections import Counter
@@ -20,6 +21,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.coming_apart import SILENT_S, ComingApart, beyond
+from flocc_agent.core.correction_evidence import way_m
 from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
 from flocc_agent.core.own_part import (
     ConsensusProblem,
@@ -33,7 +36,7 @@ from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.peer_budgets import Muted
 from flocc_agent.core.plausibility import HELD_BACK_S
 from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, PoseGraph, Trajectory
-from flocc_agent.core.reports import PartMoved, PeerRefused, RoundFailed
+from flocc_agent.core.reports import CAME_APART, PartMoved, PeerRefused, RoundFailed
 from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S
 from flocc_agent.geometry import inverse, pose7, pose_from_tq
 from flocc_protocol.arrays import Array
@@ -52,12 +55,11 @@ NEIGHBOURS_MAX = 128
 FAILURES_MAX = 6
 OVERTAKEN_S = 5.0
 """A message that is older than the last one by its number is new by its time after so long: its sender began again."""
-SILENT_S = 30.0
-"""After so long without a word what a neighbour said last counts only where both had agreed."""
 VAIN_STEPS_MAX, NEARER_RATIO = 40, 0.9
 """After so many steps that brought a robot no nearer to its neighbours it rests all the same."""
 DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
-"""How long neighbours are not heard whose word led to what the own log contradicts: the first time, and at most."""
+"""How long neighbours are not heard with whom it came apart, or whose word led to what the own log contradicts: the
+first time, and at most."""
 
 
 class GraphSource(Protocol):
@@ -112,6 +114,16 @@ class _Choice:
     shown: Shown | None = None
     not_before_s: float = float("-inf")
     failures: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Agreed:
+    """Where a robot was when no neighbour was farther away than covariances allow."""
+
+    anchor: LogId
+    origin: Float
+    origin_step: int
+    step: ConsensusStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +189,7 @@ class DistributedOptimisation:
         self._step: ConsensusStep | None = None
         self._has_news = False
         self._running_until_s: float | None = None
+        self._running_lists: dict[LogId, int] = {}
         self._moving_to: LogId | None = None
         self._next_s = float("-inf")
         self._wait_until_s = float("-inf")
@@ -187,6 +200,9 @@ class DistributedOptimisation:
         self._failures = 0
         self._distrusted = Muted(DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S)
         self._contradicted_s: float | None = None
+        self._rejoin_at_s = float("inf")
+        self._coming_apart = ComingApart()
+        self._agreed: _Agreed | None = None
         self._least_gap = float("inf")
         self._vain_steps = 0
 
@@ -198,7 +214,7 @@ class DistributedOptimisation:
             return []
         pair = self._pairs.get(sender)
         if pair is None:
-            if len(self._pairs) >= NEIGHBOURS_MAX or not message.keyframes:
+            if len(self._pairs) >= NEIGHBOURS_MAX or not message.edition:
                 return []
             pair = self._pairs[sender] = _Pair()
         if pair.said is not None and message.step < pair.said.step:
@@ -207,9 +223,13 @@ class DistributedOptimisation:
             pair.said = pair.heard = None
             if sender < self._own:
                 pair.edition, pair.keyframes = 0, ()
+            else:
+                self._list_anew(pair)
         if sender < self._own and message.edition != pair.edition and not self._take_list(sender, pair, message):
-            return []
+            return [] if message.keyframes or message.edition <= pair.edition else [self._ask_for_list(sender)]
         before, pair.said, pair.said_s = pair.said, message, now
+        if self._own < sender and before is not None and message.edition < before.edition == pair.edition:
+            self._list_anew(pair)  # it began again: what both said of the old list is of no use
         if message.edition != pair.edition or len(message) != len(pair.keyframes) or not len(message):
             return []
         pair.is_news = pair.is_news or before is None or message.step > before.step
@@ -241,12 +261,12 @@ class DistributedOptimisation:
         if self.anchor == self._own:
             self._origin_step = number
         for other, told in step.told.items():
-            pair = self._pairs.get(other)
-            if pair is not None and len(told.rows) == len(pair.keyframes):
+            pair = self._pairs[other]
+            if pair.edition == self._running_lists[other]:
                 pair.told = told
         for other, information in step.information.items():
-            pair = self._pairs.get(other)
-            if pair is not None and len(information) == len(pair.keyframes):
+            pair = self._pairs[other]
+            if pair.edition == self._running_lists[other]:
                 pair.information = Array.of(information)
         self.is_settled = max(step.moved, step.gap) <= self._parameters.tolerance
         self._has_news |= step.aligned or step.moved > self._parameters.tolerance
@@ -255,7 +275,7 @@ class DistributedOptimisation:
         self._repeat_pause_s = self._parameters.repeat_s
         self._repeat_at_s = now + self._repeat_pause_s
         reports = [self._refuse(other, reason) for other, reason in sorted(step.refused.items())]
-        return [*reports, *self._said()]
+        return [*reports, *self._watch_contacts(step, now), *self._said()]
 
     def on_failed(self, number: int, reason: str, now: float) -> list[Effect]:
         """A step without a result: it is tried again after a growing pause."""
@@ -308,15 +328,10 @@ class DistributedOptimisation:
             return []
         self._contradicted_s = None
         heard = sorted(other for other, pair in self._pairs.items() if pair.said is not None)
-        for other in heard:
-            self._distrusted.on_failed(other.robot, other.robot, now)
         self._begin_alone()
         self._step, self._undelivered = None, False
         self._next_s = now + self._parameters.period_s
-        for pair in self._pairs.values():
-            pair.said = pair.heard = pair.told = None
-            if not pair.owned:
-                pair.edition, pair.keyframes, pair.information = 0, (), None
+        self._leave(self._pairs, heard, now)
         reason = f"{why}: it goes on alone"
         return [self._refuse(other, reason) for other in heard]
 
@@ -330,6 +345,8 @@ class DistributedOptimisation:
         if self._choosing is not None and self._choosing.until_s <= now:
             effects += self.on_choice_failed(self._choosing.number, "it took too long", now)
         self._look(now)
+        if self._rejoin_at_s <= now:
+            self._rejoin_at_s, self._has_news = float("inf"), True
         if self._choosing is None and self._choose_due_s() <= now:
             effects += self._choose(now)
         if self._running_until_s is None and self._begin_at_s() <= now:
@@ -342,14 +359,14 @@ class DistributedOptimisation:
 
     def deadline(self) -> float:
         """When `tick` or `component` is due next."""
-        deliver_s = self._deliver_at_s if self._undelivered else float("inf")
+        deliver_s = self._may_deliver_s() if self._undelivered else float("inf")
         step_s = self._begin_at_s() if self._running_until_s is None else self._running_until_s
         choice_s = self._choose_due_s() if self._choosing is None else self._choosing.until_s
-        return min(step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s())
+        return min(step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s(), self._rejoin_at_s)
 
     def component(self, now: float) -> Component | None:
-        """This robot's corrected poses, at most once per period, None where there is nothing new."""
-        if self._step is None or not self._undelivered or self._deliver_at_s > now:
+        """This robot's corrected poses, at most once per period, None where there is nothing new or agreed on."""
+        if self._step is None or not self._undelivered or self._may_deliver_s() > now:
             return None
         self._undelivered = False
         self._deliver_at_s = now + DELIVER_PERIOD_S
@@ -373,6 +390,10 @@ class DistributedOptimisation:
             keyframes=0 if step is None else len(step.T_map_keyframe),
         )
         return Report(fact)
+
+    def _may_deliver_s(self) -> float:
+        """Not before that, unless a contact says that neighbours agree."""
+        return max(self._deliver_at_s, self._coming_apart.until_s())
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -489,6 +510,39 @@ class DistributedOptimisation:
         self._vain_steps = 0 if nearer else min(self._vain_steps + 1, VAIN_STEPS_MAX)
         self._least_gap = gap if nearer or gap > self._least_gap / NEARER_RATIO**4 else self._least_gap
 
+    def _watch_contacts(self, step: ConsensusStep, now: float) -> list[Effect]:
+        """Say with whom it comes apart, and go back to where it last agreed with everybody."""
+        T = {log: self._graph.trajectories[log] for log in (self._own, *step.apart) if log in self._graph.trajectories}
+        ways_m = {log: way_m(np.asarray(trajectory.T_odom_keyframe)) for log, trajectory in T.items()}
+        both_m = {log: ways_m.get(self._own, 0.0) + ways_m.get(log, 0.0) for log in step.apart}
+        contacts = {log: beyond(apart, both_m[log]) for log, apart in step.apart.items()}
+        apart = self._coming_apart.on_contacts(contacts, now)
+        if not apart:
+            if self._coming_apart.until_s() < now:
+                self._agreed = _Agreed(self.anchor, step.origin, self._origin_step, step)
+            return []
+        agreed = self._agreed
+        self._begin_alone()
+        self._step, self._undelivered = None, False
+        if agreed is not None:
+            self.anchor, self._origin, self._origin_step = agreed.anchor, agreed.origin, agreed.origin_step
+            self._state, self._step, self._is_back = agreed.step.state, agreed.step, False
+        self._leave(apart, apart, now)
+        return [*(self._refuse(other, CAME_APART) for other in apart), self.report()]
+
+    def _leave(self, logs: Iterable[LogId], distrusted: Iterable[LogId], now: float) -> None:
+        """Take back what is shared with others, and do not hear some of them for a while; it owns what it owned."""
+        for other in distrusted:
+            self._distrusted.on_failed(other.robot, other.robot, now)
+        self._coming_apart.forget(logs)
+        for other in logs:
+            pair = self._pairs[other]
+            pair.said = None
+            self._list_anew(pair)
+            self._rejoin_at_s = self._distrusted.until_s()
+            if not pair.owned:
+                pair.edition, pair.keyframes = 0, ()
+
     def _owned(self) -> tuple[OwnedClosure, ...]:
         return (*self._within, *(each for pair in self._pairs.values() for each in pair.owned))
 
@@ -552,10 +606,14 @@ class DistributedOptimisation:
                 return
             pair = self._pairs[other] = _Pair()
         if tuple(shared) != pair.keyframes or {_named(c) for c in used} != {_named(c) for c in pair.owned}:
-            pair.edition = min(max(self.number, pair.edition) + 1, INDEX_MAX)
-            pair.information = pair.heard = pair.told = None
+            self._list_anew(pair)
         pair.keyframes, pair.owned = tuple(shared), used
         self._has_news = True
+
+    def _list_anew(self, pair: _Pair) -> None:
+        """Give the list of shared poses another edition."""
+        pair.edition = min(max(self.number, pair.edition) + 1, INDEX_MAX)
+        pair.information = pair.heard = pair.told = None
 
     # What it does
 
@@ -584,8 +642,11 @@ class DistributedOptimisation:
         said = None if moves_to is None else self._pairs[moves_to[0]].said
         anchor = self.anchor if said is None else said.anchor
         shared = {
-            other: self._shared_with(other, pair, anchor, now) for other, pair in self._pairs.items() if pair.keyframes
+            other: self._shared_with(other, pair, anchor, now)
+            for other, pair in self._pairs.items()
+            if pair.keyframes and not self._is_distrusted(other, now)
         }
+        self._running_lists = {other: pair.edition for other, pair in self._pairs.items()}
         for pair in self._pairs.values():
             pair.heard, pair.is_news = None, False
         origin = self._origin if said is None else pose_from_tq(np.array(said.origin))
@@ -640,6 +701,7 @@ class DistributedOptimisation:
 
     def _begin_alone(self) -> None:
         self.anchor, self._state, self._origin, self._origin_step = self._own, None, None, -1
+        self._agreed = None
         self._is_back = True
         self._has_news = True
 
@@ -670,6 +732,16 @@ class DistributedOptimisation:
             told.known,
             told.edition,
             Array.of(told.stiffness),
+        )
+
+    def _ask_for_list(self, other: LogId) -> Effect:
+        """Tell a lower robot that its list of shared poses is not here: this robot began again."""
+        none, origin = Array.of(np.zeros(0)), pose7(np.eye(4) if self._origin is None else self._origin)
+        rows, information = Array.of(np.zeros((0, 13))), Array.of(np.zeros((0, 2)))
+        base_m = Array.of(np.zeros(3), "f8")
+        return Unicast(
+            other.robot,
+            SharedPoses(self.anchor, self.number, origin, 0, 0, (), information, base_m, rows, 0, 0, none),
         )
 
     def _refuse(self, other: LogId, reason: str) -> Effect:

@@ -111,6 +111,23 @@ class ConsensusProblem:
     state: ConsensusState | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far two robots are from each other where they share poses.
+
+    Attributes:
+        m: The largest distance.
+        strain: Mean square of all differences, over what both covariances allow: above 1 is more.
+    """
+
+    m: float
+    strain: float
+
+    def most(self, other: "Apart") -> "Apart":
+        """The larger of both, each."""
+        return Apart(max(self.m, other.m), max(self.strain, other.strain))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ConsensusStep:
     """What a step gave.
@@ -126,6 +143,7 @@ class ConsensusStep:
         cost: Half the sum of the weighted squared residuals of what the robot owns.
         aligned: The part moved into the frame it was asked to move into.
         refused: Robots that told what cannot be, and why.
+        apart: How far each robot that was heard is from this one, before the step or after it.
     """
 
     state: ConsensusState
@@ -138,3 +156,4 @@ class ConsensusStep:
     cost: float
     aligned: bool = False
     refused: Mapping[LogId, str] = field(default_factory=dict)
+    apart: Mapping[LogId, Apart] = field(default_factory=dict)

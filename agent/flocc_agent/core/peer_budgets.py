@@ -88,6 +88,10 @@ class Muted:
         silence = self._silences.get((peer, signer))
         return silence is not None and now < silence.until_s
 
+    def until_s(self) -> float:
+        """When the last silence ends that began so far."""
+        return max((silence.until_s for silence in self._silences.values()), default=float("-inf"))
+
     def on_failed(self, peer: str, signer: str, now: float) -> None:
         """A signature of a robot failed in what a peer sent."""
         last = self._silences.get((peer, signer))

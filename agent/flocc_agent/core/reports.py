@@ -80,6 +80,7 @@ class EncodingFailed:
     reason: str
 
 
+CAME_APART = "they come apart instead of agreeing on the poses that they share, and go back to where they agreed"
 WITHHELD = "the camera's axes are not those of its odometry, so closures would misplace the robot"
 """Why such a camera's keyframes are not encoded."""
 

@@ -26,6 +26,7 @@ CARRIED_BYTES_MAX = 2**31
 DIGITS_MAX = 12
 
 UNKNOWN = b"flocc: unknown latent"
+BAD_REQUEST = b"flocc: bad request"
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,16 @@ import zenoh
 from flocc_agent.budget import Budget
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import Radio
-from flocc_agent.runtime.latent_transfer import UNKNOWN, LinkRates, Partial, Partials, Piece, Server, checked_number
+from flocc_agent.runtime.latent_transfer import (
+    BAD_REQUEST,
+    UNKNOWN,
+    LinkRates,
+    Partial,
+    Partials,
+    Piece,
+    Server,
+    checked_number,
+)
 from flocc_agent.runtime.transport import LATENT, Fetched, FetchFailed, FetchProblem, LatentLookup, TrafficCounter
 from flocc_agent.runtime.zenoh_session import open_session
 from flocc_protocol import keys
@@ -106,10 +115,12 @@ class BulkService:
     def _answer(self, query: zenoh.Query) -> None:
         try:
             with query:
-                self._reply(query)
-        except FloccError as error:
-            self._counter.count_dropped("refused-request")
-            logger.debug("robot %s: refused a request for a latent: %s", self._robot, error)
+                try:
+                    self._reply(query)
+                except FloccError as error:
+                    self._counter.count_dropped("refused-request")
+                    logger.debug("robot %s: refused a request for a latent: %s", self._robot, error)
+                    query.reply_err(BAD_REQUEST)
         except zenoh.ZError as error:
             self._counter.count_dropped("not-sent")
             logger.debug("robot %s: a piece was not sent: %s", self._robot, error)

@@ -127,7 +127,7 @@ def _iterated(config: BackendConfig, problem: BlockProblem) -> BlockStep:
     finished = state.control is None and not state.has_unjudged
     origin = _origin(problem, next_state.X, aligned)
     T_map_keyframe = block_descent.rounded(X, _origin(problem, X, aligned))
-    return BlockStep(next_state, T_map_keyframe, origin, moved_most, descended.cost, aligned, finished, decided)
+    return BlockStep(next_state, T_map_keyframe, origin, moved_most, aligned, finished, decided)
 
 
 def _origin(problem: BlockProblem, X: Float, aligned: bool) -> Float:

@@ -79,7 +79,6 @@ class BlockStep:
         T_map_keyframe: (n, 4, 4) rounded poses in the map frame.
         origin: (4, r) where the map frame lies among the poses of the state.
         moved: Largest change of a number of a pose: metres, or entries of a rotation.
-        cost: Half the sum of the weighted squared residuals that concern the block.
         aligned: The block moved into the frame it was asked to move into.
         finished: Robust weights are final.
         rejected: Closures of this robot's decision with weight zero.
@@ -89,7 +88,6 @@ class BlockStep:
     T_map_keyframe: Float
     origin: Float
     moved: float
-    cost: float
     aligned: bool
     finished: bool
     rejected: int

@@ -3,7 +3,8 @@
 Robots exchange only separators: their own keyframes at the ends of closures between robots. A robot iterates when it
 has news of every neighbour that shares its frame, or has waited long enough; what is lost is said again, with pauses
 that double. Every robot starts in its own frame and moves into that of a neighbour whose anchor is lower, so that one
-frame survives: the lowest robot's. A robot gives corrections to itself only, with its iteration as the round.
+frame survives: the lowest robot's. The graph is whole from the beginning and an iteration never fails: this runs
+offline, as the paper's baseline.
 """
 
 from dataclasses import dataclass, field
@@ -11,10 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.core.distributed_optimisation import GraphSource
-from flocc_agent.core.pose_graph import Component, LoopClosure, Trajectory
-from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND
-from flocc_agent.geometry import inverse
+from flocc_agent.core.pose_graph import LoopClosure, PoseGraph
 from flocc_lab.rbcd.blocks import BlockProblem, BlockState, BlockStep
 from flocc_lab.rbcd.separators import SEPARATORS_MAX, Separators
 from flocc_protocol.arrays import Array
@@ -23,10 +21,7 @@ from flocc_protocol.messages import OFFERS_MAX, CandidatePair
 
 Float = NDArray[np.float64]
 
-DELIVER_PERIOD_S = 2.0
-"""Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
-FAILURES_MAX = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +33,6 @@ class RbcdParameters:
         wait_s: A robot waits this long for news of a neighbour before it iterates on old ones.
         repeat_s: First pause after which a robot at rest says its separators again; doubles up to `repeat_max_s`.
         repeat_max_s: Longest pause between repetitions.
-        timeout_s: An iteration without a result by then is given up.
         tolerance: A block whose poses moved less (metres, or entries of a rotation) rests until it hears something new.
     """
 
@@ -46,7 +40,6 @@ class RbcdParameters:
     wait_s: float = 1.0
     repeat_s: float = 0.5
     repeat_max_s: float = 16.0
-    timeout_s: float = 60.0
     tolerance: float = 1e-3
 
 
@@ -85,39 +78,33 @@ class RbcdMachine:
     def __init__(
         self,
         own: LogId,
-        source: GraphSource,
+        graph: PoseGraph,
         parameters: RbcdParameters,
-        iteration: int = 0,
     ) -> None:
         self.anchor = own
-        self.iteration = iteration
+        self.iteration = 0
         self.is_settled = False
         self._own = own
-        self._source = source
         self._parameters = parameters
         self._neighbours: dict[LogId, _Neighbour] = {}
         self._heard: dict[CandidatePair, float] = {}
         self._epoch = 0
         self._origin: Float | None = None
         self._origin_iteration = -1
-        self._seen: tuple[int, int] | None = None
-        self._trajectory = Trajectory(np.zeros((0, 4, 4)))
-        self._closures: tuple[LoopClosure, ...] = ()
-        self._separators: tuple[int, ...] = ()
-        self._far_ends: tuple[KeyframeId, ...] = ()
-        self._joined: tuple[LogId, ...] = ()
+        self._trajectory = graph.trajectories[own]
+        self._closures = tuple(c for c in graph.closures if own in (c.query.log, c.match.log))
+        ends = [self._ends(c) for c in self._closures if c.query.log != c.match.log]
+        self._separators = tuple(sorted({own.index for own, _ in ends}))
+        self._far_ends = tuple(sorted({other for _, other in ends}))
+        self._joined = tuple(sorted({other.log for _, other in ends}))
         self._state: BlockState | None = None
-        self._step: BlockStep | None = None
-        self._has_news = False
-        self._running_until_s: float | None = None
+        self._has_news = True
+        self._is_running = False
         self._aligning: _Neighbour | None = None
         self._next_s = float("-inf")
         self._wait_until_s = float("-inf")
         self._repeat_at_s = float("inf")
         self._repeat_pause_s = parameters.repeat_s
-        self._deliver_at_s = float("-inf")
-        self._undelivered = False
-        self._failures = 0
 
     # Events
 
@@ -144,12 +131,11 @@ class RbcdMachine:
         self._has_news |= self._take_poses(held, message) | self._take_weights(sender, message)
 
     def on_step(self, number: int, step: BlockStep, now: float) -> list[Effect]:
-        """An iteration ended: say the separators; an answer that is late or of another iteration counts for nothing."""
-        if self._running_until_s is None or number != self.iteration:
-            return []
-        self._running_until_s = None
-        self._failures = 0
-        self._state, self._step = step.state, step
+        """An iteration ended: say the separators."""
+        assert self._is_running, "nothing was asked"
+        assert number == self.iteration, "one iteration at a time"
+        self._is_running = False
+        self._state = step.state
         if step.aligned and self._aligning is not None:
             self.anchor = self._aligning.anchor
             self._origin_iteration = self._aligning.origin_iteration
@@ -159,29 +145,16 @@ class RbcdMachine:
             self._origin_iteration = number
         self.is_settled = step.moved <= self._parameters.tolerance and step.finished
         self._has_news |= not self.is_settled or step.aligned
-        self._undelivered = True
         self._repeat_pause_s = self._parameters.repeat_s
         self._repeat_at_s = now + self._repeat_pause_s
         return [*self._said()]
 
-    def on_failed(self, number: int, now: float) -> None:
-        """An iteration without a result: it is tried again after a growing pause."""
-        if self._running_until_s is None or number != self.iteration:
-            return
-        self._running_until_s = None
-        self._failures = min(self._failures + 1, FAILURES_MAX)
-        self._next_s = now + self._parameters.period_s * 2**self._failures
-        self._has_news = True
-
     # Time
 
     def tick(self, now: float) -> list[Effect]:
-        """Give up an overdue iteration, begin the next one, repeat what may have been lost."""
+        """Begin the next iteration, repeat what may have been lost."""
         effects: list[Effect] = []
-        if self._running_until_s is not None and self._running_until_s <= now:
-            self.on_failed(self.iteration, now)
-        self._look()
-        if self._running_until_s is None and self._begin_at_s() <= now:
+        if not self._is_running and self._begin_at_s() <= now:
             effects.append(self._begin(now))
         if self._repeat_at_s <= now:
             self._repeat_pause_s = min(2.0 * self._repeat_pause_s, self._parameters.repeat_max_s)
@@ -190,45 +163,10 @@ class RbcdMachine:
         return effects
 
     def deadline(self) -> float:
-        """When `tick` or `component` is due next."""
-        deliver_s = self._deliver_at_s if self._undelivered else float("inf")
-        if self._running_until_s is not None:
-            return min(self._running_until_s, self._repeat_at_s, deliver_s)
-        return min(self._begin_at_s(), self._repeat_at_s, deliver_s)
-
-    def component(self, now: float) -> Component | None:
-        """This robot's corrected poses, at most once per period, None where there is nothing new."""
-        if self._step is None or not self._undelivered or self._deliver_at_s > now:
-            return None
-        self._undelivered = False
-        self._deliver_at_s = now + DELIVER_PERIOD_S
-        T = self._step.T_map_keyframe
-        T_map_odom = T[-1] @ inverse(self._trajectory.T_odom_keyframe[len(T) - 1])
-        logs = (self._own,) if self.anchor == self._own else (self.anchor, self._own)
-        return Component(logs, {self._own: T}, {self._own: T_map_odom}, {}, cost=self._step.cost)
+        """When `tick` is due next."""
+        return self._repeat_at_s if self._is_running else min(self._begin_at_s(), self._repeat_at_s)
 
     # What it knows
-
-    def _look(self) -> None:
-        """Take in what the logs gained: every closure, keyframes in steps."""
-        revision, keyframes = self._source.revision, self._source.keyframes
-        if keyframes == 0:
-            return
-        if self._seen is not None:
-            grown = keyframes - self._seen[1]
-            if revision == self._seen[0] and grown < KEYFRAMES_PER_ROUND:
-                return
-        self._seen = (revision, keyframes)
-        graph = self._source.graph()
-        if self._own not in graph.trajectories:
-            return
-        self._trajectory = graph.trajectories[self._own]
-        self._closures = tuple(c for c in graph.closures if self._own in (c.query.log, c.match.log))
-        ends = [self._ends(c) for c in self._closures if c.query.log != c.match.log]
-        self._separators = tuple(sorted({own.index for own, _ in ends}))
-        self._far_ends = tuple(sorted({other for _, other in ends}))
-        self._joined = tuple(sorted({other.log for _, other in ends}))
-        self._has_news = True
 
     def _ends(self, closure: LoopClosure) -> tuple[KeyframeId, KeyframeId]:
         """The own and the other end of a closure between two robots."""
@@ -263,14 +201,14 @@ class RbcdMachine:
     # What it does
 
     def _begin_at_s(self) -> float:
-        if not self._has_news or len(self._trajectory) == 0:
+        if not self._has_news:
             return float("inf")
         waits = not self.is_settled and any(not neighbour.is_news for neighbour in self._sharing())
         return max(self._next_s, self._wait_until_s) if waits else self._next_s
 
     def _begin(self, now: float) -> Effect:
         self.iteration = min(self.iteration + 1, INDEX_MAX)
-        self._running_until_s = now + self._parameters.timeout_s
+        self._is_running = True
         self._next_s = now + self._parameters.period_s
         self._wait_until_s = now + self._parameters.wait_s
         self._has_news = self.is_settled = False

@@ -29,27 +29,6 @@ OnIteration = Callable[[int, Mapping[LogId, Float]], bool]
 """Takes the number of iterations of the slowest robot and everybody's poses; True ends the run."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class WholeGraph:
-    """A pose graph that is known from the beginning."""
-
-    whole: PoseGraph
-
-    @property
-    def keyframes(self) -> int:
-        """Number of keyframes."""
-        return sum(len(trajectory) for trajectory in self.whole.trajectories.values())
-
-    @property
-    def revision(self) -> int:
-        """Never grows."""
-        return 1
-
-    def graph(self) -> PoseGraph:
-        """The pose graph."""
-        return self.whole
-
-
 @dataclass(slots=True)
 class RbcdTraffic:
     """What was said: messages and bytes, by all robots."""
@@ -111,8 +90,7 @@ class _Air:
     def __init__(
         self, graph: PoseGraph, config: BackendConfig, parameters: RbcdParameters, loss_ratio: float, seed: int
     ) -> None:
-        source = WholeGraph(graph)
-        self._machines = {log: RbcdMachine(log, source, parameters) for log in sorted(graph.trajectories)}
+        self._machines = {log: RbcdMachine(log, graph, parameters) for log in sorted(graph.trajectories)}
         self._config = config
         self._loss_ratio = loss_ratio
         self._rng = np.random.default_rng(seed)
@@ -145,7 +123,6 @@ class _Air:
     def _wake(self, log: LogId) -> None:
         machine, now = self._machines[log], self._agenda.now_s
         self._carry_out(log, machine.tick(now))
-        machine.component(now)
         due_s = machine.deadline()
         if due_s < float("inf"):
             self._agenda.at(max(due_s, now + 1e-3), partial(self._wake_if_due, log))

@@ -73,11 +73,12 @@ def _saved_swarm(
 def info(folder: MapArgument, json_out: Json = False) -> None:
     """Say what a map holds, and check that it is whole."""
     from flocc_agent.runtime.map_folder import MapFolder
-    from flocc_launch.maps.map_info import map_lines
+    from flocc_launch.maps.map_info import map_lines, positions_sigma_m
 
-    lines = list(map_lines(MapFolder.open(folder)))
+    opened = MapFolder.open(folder)
+    lines = list(map_lines(opened))
     if json_out:
-        facts(dict(lines))
+        facts({**opened.manifest.model_dump(mode="json"), "positions_sigma_m": positions_sigma_m(opened)})
         return
     for name, value in lines:
         typer.echo(f"{name:14} {value}")

@@ -4,6 +4,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 
+APART_ADVICE = (
+    "Look for closures of theirs that are wrong, and for odometry whose covariances say too little; "
+    "backend.mode central has a leader solve instead."
+)
 ONE_WAY_ADVICE = "Look for a firewall or an endpoint that only one side can reach, and for unequal transmit power."
 
 

@@ -5,11 +5,19 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from statistics import median
 
-from flocc_agent.core.reports import WITHHELD, EncodingFailed, FrontEndsDiffer, NameTaken, RoundSolved
+from flocc_agent.core.reports import (
+    CAME_APART,
+    WITHHELD,
+    EncodingFailed,
+    FrontEndsDiffer,
+    NameTaken,
+    PeerRefused,
+    RoundSolved,
+)
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.cameras import doubted_cameras
-from flocc_launch.doctor.finding import Finding, Severity
+from flocc_launch.doctor.finding import APART_ADVICE, Finding, Severity
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
@@ -99,6 +107,22 @@ def solver_refusals(loaded: LoadedRun) -> list[Finding]:
     few = CLOSURES_WRONG if right[False] > right[True] or (not right and look_weak(loaded)) else MEASURED_WRONG
     advice = f"Likely reasons, in this order: {'; '.join((*few, *REASONS_LEFT))}."
     return [Finding("solver-refuses", Severity.HINDERS, sentence, advice)]
+
+
+def comings_apart(loaded: LoadedRun) -> list[Finding]:
+    """Robots in distributed mode whose exchange led away from each other."""
+    found = [event for event in of_kind(loaded.events, PeerRefused) if event.fact.reason.endswith(CAME_APART)]
+    told = Counter((event.robot, event.fact.peer) for event in found)
+    return [
+        Finding(
+            "came-apart",
+            Severity.HINDERS,
+            f"{robot} came apart from {peer} {count} times, went back to where both agreed and was deaf to it a while.",
+            APART_ADVICE,
+            (robot, peer),
+        )
+        for (robot, peer), count in sorted(told.items())
+    ]
 
 
 def left_out(loaded: LoadedRun) -> list[Pair]:
@@ -219,6 +243,7 @@ GENERAL: tuple[Callable[[LoadedRun], list[Finding]], ...] = (
     doubted_cameras,
     solver_warnings,
     solver_refusals,
+    comings_apart,
     encoding_failures,
     unsteady_leaders,
     odd_truths,

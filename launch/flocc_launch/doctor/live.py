@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from flocc_agent.core.reports import CAME_APART
 from flocc_launch.dashboard.status_table import NO_ANSWER, RobotStatus
 from flocc_launch.doctor.cameras import doubts_told, finding_of, findings_of, merged_doubtfully
 from flocc_launch.doctor.finding import (
+    APART_ADVICE,
     ONE_WAY_ADVICE,
     Finding,
     Severity,
@@ -33,7 +35,7 @@ def late(silent: Sequence[str]) -> list[Finding]:
 
 
 def _answered(rows: Sequence[RobotStatus]) -> list[Finding]:
-    checks = (shared, lonely, unheard, without_keyframes, leaderless, refusing)
+    checks = (shared, lonely, unheard, without_keyframes, leaderless, refusing, coming_apart)
     found = [finding for check in checks for finding in check(rows)]
     cameras = findings_of(doubts_told(rows))
     first = merging(rows, any(finding.cause != "refused" for finding in found))
@@ -151,11 +153,26 @@ def refusing(rows: Sequence[RobotStatus]) -> list[Finding]:
             "refused",
             Severity.HINDERS,
             f"{row.robot} dropped or refused messages: "
-            + ", ".join(f"{count} × {reason}" for reason, count in sorted(row.refused.items()))
+            + ", ".join(f"{count} × {reason}" for reason, count in sorted(refused.items()))
             + ".",
             "Run one flocc version with the same keys on all robots; drops alone mean more load than it can take.",
             (row.robot,),
         )
         for row in rows
-        if row.refused
+        if (refused := {reason: n for reason, n in row.refused.items() if not reason.endswith(CAME_APART)})
+    ]
+
+
+def coming_apart(rows: Sequence[RobotStatus]) -> list[Finding]:
+    """Robots in distributed mode whose exchange led away from each other."""
+    told = [(row.robot, n) for row in rows for reason, n in row.refused.items() if reason.endswith(CAME_APART)]
+    return [
+        Finding(
+            "came-apart",
+            Severity.HINDERS,
+            f"{robot} came apart from others {count} times, went back to where they agreed and does not hear them now.",
+            APART_ADVICE,
+            (robot,),
+        )
+        for robot, count in told
     ]

@@ -54,16 +54,23 @@ def _lens(camera: LensModel | None) -> str:
     return f"{camera.width} x {camera.height} pixels, {degrees:.0f} degrees wide"
 
 
-def _uncertainty(opened: MapFolder) -> str:
-    """The largest standard deviation of a position, against the anchor's first keyframe."""
+def positions_sigma_m(opened: MapFolder) -> tuple[float, float] | None:
+    """Median and largest standard deviation of keyframes' positions, against the anchor's first; None: not known."""
     rows = np.concatenate(
         [rows for rows in opened.covariances().values() if len(rows)] or [np.zeros((0, 21), dtype=np.float32)]
     )
     known = rows[np.isfinite(rows).all(axis=1)]
     if not len(known):
-        return "not known"
+        return None
     sigmas_m = [float(np.sqrt(np.linalg.eigvalsh(symmetric(row)[3:, 3:])[-1].clip(0))) for row in known]
-    return f"positions to {np.median(sigmas_m):.2f} m, at worst {max(sigmas_m):.2f} m (one sigma, from the anchor)"
+    return float(np.median(sigmas_m)), max(sigmas_m)
+
+
+def _uncertainty(opened: MapFolder) -> str:
+    sigmas_m = positions_sigma_m(opened)
+    if sigmas_m is None:
+        return "not known"
+    return f"positions to {sigmas_m[0]:.2f} m, at worst {sigmas_m[1]:.2f} m (one sigma, from the anchor)"
 
 
 def _size(manifest: MapManifest) -> str:

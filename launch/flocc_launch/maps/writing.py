@@ -26,6 +26,7 @@ from flocc_agent.runtime.map_folder import (
     MAP_FORMAT,
     BadMap,
     FileSum,
+    MapFolder,
     MapFrontEnd,
     MapManifest,
     SavedLogEntry,
@@ -89,11 +90,12 @@ def check_target(out: Path, *others: Path) -> None:
 
 
 def write_map(out: Path, content: MapContent) -> MapManifest:
-    """Write a map.
+    """Write a map, in the place of an earlier state of the same one if there is any.
 
     Raises:
-        BadMap: The folder cannot be written.
+        BadMap: The folder cannot be written, or holds a map of which records would be lost.
     """
+    _refuse_to_lose(out, content.logs)
     try:
         out.mkdir(parents=True, exist_ok=True)
         return _write(out, content)
@@ -101,6 +103,24 @@ def write_map(out: Path, content: MapContent) -> MapManifest:
         raise BadMap(f"{out}: cannot be written: {error.strerror or error}") from error
     except sqlite3.Error as error:
         raise BadMap(f"{out}: cannot be written: {error}") from error
+
+
+def _refuse_to_lose(out: Path, logs: Logs) -> None:
+    """Whether all that a map in this folder holds stands in logs, too.
+
+    Raises:
+        BadMap: It does not, or that map cannot be read.
+    """
+    if not (out / MANIFEST).exists():
+        return
+    there = MapFolder.open(out)
+    for log, records in there.records.items():
+        if logs.get(log, ())[: len(records)] != records:
+            of_swarm = f" of swarm {there.manifest.swarm}" if there.manifest.swarm else ""
+            raise BadMap(
+                f"{out}: holds the map {there.manifest.name!r}{of_swarm}, whose log {log} this one does not have; "
+                "choose another --out, or remove that folder first"
+            )
 
 
 def _write(out: Path, content: MapContent) -> MapManifest:

@@ -15,6 +15,7 @@ from flocc_launch.datasets.drift import kind_of
 from flocc_launch.datasets.names import robot_name as name_of
 from flocc_launch.datasets.source import DatasetError, Source
 from flocc_launch.datasets.video import is_video
+from flocc_launch.runs.plain_numbers import duration
 
 ROBOTS = 3
 ROBOTS_MAX = 16
@@ -98,7 +99,17 @@ class OwnData:
             {kind_of(self.sources[name].format, truth) for name in made if (truth := self.sources[name].truth)}
         )
         drift = f"; odometry is made of ground truth, with seeded drift as of {' and '.join(kinds)}" if made else ""
-        return f"data: {self.path}, {taken}{spacing}{drift}{self._not_taken()}{self._pairs()}"
+        return f"data: {self.path}, {taken}{self._moved()}{spacing}{drift}{self._not_taken()}{self._pairs()}"
+
+    def _moved(self) -> str:
+        """That recordings of different times are played as if they began together, and which began last."""
+        first_s = {name: source.images[0][0] for name, source in self.sources.items()}
+        if len(first_s) < 2 or self._starts_s():
+            return ""
+        last, apart_s = max(first_s, key=lambda name: first_s[name]), max(first_s.values()) - min(first_s.values())
+        return (
+            f"; {last} was recorded {duration(apart_s)} after the first, but they are played as if they began together"
+        )
 
     def _not_taken(self) -> str:
         return f"; not taken: {', '.join(self.left[:12])}" if self.left else ""

@@ -66,6 +66,17 @@ def test_two_places_with_as_many_closures_are_named(closures: list[LoopClosure])
     (sentence,) = [w for w in solved(closures).warnings if "look the same" in w]
     assert sentence.startswith("robots a and b: 4 closures agree on the place that was taken, and 4 others on another")
     assert "180 degrees away" in sentence
+    assert "jumps" not in sentence  # keyframes of both places lie between each other
+
+
+@pytest.mark.parametrize("robot", ["a", "b"])
+def test_a_jump_of_odometry_is_named_where_keyframes_before_and_after_it_say_two_places(robot: str) -> None:
+    before, after = [(k, k + 1) for k in range(4)], [(k + 5, k) for k in range(4)]
+    if robot == "b":
+        before, after = [(j, i) for i, j in before], [(j, i) for i, j in after]
+    closures = saying(turned(0.0, 5.0), before) + saying(turned(0.1, 35.0), after)
+    (sentence,) = [w for w in solved(closures).warnings if "look the same" in w]
+    assert f"and so does odometry of robot {robot} that jumps between 3 and 5, and nothing here tells" in sentence
 
 
 def test_one_closure_more_on_one_side_is_a_tie_too_and_nothing_is_held_for_it() -> None:

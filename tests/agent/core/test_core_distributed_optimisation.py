@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.core.distributed_optimisation import DELIVER_PERIOD_S, VAIN_STEPS_MAX, DistributedOptimisation
+from flocc_agent.core.coming_apart import CONTACTS, SILENT_S
+from flocc_agent.core.distributed_optimisation import (
+    DELIVER_PERIOD_S,
+    DISTRUSTED_FIRST_S,
+    VAIN_STEPS_MAX,
+    DistributedOptimisation,
+)
 from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
-from flocc_agent.core.own_part import ConsensusState, ConsensusStep, ToldPoses
+from flocc_agent.core.own_part import Apart, ConsensusState, ConsensusStep, ToldPoses
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.plausibility import HELD_BACK_S
 from flocc_agent.core.pose_graph import (
@@ -21,7 +27,7 @@ from flocc_agent.core.pose_graph import (
     PoseGraph,
     Trajectory,
 )
-from flocc_agent.core.reports import PeerRefused, RoundFailed
+from flocc_agent.core.reports import CAME_APART, PeerRefused, RoundFailed
 from flocc_agent.geometry import pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
@@ -341,6 +347,70 @@ def test_what_its_own_log_contradicts_for_long_makes_it_go_on_alone() -> None:
     _, (job,) = bench.turn(15.0)
     assert A not in job.problem.shared
     assert job.problem.state is None
+
+
+FAR = Apart(m=50.0, strain=9.0)
+
+
+def test_while_neighbours_are_too_far_away_it_does_not_correct_itself() -> None:
+    bench = Bench().shares()
+    assert bench.b.component(0.2) is not None
+    bench.b._has_news = True
+    bench.turn(3.0, apart={C: FAR})
+    assert bench.b.component(3.0) is None
+    assert bench.b.deadline() > 3.0
+    bench.b._has_news = True
+    bench.turn(4.0, apart={C: Apart(0.1, 0.1)})
+    assert bench.b.component(4.0) is not None
+    bench.b._has_news = True
+    bench.turn(7.0, apart={C: FAR})
+    assert bench.b.component(7.0 + SILENT_S) is not None
+
+
+def test_one_that_comes_apart_is_named_and_not_heard_and_it_goes_back_to_where_it_agreed() -> None:
+    bench = Bench().shares()
+    edition = told(bench.b._said())["c"].edition
+    bench.b._has_news = True
+    bench.turn(1.0, apart={C: Apart(0.1, 0.1)})
+    agreed = bench.b._state
+    found: list[str] = []
+    for k in range(CONTACTS):
+        bench.b._has_news = True
+        effects, _ = bench.turn(2.0 + k, apart={C: FAR})
+        found += reasons(effects)
+    assert found == [f"shared poses: {CAME_APART}"]
+    assert told(bench.b._said()) == {}
+    bench.b.on_shared_poses(C, said(B, 30, edition), 8.0)
+    _, (job,) = bench.turn(9.0)
+    assert job.problem.state is agreed
+    assert job.problem.shared == {}
+    _, (later,) = bench.turn(2.0 + CONTACTS + DISTRUSTED_FIRST_S)
+    assert later.problem.shared[C].edition > edition
+    assert later.problem.shared[C].told is None
+
+
+def test_one_that_lost_its_list_asks_for_it_and_is_told_a_new_one() -> None:
+    higher = DistributedOptimisation(C, Source(), PARAMETERS, {"b"}.__contains__)
+    bench = Bench().shares()
+    first = told(bench.b._said())["c"]
+    bench.b.on_shared_poses(C, said(B, 3, edition=first.edition), 0.3)
+    silent = told(bench.b._said())["c"]
+    assert silent.keyframes == ()
+    (asks,) = told(higher.on_shared_poses(B, replace(silent, step=4), 0.4)).values()
+    assert (asks.edition, len(asks)) == (0, 0)
+    bench.b.on_shared_poses(C, replace(asks, step=4), 0.5)
+    effects, _ = bench.turn(1.5)
+    again = told(effects)["c"]
+    assert again.edition > first.edition
+    assert again.keyframes == (0,)
+
+
+def test_what_a_step_found_of_an_older_list_is_not_told_of_the_new_one() -> None:
+    bench = Bench().shares()
+    bench.b._has_news = True
+    (job,) = jobs(bench.b.tick(1.0))
+    bench.b._list_anew(bench.b._pairs[C])
+    assert told(bench.b.on_step(job.number, step(job), 1.1)) == {}
 
 
 def test_an_overdue_or_failed_step_is_tried_again_after_a_growing_pause() -> None:

@@ -21,7 +21,7 @@ from flocc_agent.runtime.transport import Fetched, FetchFailed, FetchProblem, Tr
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.keys import Admin
+from flocc_protocol.keys import Admin, latent_key
 
 pytestmark = pytest.mark.swarm
 
@@ -141,6 +141,18 @@ async def test_says_why_a_latent_does_not_come() -> None:
                 FetchProblem.NO_ANSWER,
             )
         ]
+
+
+async def test_a_get_that_names_no_piece_is_answered_with_an_error() -> None:
+    async with swarm(ROBOTS[:2]) as (one, two):
+        two.held["r2/1"] = b"right"
+        assert await one.transport.fetch_latent("r2", "r2/1", 10.0) == Fetched(b"right")
+        session = one.transport._bulk._session
+        assert session is not None
+        key = latent_key("test", "r2", "r2/1")
+        for wrong in ("", "?offset=0", "?offset=-5;length=9", "?offset=abc;length=9", "?offset=0;length=9;asker=A B"):
+            replies = await asyncio.to_thread(lambda: list(session.get(key + wrong, timeout=10.0)))  # noqa: B023
+            assert [reply.err.payload.to_bytes() for reply in replies if reply.err] == [b"flocc: bad request"], wrong
 
 
 async def test_does_not_take_a_latent_that_is_larger_than_allowed() -> None:
@@ -352,7 +364,7 @@ from flocc_agent.config import TransportConfig
 from flocc_agent.runtime.zenoh_admin import ask
 from flocc_agent.runtime.zenoh_transport import ZenohTransport
 from flocc_protocol.errors import DecodeError
-from flocc_protocol.keys import Admin
+from flocc_protocol.keys import Admin, latent_key
 async def main():
     async with ZenohTransport("test", "r1", TransportConfig(multicast=False)):
         raise SystemExit(3)
