@@ -187,7 +187,7 @@ def stored_result(config: AgentConfig) -> RobotResult:
 
 
 def _sealer(config: AgentConfig) -> RecordSealer | None:
-    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
+    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls, config.name)
 
 
 def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:
