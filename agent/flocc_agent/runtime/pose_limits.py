@@ -46,7 +46,7 @@ class PoseGate:
         """
         if (fault := pose_fault(T_odom_body)) is not None:
             return fault
-        if not isinstance(stamp_s, Real):
+        if not _is_number(stamp_s):
             return f"its stamp is no number of seconds but {type(stamp_s).__name__}"
         if not abs(stamp_s) <= STAMP_MAX_S:
             return f"its stamp is not within {STAMP_MAX_S:g} s"
@@ -194,3 +194,7 @@ def breaks(stamps_s: Float, T: Float) -> NDArray[np.bool_]:
     inner |= lonely(turned_rad, BREAK_MIN_RAD, TURN_MAX_RAD_S)
     found[2:-1] = inner[1:-1]
     return found
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real)

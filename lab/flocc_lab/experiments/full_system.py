@@ -209,7 +209,7 @@ FULL_SYSTEM: Experiment[FullSystemSettings] = Experiment(
     quick={
         "sources": ["tracks"],
         "methods": [DEFAULT, "flocc smoothed lm", "metric swarm-slam", "metric distributed"],
-        "walk_m": 25.0,
+        "walk_m": 18.0,
     },
     cells=cells,
     measure=measure,
