@@ -18,7 +18,7 @@ from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_lab.dialects.bags import IMAGES, STEP_NS, ZERO_NS
 from flocc_lab.dialects.folder_writers import picture
 from flocc_lab.dialects.trap_parts import CAMERA, Rng, Trap, drawn_bag, moving, unlike, written, written_bag
-from flocc_launch.datasets.commands import convert
+from flocc_launch.datasets.commands import convert, info
 from flocc_launch.datasets.detect import read_source
 
 
@@ -119,13 +119,12 @@ def cut_off(rng: Rng, folder: Path) -> Trap:
     whole = path.read_bytes()
     share = float(rng.choice([0.5, 0.7, 0.9, 0.99, 1.0]))
     path.write_bytes(whole[: round(share * len(whole))])
-    look = lambda: _count_unlike(convert(path, folder / "out"), count)  # noqa: E731
+
+    def look() -> str | None:
+        found = [info(path).images, len(Recording.open(convert(path, folder / "out")).frames)]
+        return None if found == [count, count] else f"{found} images, not {count}"
+
     return Trap(look, must_be_refused=share < 1.0)
-
-
-def _count_unlike(recording: Path, count: int) -> str | None:
-    found = len(Recording.open(recording).frames)
-    return None if found == count else f"{found} images, not {count}"
 
 
 def two_chains(rng: Rng, folder: Path) -> Trap:
