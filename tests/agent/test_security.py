@@ -69,9 +69,7 @@ def test_a_robot_has_a_name_of_its_own_and_a_class_of_one_digit(tmp_path: Path) 
 
 
 async def test_keys_of_another_robot_are_refused_by_name(folders: dict[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(
-        TransportError, match=r"signing.key: is the key of no member of the swarm, and this .* named r1"
-    ):
+    with pytest.raises(TransportError, match=r"signing.key: is the key of no member of the swarm, and"):
         RecordSealer.of(TlsConfig(folder=make_keys(tmp_path, SWARM, [])["operator"]), "r1")
     config = loopback_configs(("r1",), tls=TlsConfig(folder=folders["r2"]))["r1"]
     with pytest.raises(TransportError, match=r"signing.key: is the key of robot r2, and this robot is named r1"):

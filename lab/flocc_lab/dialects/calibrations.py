@@ -20,7 +20,8 @@ import numpy as np
 
 from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_lab.dialects.calibration_writers import FORMS, Rig, WriterForm
+from flocc_lab.dialects.calibration_form import Rig, WriterForm
+from flocc_lab.dialects.calibration_writers import FORMS
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_protocol.errors import FloccError
 

@@ -9,8 +9,9 @@
         assert first.report.closures != second.report.closures
 
 A marked test runs its scenario and fails before its first line where an expectation was missed, also where it does not
-name `flocc_run`, which is the run; `flocc` runs any number of scenarios. A scenario is a file, relative to the test's own, or the name of a shipped
-one. This module imports nothing of flocc before a test asks for it, so that other tests do not wait for it.
+name `flocc_run`, which is the run; `flocc` runs any number of scenarios. A scenario is a file, relative to the test's
+own, or the name of a shipped one. This module imports nothing of flocc before a test asks for it, so that other tests
+do not wait for it.
 """
 
 from collections.abc import Mapping
