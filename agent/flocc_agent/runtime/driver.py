@@ -379,8 +379,8 @@ class Driver:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
         logger.error(
             "%s: %s holds records of this robot's log that are not on its disk (an older copy of the disk, a second "
-            "robot of this name, or, without keys, a lie): whoever holds the same takes nothing of what it records now; "
-            "at its next start it begins a log of its own",
+            "robot of this name, or, without keys, a lie): who holds them takes nothing of what it records now; at "
+            "its next start it begins a log of its own",
             self.robot.log,
             peer,
         )
