@@ -26,7 +26,7 @@ def rows(scene: str, seed: int, wrong_up_to: int = 40) -> list[object]:
 
 
 def test_a_rule_that_separates_keeps_all_right_and_no_wrong_pair() -> None:
-    found = fit.report(rows("a", 1) + rows("b", 2))
+    found = fit.report(rows("a", 1) + rows("b", 2), fit.rule_in_use("classical"))
 
     assert found["pairs"] == 400
     for scene in ("a", "b"):
@@ -43,7 +43,7 @@ def test_a_rule_of_the_other_scenes_is_what_judges_a_scene() -> None:
     easy = [row for row in rows("easy", 3) if row.is_right]  # type: ignore[attr-defined]
     hard = rows("hard", 4, wrong_up_to=150)
 
-    found = fit.report(easy + hard)["scenes"]
+    found = fit.report(easy + hard, fit.rule_in_use("xfeat-lighterglue"))["scenes"]
 
     assert found["hard"]["left_out"]["wrong"] > 0  # the easy scene has no wrong pair to learn from
     assert found["hard"]["fitted"]["wrong"] == 0

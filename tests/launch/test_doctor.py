@@ -43,6 +43,7 @@ class Story:
     best_similarities: dict[str, float] = field(default_factory=dict)
     left_no_result: set[str] = field(default_factory=set)
     radio: dict[str, Any] = field(default_factory=dict)
+    steps_m: dict[str, float] = field(default_factory=lambda: {"r1": 0.0, "r2": 0.0})
 
     def say(self, t: float, robot: str, event: str, **fields: Any) -> "Story":
         self.events.append({"t": t, "robot": robot, "event": event, **fields})
@@ -62,7 +63,8 @@ class Story:
 
     def result(self, robot: str) -> RobotResult:
         keyframes = [
-            KeyframeResult(index=i, stamp_s=float(i), T_odom_body=IDENTITY) for i in range(self.keyframes[robot])
+            KeyframeResult(index=i, stamp_s=float(i), T_odom_body=[self.steps_m[robot] * i, *IDENTITY[1:]])
+            for i in range(self.keyframes[robot])
         ]
         return RobotResult(
             robot=robot,

@@ -104,6 +104,19 @@ def hanging() -> Story:
     return story
 
 
+def looking_alike(elsewhere: str = "r2/25", apart: str = "r2/8", step_m: float = -1.0) -> Story:
+    """Two robots that are joined at one place and walk apart; a closure puts the first one's keyframe elsewhere."""
+    story = merged()
+    story.steps_m, story.keyframes = {"r1": step_m, "r2": 1.0}, {"r1": 30, "r2": 30}
+    near = {"T_query_match_unscaled": [0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], "scale_initial": 1.0}
+    story.closures = [
+        *(ClosureKnown(query=f"r1/{k}", match=f"r2/{k + 2}", scale=1.0, **near) for k in (3, 4, 5)),
+        ClosureKnown(query="r1/6", match=apart, scale=1.0, **near),
+        ClosureKnown(query="r1/3", match=elsewhere, **near),
+    ]
+    return story
+
+
 def refusing(refused: int = 7, used: int = 5) -> Story:
     counts = {"closures_used": used, "closures_rejected": refused}
     return merged().say(14.0, "r1", "optimised", term=1, round=3, components=[["r1", "r2"]], **counts)
@@ -131,6 +144,7 @@ STORIES: dict[str, Callable[[], Story]] = {
     "frozen-pictures": doubting("frozen", 10),
     "camera": doubting("of a later version", 2.0),
     "merged": merged,
+    "places-alike": looking_alike,
     "merged-doubtfully": doubting("mounting", 179.9, "180 degrees about z (forward)", withheld=True),
     "unknown": lambda: corrections_lost().say(
         13.1, "r2", "correction", term=1, round=2, map_frame="map/r2", T_map_odom=[0.0] * 3 + [0.0, 0.0, 0.0, 1.0]
@@ -332,6 +346,33 @@ def test_a_robot_that_hangs_by_all_of_its_closures_is_not_said_to_have_more(tmp_
         f"{robot} hangs on map/r1 by 1 closure, all that were accepted. One false closure misplaces it."
         for robot in ("r1", "r2")
     ]
+
+
+def test_a_place_that_looks_like_another_is_named_with_what_shows_it(tmp_path: Path) -> None:
+    first = diagnose(looking_alike().write(tmp_path / "run"))[0]
+    assert first.sentence.startswith(
+        "r2 hangs on map/r1 by one place only (r2/5 to r2/8), and places may look alike here: r1/3 was registered "
+        "with r2/5 and with r2/25, which odometry puts 20 m apart. Do not believe where r2 is."
+    )
+    assert first.robots == ("r2",)
+
+
+def test_a_map_that_puts_robots_side_by_side_whose_pictures_never_match_is_doubted(tmp_path: Path) -> None:
+    first = diagnose(looking_alike(elsewhere="r2/6", step_m=1.0).write(tmp_path / "run"))[0]
+    assert first.cause == "places-alike"
+    # r2/3 to r2/9 are within two keyframes of a closure at both ends
+    assert "of 30 of its keyframes that the map puts beside others', 23 match none of them." in first.sentence
+
+
+@pytest.mark.parametrize(
+    "story",
+    [
+        looking_alike(elsewhere="r2/6"),  # within reach of both closures
+        looking_alike(apart="r2/29"),  # the robots met at two places
+    ],
+)
+def test_robots_that_met_elsewhere_or_agree_are_believed(story: Story, tmp_path: Path) -> None:
+    assert diagnose(story.write(tmp_path / "run"))[0].cause == "merged"
 
 
 def test_robots_that_died_are_not_counted_among_all(tmp_path: Path) -> None:

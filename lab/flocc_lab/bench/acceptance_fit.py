@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from flocc_agent.core.registration import match_ratio
+from flocc_agent.perception.classical import sift_registrar as classical_registrar
+from flocc_agent.perception.learned import acceptance_by_model
 from flocc_agent.perception.multiview.acceptance import (
     NEVER,
     RATIO_CORRESPONDENCES_MIN,
@@ -150,8 +152,13 @@ def by_angle(rows: Sequence[AcceptanceRow], rule: Acceptance | None) -> list[Kep
     return [kept([row for row in rows if low <= row.angle_deg < high], rule) for low, high in pairwise(ANGLES_DEG)]
 
 
-def report(rows: Sequence[AcceptanceRow]) -> dict[str, Any]:
-    """The rule of all scenes, and tables by scene and angle, for the paper's rule, the fitted one and leave-one-out."""
+def rule_in_use(front_end: str) -> Acceptance:
+    """The rule that a front end ships with."""
+    return classical_registrar.ACCEPTANCE if front_end == "classical" else acceptance_by_model.ACCEPTANCE[front_end]
+
+
+def report(rows: Sequence[AcceptanceRow], in_use: Acceptance) -> dict[str, Any]:
+    """The rule of all scenes, and tables by scene and angle, for the paper's rule, both others and leave-one-out."""
     margin, left_out = chosen_margin(rows)
     rule = fitted(rows, margin)
     return {
@@ -166,15 +173,24 @@ def report(rows: Sequence[AcceptanceRow]) -> dict[str, Any]:
             name: {
                 "pairs": sum(row.scene == name for row in rows),
                 "by_ratio": _plain(kept([row for row in rows if row.scene == name], None)),
+                "in_use": _plain(kept([row for row in rows if row.scene == name], in_use)),
                 "fitted": _plain(kept([row for row in rows if row.scene == name], rule)),
                 "left_out": _plain(left_out[name]),
             }
             for name in left_out
         },
         "angles": {
-            f"{low:.0f}-{min(high, 180.0):.0f}": {"by_ratio": _plain(ratio), "fitted": _plain(by_rule)}
-            for (low, high), ratio, by_rule in zip(
-                pairwise(ANGLES_DEG), by_angle(rows, None), by_angle(rows, rule), strict=True
+            f"{low:.0f}-{min(high, 180.0):.0f}": {
+                "by_ratio": _plain(ratio),
+                "in_use": _plain(used),
+                "fitted": _plain(by_rule),
+            }
+            for (low, high), ratio, used, by_rule in zip(
+                pairwise(ANGLES_DEG),
+                by_angle(rows, None),
+                by_angle(rows, in_use),
+                by_angle(rows, rule),
+                strict=True,
             )
         },
     }
@@ -185,7 +201,7 @@ def text(name: str, found: dict[str, Any]) -> str:
     rule = found["rule"]
     lines = [f"{name}: {found['pairs']} pairs; with scale {rule['with_scale']}"]
     lines.append(f"  without {rule['without_scale']}, ratio {rule['match_ratio_min']}, margin {rule['margin']}")
-    totals = {key: [0, 0, 0] for key in ("by_ratio", "fitted", "left_out")}
+    totals = {key: [0, 0, 0] for key in ("by_ratio", "in_use", "fitted", "left_out")}
     for scene, entry in found["scenes"].items():
         shown = []
         for key, total in totals.items():
@@ -195,7 +211,7 @@ def text(name: str, found: dict[str, Any]) -> str:
         lines.append(f"  {scene:16} {entry['pairs']:5} pairs, possible {counts[2]:4}: {', '.join(shown)}")
     lines.append("  all: " + ", ".join(f"{key} {t[0]}+{t[1]}w of {t[2]}" for key, t in totals.items()))
     for angle, entry in found["angles"].items():
-        shown = [f"{key} {entry[key]['right']}+{entry[key]['wrong']}w" for key in ("by_ratio", "fitted")]
+        shown = [f"{key} {entry[key]['right']}+{entry[key]['wrong']}w" for key in ("by_ratio", "in_use", "fitted")]
         lines.append(f"  {angle:8} possible {entry['fitted']['possible']:4}: {', '.join(shown)}")
     return "\n".join(lines)
 

@@ -73,11 +73,12 @@ def acceptance(
     json_out: JsonOption = False,
 ) -> None:
     """Which pairs each front end accepts, right and wrong, by scene and angle; its rule fitted leave-one-scene-out."""
-    from flocc_lab.bench.acceptance_fit import report, text
+    from flocc_lab.bench.acceptance_fit import report, rule_in_use, text
     from flocc_lab.bench.acceptance_rows import collected
 
     for name in front_end:
-        found = report(collected(name, shared, recordings or (), scene or (), pairs, out))
+        rows = collected(name, shared, recordings or (), scene or (), pairs, out)
+        found = report(rows, rule_in_use(name))
         typer.echo(json.dumps({name: found}, indent=1) if json_out else text(name, found))
 
 

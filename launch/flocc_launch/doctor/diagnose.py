@@ -13,6 +13,7 @@ from flocc_launch.doctor.finding import Finding, Severity, together
 from flocc_launch.doctor.general import GENERAL
 from flocc_launch.doctor.merge_evidence import named
 from flocc_launch.doctor.steps import STEPS
+from flocc_launch.runs.alike_places import ADVICE, alike_places
 from flocc_launch.runs.loaded_run import LoadedRun, load
 from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.runs.timeline import ends
@@ -45,6 +46,11 @@ def merging(loaded: LoadedRun) -> list[Finding]:
         misplaced = kept_out(loaded, groups[0])
         if misplaced:
             return [merged_doubtfully(sentence, misplaced)]
+        alike = alike_places(loaded)
+        if alike:
+            who = tuple(each.robot for each in alike)
+            why = " ".join(each.headline for each in alike)
+            return [Finding("places-alike", Severity.HINDERS, f"{why} {sentence}", ADVICE, who)]
         return [Finding("merged", Severity.GOOD, sentence, robots=groups[0])]
     return [furthest(loaded, first, second) for k, first in enumerate(groups) for second in groups[k + 1 :]]
 

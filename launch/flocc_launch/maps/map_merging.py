@@ -30,7 +30,7 @@ from flocc_launch.maps.map_saving import back_end_of, latents_of, optics_of
 from flocc_launch.maps.solving import SolvedMap, solved_map
 from flocc_launch.maps.writing import MapContent, check_target, write_map
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, encode_record
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, Record, WithdrawalRecord, encode_record
 
 MERGER = "map-merge"
 """Robot name of the log that holds the closures between maps."""
@@ -87,7 +87,8 @@ def merge_maps(
     perception = perception_of(a)
     closures, registered = _closures(a, b, candidates, perception, limits, progress)
     joining = LogId(MERGER, clock_ms())
-    records = tuple(encode_record(closure) for closure in closures)
+    said: list[Record] = [*_withdrawals(a, b), *closures] if closures else []
+    records = tuple(map(encode_record, said))
     logs = {**a.records, **b.records, **({joining: records} if records else {})}
     back_end = back_end_of(a)
     solved = solved_map(f"{first} and {second}", logs, a.saved(), config=back_end)
@@ -191,6 +192,12 @@ def _best(similarities: Descriptors, count: int) -> Iterator[tuple[int, int]]:
 
 
 # Which of them are the same
+
+
+def _withdrawals(*opened: MapFolder) -> list[WithdrawalRecord]:
+    """What robots of the maps took back: their latents here are those made anew, and who judges them says so first."""
+    records = ((log, opened_record(data)[0]) for each in opened for log, rows in each.records.items() for data in rows)
+    return [record for log, record in records if isinstance(record, WithdrawalRecord) and record.log == log]
 
 
 def _closures(

@@ -23,6 +23,7 @@ from flocc_launch.report.model import (
     RunReport,
     TrackError,
 )
+from flocc_launch.runs.alike_places import alike_places
 from flocc_launch.runs.camera_doubts import camera_doubts
 from flocc_launch.runs.ground_truth import frame_sentences, in_separate_frames, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
@@ -102,6 +103,7 @@ def build(loaded: LoadedRun) -> RunReport:
         deaths_unasked=deaths_unasked(loaded.events),
         doubted_cameras=sorted({doubt.robot for doubt in camera_doubts(loaded.events) if doubt.matters}),
         misplaced_cameras={d.robot: d.headline for d in camera_doubts(loaded.events) if d.withheld},
+        doubted_places={alike.robot: alike.headline for alike in alike_places(loaded)},
         warnings=warnings_of(loaded),
     )
     return report.model_copy(update={"expectations": judged(run.expectations, report, registered_by(loaded))})

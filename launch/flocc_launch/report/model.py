@@ -209,6 +209,8 @@ class RunReport(Record):
     """Robots whose pictures contradict their odometry or calibration, or are frozen; the warnings say how."""
     misplaced_cameras: dict[str, str] = Field(default_factory=dict)
     """Those of them whose camera's axes are not their odometry's -> how, in a sentence; kept out of closures."""
+    doubted_places: dict[str, str] = Field(default_factory=dict)
+    """Robots that hang on their map by one place that looks like another one -> what shows it."""
     warnings: list[str]
 
     def has_truth(self) -> bool:

@@ -10,7 +10,13 @@ def verdict(report: RunReport) -> str:
     """Whether the maps merged, when, and what it did to the error."""
     if len(report.robots) == 1:
         return alone(report)
-    parts = (misplaced_sentence(report), map_sentence(report), error_sentence(report), camera_sentence(report))
+    parts = (
+        misplaced_sentence(report),
+        *report.doubted_places.values(),
+        map_sentence(report),
+        error_sentence(report),
+        camera_sentence(report),
+    )
     return " ".join(sentence for sentence in parts if sentence)
 
 

@@ -84,7 +84,7 @@ def world_camera(spec: WorldSpec) -> Camera:
 
 def baked_world(spec: WorldSpec) -> Baked:
     """Build the town of a spec and compute its light."""
-    scene = build_town(np.random.default_rng([spec.seed, 0]))
+    scene = build_town(np.random.default_rng([spec.seed, 0]), terraced=spec.terraced)
     return bake(scene, light_maps(scene))
 
 

@@ -62,6 +62,17 @@ def plots(rng: np.random.Generator) -> list[Plot]:
     return found + _ring(rng)
 
 
+def alike(seed: int) -> list[tuple[int, Plot]]:
+    """Plots of a town whose blocks follow one plan, each with the number of its house's kind; fronts are in line."""
+    blocks = [(column, row) for column in range(COLUMNS) for row in range(ROWS) if (column, row) != SQUARE]
+    found = [
+        (kind, plot)
+        for block in blocks
+        for kind, plot in enumerate(_block(np.random.default_rng([seed, 0]), block_low_m(*block)))
+    ]
+    return found + [(4 + k % 2, plot) for k, plot in enumerate(_ring(None))]
+
+
 def _block(rng: np.random.Generator, low_m: Float) -> list[Plot]:
     split_x, split_y = low_m + BLOCK_M * rng.uniform(0.42, 0.58, 2)
     high_m = low_m + BLOCK_M
@@ -84,21 +95,26 @@ def _set_back(
     return Plot((x0, y0), (x1, y1), fronts)
 
 
-def _ring(rng: np.random.Generator) -> list[Plot]:
-    """Houses on all four edges; each faces inwards."""
+def _ring(rng: np.random.Generator | None) -> list[Plot]:
+    """Houses on all four edges; each faces inwards. Without a generator they are of one width, and in line."""
     width, height = size_m()
     found = []
     for start, end in _pieces(rng, width):
-        found.append(Plot((start, -RING_M), (end, float(-rng.uniform(0, 0.4))), (2,)))
-        found.append(Plot((start, height + float(rng.uniform(0, 0.4))), (end, height + RING_M), (0,)))
+        found.append(Plot((start, -RING_M), (end, -_set_back_m(rng)), (2,)))
+        found.append(Plot((start, height + _set_back_m(rng)), (end, height + RING_M), (0,)))
     for start, end in _pieces(rng, height):
-        found.append(Plot((-RING_M, start), (float(-rng.uniform(0, 0.4)), end), (1,)))
-        found.append(Plot((width + float(rng.uniform(0, 0.4)), start), (width + RING_M, end), (3,)))
+        found.append(Plot((-RING_M, start), (-_set_back_m(rng), end), (1,)))
+        found.append(Plot((width + _set_back_m(rng), start), (width + RING_M, end), (3,)))
     return found
 
 
-def _pieces(rng: np.random.Generator, length_m: float) -> list[tuple[float, float]]:
+def _set_back_m(rng: np.random.Generator | None) -> float:
+    return 0.0 if rng is None else float(rng.uniform(0, 0.4))
+
+
+def _pieces(rng: np.random.Generator | None, length_m: float) -> list[tuple[float, float]]:
     count = round(length_m / 6.2)
     cuts = np.linspace(0, length_m, count + 1)
-    cuts[1:-1] += rng.uniform(-0.8, 0.8, count - 1)
+    if rng is not None:
+        cuts[1:-1] += rng.uniform(-0.8, 0.8, count - 1)
     return [(float(a), float(b)) for a, b in pairwise(cuts)]

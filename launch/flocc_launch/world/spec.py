@@ -27,6 +27,8 @@ class WorldSpec(Section):
     """Image height, pixels."""
     field_of_view_deg: float = Field(80.0, gt=20, lt=130)
     """Horizontal angle of view."""
+    terraced: bool = False
+    """All blocks are built by one plan, house by house alike: only what stands in the streets tells places apart."""
     light_change: float = Field(1.0, ge=0, le=1)
     """0: the same light for all; 1: clouds pass, and each camera has an exposure and colour balance of its own."""
     motion_blur: bool = True

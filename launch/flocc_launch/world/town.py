@@ -22,15 +22,25 @@ ROOF_TEXELS_PER_M = 40.0
 OVERHANG_M = 0.3
 
 
-def build_town(rng: np.random.Generator) -> Scene:
-    """Build the whole scene; the same generator state gives the same town."""
+def build_town(rng: np.random.Generator, *, terraced: bool = False) -> Scene:
+    """Build the whole scene; the same generator state gives the same town.
+
+    Args:
+        rng: What everything random is drawn from.
+        terraced: All blocks are built by one plan; what stands in the streets is drawn for each house all the same.
+    """
     scene = Scene()
     width, height = layout.size_m()
     add_sky(scene, rng, np.array([width / 2, height / 2]))
     _add_ground(rng, scene)
     own = props.wardrobe(rng, scene)
-    for plot in layout.plots(rng):
-        _add_house(rng, scene, plot, own)
+    if terraced:
+        seed = int(rng.integers(2**32))
+        for kind, plot in layout.alike(seed):
+            _add_house(rng, scene, plot, own, np.random.default_rng([seed, 1, kind]))
+    else:
+        for plot in layout.plots(rng):
+            _add_house(rng, scene, plot, own, rng)
     _add_square(rng, scene, own)
     return scene
 
@@ -73,23 +83,26 @@ def _from_middle(along: Float32, step: float) -> Float32:
     return np.asarray(np.abs((along - layout.STREET_M / 2 + step / 2) % step - step / 2), dtype=np.float32)
 
 
-def _add_house(rng: np.random.Generator, scene: Scene, plot: Plot, own: Wardrobe) -> None:
-    house = random_house(rng)
+def _add_house(
+    rng: np.random.Generator, scene: Scene, plot: Plot, own: Wardrobe, of_house: np.random.Generator
+) -> None:
+    """Build a house by its own generator, and put things before it by the town's."""
+    house = random_house(of_house)
     corners, high_m = plot.corners_m(), house.height_m()
     size = np.array([*(corners[2] - corners[0]), high_m])
     solid = scene.add_solid(Solid(np.array([*corners.mean(axis=0), high_m / 2]), size / 2))
-    stone = scene.add_texture(paint_wall(rng, 0.5, high_m, house.plinth, 60.0))
-    bare = scene.add_texture(paint_wall(rng, 3.0, 3.0, house.wall, 40.0))
+    stone = scene.add_texture(paint_wall(of_house, 0.5, high_m, house.plinth, 60.0))
+    bare = scene.add_texture(paint_wall(of_house, 3.0, 3.0, house.wall, 40.0))
     for side in range(4):
         start, end = corners[side], corners[(side + 1) % 4]
         if side not in plot.fronts:
             scene.add_wall(start, end, 0.0, high_m, bare, solid)
             continue
-        front = paint_front(rng, float(np.linalg.norm(end - start)), house)
+        front = paint_front(of_house, float(np.linalg.norm(end - start)), house)
         scene.add_wall(start, end, 0.0, high_m, scene.add_texture(front.pixels), solid)
-        _add_relief(rng, scene, start, end, house, front, stone, own)
+        _add_relief(of_house, scene, start, end, house, front, stone, own)
         _add_street_things(rng, scene, start, end, front, own)
-    _add_roof(rng, scene, plot, house)
+    _add_roof(of_house, scene, plot, house)
 
 
 def _add_roof(rng: np.random.Generator, scene: Scene, plot: Plot, house: House) -> None:

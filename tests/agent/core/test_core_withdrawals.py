@@ -14,7 +14,8 @@ from flocc_agent.core.events import Event, KeyframeEncoded, KeyframeEncodingFail
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure
 from flocc_agent.core.reports import ClosureWithdrawn
-from flocc_agent.core.robot import Restored, Robot
+from flocc_agent.core.restored import Restored
+from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair

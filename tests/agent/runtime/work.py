@@ -51,3 +51,9 @@ def hold_the_lock(seconds: float) -> int:
 def wait_for_ever() -> None:
     """Hang."""
     time.sleep(3600.0)
+
+
+def first_after(data: bytes, seconds: float) -> int:
+    """Give the first byte, later."""
+    time.sleep(seconds)
+    return data[0]
