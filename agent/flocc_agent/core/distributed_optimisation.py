@@ -15,7 +15,7 @@ that does not shrink, the robot goes back to where it last agreed, and does not 
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -236,7 +236,7 @@ class DistributedOptimisation:
         if message.anchor == self.anchor and not self._is_back:
             self._take_origin(message)
             if before is None or message.step > before.step:
-                pair.heard = message
+                pair.heard = _with_stiffness(message, pair.heard)
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
         self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
@@ -719,6 +719,7 @@ class DistributedOptimisation:
         assert self._origin is not None
         has_list = pair.said is not None and pair.said.edition == pair.edition
         listed = self._own < other and not has_list and pair.information is not None
+        edition = 0 if has_list and pair.said is not None and pair.said.known >= told.edition else told.edition
         return SharedPoses(
             self.anchor,
             self.number,
@@ -730,8 +731,8 @@ class DistributedOptimisation:
             Array.of(told.base_m, "f8"),
             Array.of(told.rows),
             told.known,
-            told.edition,
-            Array.of(told.stiffness),
+            edition,
+            Array.of(told.stiffness if edition else np.zeros(0)),
         )
 
     def _ask_for_list(self, other: LogId) -> Effect:
@@ -746,6 +747,13 @@ class DistributedOptimisation:
 
     def _refuse(self, other: LogId, reason: str) -> Effect:
         return Report(PeerRefused(peer=other.robot, reason=f"shared poses: {reason}"))
+
+
+def _with_stiffness(message: SharedPoses, unread: SharedPoses | None) -> SharedPoses:
+    """A message with the stiffness of one before it that no step has taken, where it has none itself."""
+    if unread is None or message.stiffness_edition or unread.edition != message.edition:
+        return message
+    return replace(message, stiffness_edition=unread.stiffness_edition, stiffness=unread.stiffness)
 
 
 def _told_by(message: SharedPoses) -> ToldPoses:
