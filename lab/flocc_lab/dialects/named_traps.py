@@ -12,13 +12,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flocc_agent.geometry import pose, q_wxyz_from_R, so3_exp
+from flocc_agent.geometry import inverse, pose, q_wxyz_from_R, so3_exp
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_lab.dialects.bags import IMAGES, STEP_NS, ZERO_NS
 from flocc_lab.dialects.folder_writers import picture
 from flocc_lab.dialects.trap_parts import CAMERA, Rng, Trap, drawn_bag, moving, unlike, written, written_bag
-from flocc_launch.datasets.commands import convert
+from flocc_launch.datasets.commands import convert, info
 from flocc_launch.datasets.detect import read_source
 
 
@@ -119,13 +119,37 @@ def cut_off(rng: Rng, folder: Path) -> Trap:
     whole = path.read_bytes()
     share = float(rng.choice([0.5, 0.7, 0.9, 0.99, 1.0]))
     path.write_bytes(whole[: round(share * len(whole))])
-    look = lambda: _count_unlike(convert(path, folder / "out"), count)  # noqa: E731
+
+    def look() -> str | None:
+        found = [info(path).images, len(Recording.open(convert(path, folder / "out")).frames)]
+        return None if found == [count, count] else f"{found} images, not {count}"
+
     return Trap(look, must_be_refused=share < 1.0)
 
 
-def _count_unlike(recording: Path, count: int) -> str | None:
-    found = len(Recording.open(recording).frames)
-    return None if found == count else f"{found} images, not {count}"
+def two_chains(rng: Rng, folder: Path) -> Trap:
+    """Two results of Kalibr: of cameras alone, and of cameras and IMU, which says where the camera sits."""
+    path, stem = folder / "data", str(rng.choice(["", "run-", "2023-11-14-", "x_"]))
+    T = pose(so3_exp(rng.uniform(-2, 2, 3)), np.round(rng.uniform(-0.5, 0.5, 3), 4))
+    camera = (
+        "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n"
+        "  intrinsics: [30, 30, 16, 12]\n  resolution: [32, 24]\n"
+    )
+    stamps_s = np.round(1_700_000_000 + 0.1 * np.arange(6), 3)
+    for k, stamp_s in enumerate(stamps_s):
+        picture(path / "images" / f"{stamp_s:.3f}.png", k)
+    write_tum(path / "odometry.tum", Trajectory(stamps_s, moving(rng, 6)))
+    name = str(
+        rng.choice([f"{stem}camchain-imucam.yaml", f"camchain-imucam{'-' if stem else ''}{stem.strip('-_')}.yaml"])
+    )
+    written(path / f"{stem}camchain.yaml", camera)
+    written(path / name, f"{camera}  T_cam_imu: {inverse(T).tolist()}\n")
+
+    def look() -> str | None:
+        lens = read_source(path).lens
+        return "no camera" if lens is None else unlike(lens.T_body_camera, T, "the mounting")
+
+    return Trap(look)
 
 
 NAMED_TRAPS: dict[str, Callable[[Rng, Path], Trap]] = {
@@ -133,4 +157,5 @@ NAMED_TRAPS: dict[str, Callable[[Rng, Path], Trap]] = {
     "a list beside names": listed_stamps,
     "a folder's name": folder_name,
     "a file cut off": cut_off,
+    "two chains": two_chains,
 }

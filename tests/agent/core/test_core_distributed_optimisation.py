@@ -437,6 +437,17 @@ def test_a_stiffness_that_the_neighbour_has_is_not_told_again() -> None:
     assert told(bench.b._said())["c"].stiffness_edition == 0
 
 
+def test_a_neighbour_that_fell_silent_is_forgotten_by_a_step_of_its_own() -> None:
+    bench = Bench().shares()
+    edition = told(bench.b._said())["c"].edition
+    bench.b.on_shared_poses(C, said(B, 3, edition, shift_m=1.0), 0.3)
+    bench.turn(0.5)
+    assert not bench.turn(0.2 + SILENT_S)[1]
+    _, (job,) = bench.turn(0.3 + SILENT_S)
+    assert job.problem.shared[C].forgotten
+    assert not bench.turn(1.0 + SILENT_S)[1]
+
+
 def test_an_overdue_or_failed_step_is_tried_again_after_a_growing_pause() -> None:
     bench = Bench(Source(seen=()))
     (job,) = jobs(bench.b.tick(0.0))
