@@ -1,4 +1,4 @@
-"""`python -m flocc_lab.bench.recordings FILE...`: what the default back end makes of recordings with labels and truth.
+"""`python -m flocc_lab.bench.labelled_recordings FILE...`: the default back end on recordings with labels and truth.
 
 Each file as it is and with unit scale: joint ATE beside that of LM without the closures that are labelled as wrong, the
 choice of closures, linear systems solved (which do not depend on the machine), and CPU seconds of the solve alone.
@@ -82,7 +82,7 @@ def answered(file: GraphFile, outliers: frozenset[int], config: BackendConfig) -
 
 def main(words: list[str]) -> None:
     """Print a row per recording and scale, and the geometric mean of the ratios of each scale."""
-    parser = argparse.ArgumentParser(prog="python -m flocc_lab.bench.recordings", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m flocc_lab.bench.labelled_recordings", description=__doc__)
     parser.add_argument("files", nargs="+", type=Path, help="JRL files with labels and true poses")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="the back end so changed")
     options = parser.parse_args(words)
