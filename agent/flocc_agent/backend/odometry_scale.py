@@ -30,6 +30,8 @@ PosedAnew = Callable[[Mapping[LogId, float]], Posed]
 DEMANDED_SIGMAS = 3.0
 OTHERS_SIGMAS = 2.0
 """How far from 1 the other robots' scales are demanded where one robot's is: these robots' odometry is not all true."""
+MOVED_SIGMAS_MAX = 3.0
+"""So far scales may move once they are applied."""
 BIAS_RATIO = 0.005
 """Standard deviation of an estimate beyond what noise explains: drift that keeps its direction looks like scale."""
 ASKED_CLOSURES_MAX = 2500
@@ -93,6 +95,11 @@ class SolvedWithScales:
         """What people are told."""
         return self.estimates.told(self.posed.problem.scaled)
 
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which closures (L,) are used."""
+        return np.asarray(self.solved.weights[self.posed.problem.closure_rows] >= ACCEPTED_WEIGHT_MIN)
+
     def penalised_cost(self) -> float:
         """The truncated cost, and for each scale what it must save at least."""
         price = 0.5 * DEMANDED_SIGMAS**2 * self.estimates.excess
@@ -119,7 +126,8 @@ def solve_with_scales(posed: Posed, initial: GraphSolution | None, anew: PosedAn
     logs = scalable(posed)
     if set(found.posed.problem.scaled) != set(logs):
         free = posed.with_scaled(dict.fromkeys(logs, 1.0))
-        found = lower(found, settled(free, solve_once(free.objective, free.start, free.places)))
+        searched = settled(free, solve_once(free.objective, free.start, free.places))
+        found = lower(found, searched) if takes_in(found, searched) else found
     applied = found.posed.problem.scales_applied(found.solved.state)
     if not applied or set(applied) == set(begun.problem.scaled):
         return found
@@ -183,27 +191,47 @@ def is_told(found: SolvedWithScales) -> bool:
     sure = np.all(np.hypot(estimates.sigma, BIAS_RATIO) <= TOLD_SIGMA_MAX)
     if problem.scaled or not estimates.logs or not sure:
         return False
-    used = found.solved.weights[problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
+    used = found.used
     ends = [{closures[k].query.log, closures[k].match.log} for k in problem.closure_ids]
     shares = (np.mean(used[[log in of for of in ends]]) for log in estimates.logs)
     return all(share >= TOLD_USED_MIN for share in shares)
 
 
 def settled(posed: Posed, solved: Solved) -> SolvedWithScales:
-    """Add the scales that a solution demands and take those away that it does not, until nothing changes."""
-    estimates = estimated(posed, solved)
+    """Add the scales that a solution demands and take those away that it does not, until nothing changes.
+
+    Scales that are not `believed` once they are applied are not.
+    """
+    here = SolvedWithScales(posed, solved, estimated(posed, solved))
     for _ in range(ROUNDS_MAX if posed.objective.config.formulation is not Formulation.BASE else 0):
-        demanded = estimates.demanded()
-        if set(demanded) == set(posed.problem.scaled):
+        demanded, scaled = here.estimates.demanded(), set(here.posed.problem.scaled)
+        if set(demanded) == scaled:
             break
-        before = solved
-        posed = replace(posed, start=solved.state).with_scaled(demanded)
-        solved = continued(posed.objective, posed.start)
-        solved = replace(solved, iterations=before.iterations + solved.iterations)
-        estimates = estimated(posed, solved)
-    if not estimates.is_metric:
-        solved = replace(solved, state=with_mean_of_one(posed, solved.state))
-    return SolvedWithScales(posed, solved, estimates)
+        there = replace(here.posed, start=here.solved.state).with_scaled(demanded)
+        solved = continued(there.objective, there.start)
+        solved = replace(solved, iterations=here.solved.iterations + solved.iterations)
+        found = SolvedWithScales(there, solved, estimated(there, solved))
+        if demanded.keys() - scaled and not believed(here, found):
+            here = replace(here, solved=replace(here.solved, iterations=solved.iterations))
+            break
+        here = found
+    if not here.estimates.is_metric:
+        here = replace(here, solved=replace(here.solved, state=with_mean_of_one(here.posed, here.solved.state)))
+    return here
+
+
+def believed(before: SolvedWithScales, applied: SolvedWithScales) -> bool:
+    """Whether scales explain what demanded them, once they are applied.
+
+    Few closures that agree and are wrong demand scales, too. These bend the rest until other closures are turned away,
+    or those themselves, and what is left suggests other scales still.
+    """
+    if not takes_in(before, applied):
+        return False
+    said, sigma = before.estimates.scale, np.hypot(before.estimates.sigma, BIAS_RATIO)
+    return len(applied.estimates.scale) != len(said) or bool(
+        np.all(np.abs(applied.estimates.scale - said) <= MOVED_SIGMAS_MAX * sigma)
+    )
 
 
 def estimated(posed: Posed, solved: Solved) -> Estimates:
@@ -238,6 +266,11 @@ def estimated(posed: Posed, solved: Solved) -> Estimates:
     excess = max(1.0, 2.0 * unexplained / max(freedom, 1.0))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0) * excess)
     return Estimates(tuple(free.problem.scaled), np.maximum(scale, SCALE_MIN), sigma, is_metric, excess)
+
+
+def takes_in(before: SolvedWithScales, applied: SolvedWithScales) -> bool:
+    """Whether with scales at least as many closures are used as without: those that explain nothing turn some away."""
+    return bool(np.count_nonzero(applied.used) >= np.count_nonzero(before.used))
 
 
 def relative_to_mean(scale: Float, covariance: Float) -> tuple[Float, Float]:

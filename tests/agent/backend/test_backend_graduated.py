@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.agent.backend.plain_team import plain_team
 
 from flocc_agent.backend import solvers
 from flocc_agent.backend.descent import Objective, Solved, descend
@@ -128,8 +129,36 @@ def test_only_a_solution_that_explains_the_closures_ends_the_search(
 def test_a_search_is_coarse_and_what_it_found_is_solved_as_far_as_is_configured() -> None:
     objective, state = objective_of(member(SMALL[0]), Solver.GNC_TLS)
     fine = replace(objective, config=objective.config.model_copy(update={"relative_tolerance": 1e-9}))
+    bound = objective.config.inlier_probability
+    sharp = replace(objective, config=objective.config.model_copy(update={"kept_probability": bound}))
     assert searching(fine).config.relative_tolerance == SEARCH_TOLERANCE_RATIO
-    assert searching(objective) is objective
+    assert searching(fine).config.kept_probability == bound
+    assert searching(sharp) is sharp
     solved = solve(fine, state)
     further = descend(fine, solved.state, solved.weights)
     assert solved.cost - further.cost <= 2e-9 * solved.cost
+
+
+def test_a_closure_just_outside_of_the_sharp_bound_is_kept_and_one_far_outside_is_not() -> None:
+    team = plain_team(5, (60, 60), lengths=Lengths.METRIC, closures=40)
+    states = []
+    for sigmas in (9.0, 12.0):
+        first, *others = team.graph.closures
+        off = first.T_query_match_unscaled.copy()
+        off[:2, 3] += 0.05 * sigmas / np.sqrt(2.0)
+        graph = PoseGraph(team.graph.trajectories, [replace(first, T_query_match_unscaled=off), *others])
+        for kept in (0.9999, BackendConfig().kept_probability):
+            solution = optimise(graph, BackendConfig(weight_by_probability=False, kept_probability=kept))
+            assert isinstance(solution, GraphSolution)
+            states.append(solution.closures[0].state is ClosureState.USED)
+    assert states == [False, True, False, False]
+
+
+def test_the_wide_bound_does_not_choose_where_a_search_ends() -> None:
+    """One right closure and two wrong ones hold the third robot: a search with a wide bound follows the wrong ones."""
+    drawn_member = member(4430)
+    solution = optimise(drawn_member.graph, BackendConfig(weight_by_probability=False))
+    assert isinstance(solution, GraphSolution)
+    used = np.array([closure.state is ClosureState.USED for closure in solution.closures])
+    assert np.count_nonzero(used) > 10
+    assert not np.any(used & ~drawn_member.is_right)

@@ -11,6 +11,7 @@ from tests.agent.backend.plain_team import plain_team
 from flocc_agent.backend import odometry_scale
 from flocc_agent.backend.descent import Objective, Solved
 from flocc_agent.backend.edges import State
+from flocc_agent.backend.odometry_scale import SolvedWithScales, believed
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.placing import Places
 from flocc_agent.backend.solvers import solve_once
@@ -69,6 +70,29 @@ def test_a_robot_that_measures_too_long_or_too_short_costs_nothing(ratio: float)
     assert [log for log, scale in scales.items() if scale.is_applied] == [SECOND]
     assert scales[SECOND].ratio == pytest.approx(ratio, abs=0.01)
     assert ate_m(off, solution) <= 1.3 * max(ate_m(true, solved(true)), 0.05)
+
+
+def test_scales_are_not_believed_that_move_or_turn_closures_away_once_they_are_applied(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What refuses them here is measured in `test_closures_that_agree_and_pull_move_what_is_old`."""
+    pairs: list[tuple[SolvedWithScales, SolvedWithScales]] = []
+
+    def noted(before: SolvedWithScales, applied: SolvedWithScales) -> bool:
+        pairs.append((before, applied))
+        return False
+
+    monkeypatch.setattr(odometry_scale, "believed", noted)
+    member = plain_team(5, (120, 130, 110), lengths=Lengths.METRIC, closures=120)
+    solution = solved(with_stretched(member, {SECOND: 0.97}))
+    assert not any(scale.is_applied for scale in component(solution).odometry_scales.values())
+    before, applied = pairs[0]
+    assert believed(before, applied)
+    moved = replace(applied.estimates, scale=applied.estimates.scale + 4.0 * np.hypot(before.estimates.sigma, 0.005))
+    assert not believed(before, replace(applied, estimates=moved))
+    fewer = applied.solved.weights.copy()
+    fewer[applied.posed.problem.closure_rows][:] = 0.0
+    assert not believed(before, replace(applied, solved=replace(applied.solved, weights=fewer)))
 
 
 def test_true_odometry_is_left_alone_and_nobody_is_warned() -> None:

@@ -14,7 +14,7 @@ from flocc_protocol.ids import KeyframeId, LogId
 R1, R2 = LogId("r1"), LogId("r2")
 CONFIG = BackendConfig(weight_by_probability=False)
 STATED = np.diag([0.02**2] * 3 + [0.05**2] * 3)
-TURN_RAD = 0.12
+TURN_RAD = 0.17
 
 
 def walk(aside_m: float) -> Float:

@@ -104,6 +104,7 @@ def test_closures_that_agree_and_pull_move_what_is_old(drawn: GeneratedGraph, fi
     assert found.whole is first
     assert whole.whole is None
     (component,), (of_whole,), (before,) = found.components, whole.components, first.components
+    assert not any(scale.is_applied for scale in of_whole.odometry_scales.values())
     moved_m, apart_m = (
         max(
             float(np.linalg.norm(component.T_map_keyframe[log][:700, :3, 3] - T[:700, :3, 3], axis=1).max())
