@@ -101,11 +101,14 @@ class Objective:
     def bounds(self) -> Float:
         """Squared residual (L,) below which a right closure lies with the configured probability.
 
-        A free scale takes one of the six degrees of freedom.
+        A free scale takes one of the six degrees of freedom. Where closures have no unit the bound is sharp: wrong ones
+        bend lengths that nothing holds.
         """
         config = self.config
         graduated = config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
         probability = config.kept_probability if graduated else config.inlier_probability
+        if self.has_directions:
+            probability = min(probability, config.inlier_probability)
         free = (self.edges.sigma[self.closures] > 0) | (self.edges.cluster[self.closures] >= 0)
         return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - probability))
 

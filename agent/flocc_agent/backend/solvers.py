@@ -28,7 +28,7 @@ EXPLAINED_RATIO = 100.0
 START_RATIOS = (1e-4, 1e-6)
 WIDENED_RATIO = 0.03
 """Control parameter at which the choice is widened: closures within 34 times the bound are asked. Smaller forgets where
-the search ended: 0.01 and 0.02 turn away what was used in two of ten recordings."""
+the search ended."""
 PLACEMENTS_MAX = 10
 SEARCH_TOLERANCE_RATIO = 1e-5
 """Candidates are compared where a step lowers their cost by less than this part; only the best one goes on from there,
@@ -87,14 +87,16 @@ def to_rest(objective: Objective, solved: Solved) -> Solved:
     covariance: a search with it would also take wrong ones for right. Where the search ended GNC begins once more with
     it, but late; what it finds is taken where nothing that was used is turned away for it.
     """
-    hold, used = objective.has_directions, accepted(objective, solved)
+    if objective.has_directions:
+        return solved
+    used = accepted(objective, solved)
     if objective.config.kept_probability > objective.config.inlier_probability and not np.all(used):
-        stages = graduated(objective, solved.state, WIDENED_RATIO, hold)
-        widened = selected(objective, stages.state, solved.iterations + stages.iterations, hold)
+        stages = graduated(objective, solved.state, WIDENED_RATIO)
+        widened = selected(objective, stages.state, solved.iterations + stages.iterations)
         if np.all(accepted(objective, widened) >= used):
             return widened
         solved = replace(solved, iterations=widened.iterations)
-    if searching(objective) is objective or hold:
+    if searching(objective) is objective:
         return solved
     return selected(objective, solved.state, solved.iterations)
 
