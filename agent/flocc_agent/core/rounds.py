@@ -81,8 +81,9 @@ class Rounds:
         """Take an answer; False for one of an earlier round or term, which counts for nothing.
 
         A round that was given up counts as long as no other one was started. The next one pauses for as long as this
-        one's solve took (on virtual time, the round, and a minute where the clock stepped), so that a large graph on a slow computer does not take all of it:
-        the first round also starts the solver's process, 20 s on a busy machine, which says nothing of the graph.
+        one's solve took (on virtual time, the round, but a minute at most: clocks step there), so that a large graph on
+        a slow computer does not take all of it: the first round also starts the solver's process, 20 s on a busy
+        machine, which says nothing of the graph.
         """
         if (term, round_number) != (self._term, self._round):
             return False
