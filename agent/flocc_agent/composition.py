@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend import build_optimiser, build_stepper
-from flocc_agent.config import AgentConfig, BackendMode
+from flocc_agent.config import AgentConfig, BackendMode, ConfigError
 from flocc_agent.core.interfaces import Camera, ImageWatch, Perception
 from flocc_agent.core.reports import Fact
 from flocc_agent.core.robot import Robot
@@ -187,7 +187,7 @@ def stored_result(config: AgentConfig) -> RobotResult:
 
 
 def _sealer(config: AgentConfig) -> RecordSealer | None:
-    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls)
+    return None if config.transport.tls is None else RecordSealer.of(config.transport.tls, config.name)
 
 
 def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:
@@ -205,6 +205,18 @@ def _compute_class(config: AgentConfig, sealer: RecordSealer | None) -> int:
 
 
 def _open_store(config: AgentConfig) -> Store:
+    """The store of a robot; a disk that fails is gone on without, a folder that can never be is a slip.
+
+    Raises:
+        ConfigError: The configuration's folder cannot be made.
+    """
+    if config.folder is not None:
+        try:
+            config.folder.mkdir(parents=True, exist_ok=True)
+        except (FileNotFoundError, FileExistsError, NotADirectoryError, PermissionError) as error:
+            raise ConfigError(f"{config.folder}: cannot be made (the key 'folder'): {error.strerror}") from error
+        except OSError:
+            pass
     return Store.open(
         None if config.folder is None else config.folder / "store",
         config.name,

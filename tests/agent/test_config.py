@@ -69,7 +69,7 @@ def annotations(section: type[BaseModel]) -> Iterator[tuple[str, Any]]:
         yield name, field.annotation
 
 
-def leaves(section: type[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def leaves(section: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     """Every key of a section and of those within it, the core's plain dataclasses among them."""
     for name, inner in get_type_hints(section).items() if is_dataclass(section) else annotations(section):
         if is_dataclass(inner) or (isinstance(inner, type) and issubclass(inner, BaseModel)):

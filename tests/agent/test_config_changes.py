@@ -43,6 +43,11 @@ def test_a_change_counts_instead_of_the_file_and_beside_it(tmp_path: Path) -> No
         ("core.loop_closing.fetch_timeout_s=-1", "fetch_timeout_s must be positive"),
         ("core.loop_closing.correspondences_min=-1", "correspondences_min must not be negative"),
         ("core.election.leader_timeout_s=nan", "leader_timeout_s: Input should be a finite number"),
+        ("folder=", "folder: a folder needs a name"),
+        (
+            'transport={control_listen=["tcp/0.0.0.0:7450"], bulk_listen=["tcp/0.0.0.0:7450"]}',
+            "'tcp/0.0.0.0:7450' is listened at twice; control and bulk",
+        ),
         ("keyframes.distance_m=true", "keyframes.distance_m: must be a number, neither true nor false"),
         ("core.rounds.period_s=true", "core.rounds.period_s: must be a number, neither true nor false"),
         ("radio.overrides=[{loss_ratio=true}]", "radio.overrides.0.loss_ratio: must be a number"),

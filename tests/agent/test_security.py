@@ -10,6 +10,7 @@ import pytest
 from tests.agent.runtime.loopback import loopback_configs, until
 from typer.testing import CliRunner
 
+from flocc_agent import Agent, AgentConfig
 from flocc_agent.config import TlsConfig, TransportConfig
 from flocc_agent.runtime.certificate_faults import certificate_faults
 from flocc_agent.runtime.network_faults import network_faults
@@ -65,6 +66,15 @@ def test_a_robot_has_a_name_of_its_own_and_a_class_of_one_digit(tmp_path: Path) 
     told = CliRunner().invoke(app, ["keys", str(tmp_path), "r1=12"])
     assert told.exit_code == 2
     assert "a compute class is a number from 0 to 9" in told.output
+
+
+async def test_keys_of_another_robot_are_refused_by_name(folders: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(TransportError, match=r"signing.key: is the key of no member of the swarm, and"):
+        RecordSealer.of(TlsConfig(folder=make_keys(tmp_path, SWARM, [])["operator"]), "r1")
+    config = loopback_configs(("r1",), tls=TlsConfig(folder=folders["r2"]))["r1"]
+    with pytest.raises(TransportError, match=r"signing.key: is the key of robot r2, and this robot is named r1"):
+        async with Agent(AgentConfig(name="r1", swarm=SWARM, transport=config)):
+            pass
 
 
 def test_the_list_of_members_says_compute_classes_once_one_is_given(tmp_path: Path) -> None:

@@ -1,12 +1,36 @@
 """The fit of a drift finds what was drawn."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.runtime.trajectory import Trajectory
-from flocc_lab.bench.odometry_drift import found_drift
+from flocc_lab.bench.odometry_drift import found_drift, of_files
 from flocc_launch.datasets.drift import DriftSpec, drifted
+
+
+def graph(path: Path, edges: np.ndarray, vertices: np.ndarray) -> Path:
+    """A planar graph: steps x, y and angle, or poses of vertices as `flocc optimise` writes them."""
+    lines = [f"EDGE_SE2 {k} {k + 1} {x} {y} {a} 1 0 0 1 0 1" for k, (x, y, a) in enumerate(edges)]
+    lines += [f"VERTEX_SE3:QUAT {k} {' '.join(map(str, row))}" for k, row in enumerate(vertices)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_planar_graph_is_held_against_its_optimum(tmp_path: Path) -> None:
+    turns = 0.02 * np.sin(np.arange(400) / 15)
+    headings = np.concatenate([[0.0], np.cumsum(turns)])
+    along = np.cumsum(0.5 * np.stack([np.cos(headings[:-1]), np.sin(headings[:-1])], 1), axis=0)
+    places = np.concatenate([[[0.0, 0.0]], along])
+    zero = np.zeros(len(headings))
+    true = np.stack([*places.T, zero, zero, zero, np.sin(headings / 2), np.cos(headings / 2)], axis=1)
+    steps = np.stack([np.full(400, 0.5 * 1.03), np.zeros(400), turns + 0.002 * 0.5], axis=1)
+    odometry, optimum = (tmp_path / name for name in ("a.g2o", "optimised.g2o"))
+    found = of_files(graph(odometry, steps, np.zeros((0, 7))), graph(optimum, np.zeros((0, 3)), true))
+    assert found.heading_rate_rad_per_m == pytest.approx(0.002, rel=0.01)
+    assert found.scale_ratio == pytest.approx(0.03, abs=0.001)
 
 
 def loop(count: int = 4000) -> Trajectory:

@@ -307,6 +307,20 @@ LISTS = [f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 9)}]\n" for k in range(9
         ),
         ("c.yaml", FLAT.replace("151.5", "1e-30"), "focal lengths of 150.5 and 1e-30 pixels are none of images"),
         ("c.yaml", FLAT + "model_type: PINHOLE\nestimate_extrinsic: 2\n", "VINS' settings that do not know where the"),
+        (
+            "c.yaml",
+            FLAT + "estimate_extrinsic: 2\nextrinsicTranslation: [0, 0, 0]\n",
+            "do not know where the camera sits",
+        ),
+        ("c.yaml", FLAT + "rpy: [-1.57, 0.0, -1.57]\n", "the key 'rpy' is not understood"),
+        ("c.yaml", FLAT + "sits_at: [0.1, 0.0, 0.3]\n", "the key 'sits_at' is not understood"),
+        ("c.yaml", FLAT + "seen_from: {x: 0.1, y: 0.0, z: 0.3}\n", "the key 'seen_from' is not understood"),
+        (
+            "c.yaml",
+            'Camera.type: "Rectified"\nCamera.k1: 0.1\n'
+            + "".join(f"Camera.{each}\n" for each in FLAT.splitlines() if "distortion" not in each),
+            "Rectified, but there are",
+        ),
         ("c.yaml", FLAT + "T_BS: [[1, 0, 0, 65], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n", "mounting in metres"),
         ("c.yaml", FLAT + "R: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nt: [0.1, 0, 0]\n", "the key 't' is not understood"),
         ("c.yaml", FLAT + "projection: equidistant\n", "the key 'projection' is not understood"),

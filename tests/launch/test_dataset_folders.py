@@ -259,6 +259,27 @@ def test_missing_intrinsics_are_said_with_what_to_do(tmp_path: Path) -> None:
         convert(path, tmp_path / "out")
 
 
+def test_a_chain_of_cameras_and_imu_is_taken_before_one_of_cameras_alone(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    size = read_source(path).lens
+    assert size is not None
+    (path / "camera.toml").unlink()
+    (path / "calib.yml").write_text("nothing")
+    with pytest.raises(DatasetError, match=r"--camera \(calib.yml may be one\)"):
+        convert(path, tmp_path / "out")
+    camera = (
+        "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n"
+        f"  intrinsics: [30, 30, 16, 12]\n  resolution: [{size.camera.width}, {size.camera.height}]\n"
+    )
+    placed = "  T_cam_imu: [[1, 0, 0, 0.25], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    (path / "run-camchain.yaml").write_text(camera)
+    (path / "run-camchain-imucam.yaml").write_text(camera + placed)
+    lens = read_source(path).lens
+    assert lens is not None
+    assert lens.T_body_camera[0, 3] == -0.25
+    assert any("not run-camchain.yaml" in note for note in lens.notes)
+
+
 def test_intrinsics_of_another_size_are_refused(tmp_path: Path) -> None:
     path = write_plain(tmp_path / "p")
     write_camera(tmp_path / "other.toml", Camera(64, 48, 30.0, 30.0, 32.0, 24.0), np.eye(4))

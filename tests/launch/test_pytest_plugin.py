@@ -64,13 +64,19 @@ def test_scenarios_that_pass_fail_or_cannot_be_used(pytester: pytest.Pytester) -
         @pytest.mark.flocc("nowhere.toml")
         def test_no_file(flocc_run): ...
 
+        @pytest.mark.flocc("nowhere.toml")
+        def test_no_file_and_no_look_at_the_run(): ...
+
+        @pytest.mark.flocc("hangar.toml", faults=APART)
+        def test_a_miss_that_nobody_looks_at(): ...
+
         @pytest.mark.flocc("hangar.toml", driver="gazebo")
         def test_no_driver(flocc_run): ...
 
         def test_no_marker(flocc_run): ...
         """,
     )
-    result.assert_outcomes(passed=3, failed=1, errors=4)
+    result.assert_outcomes(passed=3, failed=2, errors=5)
     lines = "\n".join(result.outlines)
     assert re.search(r"merged_within_s: expected 20.0, was None.*heard nobody at all.*report.html", lines, re.S)
     assert "the check fails before" not in re.sub(r"raise AssertionError.*", "", lines)

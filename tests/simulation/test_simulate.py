@@ -152,3 +152,9 @@ def test_a_fault_of_the_leader_where_nobody_leads_ends_the_run_with_a_sentence(t
     kill = {"at_s": 0.1, "kind": "kill", "robots": ["leader"]}
     with pytest.raises(FaultError, match=r"'kill' at 0\.1 s concerns the leader, but nobody leads then"):
         simulate(scenario(faults=[kill]), tmp_path / "run")
+
+
+def test_a_fault_an_hour_after_all_was_played_is_a_slip(tmp_path: Path) -> None:
+    faults = [{"at_s": 1e6, "kind": "kill", "robots": ["r1"]}]
+    with pytest.raises(FaultError, match=r"small: a fault at 1e\+06 s comes over 60 min 0 s after the end of all that"):
+        simulate(scenario(faults=faults), tmp_path / "run")

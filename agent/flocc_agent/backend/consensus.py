@@ -46,6 +46,8 @@ Int = NDArray[np.int64]
 STIFFNESS_AFTER = (5, 12)
 """After which steps a robot says how stiff it holds its shared poses: first by a guess of its other neighbours, then by
 what they said; dense graphs are at rest before the second."""
+STIFFNESS_SAME = 0.05
+"""One that differs by less, in its factors, is not said: a penalty need not be exact, only the same on both sides."""
 RELAXATION = 0.8
 """Of what is heard; at 0.9 smallGrid3D comes apart, at 0.5 chains take half as long again."""
 ANCHORING_FLOATING = 0.03
@@ -242,8 +244,10 @@ class ConsensusPart:
                 told[other] = self._stiffness(other)
         for other, stiffness in told.items():
             neighbour = self.neighbours[other]
-            neighbour.ours[STIFFNESS_AFTER.index(neighbour.steps) + 1] = stiffness
-            neighbour.stiffen(self.state.poses()[neighbour.index])
+            before = neighbour.ours.get(max(neighbour.ours, default=0))
+            if before is None or stiffness.differs(before) > STIFFNESS_SAME:
+                neighbour.ours[STIFFNESS_AFTER.index(neighbour.steps) + 1] = stiffness
+                neighbour.stiffen(self.state.poses()[neighbour.index])
 
     def tell(self, other: LogId) -> Tidings:
         """What a neighbour hears after this step."""

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from flocc_agent.backend.edges import Edges, Residuals, State, directions, residuals, taken
 from flocc_agent.backend.linear import LinearSolver, SingularSystem
-from flocc_agent.config import BackendConfig
+from flocc_agent.config import BackendConfig, Solver
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -103,8 +103,11 @@ class Objective:
 
         A free scale takes one of the six degrees of freedom.
         """
+        config = self.config
+        graduated = config.solver in (Solver.GNC_TLS, Solver.GNC_GM)
+        probability = config.kept_probability if graduated else config.inlier_probability
         free = (self.edges.sigma[self.closures] > 0) | (self.edges.cluster[self.closures] >= 0)
-        return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - self.config.inlier_probability))
+        return np.asarray(chdtri(np.where(free, 5.0, 6.0), 1.0 - probability))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

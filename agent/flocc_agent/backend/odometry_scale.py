@@ -40,6 +40,10 @@ ASKED_EVERY_ROUND_EDGES_MAX = 5000
 ASKED_POSES_MAX = 50_000
 """A still larger graph is not asked at all: everything but the scales is eliminated for it."""
 SCALE_MIN = 0.1
+TOLD_SIGMA_MAX = 0.01
+TOLD_USED_MIN = 0.75
+"""Scales are not freed for another search where each robot uses so many of its closures, and they tell its scale with
+at most this standard deviation, drift included."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,8 +116,10 @@ def solve_with_scales(posed: Posed, initial: GraphSolution | None, anew: PosedAn
     found = settled(begun, solved)
     if not is_worth_another(found):
         return found
-    free = posed.with_scaled(dict.fromkeys(scalable(posed), 1.0))
-    found = lower(found, settled(free, solve_once(free.objective, free.start, free.places)))
+    logs = scalable(posed)
+    if set(found.posed.problem.scaled) != set(logs):
+        free = posed.with_scaled(dict.fromkeys(logs, 1.0))
+        found = lower(found, settled(free, solve_once(free.objective, free.start, free.places)))
     applied = found.posed.problem.scales_applied(found.solved.state)
     if not applied or set(applied) == set(begun.problem.scaled):
         return found
@@ -163,7 +169,24 @@ def is_worth_another(found: SolvedWithScales) -> bool:
     config, posed = found.posed.objective.config, found.posed
     robust = config.solver in (Solver.GNC_TLS, Solver.GNC_GM) and config.formulation is not Formulation.BASE
     few = posed.problem.poses <= ASKED_POSES_MAX
-    return robust and few and not posed.is_confirmed(found.solved) and not explains(posed.objective, found.solved)
+    if not robust or not few or posed.is_confirmed(found.solved) or explains(posed.objective, found.solved):
+        return False
+    return not is_told(found)
+
+
+def is_told(found: SolvedWithScales) -> bool:
+    """Whether most closures of every robot are used, and tell its scale so surely that freeing it can change nothing.
+
+    A scale that is wrong turns its robot's closures away, or it is demanded by those that are used.
+    """
+    estimates, problem, closures = found.estimates, found.posed.problem, found.posed.places.closures
+    sure = np.all(np.hypot(estimates.sigma, BIAS_RATIO) <= TOLD_SIGMA_MAX)
+    if problem.scaled or not estimates.logs or not sure:
+        return False
+    used = found.solved.weights[problem.closure_rows] >= ACCEPTED_WEIGHT_MIN
+    ends = [{closures[k].query.log, closures[k].match.log} for k in problem.closure_ids]
+    shares = (np.mean(used[[log in of for of in ends]]) for log in estimates.logs)
+    return all(share >= TOLD_USED_MIN for share in shares)
 
 
 def settled(posed: Posed, solved: Solved) -> SolvedWithScales:

@@ -36,6 +36,8 @@ MORE_RATIO = 1.5
 """unless so many more closures agree with it that the used ones may have bent the body."""
 NEARLY_RATIO = 0.5
 """So many of the votes that hold a body are enough of unused closures to try the place that they agree on."""
+UNUSED_RATIO_MIN = min(1.0 - KEPT_RATIO_MAX, MORE_RATIO - 1.0, NEARLY_RATIO)
+"""Where unused closures have fewer of those votes, no place can be proposed by any of these rules."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +70,8 @@ class Places:
         for body in self._bodies(chosen):
             crossing = self._crossing(body)
             here = chosen & crossing
+            if self.votes[crossing & ~chosen].sum() < UNUSED_RATIO_MIN * self.votes[here].sum():
+                continue
             for asked, least_ratio in ((crossing, 1.0), (crossing & ~chosen, NEARLY_RATIO)):
                 found = self._aligned(body, asked, T, path_m)
                 if found is None or (least_ratio < 1.0 and not self._is_apart(body, T, found.T_a_b)):

@@ -39,6 +39,11 @@ class SharedStiffness:
     ties: Float
     tied: Float
 
+    def differs(self, before: "SharedStiffness") -> float:
+        """Largest difference of a factor from another one of the same poses, relative to that one."""
+        factors = [(self.knots, before.knots), *zip(self.ties, before.ties, strict=True)]
+        return max(float(np.linalg.norm(now - then) / np.linalg.norm(then)) for now, then in factors)
+
     def packed(self) -> Float:
         """Its numbers (N,)."""
         ties = self.ties[:, _LOWER_6[0], _LOWER_6[1]]

@@ -103,10 +103,13 @@ def lowest(objective: Objective, state: State) -> Solved:
 
 
 def best(objective: Objective, state: State, places: Places | None) -> Solved:
-    """GNC by several schedules from one state; the lowest truncated cost wins, each taken where it ended."""
+    """GNC by several schedules from one state; the lowest truncated cost wins, each taken where it ended.
+
+    With directions the careful schedule is the one that tells them by their angles.
+    """
     says = places.votes if places is not None else 1.0
     found = [scheduled(objective, state, START_RATIOS[0])]
-    if not explains(objective, found[0]):
+    if not objective.has_directions and not explains(objective, found[0]):
         found += [scheduled(objective, state, ratio) for ratio in START_RATIOS[1:]]
     found = different(objective, found)
     if objective.has_directions:
@@ -141,7 +144,7 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
     Votes make it cheap to let go of closures that stand close together: where odometry is stated too exact, a place
     that leaves hardly any may cost less than all that bend it (drawn seeds 2088, 2593).
     """
-    cost = voted_cost(objective, solved.state, places.votes)
+    cost: float | None = None
     for _ in range(PLACEMENTS_MAX):
         chosen, better = accepted(objective, solved), None
         votes_min = NEARLY_RATIO * places.votes[chosen].sum()
@@ -150,6 +153,7 @@ def replaced(objective: Objective, solved: Solved, places: Places) -> Solved:
             there = selected(objective, moved.state, moved.iterations)
             if places.votes[accepted(objective, there)].sum() < votes_min:
                 continue
+            cost = voted_cost(objective, solved.state, places.votes) if cost is None else cost
             if (lower := voted_cost(objective, there.state, places.votes)) < cost:
                 better, cost = there, lower
                 break

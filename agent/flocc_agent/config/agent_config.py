@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, PlainSerializer, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, field_validator, model_validator
 
 from flocc_agent.config.backend import BackendConfig, BackendMode
 from flocc_agent.config.emulated_radio import RadioConfig
@@ -116,6 +116,13 @@ class AgentConfig(Section):
         if self.map is not None and self.backend.mode is BackendMode.DISTRIBUTED:
             raise ValueError(NO_MAPS)
         return self
+
+    @field_validator("folder", mode="before")
+    @classmethod
+    def _is_named(cls, folder: object) -> object:
+        if folder == "":
+            raise ValueError("a folder needs a name ('.' is the one where the agent is started)")
+        return folder
 
     @model_validator(mode="after")
     def _has_one_source(self) -> "AgentConfig":

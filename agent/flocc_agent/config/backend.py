@@ -83,7 +83,10 @@ class BackendConfig(Section):
     """Multiply each closure's information by the probability of Eq. (2); off for measurements that carry a trusted
     covariance of their own."""
     inlier_probability: float = inner(0.9999, gt=0, lt=1)
-    """Chi-square quantile below which a closure counts as right; larger rejects less."""
+    """Chi-square quantile below which closures, or a closure and odometry, agree with each other."""
+    kept_probability: float = inner(0.9999, gt=0, lt=1)
+    """Chi-square quantile below which GNC keeps a closure; larger rejects less. Real noise has heavier tails than its
+    covariance: 0.9999999999 is nearer to the truth on recordings, and lets one group of closures set a wrong scale."""
     gnc_start_ratio: float = inner(1e-4, gt=0)
     """Control parameter at which GNC starts at the latest; smaller starts more convex and takes more solves."""
     gnc_step: float = inner(2.0, gt=1)

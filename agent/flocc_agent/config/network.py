@@ -136,6 +136,9 @@ class TransportConfig(Section):
         if misnamed:
             raise ValueError(f"the roster's {misnamed[0]!r} cannot be a robot's name")
         endpoints = [*self.control_listen, *self.bulk_listen]
+        twice = [e for e in endpoints if endpoints.count(e) > 1 and not e.endswith(":0")]
+        if twice:
+            raise ValueError(f"{twice[0]!r} is listened at twice; control and bulk have sessions of their own")
         endpoints += [e for peer in self.roster.values() for e in (*peer.control, *peer.bulk)]
         wrong = [e for e in endpoints if not e.startswith("tls/")] if self.tls else []
         if wrong:

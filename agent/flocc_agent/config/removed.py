@@ -81,6 +81,7 @@ REMOVED: dict[str, str] = {
     "backend.scale_prior_sigma_ratio": "always 0.5",
     "backend.scale_prior_unknown_sigma_ratio": "always 20.0",
     "backend.inlier_probability": "always 0.9999",
+    "backend.kept_probability": "always 0.9999",
     "backend.gnc_start_ratio": "always 0.0001",
     "backend.gnc_step": "always 2.0",
     "backend.gnc_inner_steps": "always 1",

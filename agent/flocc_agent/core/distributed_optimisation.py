@@ -15,7 +15,7 @@ that does not shrink, the robot goes back to where it last agreed, and does not 
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -201,6 +201,7 @@ class DistributedOptimisation:
         self._distrusted = Muted(DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S)
         self._contradicted_s: float | None = None
         self._rejoin_at_s = float("inf")
+        self._silences_seen_s = float("-inf")
         self._coming_apart = ComingApart()
         self._agreed: _Agreed | None = None
         self._least_gap = float("inf")
@@ -236,7 +237,7 @@ class DistributedOptimisation:
         if message.anchor == self.anchor and not self._is_back:
             self._take_origin(message)
             if before is None or message.step > before.step:
-                pair.heard = message
+                pair.heard = _with_stiffness(message, pair.heard)
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
         self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
@@ -345,6 +346,8 @@ class DistributedOptimisation:
         if self._choosing is not None and self._choosing.until_s <= now:
             effects += self.on_choice_failed(self._choosing.number, "it took too long", now)
         self._look(now)
+        if self._silent_at_s() <= now:
+            self._silences_seen_s, self._has_news = now, True
         if self._rejoin_at_s <= now:
             self._rejoin_at_s, self._has_news = float("inf"), True
         if self._choosing is None and self._choose_due_s() <= now:
@@ -362,7 +365,9 @@ class DistributedOptimisation:
         deliver_s = self._may_deliver_s() if self._undelivered else float("inf")
         step_s = self._begin_at_s() if self._running_until_s is None else self._running_until_s
         choice_s = self._choose_due_s() if self._choosing is None else self._choosing.until_s
-        return min(step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s(), self._rejoin_at_s)
+        return min(
+            step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s(), self._rejoin_at_s, self._silent_at_s()
+        )
 
     def component(self, now: float) -> Component | None:
         """This robot's corrected poses, at most once per period, None where there is nothing new or agreed on."""
@@ -390,6 +395,11 @@ class DistributedOptimisation:
             keyframes=0 if step is None else len(step.T_map_keyframe),
         )
         return Report(fact)
+
+    def _silent_at_s(self) -> float:
+        """When the next neighbour is silent so long that only what both agreed on counts: that takes a step."""
+        ends = (pair.said_s + SILENT_S for pair in self._pairs.values() if pair.said is not None and pair.keyframes)
+        return min((end for end in ends if end > self._silences_seen_s), default=float("inf"))
 
     def _may_deliver_s(self) -> float:
         """Not before that, unless a contact says that neighbours agree."""
@@ -719,6 +729,7 @@ class DistributedOptimisation:
         assert self._origin is not None
         has_list = pair.said is not None and pair.said.edition == pair.edition
         listed = self._own < other and not has_list and pair.information is not None
+        edition = 0 if has_list and pair.said is not None and pair.said.known >= told.edition else told.edition
         return SharedPoses(
             self.anchor,
             self.number,
@@ -730,8 +741,8 @@ class DistributedOptimisation:
             Array.of(told.base_m, "f8"),
             Array.of(told.rows),
             told.known,
-            told.edition,
-            Array.of(told.stiffness),
+            edition,
+            Array.of(told.stiffness if edition else np.zeros(0)),
         )
 
     def _ask_for_list(self, other: LogId) -> Effect:
@@ -746,6 +757,13 @@ class DistributedOptimisation:
 
     def _refuse(self, other: LogId, reason: str) -> Effect:
         return Report(PeerRefused(peer=other.robot, reason=f"shared poses: {reason}"))
+
+
+def _with_stiffness(message: SharedPoses, unread: SharedPoses | None) -> SharedPoses:
+    """A message with the stiffness of one before it that no step has taken, where it has none itself."""
+    if unread is None or message.stiffness_edition or unread.edition != message.edition:
+        return message
+    return replace(message, stiffness_edition=unread.stiffness_edition, stiffness=unread.stiffness)
 
 
 def _told_by(message: SharedPoses) -> ToldPoses:

@@ -24,8 +24,10 @@ LOST_S = 30.0
 WANTS_TURN_S = 10.0
 WANTS_MAX = 8
 """Latents out of reach that are asked of relays at one time; a message carries 16."""
-WISHED_AGAIN_S = 2.5
-"""A wish is told again after so long only, or to a new neighbour: relays remember it."""
+TOLD_AGAIN_S = 2.5
+"""A wish or an offer is told again after so long only, or to a new neighbour: who hears it remembers it."""
+HEARD_S = 3.0 * TOLD_AGAIN_S
+"""So long an offer counts that was heard: two in a row may be lost."""
 RELAYS_MAX = 16
 """Latents kept for others at one time: the wants of two robots."""
 OFFERED_S = 20.0
@@ -192,8 +194,8 @@ class Relayed:
         return self.is_here and self.offered_until_s is not None and now < self.offered_until_s
 
 
-class WishesTold:
-    """Which of a robot's wishes a heartbeat tells."""
+class ToldNowAndThen:
+    """Which of a robot's wishes, or of its offers, a heartbeat tells."""
 
     def __init__(self) -> None:
         self._told_s: dict[KeyframeId, float] = {}
@@ -202,11 +204,32 @@ class WishesTold:
         """A robot came into range, and heard none."""
         self._told_s.clear()
 
-    def due(self, wishes: Sequence[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
+    def due(self, latents: Sequence[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
         """Those that were not told for a while."""
-        due = tuple(k for k in wishes if self._told_s.get(k, float("-inf")) + WISHED_AGAIN_S <= now)
-        self._told_s = {**{k: self._told_s[k] for k in wishes if k not in due}, **dict.fromkeys(due, now)}
+        due = tuple(k for k in latents if self._told_s.get(k, float("-inf")) + TOLD_AGAIN_S <= now)
+        self._told_s = {**{k: self._told_s[k] for k in latents if k not in due}, **dict.fromkeys(due, now)}
         return due
+
+
+class OffersHeard:
+    """Latents that robots in range hold for others, as far as they said so a short while ago."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[str, dict[KeyframeId, float]] = {}
+
+    def hear(self, name: str, offers: Iterable[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
+        """A robot told some: all that count of it now, the newest `RELAYS_MAX` at most."""
+        until_s = self._until_s.setdefault(name, {})
+        for keyframe in offers:
+            until_s.pop(keyframe, None)
+            remember(until_s, keyframe, now + HEARD_S, RELAYS_MAX)
+        for keyframe in [k for k, end_s in until_s.items() if end_s <= now]:
+            del until_s[keyframe]
+        return tuple(sorted(until_s))
+
+    def on_lost(self, name: str) -> None:
+        """A robot is out of range."""
+        self._until_s.pop(name, None)
 
 
 class LatentNames:

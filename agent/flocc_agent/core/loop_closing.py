@@ -20,7 +20,7 @@ from flocc_agent.core.candidate_order import SpectralOrder
 from flocc_agent.core.effects import Effect, Register, Report
 from flocc_agent.core.front_ends import FrontEnds
 from flocc_agent.core.known_sets import PairSet
-from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, Peer, Reach, WishesTold
+from flocc_agent.core.latents import WANTS_MAX, WANTS_TURN_S, Latents, OffersHeard, Peer, Reach, ToldNowAndThen
 from flocc_agent.core.offers import Offers, Recipient
 from flocc_agent.core.parameters import LoopClosingParameters
 from flocc_agent.core.place_recognition import Candidate
@@ -93,7 +93,9 @@ class LoopClosing:
         self._undecided: dict[CandidatePair, Candidate] = {}
         self._listens_until_s = listens_until_s
         self._wanted: tuple[KeyframeId, ...] = ()
-        self._wishes_told = WishesTold()
+        self._wishes_told = ToldNowAndThen()
+        self._offers_told = ToldNowAndThen()
+        self._offers_heard = OffersHeard()
         self._turn = -1
         self._changed = True
         self._due_s = float("inf")
@@ -322,7 +324,11 @@ class LoopClosing:
 
     def holds(self, now: float) -> tuple[KeyframeId, ...]:
         """Latents of others that this robot holds because somebody wanted them, as far as that is to be told now."""
-        return self.latents.holds(now)
+        return self._offers_told.due(self.latents.holds(now), now)
+
+    def held_by(self, name: str, told: Sequence[KeyframeId], now: float) -> tuple[KeyframeId, ...]:
+        """Latents that a robot in range holds for others, of which it told these just now."""
+        return self._offers_heard.hear(name, told, now)
 
     def lost(self, now: float) -> tuple[KeyframeId, ...]:
         """Latents that neighbours want and that exist no more."""
@@ -335,6 +341,7 @@ class LoopClosing:
         if name not in self._reach:
             self.latents.on_reached(name)
             self._wishes_told.on_reached()
+            self._offers_told.on_reached()
         if self._reach.update(name, peer):
             self._offers.on_peer(name)
             self._chosen, self._changed = None, True
@@ -345,6 +352,7 @@ class LoopClosing:
     def on_lost(self, name: str, now: float) -> None:
         """A robot is out of range; the pairs that it was to register wait for `TAKEOVER_S`."""
         self._reach.remove(name)
+        self._offers_heard.on_lost(name)
         self.latents.on_lost(name)
         self._offers.on_lost(name, now)
         self._chosen, self._changed = None, True

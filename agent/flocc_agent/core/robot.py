@@ -370,7 +370,8 @@ class Robot:
         effects += self._compare(sender, heartbeat, now)
         compute_class = self.election.class_of(sender.robot, heartbeat.compute_class)
         helps = NOBODY if self.neighbours.is_double(sender.robot) else compute_class
-        self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, heartbeat.holds, sender))
+        holds = self.closing.held_by(sender.robot, heartbeat.holds, now)
+        self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, holds, sender))
         self.closing.on_wants(sender.robot, heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
             effects += self._reject_lost([pair], keyframe, now)

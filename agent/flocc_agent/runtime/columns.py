@@ -18,6 +18,11 @@ _UNIT_NAMES = {
     "microseconds": ("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
     "nanoseconds": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"),
 }
+_OTHER_UNITS = (
+    *("min", "mins", "minute", "minutes", "h", "hr", "hrs", "hour", "hours", "d", "day", "days"),
+    *("frame", "frames", "tick", "ticks", "sample", "samples", "cycle", "cycles", "100ns", "10us", "100us", "week"),
+)
+"""What stamps are sometimes counted in, and flocc does not read."""
 _METRES = {"": 1.0, "m": 1.0, "meter": 1.0, "meters": 1.0, "metres": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3}
 _UNIT_OF = {name: unit for unit, names in _UNIT_NAMES.items() for name in names}
 _STAMP = re.compile(r"(.*[._/])?(t|ts|time|times|stamp|timestamp|timestamp_kf|time_stamp|unix_?time|epoch|utc|clock)")
@@ -59,6 +64,8 @@ _PX4 = ("timestamp_sample", "q_offset[")
 _OTHER_PARTS = ("cov", "twist", "veloc", "accel", "gyro", "bias", "sigma", "std", "error", "imu", "mag")
 
 
+_BIASES = ("bg", "b_g")
+"""A gyroscope's bias, `bgx` (Kimera), which is no frame in another."""
 REVERSED_MIN = 3
 """Words of a line that say so; a name or two may mean something else."""
 
@@ -165,12 +172,15 @@ def _px4_named(header: str) -> str:
         return header
     named = re.sub(r"\bposition\[([0-2])\]", lambda found: "position_" + "xyz"[int(found[1])], header)
     named = re.sub(r"\bq\[([0-3])\]", lambda found: "q_" + "wxyz"[int(found[1])], named)
+    if re.search(r"\btimestamp_sample\b", named):  # when it was measured; `timestamp` is when it was published
+        named = re.sub(r"\btimestamp\b(?!_)", "published", named)
+        return re.sub(r"\btimestamp_sample\b", "timestamp[us]", named)
     return re.sub(r"\btimestamp\b(?!_)", "timestamp[us]", named)
 
 
 def _is_reversed(name: str) -> bool:
     frames = re.sub(r"_?[xyzw]$", "", re.split(r"[./]", _bare(name))[-1])
-    return _REVERSED.search(frames) is not None
+    return frames not in _BIASES and _REVERSED.search(frames) is not None
 
 
 def _metres(name: str) -> float:
@@ -233,5 +243,8 @@ def _unit(name: str) -> str | None:
     if _HEADER_STAMP.fullmatch(_bare(name)):
         return "nanoseconds"  # as rostopic echo -p writes it
     bracketed = re.search(r"[\[(](.*?)[\])]", name)
-    words = [bracketed[1].lower()] if bracketed else []
-    return next((_UNIT_OF[word] for word in [*words, _bare(name).rpartition("_")[2]] if word in _UNIT_OF), None)
+    words = [bracketed[1].strip().lower()] if bracketed else []
+    words.append(_bare(name).rpartition("_")[2])
+    if (other := next((word for word in words if word in _OTHER_UNITS), None)) is not None:
+        raise HeaderError(f"the header gives stamps in {other!r}: write them in seconds")
+    return next((_UNIT_OF[word] for word in words if word in _UNIT_OF), None)

@@ -378,8 +378,9 @@ class Driver:
     def _end_log(self, peer: str) -> None:
         """Others hold records of this robot's log that it did not write here: an old disk, or a second writer."""
         logger.error(
-            "%s: %s holds records of this robot's log that are not on its disk (an older copy of the disk, or a second "
-            "robot of this name): what it records now reaches nobody; at its next start it begins a log of its own",
+            "%s: %s holds records of this robot's log that are not on its disk (an older copy of the disk, a second "
+            "robot of this name, or, without keys, a lie): who holds them takes nothing of what it records now; at "
+            "its next start it begins a log of its own",
             self.robot.log,
             peer,
         )

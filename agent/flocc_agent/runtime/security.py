@@ -199,11 +199,16 @@ class RecordSealer:
         self._verdicts: dict[bytes, bool] = {}
 
     @classmethod
-    def of(cls, tls: TlsConfig) -> "RecordSealer":
+    def of(cls, tls: TlsConfig, robot: str | None = None) -> "RecordSealer":
         """Read this robot's signing key and the members' public ones.
 
+        Args:
+            tls: Where they are.
+            robot: Whose key it must be; None: any member's.
+
         Raises:
-            TransportError: A file is missing or not a key, or the extra `secure` is not installed.
+            TransportError: A file is missing or not a key, the key is of another robot, or the extra `secure` is not
+                installed.
         """
         _check_installed()
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -217,6 +222,14 @@ class RecordSealer:
         if not isinstance(signing_key, Ed25519PrivateKey):
             raise TransportError(f"{path}: is not an Ed25519 key")
         members = read_members(tls.folder / MEMBERS)
+        if robot is not None:
+            public_key = signing_key.public_key().public_bytes_raw()
+            owner = next((name for name, key in members.robots.items() if key == public_key), None)
+            if owner != robot:
+                whose = f"is the key of robot {owner}" if owner else "is the key of no member of the swarm"
+                raise TransportError(
+                    f"{path}: {whose}, and this robot is named {robot}; its keys are in another folder"
+                )
         return cls(members.swarm, signing_key, members.robots, members.compute_classes)
 
     def seal(self, log: LogId, number: int, record: bytes) -> bytes:

@@ -173,12 +173,12 @@ class WorkerProcess:
             if self._idle is not None:
                 self._idle.cancel()
             try:
-                request = await asyncio.to_thread(pickle.dumps, (function, arguments))
+                request = [await asyncio.to_thread(pickle.dumps, (function, arguments))]
             except Exception as error:
                 return _failed(self._kind, error)
             try:
                 async with asyncio.timeout(self._timeout_s):
-                    answer = await self._exchange(request)
+                    answer = await self._exchange(request.pop())
             except TimeoutError:
                 await self._end()
                 return self._died(f"took longer than {self._timeout_s:g} s")
@@ -193,10 +193,13 @@ class WorkerProcess:
             return await self._read(answer)
 
     async def _exchange(self, request: bytes) -> bytes:
+        """Send a request, which is let go once it is sent: a task may take long."""
         process = self._process = self._process or await _started()
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(LENGTH.pack(len(request)) + request)
+        process.stdin.write(LENGTH.pack(len(request)))
+        process.stdin.write(request)
+        del request
         await process.stdin.drain()
         (length,) = LENGTH.unpack(await process.stdout.readexactly(LENGTH.size))
         return await process.stdout.readexactly(length)

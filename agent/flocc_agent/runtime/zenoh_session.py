@@ -44,7 +44,8 @@ def session_settings(
 ) -> dict[str, Any]:
     """Give zenoh's settings, by zenoh's path, for one session of one robot.
 
-    Robots with a higher name dial those with a lower one, so that each pair has one link. An operator dials all.
+    Robots with a higher name dial those with a lower one, so that each pair has one link. An operator dials all, also
+    those that scouting finds: he does not listen, so that nobody could dial him.
     """
     control = plane is Plane.CONTROL
     dialled = [
@@ -53,7 +54,7 @@ def session_settings(
         if name < robot or dials_all
         for endpoint in (peer.control if control else peer.bulk)
     ]
-    strategy = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+    strategy = {"peer": {"to_router": "always", "to_peer": "always" if dials_all else "greater-zid"}}
     message_bytes_max = config.message_bytes_max if control else config.chunk_bytes
     settings: dict[str, Any] = {
         "mode": "peer",

@@ -5,11 +5,17 @@ displacement. What all pieces of a recording share is its constant (scale, headi
 
     python -m flocc_lab.bench.odometry_drift drone odometry1.txt truth1.txt odometry2.txt truth2.txt
     python -m flocc_lab.bench.odometry_drift car kitti_00.g2o kitti_poses/00.txt
+    python -m flocc_lab.bench.odometry_drift wheeled MITb.g2o optimised.g2o
+    python -m flocc_lab.bench.odometry_drift handheld team.jrl
+
+A `.jrl` holds odometry and truth of several robots, each a recording. Where a planar graph has no truth, its
+optimum stands for it (`flocc optimise MITb.g2o --out DIR`).
 """
 
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,10 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.geometry import between, inverse, pose, so3_exp, so3_log
+from flocc_agent.geometry import between, inverse, pose, pose_from_tq, so3_exp, so3_log
 from flocc_agent.runtime.trajectory import Trajectory
 from flocc_agent.runtime.trajectory_text import read_poses, read_trajectory
 from flocc_launch.datasets.drift import DRIFTS
+from flocc_launch.graph_files import read_graph_file
 
 Float = NDArray[np.float64]
 
@@ -112,19 +119,44 @@ def _pieces(
 def of_files(odometry: Path, truth: Path) -> DriftFound:
     """Fit a file of odometry against one of ground truth: trajectories, or KITTI's planar graph and its poses."""
     if odometry.suffix == ".g2o":
-        world = read_poses(truth).T_fixed_body
+        of_plane = truth.suffix == ".g2o"
+        world = _vertices(truth) if of_plane else read_poses(truth).T_fixed_body
         steps = [line.split()[3:6] for line in odometry.read_text().splitlines() if line.startswith("EDGE_SE2 ")]
         ends = [line.split()[1:3] for line in odometry.read_text().splitlines() if line.startswith("EDGE_SE2 ")]
-        plane = pose(CAMERA_OF_PLANE, np.zeros(3))
+        plane = pose(np.eye(3) if of_plane else CAMERA_OF_PLANE, np.zeros(3))
         poses = [np.eye(4)]
         for (x, y, angle), (a, b) in zip(steps, ends, strict=True):
             if int(b) == int(a) + 1:
                 step = pose(so3_exp(np.array([0.0, 0.0, float(angle)])), np.array([float(x), float(y), 0.0]))
                 poses.append(poses[-1] @ plane @ step @ inverse(plane))
-        return found_drift(np.array(poses), world[: len(poses)], np.array([0.0, -1.0, 0.0]), True)
+        up = np.array([0.0, 0.0, 1.0]) if of_plane else np.array([0.0, -1.0, 0.0])
+        return found_drift(np.array(poses), world[: len(poses)], up, True)
     said, _ = read_trajectory(odometry, "tum")
     true, _ = read_trajectory(truth)
     return found_drift(*_paired(said, true), np.array([0.0, 0.0, 1.0]))
+
+
+def _vertices(graph: Path) -> Float:
+    """(N, 4, 4) poses of a graph of vertices x y z qx qy qz qw, in the order of their numbers."""
+    rows = [line.split() for line in graph.read_text().splitlines() if line.startswith("VERTEX_SE3:QUAT ")]
+    ordered = sorted(([int(row[1]), *map(float, row[2:9])] for row in rows), key=lambda row: row[0])
+    return np.array([pose_from_tq(np.array(row)[[1, 2, 3, 7, 4, 5, 6]]) for row in ordered])
+
+
+def of_team(path: Path) -> list[DriftFound]:
+    """Fit the odometry of every robot in a `.jrl` against its true poses; its world's z points up."""
+    file = read_graph_file(path)
+    up = np.array([0.0, 0.0, 1.0])
+    robots = file.graph.trajectories
+    return [found_drift(robots[log].T_odom_keyframe, T, up) for log, T in sorted(file.T_truth.items())]
+
+
+def of_arguments(files: Sequence[Path]) -> list[DriftFound]:
+    """Recordings of teams, and of odometry and truth in turn."""
+    teams = [path for path in files if path.suffix == ".jrl"]
+    pairs = [path for path in files if path.suffix != ".jrl"]
+    found = [of_files(odometry, truth) for odometry, truth in zip(pairs[::2], pairs[1::2], strict=True)]
+    return [*(each for path in teams for each in of_team(path)), *found]
 
 
 def _paired(said: Trajectory, true: Trajectory) -> tuple[Float, Float]:
@@ -139,9 +171,9 @@ def main() -> None:
     """Print what was found in each recording, the sigma of all, and what the kind is given."""
     parser = argparse.ArgumentParser(description="How real odometry drifts, beside what is drawn for its kind.")
     parser.add_argument("kind", choices=list(DRIFTS))
-    parser.add_argument("files", type=Path, nargs="+", help="odometry and truth, in turn")
+    parser.add_argument("files", type=Path, nargs="+", help="odometry and truth, in turn, or a team's .jrl")
     given = parser.parse_args()
-    found = [of_files(a, b) for a, b in zip(given.files[::2], given.files[1::2], strict=True)]
+    found = of_arguments(given.files)
     terms = list(asdict(found[0]))[1:]
     sigma = {term: float(np.sqrt(np.mean([getattr(each, term) ** 2 for each in found]))) for term in terms}
     table = {

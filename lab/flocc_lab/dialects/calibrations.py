@@ -20,7 +20,8 @@ import numpy as np
 
 from flocc_agent.geometry import pose, so3_exp
 from flocc_agent.lenses import CameraModel, LensKind
-from flocc_lab.dialects.calibration_writers import FORMS, Rig, WriterForm
+from flocc_lab.dialects.calibration_form import Rig, WriterForm
+from flocc_lab.dialects.calibration_writers import FORMS
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_protocol.errors import FloccError
 
@@ -94,21 +95,37 @@ def _drawn_lens(
 Fault = Callable[[str], str]
 
 
-def _unknown_key(text: str) -> str:
-    """A coefficient under a name that no reader knows."""
+def _with_key(text: str, key: str, value: object) -> str:
+    """A file with one more key in the map of its camera; a map in an XML is left as it is."""
     if text.lstrip().startswith("{"):
         table = json.loads(text)
         place = table["value0"]["intrinsics"][0]["intrinsics"] if "value0" in table else _inner(table)
-        place["thin_prism_q"] = 0.01
+        place[key] = value
         return json.dumps(table)
     if text.startswith("<?xml"):
-        return text.replace("</opencv_storage>", "<thin_prism_q>0.01</thin_prism_q></opencv_storage>")
+        added = f"<{key}>{value}</{key}></opencv_storage>" if isinstance(value, float) else "</opencv_storage>"
+        return text.replace("</opencv_storage>", added)
     if re.match(r"\[camera\]", text):
-        return text + "thin_prism_q = 0.01\n"
+        return text + f"{key} = {json.dumps(value)}\n"
     found = re.search(r"^( *)(?:image_width|resolution|width|image_height|camera_model):", text, re.MULTILINE)
     indent = found[1] if found else ""
-    place = found.start() if found else len(text)
-    return f"{text[:place]}{indent}thin_prism_q: 0.01\n{text[place:]}"
+    at = found.start() if found else len(text)
+    return f"{text[:at]}{indent}{key}: {json.dumps(value)}\n{text[at:]}"
+
+
+def _unknown_key(text: str) -> str:
+    """A coefficient under a name that no reader knows."""
+    return _with_key(text, "thin_prism_q", 0.01)
+
+
+def _angles(text: str) -> str:
+    """A mounting by angles, which no reader takes."""
+    return _with_key(text, "rpy", [-1.57, 0.0, 0.1])
+
+
+def _place(text: str) -> str:
+    """A position under a name that nobody has seen."""
+    return _with_key(text, "sits_at", [0.1, -0.05, 0.3])
 
 
 def _inner(table: dict) -> dict:  # type: ignore[type-arg]
@@ -160,13 +177,28 @@ def _not_rigid(text: str) -> str:
     return text.replace(found[0], f"{found[1]}{', '.join(numbers)}]", 1) if len(numbers) > 3 else text
 
 
+def _unknown_mounting(text: str) -> str:
+    """VINS' settings that give a mounting and say that nothing is known of it."""
+    return text.replace("estimate_extrinsic: 0", "estimate_extrinsic: 2")
+
+
+def _rectified(text: str) -> str:
+    """ORB-SLAM's rectified camera, which has no coefficients, with some."""
+    has_coefficients = re.search(r"Camera\d?\.k1: *-?0*\.?0*[1-9]", text) is not None
+    return re.sub(r'(Camera\.type: *)"PinHole"', r'\1"Rectified"', text) if has_coefficients else text
+
+
 FAULTS: dict[str, Fault] = {
     "a key that nobody knows": _unknown_key,
+    "a mounting by angles": _angles,
+    "a position that nobody knows": _place,
     "a number that is none": _not_finite,
     "a key twice": _twice,
     "a coefficient too few": _short,
     "a model that contradicts": _model_contradicts,
     "a mounting that is no pose": _not_rigid,
+    "a mounting that is unknown": _unknown_mounting,
+    "a rectified camera with coefficients": _rectified,
 }
 TEXTS = (
     "ROS INI", "COLMAP", "DSO, TUM monoVO", "DROID-SLAM", "KITTI odometry", "KITTI raw", "ZED", "ZED, distortion apart",

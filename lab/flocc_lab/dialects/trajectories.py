@@ -35,7 +35,7 @@ from flocc_protocol.errors import FloccError
 
 POSES = (8, 120)
 SURFACES = ("as it is", "BOM", "UTF-16", "CRLF", "old Mac", "tabs", "semicolons", "decimal commas", "comments", "blank")
-UNITLESS = ("OKVIS", "LaMAR", "ZED")
+UNITLESS = ("OKVIS", "LaMAR", "ZED", "Kimera")
 """Forms whose header names no unit: stamps say it themselves where they count from 1970."""
 FAULTS = ("nan", "word", "short", "zero quaternion", "duplicate", "step back")
 
@@ -160,18 +160,19 @@ def judge_trajectory(rng: np.random.Generator, folder: Path) -> FileVerdict:
 def free_form(rows: list[Row], rng: np.random.Generator) -> tuple[str, str, bool]:
     """A table as somebody would write it: any order, unit, separator, with or without a header."""
     is_wxyz, separator = bool(rng.integers(2)), str(rng.choice([" ", ",", "\t", ", "]))
-    unit = str(rng.choice(["s", "ms", "us", "ns"]))
-    per_s = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
     header = str(rng.choice(["none", "unit", "full"]))
+    unit = str(rng.choice(["s", "ms", "us", "ns", *(["min", "h"] if header != "none" else [])]))
+    per_s = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9, "min": 1 / 60, "h": 1 / 3600}[unit]
     q = "qw qx qy qz" if is_wxyz else "qx qy qz qw"
     names = {"unit": f"time[{unit}] x y z {q}", "full": f"timestamp_{unit} p_x p_y p_z {q.replace('q', 'q_')}"}
     mark = str(rng.choice(["# ", ""]))
     head = "" if header == "none" else mark + separator.join(names[header].split()) + "\n"
     text = head + "".join(
-        line([r[0] if unit == "s" else round(r[0] * per_s), *(wxyz(r) if is_wxyz else xyzw(r))], separator)
+        line([r[0] * per_s if per_s <= 1 else round(r[0] * per_s), *(wxyz(r) if is_wxyz else xyzw(r))], separator)
         for r in rows
     )
-    return f"{'wxyz' if is_wxyz else 'xyzw'} in {unit}, header {header}", text, header != "none"
+    said = header != "none" and per_s >= 1
+    return f"{'wxyz' if is_wxyz else 'xyzw'} in {unit}, header {header}", text, said
 
 
 def _judged(name: str, must_read: bool, path: Path, truth: Trajectory) -> FileVerdict:

@@ -162,7 +162,15 @@ FORMS: dict[str, TrajectoryForm] = {
         "header",
         lambda rows: (
             "timestamp,timestamp_sample,position[0],position[1],position[2],q[0],q[1],q[2],q[3],pose_frame\n"
-            + "".join(line([ns(row[0]) // 1000, ns(row[0]) // 1000 - 9, *wxyz(row), 1], ",") for row in rows)
+            + "".join(line([ns(row[0]) // 1000 + 45_000, ns(row[0]) // 1000, *wxyz(row), 1], ",") for row in rows)
+        ),
+    ),
+    "Kimera": TrajectoryForm(
+        "traj_vio.csv",
+        "header",
+        lambda rows: (
+            "#timestamp,x,y,z,qw,qx,qy,qz,vx,vy,vz,bgx,bgy,bgz,bax,bay,baz\n"
+            + "".join(line([ns(row[0]), *wxyz(row), *[0.5] * 9], ",") for row in rows)
         ),
     ),
     "bagpy": TrajectoryForm(
@@ -217,6 +225,10 @@ REFUSED: dict[str, tuple[str, str]] = {
     "Redwood, Open3D": ("trajectory.log", "0 0 1\n1 0 0 5\n0 1 0 5\n0 0 1 5\n0 0 0 1\n"),
     "unknown order": ("vio.txt", "1700000000.0 1 2 3 0.5 0.5 0.5 0.5\n1700000000.1 1 2 3 0.5 0.5 0.5 0.5\n"),
     "unknown unit": ("odometry.txt", "".join(f"{2 * k} {k} 0 0 0 0 0 1\n" for k in range(5))),
+    "stamps in minutes": (
+        "poses.csv",
+        "time [min],x,y,z,qx,qy,qz,qw\n" + "".join(f"{k / 600:.6f},{k},0,0,0,0,0,1\n" for k in range(8)),
+    ),
     "g2o": ("poses.g2o", "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n"),
     "the world in the camera": (
         "poses.csv",

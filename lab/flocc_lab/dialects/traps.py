@@ -3,7 +3,7 @@
 Each kind was found by people who tried to break the readers: half of one robot beside half of another, transforms of
 robots whose frames have the same names, goals beside odometry, cameras beyond the first of a chain, matrices column by
 column, several models of one reconstruction, an applied scale, the last frame of a video, options that a source does
-not use, a time shift, a phone's folders. Everything else of an input is drawn.
+not use, a time shift, a phone's folders, and those of `named_traps`. Everything else of an input is drawn.
 
     python -m flocc_lab.dialects.traps --count 200 --seed 1
 """
@@ -15,119 +15,59 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flocc_agent.geometry import inverse, pose, pose_from_tq, q_wxyz_from_R, so3_exp
 from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
 from flocc_agent.runtime.trajectory_text import read_trajectory
-from flocc_lab.dialects.bags import IMAGES, MOUNT, STEP_NS, ZERO_NS, BagScript, Draw
+from flocc_lab.dialects.bags import IMAGES, MOUNT, STEP_NS, ZERO_NS, BagScript
 from flocc_lab.dialects.folder_writers import HEIGHT, OPENGL, WIDTH, picture
+from flocc_lab.dialects.named_traps import NAMED_TRAPS
+from flocc_lab.dialects.trap_parts import (
+    CAMERA,
+    Float,
+    Rng,
+    Trap,
+    TrapVerdict,
+    drawn_bag,
+    moving,
+    unlike,
+    written,
+    written_bag,
+)
 from flocc_launch.datasets.commands import COUNTS_FOR, convert
 from flocc_launch.datasets.detect import read_source
 from flocc_launch.datasets.intrinsics import read_lens
 from flocc_protocol.errors import FloccError
 
-Float = NDArray[np.float64]
-Rng = np.random.Generator
-
 NAMES = (("r1", "r2"), ("alpha", "bravo"), ("robot_1", "robot_2"), ("tb3_0", "tb3_1"), ("uav1", "ugv1"))
-CAMERA = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 30\nfy: 30\ncx: 16\ncy: 12\n"
-
-
-@dataclass(frozen=True, slots=True)
-class TrapVerdict:
-    """What became of one input.
-
-    Attributes:
-        kind: Of the trap.
-        wrong: What was read wrongly, or None.
-        refusal: What a reader said that refused it, or None.
-        may_be_refused: Whether that is right, too.
-        must_be_refused: Whether nothing else is right.
-    """
-
-    kind: str
-    wrong: str | None
-    refusal: str | None = None
-    may_be_refused: bool = False
-    must_be_refused: bool = False
-
-    @property
-    def good(self) -> bool:
-        """Whether it is what it has to be."""
-        if self.refusal is not None:
-            return self.may_be_refused or self.must_be_refused
-        return self.wrong is None and not self.must_be_refused
-
-
-@dataclass(frozen=True, slots=True)
-class Trap:
-    """An input that was drawn, and what is right to make of it.
-
-    Attributes:
-        look: Reads it; returns what is wrong, or None.
-        may_be_refused: Whether a refusal is right, too.
-        must_be_refused: Whether only a refusal is right.
-    """
-
-    look: Callable[[], str | None]
-    may_be_refused: bool = False
-    must_be_refused: bool = False
-
-
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-def _moving(rng: Rng, count: int) -> Float:
-    """Poses that start anywhere, go on and turn."""
-    T, poses = pose(so3_exp(rng.uniform(-2, 2, 3)), rng.uniform(-20, 20, 3)), []
-    for _ in range(count):
-        poses.append(T)
-        T = T @ pose(so3_exp(rng.normal(0, 0.1, 3)), rng.normal(0, 0.3, 3))
-    return np.array(poses)
-
-
-def _unlike(found: Float, wanted: Float, what: str, tolerance: float = 1e-5) -> str | None:
-    same = found.shape == wanted.shape and np.allclose(found, wanted, atol=tolerance)
-    return None if same else f"{what} is {np.round(found, 4).tolist()}, not {np.round(wanted, 4).tolist()}"
-
-
-def _bag(rng: Rng, poses: str, mounted: bool) -> BagScript:
-    kind = str(rng.choice(["bag", "db3", "mcap"]))
-    return BagScript(Draw(kind, 1, poses, mounted, bool(rng.integers(2)), "one", 0))
-
-
-def _written(script: BagScript, folder: Path, rng: Rng) -> Path:
-    path = folder / ("run.bag" if script.draw.kind == "bag" else "run")
-    script.write(path, rng)
-    return path
 
 
 def _first_x_m(path: Path) -> float:
-    return float(Recording.open(path).frames[0].T_odom_body[0, 3])
+    """Where a recording begins; NaN where it was written and cannot be opened, which is no refusal."""
+    try:
+        return float(Recording.open(path).frames[0].T_odom_body[0, 3])
+    except FloccError:
+        return float("nan")
 
 
 def halves(rng: Rng, folder: Path) -> Trap:
     """A whole robot beside half of another, or two halves that are nobody's."""
     first, second = NAMES[rng.integers(len(NAMES))][:: 1 if rng.integers(2) else -1]
-    script = _bag(rng, str(rng.choice(["Odometry", "TransformStamped"])), mounted=False)
+    script = drawn_bag(rng, str(rng.choice(["Odometry", "TransformStamped"])), mounted=False)
     both_halves = bool(rng.integers(2))
     _half(script, first, 5.0, images=True, poses=not both_halves)
     _half(script, second, 50.0, images=not both_halves and bool(rng.integers(2)), poses=True)
     if both_halves:
-        path = _written(script, folder, rng)
+        path = written_bag(script, folder, rng)
         return Trap(lambda: f"paired: x is {_first_x_m(convert(path, folder / 'out'))}", must_be_refused=True)
-    path = _written(script, folder, rng)
+    path = written_bag(script, folder, rng)
 
     def look() -> str | None:
         convert(path, folder / "out")
@@ -152,7 +92,7 @@ def _half(script: BagScript, name: str, x_m: float, images: bool, poses: bool) -
 def transforms_by_namespace(rng: Rng, folder: Path) -> Trap:
     """Robots with transforms on topics of their own, whose frames have the same names."""
     names = NAMES[rng.integers(len(NAMES))]
-    script = _bag(rng, "Odometry", mounted=True)
+    script = drawn_bag(rng, "Odometry", mounted=True)
     heights_m = np.round(rng.uniform(0.1, 2.0, len(names)), 3).tolist()
     for number, (name, height_m) in enumerate(zip(names, heights_m, strict=True)):
         lens = script.transform(ZERO_NS, ("base_link", "optical"), (0.1, 0.0, height_m), MOUNT[1])
@@ -162,14 +102,14 @@ def transforms_by_namespace(rng: Rng, folder: Path) -> Trap:
             bag_ns = ZERO_NS + k * STEP_NS
             script.camera(bag_ns, bag_ns, f"/{name}/camera", "optical", k)
             script.pose(bag_ns + 1000, bag_ns, f"/{name}/", "base_link", 100.0 * number + 0.2 * k)
-    path = _written(script, folder, rng)
+    path = written_bag(script, folder, rng)
 
     def look() -> str | None:
         convert(path, folder / "out")
         for number, (name, height_m) in enumerate(zip(names, heights_m, strict=True)):
             found = Recording.open(folder / "out" / name)
             place = np.array([found.T_body_camera[2, 3], found.frames[0].T_odom_body[0, 3]])
-            wrong = _unlike(place, np.array([height_m, 100.0 * number]), f"height and x of {name}")
+            wrong = unlike(place, np.array([height_m, 100.0 * number]), f"height and x of {name}")
             if wrong:
                 return wrong
         return None
@@ -179,7 +119,7 @@ def transforms_by_namespace(rng: Rng, folder: Path) -> Trap:
 
 def goals(rng: Rng, folder: Path) -> Trap:
     """Poses to which a robot is sent, beside those where it is, or alone."""
-    script = _bag(rng, "PoseStamped", mounted=False)
+    script = drawn_bag(rng, "PoseStamped", mounted=False)
     leaf = str(rng.choice(["goal_pose", "goal", "setpoint_position", "target_pose", "waypoint", "plan", "cmd_pose"]))
     alone = bool(rng.integers(2))
     odometry = BagScript(replace(script.draw, poses="Odometry"))
@@ -193,14 +133,18 @@ def goals(rng: Rng, folder: Path) -> Trap:
         (bag_ns, topic.replace("/goals_of/odom", f"/{leaf}"), kind, message)
         for bag_ns, topic, kind, message in script.messages
     ] + odometry.messages
-    path = _written(script, folder, rng)
-    look = lambda: _unlike(np.array(_first_x_m(convert(path, folder / "out"))), np.array(7.0), "x")  # noqa: E731
+    path = written_bag(script, folder, rng)
+
+    def look() -> str | None:
+        recording = convert(path, folder / "out")
+        return "nothing was refused" if alone else unlike(np.array(_first_x_m(recording)), np.array(7.0), "x")
+
     return Trap(look, must_be_refused=alone)
 
 
 def unnamed_body(rng: Rng, folder: Path) -> Trap:
     """Poses that do not say what they move, of a robot with static transforms."""
-    script = _bag(rng, str(rng.choice(["PoseStamped", "PoseWithCovarianceStamped"])), mounted=True)
+    script = drawn_bag(rng, str(rng.choice(["PoseStamped", "PoseWithCovarianceStamped"])), mounted=True)
     body = str(rng.choice(["base_link", "base_footprint", "body", "imu", "sensor_mast"]))
     t = tuple(np.round(rng.uniform(-1, 1, 3), 3).tolist())
     lens = script.transform(ZERO_NS, (body, "optical"), t, MOUNT[1])
@@ -209,12 +153,12 @@ def unnamed_body(rng: Rng, folder: Path) -> Trap:
         bag_ns = ZERO_NS + k * STEP_NS
         script.camera(bag_ns, bag_ns, "/camera", "optical", k)
         script.pose(bag_ns + 1000, bag_ns, "/", "base_link", 0.2 * k)
-    path = _written(script, folder, rng)
+    path = written_bag(script, folder, rng)
 
     def look() -> str | None:
         found = Recording.open(convert(path, folder / "out")).T_body_camera
         (qx, qy, qz, qw) = MOUNT[1]
-        return _unlike(found, pose_from_tq(np.array([*t, qw, qx, qy, qz])), "the mounting")
+        return unlike(found, pose_from_tq(np.array([*t, qw, qx, qy, qz])), "the mounting")
 
     return Trap(look, may_be_refused=body in ("imu", "sensor_mast"))
 
@@ -237,14 +181,14 @@ def chain(rng: Rng, folder: Path) -> Trap:
             f"  distortion_model: radtan\n  distortion_coeffs: [0.0{k + 1}, 0.0, 0.0, 0.0]\n"
             f"  timeshift_cam_imu: {shifts_s[k]}\n"
         )
-    path = _write(folder / "camchain-imucam.yaml", text)
+    path = written(folder / "camchain-imucam.yaml", text)
     wanted = int(rng.integers(0, count))
 
     def look() -> str | None:
         lens = read_lens(path.with_name(f"{path.name}#cam{wanted}"))
         numbers = np.array([lens.camera.fx, lens.camera.distortion[0], lens.time_shift_s])
         told = np.array([300.0 + wanted, 0.01 * (wanted + 1), shifts_s[wanted]])
-        return _unlike(numbers, told, "focal length, k1 and shift") or _unlike(
+        return unlike(numbers, told, "focal length, k1 and shift") or unlike(
             lens.T_body_camera, inverse(T_cams_imu[wanted]), "the mounting"
         )
 
@@ -253,7 +197,7 @@ def chain(rng: Rng, folder: Path) -> Trap:
 
 def matrices(rng: Rng, folder: Path) -> Trap:
     """Poses as matrices of 12 or 16 numbers, by rows or by columns, with a stamp or without."""
-    poses = _moving(rng, int(rng.integers(8, 40)))
+    poses = moving(rng, int(rng.integers(8, 40)))
     by_columns, stamped = bool(rng.integers(2)), bool(rng.integers(2))
     count = 16 if by_columns else int(rng.choice([12, 16]))
     stamps_s = np.round(1_700_000_000 + 0.1 * np.arange(len(poses)), 3)
@@ -261,8 +205,8 @@ def matrices(rng: Rng, folder: Path) -> Trap:
     for stamp_s, T in zip(stamps_s, poses, strict=True):
         numbers = (T.T if by_columns else T).ravel()[:count]
         rows.append(" ".join([*([f"{stamp_s:.3f}"] if stamped else []), *map(repr, numbers.tolist())]))
-    path = _write(folder / str(rng.choice(["poses.txt", "trajectory.txt", "odometry.csv"])), "\n".join(rows) + "\n")
-    look = lambda: _unlike(read_trajectory(path, None, stamps_s.tolist())[0].T_fixed_body, poses, "the poses")  # noqa: E731
+    path = written(folder / str(rng.choice(["poses.txt", "trajectory.txt", "odometry.csv"])), "\n".join(rows) + "\n")
+    look = lambda: unlike(read_trajectory(path, None, stamps_s.tolist())[0].T_fixed_body, poses, "the poses")  # noqa: E731
     return Trap(look, must_be_refused=by_columns)
 
 
@@ -270,7 +214,7 @@ def models(rng: Rng, folder: Path) -> Trap:
     """COLMAP's several models of one set of images, of which the largest is meant."""
     sizes = rng.permutation([int(rng.integers(2, 4)), int(rng.integers(5, 9))]).tolist()
     count = sum(sizes)
-    poses = _moving(rng, count)
+    poses = moving(rng, count)
     for k in range(count):
         picture(folder / "data" / "images" / f"{k:04d}.jpg", k)
     first = 0
@@ -281,8 +225,8 @@ def models(rng: Rng, folder: Path) -> Trap:
             numbers = " ".join(map(repr, [*q_wxyz_from_R(T[:3, :3]).tolist(), *T[:3, 3].tolist()]))
             lines.append(f"{k + 1} {numbers} 1 {k:04d}.jpg\n\n")
         model = folder / "data" / "sparse" / str(number)
-        _write(model / "images.txt", "# Image list\n" + "".join(lines))
-        _write(model / "cameras.txt", f"1 PINHOLE {WIDTH} {HEIGHT} 3{number} 30 16 12\n")
+        written(model / "images.txt", "# Image list\n" + "".join(lines))
+        written(model / "cameras.txt", f"1 PINHOLE {WIDTH} {HEIGHT} 3{number} 30 16 12\n")
         first += size
     largest = int(np.argmax(sizes))
     begin = sum(sizes[:largest])
@@ -291,7 +235,7 @@ def models(rng: Rng, folder: Path) -> Trap:
         source = read_source(folder / "data")
         assert source.truth is not None
         assert source.lens is not None
-        return _unlike(np.array(source.lens.camera.fx), np.array(30.0 + largest), "fx") or _unlike(
+        return unlike(np.array(source.lens.camera.fx), np.array(30.0 + largest), "fx") or unlike(
             source.truth.T_fixed_body, poses[begin : begin + sizes[largest]], "the poses"
         )
 
@@ -300,7 +244,7 @@ def models(rng: Rng, folder: Path) -> Trap:
 
 def applied_scale(rng: Rng, folder: Path) -> Trap:
     """Nerfstudio's poses, which were scaled before they were written."""
-    poses = _moving(rng, 6)
+    poses = moving(rng, 6)
     scale = float(np.round(rng.uniform(0.05, 4.0), 4))
     frames = []
     for k, T in enumerate(poses):
@@ -309,12 +253,12 @@ def applied_scale(rng: Rng, folder: Path) -> Trap:
         scaled[:3, 3] *= scale
         frames.append({"file_path": f"images/frame_{k:05d}.png", "transform_matrix": (scaled @ OPENGL).tolist()})
     camera = {"w": WIDTH, "h": HEIGHT, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "applied_scale": scale}
-    _write(folder / "data" / "transforms.json", json.dumps({**camera, "frames": frames}))
+    written(folder / "data" / "transforms.json", json.dumps({**camera, "frames": frames}))
 
     def look() -> str | None:
         truth = read_source(folder / "data").truth
         assert truth is not None
-        return _unlike(truth.T_fixed_body, poses, "the poses")
+        return unlike(truth.T_fixed_body, poses, "the poses")
 
     return Trap(look)
 
@@ -325,7 +269,7 @@ def _phone(rng: Rng, path: Path, stamped: bool) -> tuple[Float, Float]:
     stamps_s = np.round(1_700_000_000 + 0.2 * np.arange(8) + rng.uniform(0, 0.05, 8), 3)
     for k, stamp_s in enumerate(stamps_s):
         picture(path / where / (f"{stamp_s:.3f}.png" if stamped else f"IMG_{k:04d}.png"), k)
-    _write(path / "camera.yaml", CAMERA)
+    written(path / "camera.yaml", CAMERA)
     dense_s = np.linspace(1_699_999_999.5, 1_700_000_003.45, 80)
     poses = np.tile(np.eye(4), (len(dense_s), 1, 1))
     poses[:, 0, 3] = dense_s - dense_s[0]
@@ -345,8 +289,8 @@ def times(rng: Rng, folder: Path) -> Trap:
         3: [f"IMG_{k:04d}.png,{s:.3f},0.01" for k, s in enumerate(stamps_s)],
     }[form]
     short = bool(rng.integers(4) == 0)
-    _write(path / str(rng.choice(["times.txt", "timestamps.txt"])), "\n".join(rows[: len(rows) - short]) + "\n")
-    look = lambda: _unlike(np.array([s for s, _ in read_source(path).images]), stamps_s, "the stamps", 2e-6)  # noqa: E731
+    written(path / str(rng.choice(["times.txt", "timestamps.txt"])), "\n".join(rows[: len(rows) - short]) + "\n")
+    look = lambda: unlike(np.array([s for s, _ in read_source(path).images]), stamps_s, "the stamps", 2e-6)  # noqa: E731
     return Trap(look, must_be_refused=short)
 
 
@@ -355,16 +299,16 @@ def shifted(rng: Rng, folder: Path) -> Trap:
     path = folder / "data"
     stamps_s, _ = _phone(rng, path, stamped=True)
     shift_s = float(np.round(rng.uniform(-0.3, 0.3), 4))
-    _write(
+    written(
         path / "camera.yaml",
         f"cam0:\n  camera_model: pinhole\n  intrinsics: [30, 30, 16, 12]\n  resolution: [{WIDTH}, {HEIGHT}]\n"
         f"  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n  timeshift_cam_imu: {shift_s}\n",
     )
     of_camera = bool(rng.integers(2))
     if of_camera:
-        write_tum(path / "odometry.tum", Trajectory(stamps_s, _moving(rng, len(stamps_s))))
+        write_tum(path / "odometry.tum", Trajectory(stamps_s, moving(rng, len(stamps_s))))
     wanted = stamps_s if of_camera else stamps_s + shift_s
-    look = lambda: _unlike(np.array([s for s, _ in read_source(path).images]), wanted, "the stamps", 2e-6)  # noqa: E731
+    look = lambda: unlike(np.array([s for s, _ in read_source(path).images]), wanted, "the stamps", 2e-6)  # noqa: E731
     return Trap(look)
 
 
@@ -394,7 +338,7 @@ def video(rng: Rng, folder: Path) -> Trap:
     for k in range(count):
         writer.write(np.full((48, 64, 3), 8 * k, np.uint8))
     writer.release()
-    _write(folder / "camera.yaml", "width: 64\nheight: 48\nfx: 60\nfy: 60\ncx: 32\ncy: 24\n")
+    written(folder / "camera.yaml", "width: 64\nheight: 48\nfx: 60\nfy: 60\ncx: 32\ncy: 24\n")
     posed = count - int(rng.integers(0, 4))
     poses = np.tile(np.eye(4), (posed, 1, 1))
     poses[:, 0, 3] = np.arange(posed)
@@ -403,7 +347,7 @@ def video(rng: Rng, folder: Path) -> Trap:
     def look() -> str | None:
         frames = Recording.open(convert(path, folder / "out")).frames
         found = np.array([frame.T_odom_body[0, 3] for frame in frames])
-        return _unlike(found, np.arange(float(posed)), "x of the frames", 0.05)
+        return unlike(found, np.arange(float(posed)), "x of the frames", 0.05)
 
     return Trap(look)
 
@@ -421,6 +365,7 @@ TRAPS: dict[str, Callable[[Rng, Path], Trap]] = {
     "a time shift": shifted,
     "an option without use": unused_option,
     "the end of a video": video,
+    **NAMED_TRAPS,
 }
 
 

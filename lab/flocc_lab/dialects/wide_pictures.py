@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from flocc_agent.core.interfaces import Camera
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.runtime.trajectory import write_tum
-from flocc_lab.dialects.calibration_writers import Rig, kalibr
+from flocc_lab.dialects.calibration_form import Rig
+from flocc_lab.dialects.calibration_writers import kalibr
 from flocc_launch.datasets.detect import read_source
 from flocc_launch.datasets.pixels import agents_camera, read_bytes
 from flocc_launch.datasets.source import DatasetError

@@ -67,7 +67,7 @@ FIXED_WHAT = "--map-fixed says of --map that it does not move; give --map FOLDER
 WHAT_RUNS = "Scenario file (TOML), name of a shipped one, or own data: a data set, a bag, a folder of one per robot."
 ROS_ARGS = "All that follows goes to ROS 2: -p KEY:=VALUE, -r FROM:=TO, --params-file FILE."
 HOW_MANY = "Number of robots of the world, or into which one data set is cut."
-Out = Annotated[Path, typer.Option(help="Run folder; an earlier run in it is replaced.")]
+Out = Annotated[Path, typer.Option(help="Run folder; an earlier run of the same scenario in it is replaced.")]
 Loss = Annotated[float | None, typer.Option(min=0.0, max=1.0, help="Share of messages lost on every link, 0 to 1.")]
 Latency = Annotated[float | None, typer.Option(min=0.0, help="Delay on every link, seconds.")]
 Bandwidth = Annotated[float | None, typer.Option(min=0.001, help="Capacity of a link and budget of a robot, kB/s.")]
@@ -232,7 +232,7 @@ def simulate(
     check_measurable(read, paths)
     if use is not None:
         use.check_fully(read)  # before the earlier run goes
-    fresh_folder(out, use)
+    fresh_folder(out, read.name, use)
     show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 
 

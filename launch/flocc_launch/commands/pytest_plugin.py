@@ -8,9 +8,10 @@
         first, second = (flocc.simulate("hangar.toml", seed=seed).check() for seed in (1, 2))
         assert first.report.closures != second.report.closures
 
-`flocc_run` has run the scenario of its marker, and the test fails before its first line where an expectation was
-missed; `flocc` runs any number of scenarios. A scenario is a file, relative to the test's own, or the name of a shipped
-one. This module imports nothing of flocc before a test asks for it, so that other tests do not wait for it.
+A marked test runs its scenario and fails before its first line where an expectation was missed, also where it does not
+name `flocc_run`, which is the run; `flocc` runs any number of scenarios. A scenario is a file, relative to the test's
+own, or the name of a shipped one. This module imports nothing of flocc before a test asks for it, so that other tests
+do not wait for it.
 """
 
 from collections.abc import Mapping
@@ -133,6 +134,12 @@ def flat(changes: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 def pytest_configure(config: pytest.Config) -> None:
     """Make the marker known."""
     config.addinivalue_line("markers", MARKER)
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """A marked test runs its scenario also where it does not look at the run."""
+    if isinstance(item, pytest.Function) and item.get_closest_marker("flocc") and "flocc_run" not in item.fixturenames:
+        item.fixturenames.append("flocc_run")
 
 
 @pytest.fixture

@@ -138,7 +138,11 @@ def _wanted(layout: Layout, options: BagOptions) -> list[RobotTopics]:
         if not robots:
             raise DatasetError(f"{bag.path}: has no robot {options.robot}; its namespaces are those of other robots")
     if options.odometry is None and any(robot.poses is None for robot in robots):
-        only(bag, [t for t in bag.topics.values() if t.type in POSE_TYPES], "odometry", "--odometry-topic")
+        other = only(bag, [t for t in bag.topics.values() if t.type in POSE_TYPES], "odometry", "--odometry-topic")
+        raise DatasetError(
+            f"{bag.path}: has no odometry: {other} is of goals or of what a camera sees, by its name or frame; name it "
+            "with --odometry-topic if it is the robot's"
+        )
     return robots
 
 

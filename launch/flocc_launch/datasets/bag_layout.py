@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.runtime.ros2.static_frames import FRAMES_MAX, STILL_MAX, StaticFrames, pose_of_transform
+from flocc_agent.runtime.ros2.static_frames import (
+    FRAMES_MAX,
+    STILL_MAX,
+    StaticFrames,
+    pose_of_transform,
+    stands_as_a_link,
+)
 from flocc_agent.runtime.ros2.types import BadMessage
 from flocc_launch.datasets.bag_messages import CAMERA_TYPE, DEPTH_NAME, IMAGE_TYPES, POSE_TYPES, TRANSFORMS_TYPES
 from flocc_launch.datasets.bag_reader import Bag, BagTopic
@@ -395,6 +401,11 @@ class Layout:
         T_body_camera = frames.static.between(body, camera) if body and camera else None
         if T_body_camera is None and body and camera and frames.edges:
             T_body_camera = self._between_on_tf(frames, body, camera)
+        if T_body_camera is not None and stands_as_a_link(camera, T_body_camera):
+            raise DatasetError(
+                f"{self.bag.path}: {robot.image.name} is of the frame {camera}, which stands as a link does (z up), "
+                "not as a camera (z forward): name a camera file with T_body_camera (--camera)"
+            )
         if T_body_camera is not None:
             return T_body_camera, None
         beside = frames.named.get(camera) if camera else None

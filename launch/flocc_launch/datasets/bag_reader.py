@@ -22,6 +22,7 @@ from flocc_launch.datasets.source import DatasetError
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 SALVAGE_ERRORS = (struct.error, ValueError, KeyError, IndexError, EOFError, OSError, RuntimeError, sqlite3.Error)
 """What bytes that are no bag make of those who read them."""
+UNENDED = "it does not end as an MCAP ends"
 PARTS_GAP_MAX_S = 60.0
 """Parts of one ROS 1 recording follow each other; bags of several robots overlap, or are of other days."""
 
@@ -282,6 +283,7 @@ class Bag:
         except SALVAGE_ERRORS as error:
             raise DatasetError(f"{self.path}: cannot be opened: {reason}") from error
         if not self.topics:
+            reason = UNENDED if file.suffix == ".mcap" and not mcap_is_whole(file) else reason
             raise DatasetError(f"{self.path}: cannot be opened, and no message could be found in it: {reason}")
         if not (is_mcap_of_ros1 and mcap_is_whole(file)):
             self.damage = f"{self.path}: is damaged or cut off: {reason}"
@@ -299,6 +301,8 @@ class Bag:
                 f"{self.path}: is an MCAP of {' and '.join(self._salvage.encodings)} messages, not of ROS; flocc reads "
                 f"Foxglove's {', '.join(ROS_TYPES)}, and it has {listed}"
             )
+        if not mcap_is_whole(file):
+            self.damage = f"{self.path}: is damaged or cut off: {UNENDED}"
 
 
 def _default_types() -> Any:

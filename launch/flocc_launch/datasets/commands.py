@@ -212,15 +212,15 @@ def _told(camera: CameraModel) -> str:
 
 def _bag_info(path: Path) -> Info:
     with Bag(path) as bag:
-        images = [topic.count for topic in bag.topics.values() if topic.type in IMAGE_TYPES and topic.count is not None]
+        images, start_ns, end_ns = _images_of(bag)
         robots, faults = _robots_of(Layout.of(bag))
         return Info(
             path=path,
             format="bag",
-            images=sum(images),
+            images=images,
             posed=None,
-            from_s=(bag.start_ns or 0) * 1e-9,
-            to_s=(bag.end_ns or 0) * 1e-9,
+            from_s=start_ns * 1e-9,
+            to_s=end_ns * 1e-9,
             camera=None,
             odometry_poses=None,
             truth_poses=None,
@@ -229,6 +229,17 @@ def _bag_info(path: Path) -> Info:
             topics=tuple(str(topic) for topic in bag.topics.values()),
             robots=tuple(robots),
         )
+
+
+def _images_of(bag: Bag) -> tuple[int, int, int]:
+    """How many images a bag has, and its first and last time: of its index, else of its images, which are counted."""
+    topics = [topic for topic in bag.topics.values() if topic.type in IMAGE_TYPES]
+    if bag.start_ns is not None and bag.end_ns is not None:
+        return sum(topic.count or 0 for topic in topics), bag.start_ns, bag.end_ns
+    count, start_ns, end_ns = 0, 0, 0
+    for _, stamp_ns, _ in bag.raw([topic.name for topic in topics]):
+        count, start_ns, end_ns = count + 1, start_ns or stamp_ns, max(end_ns, stamp_ns)
+    return count, start_ns, end_ns
 
 
 def _robots_of(layout: Layout) -> tuple[list[str], list[str]]:

@@ -69,8 +69,8 @@ DRIFTS: dict[DriftKind, DriftSpec] = {
 }
 """What odometry of each kind is like: a hand-held camera with a poor visual-inertial odometry in a small room, wheels,
 a car's stereo odometry, a drone's visual-inertial odometry. Those of the drone are fitted to three flights of EuRoC,
-those of the car to one drive of KITTI (`flocc_lab.bench.odometry_drift`; docs/data-sets.md has the figures). No
-odometry of the other two was at hand, and theirs are chosen."""
+those of the car to one drive of KITTI (`flocc_lab.bench.odometry_drift`; docs/data-sets.md has the figures). The other
+two are chosen: the heading of wheels is as in two graphs, a hand's is much worse than LiDAR's odometry."""
 HEADING_END_MAX_RAD = 0.2
 """Standard deviation of the heading at the end of a robot's path; longer paths are given a better odometry."""
 CAR_SPEED_MIN_M_PER_S = 4.0

@@ -24,6 +24,8 @@ CAMERA_FILES = (
     "intrinsics.yml", "sensor.yaml", "camera_info.yaml", "camchain.yaml", "ost.yaml", "camera.json", "calibration.json",
     "intrinsics.json", "cameras.txt", "camera.txt", "intrinsics.txt", "calibration.txt", "ost.txt", "camera_matrix.csv",
 )  # fmt: skip
+CAMERA_SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".xml", ".toml", ".cfg", ".ini", ".conf")
+PERHAPS_CAMERA = re.compile(r"calib|camera|intrin|^cam\d*$|^k$|sensors?$|^ost$")
 
 
 def unequal(folder: Path, images: int, stamps_file: Path, stamps: int, poses: int) -> tuple[str, ...]:
@@ -148,8 +150,22 @@ def _what_is_there(where: Path) -> str:
 
 def camera_files(path: Path) -> list[Path]:
     """Files of a folder that describe a camera, by their names; the first is taken."""
+    chains = sorted(path.glob("*camchain*.yaml"), key=_says_less) if path.is_dir() else []
     files = [path / name for name in CAMERA_FILES if os.path.lexists(path / name)]
-    return files + (sorted(path.glob("*-camchain.yaml")) if path.is_dir() else [])
+    of_kalibr = [file for file in files if file in chains]
+    at = files.index(of_kalibr[0]) if of_kalibr else len(files)
+    return [*files[:at], *chains, *(file for file in files[at:] if file not in chains)]
+
+
+def _says_less(chain: Path) -> tuple[bool, str]:
+    """Order of Kalibr's chains: those of cameras and IMU say where the cameras sit, those of cameras alone do not."""
+    return "imu" not in chain.name.lower(), chain.name
+
+
+def perhaps_cameras(path: Path) -> list[str]:
+    """Names of at most three files of a folder that may describe a camera, though no camera is looked for there."""
+    texts = sorted(file for file in path.iterdir() if file.suffix.lower() in CAMERA_SUFFIXES) if path.is_dir() else []
+    return [file.name for file in texts if PERHAPS_CAMERA.search(file.stem.lower())][:3]
 
 
 def camera_file(

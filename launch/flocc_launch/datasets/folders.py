@@ -3,6 +3,7 @@
 Each reader takes what is good and lists what is wrong as faults; it raises only where nothing can be used.
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from flocc_agent.geometry import inverse
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.pose_limits import spikes
-from flocc_agent.runtime.text_tables import RecordingError, number_lines
+from flocc_agent.runtime.text_tables import RecordingError, number_lines, text_lines
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import DAMAGED_RATIO_MAX, read_trajectory
 from flocc_launch.datasets.files import (
@@ -36,7 +37,8 @@ Float = NDArray[np.float64]
 SEVENSCENES_RATE_HZ = 30.0
 SEVENSCENES_FOCAL, SEVENSCENES_SIZE = 585.0, (640, 480)
 KITTI_RATE_HZ = 10.0
-EUROC_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt0")
+EUROC_TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt0", "vicon0")
+NAME_APART_MAX_S = 1e-4
 UP_CAMERA = np.array([0.0, -1.0, 0.0])
 
 # Published calibrations of the TUM RGB-D colour cameras: fx fy cx cy, k1 k2 p1 p2, k3
@@ -52,7 +54,7 @@ def read_tum_rgbd(path: Path) -> Source:
     images, faults = listed_images(path / "rgb.txt")
     lens = camera_file(path, images)
     for name, ((fx, fy, cx, cy), distortion, k3) in TUM_CAMERAS.items():
-        if lens is None and name in path.resolve().name:
+        if lens is None and re.search(rf"{name}(?!\d)", path.resolve().name):
             lens = Lens(CameraModel(640, 480, fx, fy, cx, cy, (*distortion, k3)))
     truth, notes = read_trajectory(path / "groundtruth.txt", otherwise="tum")
     return Source(path, "tum", images, lens, truth=truth, faults=faults, notes=notes)
@@ -94,6 +96,11 @@ def _euroc_images(cam: Path) -> tuple[Stamped, tuple[str, ...], tuple[str, ...]]
     folder, listing = cam / "data", cam / "data.csv"
     files = some(tuple(image_files(folder)), folder)
     stamped = tuple((int(file.stem) * 1e-9, file) for file in files if len(file.stem) > 9 and file.stem.isdecimal())
+    if stamped and (apart_s := _apart_s(stamped, listing)) > NAME_APART_MAX_S:
+        note = (
+            f"{listing}: says other stamps than the names of the images (up to {apart_s:.3f} s apart); its stamps count"
+        )
+        return *listed_images(listing, folder), (note,)
     if stamped:
         odd = [file for file in files if not (len(file.stem) > 9 and file.stem.isdecimal())]
         note = f"{folder}: {len(odd)} of {len(files)} images were left out, as {{}} is no stamp in nanoseconds"
@@ -104,6 +111,14 @@ def _euroc_images(cam: Path) -> tuple[Stamped, tuple[str, ...], tuple[str, ...]]
         f"{folder}: the names of the images are no stamps in nanoseconds ({files[0].name}): name them so, or list them "
         f"in {listing} with lines 'stamp_ns,name'"
     )
+
+
+def _apart_s(stamped: Stamped, listing: Path) -> float:
+    """How far stamps of a list are from those in the names of its images, at most; 0 where there is none."""
+    named = {file.name: stamp_s for stamp_s, file in stamped}
+    rows = [re.split(r"[\s,;]+", text, maxsplit=1) for _, text in text_lines(listing)] if listing.exists() else []
+    listed = [(row[0], row[1].strip()) for row in rows if len(row) > 1 and row[0].isdecimal()]
+    return max((abs(int(stamp) * 1e-9 - named[name]) for stamp, name in listed if name in named), default=0.0)
 
 
 def read_kitti(path: Path) -> Source:

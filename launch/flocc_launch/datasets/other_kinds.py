@@ -58,6 +58,13 @@ FOLDERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
      "make groundtruth.tum of pose_lcam_front.txt, which is in NED axes, beside the images"),
     ("3D Scanner App's export", ("frame_00000.jpg", "frame_00000.json"),
      "make transforms.json of the frames' cameraPoseARFrame"),
+    ("kapture", ("sensors/sensors.txt",), "write COLMAP's text form of it: kapture_export_colmap.py"),
+    ("OpenMVG's reconstruction", ("sfm_data.json",), "write COLMAP's text form of it: openMVG_main_openMVG2Colmap"),
+    ("a trained splat", ("cameras.json", "cfg_args"), "give the COLMAP model and the images that it was trained on"),
+    ("OpenLORIS", ("color.txt", "sensors.yaml"),
+     "call color.txt rgb.txt, and write camera.yaml of the colour camera in sensors.yaml"),
+    ("UZH-FPV", ("img", "left_images.txt"),
+     "write images.txt of the stamps and names in left_images.txt, and camera.yaml of the calibration"),
 )  # fmt: skip
 FILES: dict[str, tuple[str, str]] = {
     ".zip": ("an archive", "unpack it"),

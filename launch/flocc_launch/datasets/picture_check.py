@@ -82,7 +82,7 @@ def seen_faults(source: Source, trajectory: Trajectory, is_settled: bool = False
     Raises:
         DatasetError: They contradict the order of the quaternions, which nobody has settled.
     """
-    pairs = _pairs(source, trajectory)
+    pairs = posed_pairs(source, trajectory)
     verdict = verdict_of(pairs) if pairs else None
     if verdict is None or (verdict.order is not None and source.format in POSED_BY_MATRICES):
         return ()
@@ -126,10 +126,10 @@ def verdict_of(pairs: Sequence["PosedPair"]) -> PictureVerdict | None:
         return None
     seen = [pair.motion(1.0, False) for pair in watched]
     given = motions_of(seen, [between(pair.flow.T_odom_before, pair.flow.T_odom_now) for pair in pairs])
-    left = _least(given)
+    left = least_costs(given)
     if trimmed(left) > WRONG_MIN:
         for order in ORDERS:
-            other = _least(motions_of(seen, [pair.shifted(order) for pair in pairs]))
+            other = least_costs(motions_of(seen, [pair.shifted(order) for pair in pairs]))
             is_better = BETTER_MIN_RATIO * trimmed(other) < trimmed(left)
             if is_better and float(np.mean(other < left)) >= PREFER_MIN_RATIO:
                 return PictureVerdict(order, None, len(pairs))
@@ -137,7 +137,7 @@ def verdict_of(pairs: Sequence["PosedPair"]) -> PictureVerdict | None:
     return None if verdict is None else PictureVerdict(None, verdict, len(pairs))
 
 
-def _least(motions: Motions) -> Float:
+def least_costs(motions: Motions) -> Float:
     """(N,) costs under the better of the mounting as it is given and the one that fits best."""
     return min((costs(motions, X) for X in (np.eye(3), constant_turn(motions))), key=trimmed)
 
@@ -171,7 +171,7 @@ def reordered(T: Float, places: int) -> Float:
     return turned
 
 
-def _pairs(source: Source, trajectory: Trajectory) -> list[PosedPair] | None:
+def posed_pairs(source: Source, trajectory: Trajectory) -> list[PosedPair] | None:
     """Pairs of pictures between which the camera turns, from all over the recording; None where nothing can be seen."""
     registrar_of = build_perception(PerceptionConfig())
     registrar, lens = registrar_of.registrar, source.lens

@@ -19,6 +19,7 @@ from flocc_agent.core.interfaces import Camera
 from flocc_agent.runtime.pictures import PictureError
 from flocc_agent.runtime.recording import MASK, read_mask, write_camera
 from flocc_agent.runtime.trajectory import Trajectory, write_tum
+from flocc_launch.datasets.files import perhaps_cameras
 from flocc_launch.datasets.pixels import ImageWriter, encoded_image, read_bytes
 from flocc_launch.datasets.source import DatasetError, Lens, Source
 
@@ -320,8 +321,10 @@ def _written(images: ImageWriter, file: Path) -> tuple[bytes, str]:
 
 def _lens(source: Source) -> Lens:
     if source.lens is None:
+        seen = perhaps_cameras(source.path)
         raise DatasetError(
             f"{source.path}: intrinsics are missing; put a camera.toml or camera.yaml with width, height, fx, fy, cx, "
             "cy and distortion there, or name such a file with flocc dataset ... --camera"
+            + (f" ({', '.join(seen)} may be one)" if seen else "")
         )
     return source.lens

@@ -28,15 +28,18 @@ from flocc_launch.runs.timeline import deaths_unasked, how_it_died
 LEADER_CHANGES_MANY = 6
 CLOSURES_FEW = 3
 REFUSED_MIN = 4
+CLOCKS_APART = "pictures and odometry are on clocks that differ (flocc dataset clock measures by how much)"
 CLOSURES_WRONG = (
     "places that look alike are taken for one (look at the pictures in the report, then raise "
     "core.loop_closing.match_ratio_threshold or use the learned front end)",
     "the camera's intrinsics or T_body_camera are wrong",
     "odometry is not metric, or jumps",
+    CLOCKS_APART,
 )
 MEASURED_WRONG = (
     "the camera's intrinsics or T_body_camera are wrong",
     "odometry is not metric, or jumps",
+    CLOCKS_APART,
     "places that look alike are taken for one (look at the pictures in the report)",
 )
 REASONS_LEFT = (
@@ -47,6 +50,7 @@ REASONS_LEFT = (
 SOLVER_ADVICE = {
     "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
     "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
+    "look the same": "Look at the pictures of both places in the report; a fix, a tag or a known start decides.",
     "the distance between robots": "Let them meet side by side as well as ahead, or measure a length: fix, tag, range.",
 }
 """What to do about warnings that say so."""

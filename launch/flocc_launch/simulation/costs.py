@@ -79,7 +79,7 @@ class Cheap:
 
     def _fetches(self, step: Step, life: tuple[str, int], fetch: FetchLatent) -> Iterator[str]:
         now_s = step.station.now_s()  # the robot gives a fetch up by its own clock, which may step
-        if fetch.keyframe in step.station.disk.latents:
+        if fetch.keyframe in step.station.disk.latents and fetch.keyframe not in step.station.unheard:
             yield f"{life[0]} fetches {fetch.keyframe}, which it holds"
         _, until_s = self._fetching.get((*life, fetch.keyframe), ("", float("-inf")))
         if now_s < until_s - 0.5:

@@ -26,8 +26,10 @@ from flocc_launch.maps.opening import MapUse, opened_for
 from flocc_launch.report.finish import finish
 from flocc_launch.report.model import RunReport
 from flocc_launch.runs.ground_truth import truth_path, write_truth
+from flocc_launch.runs.plain_numbers import duration
 from flocc_launch.runs.run_folder import Run, RunFolder
 from flocc_launch.scenarios.expectations import check_measurable
+from flocc_launch.scenarios.leader_faults import FaultError
 from flocc_launch.scenarios.scenario import Scenario
 from flocc_launch.scenarios.sensors import sense
 from flocc_launch.scenarios.walks import walks
@@ -41,6 +43,8 @@ from flocc_launch.simulation.virtual_workers import WorkTimes
 
 LOOK_S = 1.0
 LONGEST_AFTER_LAST_S = 300.0
+FAULT_AFTER_LAST_S = 3600.0
+"""A fault later than that after all was played is a slip of units."""
 QUIET_KINDS = (RoundSolved, CorrectionApplied, KeyframeTaken, CandidateFound, ClosureAccepted, ClosureRejected)
 
 
@@ -127,12 +131,22 @@ def playbacks_of(
 
 
 def run(swarm: Swarm) -> float:
-    """Let time pass to the scenario's end, or until everything has settled; gives the end, seconds."""
+    """Let time pass to the scenario's end, or until everything has settled; gives the end, seconds.
+
+    Raises:
+        FaultError: A fault lies far beyond all that is played.
+    """
     scenario = swarm.scenario
     if scenario.duration_s is not None:
         swarm.run_until(scenario.duration_s)
         return scenario.duration_s
-    last_s = max([_last_capture_s(swarm, name) for name in swarm.stations] + [fault.at_s for fault in scenario.faults])
+    played_s = max(_last_capture_s(swarm, name) for name in swarm.stations)
+    last_s = max([played_s] + [fault.at_s for fault in scenario.faults])
+    if last_s > played_s + FAULT_AFTER_LAST_S:
+        raise FaultError(
+            f"{scenario.name}: a fault at {last_s:g} s comes over {duration(FAULT_AFTER_LAST_S)} after the end of all "
+            f"that is played ({played_s:.1f} s); give the scenario a duration_s if that is meant"
+        )
     swarm.run_until(last_s)
     while swarm.agenda.now_s < last_s + LONGEST_AFTER_LAST_S and not _is_quiet(swarm, last_s):
         swarm.run_until(swarm.agenda.now_s + LOOK_S)

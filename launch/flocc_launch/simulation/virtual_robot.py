@@ -25,10 +25,11 @@ from flocc_agent.core.effects import (
     StepConsensus,
     Unicast,
 )
-from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, Measured, MessageReceived
+from flocc_agent.core.events import Event, GraphOptimised, KeyframeCaptured, LatentFetched, Measured, MessageReceived
 from flocc_agent.core.measurements import BadMeasurement
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.pose_graph import GraphSolution
+from flocc_agent.core.reports import SolutionIgnored
 from flocc_agent.core.robot import Robot
 from flocc_agent.geometry import pose7
 from flocc_agent.runtime.given_keyframes import GivenKeyframes
@@ -88,7 +89,8 @@ class Station:
         compute_class: 0 (small) to 9.
         core: The robot's behaviour, None while it is switched off.
         life: Counts starts.
-        solution: The last solution it made as a leader.
+        solution: The last solution it made as a leader, and that counted.
+        unheard: Latents that it holds already, and whose news waits for its disk.
         lies: As a leader it tells others that they are far away.
         dies_after: The power is cut when so many effects of a step with more are carried out; None: it is not.
     """
@@ -114,6 +116,7 @@ class Station:
         self.core: Robot | None = None
         self.life = 0
         self.solution: GraphSolution | None = None
+        self.unheard: set[KeyframeId] = set()
         self.lies = False
         self.dies_after: int | None = None
         self.compute_class = compute_class
@@ -139,6 +142,7 @@ class Station:
         assert self.core is None
         self.life += 1
         self.workers.restart()
+        self.unheard.clear()
         restored = self.disk.restored()
         self.core = Robot(
             self.log,
@@ -202,11 +206,15 @@ class Station:
         """Let the core know, and carry out what it wants; while it waits for its disk, later."""
         assert self.core is not None
         if self._agenda.now_s < self._blocked_until_s:
+            self.unheard |= {event.keyframe} if isinstance(event, LatentFetched) else set()
             self.later(self._blocked_until_s, lambda: event)
             return
-        if isinstance(event, GraphOptimised):
+        self.unheard -= {event.keyframe} if isinstance(event, LatentFetched) else set()
+        effects = self.core.handle(event, self.now_s())
+        came_late = any(isinstance(effect, Report) and isinstance(effect.fact, SolutionIgnored) for effect in effects)
+        if isinstance(event, GraphOptimised) and not came_late:
             self.solution = event.solution
-        self._carry_out(event, self.core.handle(event, self.now_s()))
+        self._carry_out(event, effects)
 
     def later(self, time_s: float, event: Callable[[], Event]) -> None:
         """Hand an event to the core at a true time, unless the robot died in between."""

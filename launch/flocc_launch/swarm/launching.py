@@ -6,6 +6,7 @@ changed for `settle_s`.
 
 import asyncio
 import json
+import logging
 import shutil
 import signal
 import time
@@ -32,6 +33,8 @@ from flocc_launch.setup.credentials import make_keys
 from flocc_launch.swarm.agent_process import Lines, ending_signals, recover_result
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
+
+logger = logging.getLogger(__name__)
 
 Seen = tuple[dict[str, tuple[int, int]], str | None, int | None, str | None, bool]
 """Logs, map frame, round, leader, and whether it plays: a run goes on while they change."""
@@ -101,13 +104,15 @@ def launch(
     check_measurable(scenario, paths)
     if use is not None:
         use.check_fully(scenario)  # before the earlier run goes
-    folder = fresh_folder(out, use)
+    folder = fresh_folder(out, scenario.name, use)
     given = on_watch or (lambda _: None)
     return asyncio.run(_Launch(scenario, folder, paths, given, secure, served, use, lives).run())
 
 
-def fresh_folder(out: Path, use: MapUse | None = None) -> RunFolder:
+def fresh_folder(out: Path, scenario: str, use: MapUse | None = None) -> RunFolder:
     """An empty run folder; only an earlier run folder is ever replaced, and never one that holds the map in use.
+
+    An earlier run of another scenario is kept beside it: its robots' stores may be all that is left of a mission.
 
     Raises:
         LaunchError: Something else stands there, or the map does.
@@ -115,10 +120,26 @@ def fresh_folder(out: Path, use: MapUse | None = None) -> RunFolder:
     if use is not None and use.folder.resolve().is_relative_to(out.resolve()):
         raise LaunchError(f"{out}: holds the map {use.folder}, which is only read; choose another --out")
     if out.exists() and any(out.iterdir()):
-        if not (out / "run.json").exists():
+        if not (out / "run.json").exists() and not (out / "robots").is_dir():  # which a run that was killed leaves
             raise LaunchError(f"{out}: is not empty and not an earlier run; choose another --out")
-        shutil.rmtree(out)
+        before = _scenario_of(out)
+        if before != scenario:
+            aside = out.with_name(f"{out.name}.before")
+            shutil.rmtree(aside, ignore_errors=True)
+            out.rename(aside)
+            logger.warning("%s: held a run of %s, which is kept as %s", out, before or "no known scenario", aside)
+        else:
+            shutil.rmtree(out)
     return RunFolder.create(out)
+
+
+def _scenario_of(run: Path) -> str | None:
+    """Whose run a folder holds; None where it does not say so."""
+    try:
+        content = json.loads((run / "run.json").read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return content.get("scenario") if isinstance(content, dict) else None
 
 
 def check_network() -> None:

@@ -2,14 +2,27 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NoReturn
 
 import numpy as np
 import pytest
 from tests.agent.backend.plain_team import plain_team
 
+from flocc_agent.backend import odometry_scale
+from flocc_agent.backend.descent import Objective, Solved
+from flocc_agent.backend.edges import State
 from flocc_agent.backend.optimiser import optimise
+from flocc_agent.backend.placing import Places
+from flocc_agent.backend.solvers import solve_once
 from flocc_agent.config import BackendConfig, Formulation
-from flocc_agent.core.pose_graph import Component, GraphSolution, OptimisationFailed, PoseGraph, stretched
+from flocc_agent.core.pose_graph import (
+    ClosureState,
+    Component,
+    GraphSolution,
+    OptimisationFailed,
+    PoseGraph,
+    stretched,
+)
 from flocc_lab.graph_family.family_spec import Lengths
 from flocc_lab.graph_family.graphs import Member
 from flocc_lab.graph_family.judge import judged
@@ -122,3 +135,31 @@ def test_odometry_that_is_true_does_not_seem_too_long_where_its_steps_are_noisy(
         ratios += [scale.ratio for component in found.components for scale in component.odometry_scales.values()]
     assert len(ratios) == 6
     assert abs(float(np.mean(ratios)) - 1.0) < 0.01
+
+
+def test_what_most_closures_tell_surely_is_not_searched_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in twenty closures is wrong: no scale explains them."""
+
+    def searched(*_: object) -> NoReturn:
+        raise AssertionError("searched again")
+
+    monkeypatch.setattr(odometry_scale, "solve_once", searched)
+    member = plain_team(5, (120, 130, 110), lengths=Lengths.METRIC, closures=120, outliers=0.05)
+    solution = solved(member)
+    states = [closure.state is ClosureState.USED for closure in solution.closures]
+    assert 0 < np.count_nonzero(~member.is_right) <= states.count(False)
+    assert len(solution.components) == 1
+
+
+def test_a_robot_that_uses_few_of_its_closures_is_searched_for_with_all_scales_free(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+
+    def searched(objective: Objective, state: State, places: Places) -> Solved:
+        asked.append(len(state.scale))
+        return solve_once(objective, state, places)
+
+    monkeypatch.setattr(odometry_scale, "solve_once", searched)
+    solved(plain_team(5, (120, 130, 110), lengths=Lengths.METRIC, closures=120, outliers=0.5))
+    assert asked == [3]

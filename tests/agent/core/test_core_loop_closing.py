@@ -18,11 +18,12 @@ from flocc_agent.core.events import (
 )
 from flocc_agent.core.latents import (
     BACKLOG_MAX,
+    HEARD_S,
     OFFERED_S,
     RELAYS_MAX,
     RETRY_S,
+    TOLD_AGAIN_S,
     WANTS_TURN_S,
-    WISHED_AGAIN_S,
     Latents,
     Peer,
     Reach,
@@ -415,13 +416,35 @@ def test_a_wish_is_told_now_and_then_and_all_of_them_to_whoever_comes_into_range
     machine.on_peer("r4", Peer(0))
     first = machine.wants(0.0)
     assert first == (KeyframeId(R2, 1),)
-    assert machine.wants(WISHED_AGAIN_S / 2) == ()
+    assert machine.wants(TOLD_AGAIN_S / 2) == ()
     machine.on_peer("r4", Peer(0))
-    assert machine.wants(WISHED_AGAIN_S / 2) == ()
+    assert machine.wants(TOLD_AGAIN_S / 2) == ()
     machine.on_peer("r5", Peer(0))
-    assert machine.wants(WISHED_AGAIN_S / 2) == first
-    assert machine.wants(WISHED_AGAIN_S) == ()
-    assert machine.wants(1.5 * WISHED_AGAIN_S) == first
+    assert machine.wants(TOLD_AGAIN_S / 2) == first
+    assert machine.wants(TOLD_AGAIN_S) == ()
+    assert machine.wants(1.5 * TOLD_AGAIN_S) == first
+
+
+def test_an_offer_is_told_now_and_then_and_counts_meanwhile_for_who_heard_it() -> None:
+    machine, hears, held = closing(), closing(own=R2), keyframe("r3/0")
+    machine.on_wants("r2", [held], 0.0)
+    machine.on_held(held)
+    told = [machine.holds(0.5 * k) for k in range(8)]
+    assert [k for k, each in enumerate(told) if each] == [0, 5]
+    heard = [hears.held_by("r1", each, 0.5 * k) for k, each in enumerate(told)]
+    assert heard == [(held,)] * 8
+    machine.on_peer("r4", Peer(0))
+    assert machine.holds(4.0) == (held,)
+    assert hears.held_by("r1", (), 2.5 + HEARD_S - 0.1) == (held,)
+    assert hears.held_by("r1", (), 2.5 + HEARD_S) == ()
+
+
+def test_what_a_robot_says_to_hold_is_remembered_up_to_a_maximum_and_while_it_is_in_range() -> None:
+    machine, many = closing(), [keyframe(f"r3/{k}") for k in range(3 * RELAYS_MAX)]
+    assert [machine.held_by("r2", [each], 0.0) for each in many][-1] == tuple(many[-RELAYS_MAX:])
+    machine.on_peer("r2", Peer(0))
+    machine.on_lost("r2", 0.1)
+    assert machine.held_by("r2", (), 0.2) == ()
 
 
 def handed(machine: LoopClosing, now: float) -> list[CandidatePair]:

@@ -10,7 +10,7 @@ import pytest
 
 from flocc_agent import Agent, AgentConfig
 from flocc_agent.agent import BadKeyframe, NotRunning
-from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.config import ConfigError, PerceptionConfig, TransportConfig
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.interfaces import Camera, Image, OdometryPair, Perception
 from flocc_agent.core.measurements import (
@@ -114,6 +114,14 @@ async def test_nothing_is_taken_in_before_the_start_and_after_the_end() -> None:
         await refused("has stopped")
     await refused("has stopped")
     assert [correction.map_frame async for correction in agent.corrections()] == [f"map/{agent.log}"]
+
+
+@pytest.mark.parametrize("folder", ["/proc/r1", "file/r1"])
+async def test_a_folder_that_can_never_be_is_refused(tmp_path: Path, folder: str) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=rf"{folder}: cannot be made \(the key 'folder'\)"):
+        async with Agent(CONFIG.model_copy(update={"folder": tmp_path / folder}), camera()):
+            pass
 
 
 async def test_one_agent_is_one_robot() -> None:

@@ -114,3 +114,24 @@ def test_threads_of_an_agents_process_share_one_heap_unless_its_user_wants_more(
     command = [sys.executable, "-c", THREADS]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, check=True)
     assert (done.stdout.count(b"<heap nr=") == 1) is is_one
+
+
+async def test_while_a_task_runs_nobody_holds_what_was_sent_of_it() -> None:
+    """Else a round's graph is there thrice for as long as the solver works."""
+    argument = os.urandom(4 * MEBIBYTE)
+    pools = workers.Workers()
+
+    def was_sent_and_let_go() -> bool:
+        held, most = tracemalloc.get_traced_memory()
+        return most > 4 * MEBIBYTE > 4 * held
+
+    try:
+        await pools.run("optimise", work.add, 1, 1)  # its process is there
+        tracemalloc.start()
+        running = asyncio.create_task(pools.run("optimise", work.first_after, argument, 60.0))
+        await until(was_sent_and_let_go)
+        assert not running.done()
+    finally:
+        tracemalloc.stop()
+        await pools.close()
+    await running

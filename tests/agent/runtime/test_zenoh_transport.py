@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.agent.runtime.loopback import loopback_configs, until
+from tests.agent.runtime.loopback import free_ports, loopback_configs, until
 
 from flocc_agent.config import TransportConfig
 from flocc_agent.radio import LinkParameters, Partition, Radio, RadioParameters
@@ -356,6 +356,18 @@ async def test_an_operator_is_answered_by_everybody_or_by_one() -> None:
         }
         assert await ask(configs["r1"], "test", Admin.STATUS, b"", "r2", timeout_s=1.0) == {"r2": b"r2"}
         assert await ask(configs["r1"], "test", Admin.CHAOS, b"", timeout_s=1.0) == {}
+
+
+async def test_an_operator_finds_everybody_by_scouting_whatever_the_identifiers_of_sessions() -> None:
+    """Sessions of robots dial by their identifiers, which are drawn: a few operators are tried."""
+    config = TransportConfig(interface="lo", multicast_address=f"224.0.0.224:{free_ports(1)[0]}")
+    members = [Member(name, config) for name in ROBOTS]
+    for member in members:
+        member.transport.serve_admin(Admin.STATUS, partial(greeting_of, member.robot))
+    async with members[0].transport, members[1].transport, members[2].transport:
+        await meet(members)
+        for _ in range(4):
+            assert sorted(await ask(config, "test", Admin.STATUS, timeout_s=1.5)) == list(ROBOTS)
 
 
 LEAVES = """

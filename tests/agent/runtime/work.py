@@ -43,7 +43,7 @@ def hold_the_lock(seconds: float) -> int:
     """Be busy without ever releasing the interpreter lock for long, as GTSAM is."""
     end_s, rounds = time.monotonic() + seconds, 0
     while time.monotonic() < end_s:
-        math.factorial(60_000)
+        math.factorial(200_000)
         rounds += 1
     return rounds
 
@@ -51,3 +51,9 @@ def hold_the_lock(seconds: float) -> int:
 def wait_for_ever() -> None:
     """Hang."""
     time.sleep(3600.0)
+
+
+def first_after(data: bytes, seconds: float) -> int:
+    """Give the first byte, later."""
+    time.sleep(seconds)
+    return data[0]

@@ -17,7 +17,7 @@ from flocc_agent.runtime.ros2.incoming import Eye, model_of, odometry_of
 from flocc_agent.runtime.ros2.odometry_covariance import StepCovariances
 from flocc_agent.runtime.ros2.problems import Problems
 from flocc_agent.runtime.ros2.satellite import SatelliteFixes, fix_of
-from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers
+from flocc_agent.runtime.ros2.static_frames import StaticFrames, pose_of_numbers, stands_as_a_link
 from flocc_agent.runtime.ros2.synchroniser import HeldImages, PosedImage, Synchroniser
 from flocc_agent.runtime.ros2.topics import Offer, Qos, Topic
 from flocc_agent.runtime.ros2.types import (
@@ -87,6 +87,7 @@ class Hearing:
         self.eye: Eye | None = None
         self.T_body_camera: Float | None = None
         self._camera_frame = config.camera_frame
+        self._is_link = False
         self._eye_frame = ""
         if config.camera_mounting is not None:
             self.mount(pose_of_numbers(config.camera_mounting, "camera_mounting"))
@@ -211,7 +212,8 @@ class Hearing:
         """`T_body_camera`, found once; None while /tf_static does not connect the two."""
         if self.T_body_camera is None:
             T_body_camera = self._static.between(self._config.base_frame, camera_frame)
-            if T_body_camera is not None:
+            self._is_link = T_body_camera is not None and stands_as_a_link(camera_frame, T_body_camera)
+            if T_body_camera is not None and not self._is_link:
                 self._camera_frame = camera_frame
                 self.mount(T_body_camera)
         return self.T_body_camera
@@ -238,7 +240,10 @@ class Hearing:
             if not self.heard[kind]:
                 self.complain(kind, f"no {topic.type} has come yet")
         if self._wanted and self.eye is not None and self.T_body_camera is None:
-            self.complain("tf_static", f"does not connect {self._config.base_frame!r} with the camera's frame")
+            told = f"does not connect {self._config.base_frame!r} with the camera's frame"
+            if self._is_link:
+                told = "images are of a link's frame (z up), not an optical one (z forward): give camera_mounting"
+            self.complain("tf_static", told)
 
     def compare_clocks(self, now_ns: int) -> None:
         """Say when odometry that still comes is stamped by another clock than the node's: tf2 finds nothing then.

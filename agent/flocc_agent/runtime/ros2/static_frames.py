@@ -18,6 +18,8 @@ FRAMES_MAX = 4096
 DEPTH_MAX = 64
 STILL_MAX = 1e-4
 """By how much a transform that stays as it is may differ from an earlier one: metres, and parts of a rotation."""
+LINK_UP_MIN = math.cos(math.radians(45))
+"""How far along the body's z axis that of a link must point to be the link's own, not where a camera looks."""
 POSITION_MAX_M = COORDINATE_MAX / 4
 """So that a camera on such a body is still within what may be sent."""
 
@@ -93,6 +95,17 @@ class StaticFrames:
             T = T_parent_child @ T
             found[frame] = T
         return found
+
+
+def stands_as_a_link(frame: str, T_body_frame: Float) -> bool:
+    """Whether a frame is called a link and stands as links do, z up (REP 103): a camera looks along its z, not up.
+
+    Args:
+        frame: Name of the frame that images are said to be of.
+        T_body_frame: (4, 4) its pose in a body whose z points up.
+    """
+    is_link = frame.lower().rstrip("_0123456789").endswith("link") and "optical" not in frame.lower()
+    return is_link and bool(T_body_frame[2, 2] > LINK_UP_MIN)
 
 
 def pose_of_transform(transform: Any, where: str) -> Float:

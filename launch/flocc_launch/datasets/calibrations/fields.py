@@ -75,9 +75,10 @@ COUNTS = (0, 4, 5, 8, 12)
 _MATTERS = re.compile(
     r"dist|^k\d|^d\d*$|^p\d|^q[wxyz]?$|coef|intrin|model|^t[a-z]{2,3}\d?$|^t[a-z]*(cam|imu|body|sensor)|extrin|^r\d*$|^xi|alpha|"
     r"^beta|mirror|fisheye|rotat|translat|skew|gamma|offset|crop|roi|binning|focal|lens|fov|poly|tau|^s\d$|omega|transform|"
-    r"prism|mount|ext[rt]$|^rc[li]$|^pc[li]$|pose|zoom|scale|resiz|^f$|^fl|^f[xyuv]|^c[xyuv]$|matrix|tocam|camto|principal|center|centre|affine|shear"
+    r"prism|mount|^rpy|^ypr|^xyz|^pos$|^roll|^pitch|^yaw|euler|orient|position|quat|^tilt|^pan$|ext[rt]$|^rc[li]$|^pc[li]$|pose|zoom|scale|resiz|^f$|^fl|^f[xyuv]|^c[xyuv]$|matrix|tocam|camto|principal|center|centre|affine|shear"
 )
 """Plain names of keys that say something about a camera; one that is not understood is refused."""
+POSE_NUMBERS = (3, 6, 7, 9, 12, 16)
 HARMLESS_UNITS = ("", "m", "meter", "meters", "metre", "metres", "px", "pixel", "pixels")
 HARMLESS = re.compile(
     r"^(lidar.*|camera(1|2)?(fps|rgb|bf|newwidth|newheight|id|name|label)|imu.*|acc.*|gyr.*|orbextractor.*|viewer.*|stereo.*|"
@@ -86,7 +87,7 @@ HARMLESS = re.compile(
     r"depthscale|depthfactor|thdepth|thfarpoints|aabbscale|applied(transform|scale)|perviewreprojectionerrors|imagepoints|"
     r"extrinsicparameters|gridpoints|flagvalue|flags|fixprincipalpoint|ttracking|tlr|left.*|right.*|camera2.*|tcncnm1|"
     r"perviewerrors|stddevintrinsics|stddevextrinsics|intrinsicsstd|camoverlaps|rotationrate|t\d\d|posestd|calibaccel.*|"
-    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile|mindist(ance)?|maxcnt|fthreshold|posegraphsavepath|visualizecamerasize)$"
+    r"calibgyro.*|fisheyemodelname|vignette.*|estimateextrinsic|centerdepth|.*depth.*scale|.*scale.*depth|rollingshutter.*|(camera1)?overlapping.*|camtimeoffset.*|camtimeoffsetns|mocaptoimuoffsetns|view.*|responsefile|gravity|gnorm|mindist(ance)?|maxcnt|fthreshold|posegraphsavepath|visualizecamerasize)$"
 )
 """Plain names of keys that look as if they mattered and do not: of other sensors or rectified images."""
 
@@ -127,7 +128,21 @@ def _matters(key: str, value: Any) -> bool:
         return plain(value) not in HARMLESS_UNITS
     if isinstance(value, str) and not re.search(r"model|type|distort|lens|fisheye", name):
         return False
-    return bool(_MATTERS.search(name)) and not HARMLESS.match(name) and not _says_nothing(value)
+    if HARMLESS.match(name) or _says_nothing(value):
+        return False
+    return bool(_MATTERS.search(name)) or _could_be_a_pose(value)
+
+
+def _could_be_a_pose(value: Any) -> bool:
+    """Whether a value is as many numbers as a position or a rotation or both, or names their axes."""
+    if isinstance(value, dict):
+        return {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
+    if not isinstance(value, list):
+        return False
+    try:
+        return len(flat_numbers(value, "value")) in POSE_NUMBERS
+    except ValueError:
+        return False
 
 
 def _says_nothing(value: Any) -> bool:

@@ -106,6 +106,8 @@ def _orb(document: Map) -> Cameras:
     rest |= {key: value for key, value in imu.items() if plain(key) in ("tbc", "tbc1")}
     first = {**rest, **_merged(shared, groups.pop("Camera1", {}))}
     if plain(str(first.get("type", ""))) == "rectified":
+        if any(value for key, value in first.items() if re.fullmatch(r"[kp]\d", key)):
+            raise ValueError("Camera.type is Rectified, but there are distortion coefficients: take one of them out")
         first = {key: value for key, value in first.items() if key != "type"}
     if "LEFT" in groups:
         return {"Camera": first, **{name: {**rest, **groups[name]} for name in ("LEFT", "RIGHT") if name in groups}}
@@ -422,8 +424,8 @@ FORMS: tuple[Form, ...] = (
 REFUSED_MAPS: tuple[tuple[str, Callable[[Mapping[str, Any]], bool], str], ...] = (
     ("a Meshroom or OpenMVG scene", lambda d: "views" in d and "intrinsics" in d, "export COLMAP's text form from it"),
     ("VINS' settings that do not know where the camera sits (estimate_extrinsic: 2)",
-     lambda d: d.get("estimate_extrinsic") == 2 and "extrinsicRotation" not in d and "body_T_cam0" not in d,
-     "write body_T_cam0 of what VINS found, or take estimate_extrinsic out where the camera is the body"),
+     lambda d: d.get("estimate_extrinsic") == 2,
+     "write body_T_cam0 of what VINS found and 0 for it, or take the key out where the camera is the body"),
     ("a Kalibr target", lambda d: "target_type" in d, "give the camchain file that Kalibr writes"),
     ("Kalibr's IMU file", lambda d: "accelerometer_noise_density" in d and "fx" not in d and "intrinsics" not in d,
      "give the camchain file that Kalibr writes"),

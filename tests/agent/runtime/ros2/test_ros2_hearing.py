@@ -87,6 +87,13 @@ def test_a_bad_static_transform_does_not_take_the_others_with_it() -> None:
     ]
 
 
+@pytest.mark.parametrize(("frame", "is_taken"), [("camera_link", False), ("camera_link_optical", True), ("cam", True)])
+def test_images_of_a_links_frame_have_no_mounting_but_a_configured_one(frame: str, is_taken: bool) -> None:
+    heard = Heard()
+    heard.static((frame, UPRIGHT))
+    assert (heard.hearing.mounting(frame) is not None) == is_taken
+
+
 def test_images_of_another_camera_do_not_get_the_mounting_of_the_first() -> None:
     heard = Heard()
     heard.static(("left", UPRIGHT), ("right", UPRIGHT))

@@ -1,0 +1,41 @@
+"""Run folders that are given again: nothing that was recorded goes by a slip."""
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+
+from flocc_launch.swarm.launching import LaunchError, fresh_folder
+
+
+def held(path: Path, scenario: str | None) -> Path:
+    """A run folder with a store in it; None: its run was killed before it said of what it is."""
+    (path / "robots/r1").mkdir(parents=True)
+    (path / "robots/r1/store").write_text("a mission")
+    if scenario is not None:
+        (path / "run.json").write_text(json.dumps({"scenario": scenario}))
+    return path
+
+
+def test_a_run_of_the_same_scenario_is_replaced(tmp_path: Path) -> None:
+    fresh_folder(held(tmp_path / "run", "town"), "town")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert list((tmp_path / "run/robots").iterdir()) == []
+
+
+@pytest.mark.parametrize("earlier", ["field", None])
+def test_any_other_run_is_kept_beside_it_and_said(
+    tmp_path: Path, earlier: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        fresh_folder(held(tmp_path / "run", earlier), "town")
+    assert (tmp_path / "run.before/robots/r1/store").read_text() == "a mission"
+    assert list((tmp_path / "run/robots").iterdir()) == []
+    assert f"held a run of {earlier or 'no known scenario'}, which is kept as {tmp_path / 'run.before'}" in caplog.text
+
+
+def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("three years")
+    with pytest.raises(LaunchError, match="is not empty and not an earlier run"):
+        fresh_folder(tmp_path, "town")
