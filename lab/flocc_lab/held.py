@@ -32,10 +32,13 @@ UNBOUNDED = ("assembly._closures", "assembly._odometry", "closing._resolved", "g
 
 
 def held_kb(core: Robot) -> dict[str, int]:
-    """Kilobytes by attribute of a core and of its machines, the largest first."""
+    """Kilobytes by attribute of a core and of its machines, the largest first.
+
+    What helpers of the core share with its machines is the machines': they come first.
+    """
     found: dict[str, int] = {}
     seen = {id(core)}
-    for name, machine in sorted(vars(core).items()):
+    for name, machine in sorted(vars(core).items(), key=lambda each: (each[0].startswith("_"), each[0])):
         if type(machine).__module__.startswith(CORE) and hasattr(machine, "__dict__"):
             seen.add(id(machine))
             found |= {f"{name}.{part}": _size(value, seen) for part, value in sorted(vars(machine).items())}

@@ -52,7 +52,7 @@ CUT = (0, r"the image is cut off: 1 of 16 images was left out")
 ON_BODY = r"nothing says where the camera \(camera_optical\) sits on the body \(base_link\)"
 SOLVED = (0, r"cost +0\.66666.*components +1 .*rejected +0 closures")
 MIXED = (2, r"the image is 160x88, but the intrinsics are for 160x120 \(and 9 others\): 10 of 20 images cannot be used")
-NO_IMAGES = (0, r"images +0, .*/camera \(sensor_msgs/msg/CompressedImage")
+NO_INDEX = (0, r"images +5, .*/camera \(sensor_msgs/msg/CompressedImage")
 
 SAID: dict[str, tuple[tuple[int, str], ...]] = {
     "07": (KEPT, (0, "can only be in seconds, and were read so.*recording: "), KEPT),
@@ -93,7 +93,7 @@ SAID: dict[str, tuple[tuple[int, str], ...]] = {
         (0, ON_BODY),
     ),
     "19": (
-        *[NO_IMAGES, (2, r"has no odometry topic; it has /camera \(sensor_msgs/msg/CompressedImage")] * 2,
+        *[NO_INDEX, (2, r"has no odometry topic; it has /camera \(sensor_msgs/msg/CompressedImage")] * 2,
         (0, "images +6, .*/cam/camera_info is of frame camera_optical, but /cam/image of c"),
         (2, "/cam/camera_info is of frame camera_optical, but /cam/image of c; name a camera file with --camera"),
     ),

@@ -13,6 +13,8 @@ from tests.swarm.robot_program import CAMERA, T_world_camera_at
 
 from flocc_agent import Agent, AgentConfig
 from flocc_agent.config import PerceptionConfig, TransportConfig
+from flocc_agent.core.effects import Effect
+from flocc_agent.core.events import Event
 from flocc_agent.core.reports import Fact, PeerRefused
 from flocc_agent.perception.synthetic import pose_image
 from flocc_agent.runtime.event_lines import Reported
@@ -49,11 +51,16 @@ async def reached(is_true: Callable[[], bool], what: Callable[[], object]) -> No
 
 
 async def write(agent: Agent, number: int) -> None:
-    """Let a robot append a record as a later version would."""
-    driver = agent._driver
-    assert driver is not None
-    data = to_bytes([77, {"a kind of": "a later version", "number": number}])
-    await driver._carry_out(driver.robot._append(UnknownRecord(77, data), driver._clock_s()))
+    """Let a robot append a record as a later version would: with the next event that it handles, in its own order."""
+    robot = agent.robot
+    record = UnknownRecord(77, to_bytes([77, {"a kind of": "a later version", "number": number}]))
+
+    def handle(event: Event, now: float) -> list[Effect]:
+        del vars(robot)["handle"]
+        return [*robot._append(record, now), *robot.handle(event, now)]
+
+    vars(robot)["handle"] = handle
+    await reached(lambda: "handle" not in vars(robot), agent.status)
 
 
 def logs(agents: list[Agent]) -> list[Any]:

@@ -13,17 +13,17 @@ robot begins again alone. Nor is one while neighbours are farther away than cova
 that does not shrink, the robot goes back to where it last agreed, and does not hear those for a while.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.closure_choices import FAILURES_MAX, Choosing, ClosureChoices, used_closures
 from flocc_agent.core.coming_apart import SILENT_S, ComingApart, beyond
 from flocc_agent.core.correction_evidence import way_m
-from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
+from flocc_agent.core.effects import Effect, Report, StepConsensus, Unicast
 from flocc_agent.core.own_part import (
     ConsensusProblem,
     ConsensusState,
@@ -32,27 +32,24 @@ from flocc_agent.core.own_part import (
     SharedWith,
     ToldPoses,
 )
+from flocc_agent.core.pair_exchange import SharedPair, ToldFrame, asking_for_list, told_by, with_stiffness
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.peer_budgets import Muted
 from flocc_agent.core.plausibility import HELD_BACK_S
-from flocc_agent.core.pose_graph import ClosureState, Component, GraphSolution, LoopClosure, PoseGraph, Trajectory
+from flocc_agent.core.pose_graph import Component, GraphSolution, LoopClosure, PoseGraph, Trajectory
 from flocc_agent.core.reports import CAME_APART, PartMoved, PeerRefused, RoundFailed
 from flocc_agent.core.rounds import KEYFRAMES_PER_ROUND, PATIENCE_S
-from flocc_agent.geometry import inverse, pose7, pose_from_tq
+from flocc_agent.geometry import inverse, pose_from_tq
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId, Term
 from flocc_protocol.messages import SHARED_MAX, SharedPoses
 
 Float = NDArray[np.float64]
-Shown = tuple[int, int, int]
-"""Closures between two robots, within the lower and within the higher one: of which a choice was made."""
-
 STEPS_AFTER_RESTART = 1000
 """A restarted robot counts on from its last correction and this: above whatever it said before."""
 DELIVER_PERIOD_S = 2.0
 """Shortest time between two corrections that a robot gives itself, as between a leader's."""
 NEIGHBOURS_MAX = 128
-FAILURES_MAX = 6
 OVERTAKEN_S = 5.0
 """A message that is older than the last one by its number is new by its time after so long: its sender began again."""
 VAIN_STEPS_MAX, NEARER_RATIO = 40, 0.9
@@ -80,42 +77,6 @@ class GraphSource(Protocol):
         ...
 
 
-@dataclass(slots=True)
-class _Pair:
-    """What a robot shares with another, and what that one said last.
-
-    Attributes:
-        edition: Of the list of shared poses; 0 before there is one.
-        keyframes: It: numbers in the higher robot's log.
-        information: (S, 2) of the closures there; of an owner's own as its last step gave it.
-        owned: Closures of the pair that this robot, the lower one, uses.
-        said: The other's last message, of whatever edition.
-        said_s: When that came.
-        heard: The same, where it is of this edition and frame and no step has taken it yet.
-        is_news: It came since the last step began.
-        told: What this robot's last step wants told.
-    """
-
-    edition: int = 0
-    keyframes: tuple[int, ...] = ()
-    information: Array | None = None
-    owned: tuple[OwnedClosure, ...] = ()
-    said: SharedPoses | None = None
-    said_s: float = float("-inf")
-    heard: SharedPoses | None = None
-    is_news: bool = True
-    told: ToldPoses | None = None
-
-
-@dataclass(slots=True)
-class _Choice:
-    """What was chosen of one log or two, and of what; `shown` is None before the first time."""
-
-    shown: Shown | None = None
-    not_before_s: float = float("-inf")
-    failures: int = 0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Agreed:
     """Where a robot was when no neighbour was farther away than covariances allow."""
@@ -124,17 +85,6 @@ class _Agreed:
     origin: Float
     origin_step: int
     step: ConsensusStep
-
-
-@dataclass(frozen=True, slots=True)
-class _Choosing:
-    """A choice that is being made."""
-
-    number: int
-    other: LogId
-    shown: Shown
-    until_s: float
-    graph: PoseGraph = field(repr=False)
 
 
 class DistributedOptimisation:
@@ -172,7 +122,7 @@ class DistributedOptimisation:
         self._source = source
         self._parameters = parameters
         self._near = near
-        self._pairs: dict[LogId, _Pair] = {}
+        self._pairs: dict[LogId, SharedPair] = {}
         self._within: tuple[OwnedClosure, ...] = ()
         self._T_alone: Float = np.zeros((0, 4, 4))
         self._origin: Float | None = None
@@ -180,11 +130,7 @@ class DistributedOptimisation:
         self._seen: tuple[int, int] | None = None
         self._seen_s = float("-inf")
         self._graph = PoseGraph({})
-        self._shown: dict[LogId, Shown] = {}
-        self._choices: dict[LogId, _Choice] = {}
-        self._choosing: _Choosing | None = None
-        self._choices_made = 0
-        self._choose_at_s = float("-inf")
+        self._choices = ClosureChoices(own, parameters)
         self._state: ConsensusState | None = None
         self._step: ConsensusStep | None = None
         self._has_news = False
@@ -217,7 +163,7 @@ class DistributedOptimisation:
         if pair is None:
             if len(self._pairs) >= NEIGHBOURS_MAX or not message.edition:
                 return []
-            pair = self._pairs[sender] = _Pair()
+            pair = self._pairs[sender] = SharedPair()
         if pair.said is not None and message.step < pair.said.step:
             if now < pair.said_s + OVERTAKEN_S:
                 return []  # messages overtake each other, but not for so long: it began again
@@ -237,7 +183,7 @@ class DistributedOptimisation:
         if message.anchor == self.anchor and not self._is_back:
             self._take_origin(message)
             if before is None or message.step > before.step:
-                pair.heard = _with_stiffness(message, pair.heard)
+                pair.heard = with_stiffness(message, pair.heard)
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
         self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
@@ -291,11 +237,9 @@ class DistributedOptimisation:
 
     def on_chosen(self, number: int, solution: GraphSolution, now: float) -> list[Effect]:
         """One or two logs were solved for themselves: take the closures that are right."""
-        choosing = self._choosing
-        if choosing is None or choosing.number != number:
+        choosing = self._choices.end(number, now)
+        if choosing is None:
             return []
-        self._choosing = None
-        self._choices[choosing.other] = _Choice(choosing.shown, now + self._parameters.choose_s)
         if choosing.other == self._own:
             self._take_own(choosing.graph, solution)
         else:
@@ -304,13 +248,8 @@ class DistributedOptimisation:
 
     def on_choice_failed(self, number: int, reason: str, now: float) -> list[Effect]:
         """They could not be solved: tried again after a growing pause."""
-        choosing = self._choosing
-        if choosing is None or choosing.number != number:
+        if not self._choices.fail(number, now):
             return []
-        self._choosing = None
-        held = self._choices.setdefault(choosing.other, _Choice())
-        held.failures = min(held.failures + 1, FAILURES_MAX)
-        held.not_before_s = now + self._parameters.choose_s * 2**held.failures
         return [Report(RoundFailed(term=Term(0, self._own), round=self.number, reason=reason))]
 
     def on_judged(self, why: str | None, now: float) -> list[Effect]:
@@ -343,15 +282,15 @@ class DistributedOptimisation:
         effects: list[Effect] = []
         if self._running_until_s is not None and self._running_until_s <= now:
             effects += self.on_failed(self.number, "it took too long", now)
-        if self._choosing is not None and self._choosing.until_s <= now:
-            effects += self.on_choice_failed(self._choosing.number, "it took too long", now)
+        overdue = self._choices.overdue(now)
+        if overdue is not None:
+            effects += self.on_choice_failed(overdue, "it took too long", now)
         self._look(now)
         if self._silent_at_s() <= now:
             self._silences_seen_s, self._has_news = now, True
         if self._rejoin_at_s <= now:
             self._rejoin_at_s, self._has_news = float("inf"), True
-        if self._choosing is None and self._choose_due_s() <= now:
-            effects += self._choose(now)
+        effects += self._choices.begin(self._graph, now)
         if self._running_until_s is None and self._begin_at_s() <= now:
             effects.append(self._begin(now))
         if self._repeat_at_s <= now:
@@ -364,7 +303,7 @@ class DistributedOptimisation:
         """When `tick` or `component` is due next."""
         deliver_s = self._may_deliver_s() if self._undelivered else float("inf")
         step_s = self._begin_at_s() if self._running_until_s is None else self._running_until_s
-        choice_s = self._choose_due_s() if self._choosing is None else self._choosing.until_s
+        choice_s = self._choices.deadline()
         return min(
             step_s, choice_s, self._repeat_at_s, deliver_s, self._look_at_s(), self._rejoin_at_s, self._silent_at_s()
         )
@@ -423,7 +362,7 @@ class DistributedOptimisation:
     @property
     def has_chosen(self) -> bool:
         """Whether all closures that it knows of were chosen or turned away."""
-        return self._choosing is None and self._choose_due_s() == float("inf")
+        return self._choices.deadline() == float("inf")
 
     @property
     def gap(self) -> float:
@@ -446,7 +385,7 @@ class DistributedOptimisation:
         if self._own not in graph.trajectories:
             return
         self._graph = graph
-        self._shown = self._shown_now()
+        self._choices.look(graph)
         self._has_news = True
 
     def _look_at_s(self) -> float:
@@ -459,22 +398,10 @@ class DistributedOptimisation:
             return self._seen_s
         return self._seen_s + PATIENCE_S if grown else float("inf")
 
-    def _shown_now(self) -> dict[LogId, Shown]:
-        """Of what each choice of this robot is to be made: by the other robot, its own log by its own name."""
-        ends = Counter(tuple(sorted((c.query.log, c.match.log))) for c in self._graph.closures)
-        within = {low: count for (low, high), count in ends.items() if low == high}
-        own = within.get(self._own, 0)
-        shown = {
-            high: (count, own, within.get(high, 0))
-            for (low, high), count in sorted(ends.items())
-            if low == self._own != high
-        }
-        return {**shown, self._own: (0, own, 0)} if own else shown
-
     def _is_distrusted(self, log: LogId, now: float) -> bool:
         return self._distrusted.is_muted(log.robot, log.robot, now)
 
-    def _take_list(self, sender: LogId, pair: _Pair, message: SharedPoses) -> bool:
+    def _take_list(self, sender: LogId, pair: SharedPair, message: SharedPoses) -> bool:
         """Take the list of shared poses that a lower robot made, if it is newer and closures here bear it out."""
         listed = tuple(message.keyframes)
         if message.edition <= pair.edition or not listed or listed[-1] >= len(self._trajectory):
@@ -506,7 +433,7 @@ class DistributedOptimisation:
         apart[:, :3] += message.base_m.numpy() - before.base_m.numpy()
         return bool(np.abs(apart).max() > 0.5 * self._parameters.tolerance)
 
-    def _sharing(self) -> list[_Pair]:
+    def _sharing(self) -> list[SharedPair]:
         """Those with whom it agrees on poses in its frame."""
         return [p for p in self._pairs.values() if p.keyframes and p.said is not None and p.said.anchor == self.anchor]
 
@@ -558,53 +485,24 @@ class DistributedOptimisation:
 
     # What it chooses
 
-    def _choose_due_s(self) -> float:
-        due = [
-            max(self._choose_at_s, choice.not_before_s)
-            for other, shown in self._shown.items()
-            if (choice := self._choices.get(other, _Choice())).shown != shown
-        ]
-        return min(due, default=float("inf"))
-
-    def _choose(self, now: float) -> list[Effect]:
-        """Have the next log or pair solved for itself."""
-        due = [
-            (choice.not_before_s, other)
-            for other, shown in self._shown.items()
-            if (choice := self._choices.get(other, _Choice())).shown != shown and choice.not_before_s <= now
-        ]
-        if not due:
-            return []
-        _, other = min(due)
-        logs = {self._own, other}
-        graph = PoseGraph(
-            {log: self._graph.trajectories[log] for log in sorted(logs) if log in self._graph.trajectories},
-            tuple(c for c in self._graph.closures if {c.query.log, c.match.log} <= logs),
-        )
-        self._choices_made += 1
-        self._choose_at_s = now + self._parameters.period_s
-        until_s = now + self._parameters.timeout_s
-        self._choosing = _Choosing(self._choices_made, other, self._shown[other], until_s, graph)
-        return [ChooseClosures(self._choices_made, graph)]
-
     def _take_own(self, graph: PoseGraph, solution: GraphSolution) -> None:
         component = next((c for c in solution.components if self._own in c.logs), None)
         if component is None:
             return
         T = np.asarray(component.T_map_keyframe[self._own], dtype=float)
-        self._within = _used(graph.closures, solution, {self._own: T})
+        self._within = used_closures(graph.closures, solution, {self._own: T})
         self._T_alone = T
         if not any(pair.said is not None for pair in self._pairs.values()):
             self._state = None  # nobody was heard yet: what was found alone is all there is
         self._has_news = True
 
-    def _take_pair(self, choosing: _Choosing, solution: GraphSolution) -> None:
+    def _take_pair(self, choosing: Choosing, solution: GraphSolution) -> None:
         """Share what was found right; the list is a new one only where it is another one."""
         other = choosing.other
         component = next((c for c in solution.components if {self._own, other} <= set(c.logs)), None)
         T = {} if component is None else {log: component.T_map_keyframe[log] for log in (self._own, other)}
         between = [c for c in choosing.graph.closures if c.query.log != c.match.log]
-        used = _used(choosing.graph.closures, solution, T, between)
+        used = used_closures(choosing.graph.closures, solution, T, between)
         shared = sorted({max(each.closure.query, each.closure.match).index for each in used})
         if len(shared) > SHARED_MAX:
             evenly = np.round(np.linspace(0, len(shared) - 1, SHARED_MAX)).astype(int)
@@ -614,13 +512,13 @@ class DistributedOptimisation:
         if pair is None:
             if not shared or len(self._pairs) >= NEIGHBOURS_MAX:
                 return
-            pair = self._pairs[other] = _Pair()
-        if tuple(shared) != pair.keyframes or {_named(c) for c in used} != {_named(c) for c in pair.owned}:
+            pair = self._pairs[other] = SharedPair()
+        if tuple(shared) != pair.keyframes or {c.ends for c in used} != {c.ends for c in pair.owned}:
             self._list_anew(pair)
         pair.keyframes, pair.owned = tuple(shared), used
         self._has_news = True
 
-    def _list_anew(self, pair: _Pair) -> None:
+    def _list_anew(self, pair: SharedPair) -> None:
         """Give the list of shared poses another edition."""
         pair.edition = min(max(self.number, pair.edition) + 1, INDEX_MAX)
         pair.information = pair.heard = pair.told = None
@@ -635,7 +533,7 @@ class DistributedOptimisation:
         )
         return max(self._next_s, self._wait_until_s) if waits else self._next_s
 
-    def _is_met(self, other: LogId, pair: _Pair) -> bool:
+    def _is_met(self, other: LogId, pair: SharedPair) -> bool:
         """Whether a neighbour in this robot's frame is in range."""
         return pair.said is not None and pair.said.anchor == self.anchor and self._near(other.robot)
 
@@ -679,7 +577,7 @@ class DistributedOptimisation:
         ends = [end for end in (closure.query, closure.match) if end.log == self._own]
         return all(end.index < len(self._trajectory) for end in ends)
 
-    def _shared_with(self, other: LogId, pair: _Pair, anchor: LogId, now: float) -> SharedWith:
+    def _shared_with(self, other: LogId, pair: SharedPair, anchor: LogId, now: float) -> SharedWith:
         """What it shares with another; what that one said in another frame than this step's is not heard.
 
         One that fell silent before both agreed pulls no more: of one that agreed the last word stands.
@@ -690,7 +588,7 @@ class DistributedOptimisation:
             pair.edition,
             tuple(KeyframeId(high, index) for index in pair.keyframes),
             None if pair.information is None else pair.information.numpy(),
-            None if heard is None else _told_by(heard),
+            None if heard is None else told_by(heard),
             forgotten=pair.said_s + SILENT_S <= now,
         )
 
@@ -707,7 +605,7 @@ class DistributedOptimisation:
         if not lower:
             return None
         _, _, other, said = min(lower, key=lambda found: found[:3])
-        return other, _told_by(said)
+        return other, told_by(said)
 
     def _begin_alone(self) -> None:
         self.anchor, self._state, self._origin, self._origin_step = self._own, None, None, -1
@@ -717,82 +615,22 @@ class DistributedOptimisation:
 
     def _said(self) -> list[Effect]:
         """What neighbours in range are told; with the list of shared poses until they have it."""
+        if self._origin is None:
+            return []
+        frame = self._frame(self._origin)
         return [
-            Unicast(other.robot, self._message(other, pair))
+            Unicast(other.robot, pair.message(frame, self._own < other))
             for other, pair in sorted(self._pairs.items())
-            if pair.told is not None and self._origin is not None and self._near(other.robot)
+            if pair.told is not None and self._near(other.robot)
         ]
 
-    def _message(self, other: LogId, pair: _Pair) -> SharedPoses:
-        told = pair.told
-        assert told is not None
-        assert self._origin is not None
-        has_list = pair.said is not None and pair.said.edition == pair.edition
-        listed = self._own < other and not has_list and pair.information is not None
-        edition = 0 if has_list and pair.said is not None and pair.said.known >= told.edition else told.edition
-        return SharedPoses(
-            self.anchor,
-            self.number,
-            pose7(self._origin),
-            max(self._origin_step, 0),
-            pair.edition,
-            pair.keyframes if listed else (),
-            pair.information if listed and pair.information is not None else Array.of(np.zeros((0, 2))),
-            Array.of(told.base_m, "f8"),
-            Array.of(told.rows),
-            told.known,
-            edition,
-            Array.of(told.stiffness if edition else np.zeros(0)),
-        )
+    def _frame(self, origin: Float) -> ToldFrame:
+        return ToldFrame(self.anchor, self.number, origin, max(self._origin_step, 0))
 
     def _ask_for_list(self, other: LogId) -> Effect:
         """Tell a lower robot that its list of shared poses is not here: this robot began again."""
-        none, origin = Array.of(np.zeros(0)), pose7(np.eye(4) if self._origin is None else self._origin)
-        rows, information = Array.of(np.zeros((0, 13))), Array.of(np.zeros((0, 2)))
-        base_m = Array.of(np.zeros(3), "f8")
-        return Unicast(
-            other.robot,
-            SharedPoses(self.anchor, self.number, origin, 0, 0, (), information, base_m, rows, 0, 0, none),
-        )
+        frame = self._frame(np.eye(4) if self._origin is None else self._origin)
+        return Unicast(other.robot, asking_for_list(frame))
 
     def _refuse(self, other: LogId, reason: str) -> Effect:
         return Report(PeerRefused(peer=other.robot, reason=f"shared poses: {reason}"))
-
-
-def _with_stiffness(message: SharedPoses, unread: SharedPoses | None) -> SharedPoses:
-    """A message with the stiffness of one before it that no step has taken, where it has none itself."""
-    if unread is None or message.stiffness_edition or unread.edition != message.edition:
-        return message
-    return replace(message, stiffness_edition=unread.stiffness_edition, stiffness=unread.stiffness)
-
-
-def _told_by(message: SharedPoses) -> ToldPoses:
-    """What a message tells, as numbers."""
-    stiffness = message.stiffness.numpy()
-    return ToldPoses(message.base_m.numpy(), message.rows.numpy(), message.known, message.stiffness_edition, stiffness)
-
-
-def _used(
-    closures: Iterable[LoopClosure],
-    solution: GraphSolution,
-    T: Mapping[LogId, Float],
-    of: Iterable[LoopClosure] | None = None,
-) -> tuple[OwnedClosure, ...]:
-    """Closures that a solution uses, of some or all, between the logs that it placed."""
-    wanted = None if of is None else {id(closure) for closure in of}
-    found = []
-    for closure, result in zip(closures, solution.closures, strict=True):
-        ends = sorted((closure.query, closure.match))
-        placed = all(end.log in T and end.index < len(T[end.log]) for end in ends)
-        if result.state is not ClosureState.USED or result.weight <= 0.0 or not placed:
-            continue
-        if wanted is None or id(closure) in wanted:
-            low, high = ends
-            T_low_high = inverse(T[low.log][low.index]) @ T[high.log][high.index]
-            knows = closure.metric or closure.scale_initial is not None
-            found.append(OwnedClosure(closure, result.weight, None if knows else result.scale, T_low_high))
-    return tuple(found)
-
-
-def _named(owned: OwnedClosure) -> tuple[KeyframeId, KeyframeId]:
-    return owned.closure.query, owned.closure.match

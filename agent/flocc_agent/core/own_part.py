@@ -58,6 +58,11 @@ class OwnedClosure:
     scale: float | None
     T_low_high: Float
 
+    @property
+    def ends(self) -> tuple[KeyframeId, KeyframeId]:
+        """Query and match of the closure, which name it."""
+        return self.closure.query, self.closure.match
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedWith:

@@ -81,14 +81,16 @@ class Rounds:
         """Take an answer; False for one of an earlier round or term, which counts for nothing.
 
         A round that was given up counts as long as no other one was started. The next one pauses for as long as this
-        one's solve took (on virtual time, the round), so that a large graph on a slow computer does not take all of it:
-        the first round also starts the solver's process, 20 s on a busy machine, which says nothing of the graph.
+        one's solve took (on virtual time, the round, but a minute at most: clocks step there), so that a large graph on
+        a slow computer does not take all of it: the first round also starts the solver's process, 20 s on a busy
+        machine, which says nothing of the graph.
         """
         if (term, round_number) != (self._term, self._round):
             return False
+        took_s = min(now - self._started_s, TIMEOUT_S)
         self._running_until_s = None
         self._failures = 0
-        self._next_s = max(self._next_s, now + (solution.solve_s or now - self._started_s))
+        self._next_s = max(self._next_s, now + (solution.solve_s or took_s))
         keyframes = sum(len(T) for component in solution.components for T in component.T_map_keyframe.values())
         self._solution.put(solution, keyframes > self._keyframes_held)
         return True

@@ -137,12 +137,12 @@ def of_scenario(name: str, scenario: Scenario) -> dict[str, Any]:
     return _row(name, closures[0], closures[1], found)
 
 
-def walk_scenario(seed: int) -> Scenario:
-    """Five robots that walk through a town, with wrong closures among theirs."""
+def walk_scenario(seed: int, robots: int = 5, length_m: float = 150.0, area_m: float = 60.0) -> Scenario:
+    """Robots that walk through a town, with wrong closures among theirs."""
     fields = {
         "name": f"walk-{seed}",
         "seed": seed,
-        "tracks": {"robots": 5, "seed": seed, "area_m": 60.0, "length_m": 150.0},
+        "tracks": {"robots": robots, "seed": seed, "area_m": area_m, "length_m": length_m},
         "keyframes": {"distance_m": 1.0, "rotation_rad": 0.7},
         "radio": {"range_m": 25.0, "latency_s": 0.02},
         "perception": {"method": "synthetic"},

@@ -134,6 +134,15 @@ def test_the_next_round_pauses_as_long_as_the_last_solve_took(solve_s: float, ne
     assert rounds.deadline() == next_s
 
 
+def test_a_clock_that_steps_while_a_round_is_solved_does_not_pause_the_next_one_for_as_long() -> None:
+    """Seed 99902824: three minutes without a round."""
+    rounds, assembly = leading()
+    rounds.tick(0.0)
+    rounds.on_solution(TERM, 1, GraphSolution((), ()), 180.0)
+    add_keyframes(assembly, R2, 0, 1)
+    assert rounds.deadline() == 180.0 + TIMEOUT_S
+
+
 def test_a_round_that_gives_no_answer_is_given_up_and_tried_again() -> None:
     rounds, _ = leading()
     rounds.tick(0.0)

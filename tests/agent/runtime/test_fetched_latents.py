@@ -28,7 +28,7 @@ def fetched(served: bytes, named: LatentRecord | None) -> tuple[Any, list[bytes]
         perception=SimpleNamespace(encode_s=lambda: None),
         transport=SimpleNamespace(fetch_latent=fetch_latent),
         workers=SimpleNamespace(stages=SimpleNamespace(observe=lambda *_: None)),
-        store=SimpleNamespace(put_latent=lambda _, latent: kept.append(latent)),
+        store=SimpleNamespace(replace_latent=lambda *_: None, put_latent=lambda _, latent: kept.append(latent)),
         clock_s=lambda: 0.0,
     )
     return asyncio.run(fetch(FetchLatent(KEYFRAME, "r2", 1.0, named), tools)), kept
