@@ -39,3 +39,20 @@ def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("three years")
     with pytest.raises(LaunchError, match="is not empty and not an earlier run"):
         fresh_folder(tmp_path, "town")
+
+
+def test_a_folder_of_ones_own_that_has_robots_in_it_is_no_killed_run(tmp_path: Path) -> None:
+    (held(tmp_path / "data", None) / "notes.txt").write_text("mine")
+    with pytest.raises(LaunchError, match="is not empty and not an earlier run"):
+        fresh_folder(tmp_path / "data", "town")
+    assert (tmp_path / "data/robots/r1/store").read_text() == "a mission"
+
+
+def test_what_stands_where_a_run_would_be_kept_is_not_deleted_unless_it_is_one(tmp_path: Path) -> None:
+    run = held(tmp_path / "run", "field")
+    (tmp_path / "run.before").mkdir()
+    (tmp_path / "run.before/thesis.tex").write_text("three years")
+    with pytest.raises(LaunchError, match=r"run\.before is no run: choose another --out"):
+        fresh_folder(run, "town")
+    assert (tmp_path / "run.before/thesis.tex").exists()
+    assert (run / "robots/r1/store").exists()

@@ -103,7 +103,7 @@ class OwnData:
 
     def _moved(self) -> str:
         """That recordings of different times are played as if they began together, and which began last."""
-        first_s = {name: source.images[0][0] for name, source in self.sources.items()}
+        first_s = self._first_s()
         if len(first_s) < 2 or self._starts_s():
             return ""
         last, apart_s = max(first_s, key=lambda name: first_s[name]), max(first_s.values()) - min(first_s.values())
@@ -126,9 +126,13 @@ class OwnData:
         distance_m = statistics.median(lengths_m) / KEYFRAMES_WANTED if lengths_m else DISTANCE_MAX_M
         return max(round(distance_m, 3), DISTANCE_MIN_M) if distance_m < DISTANCE_MAX_M else None
 
+    def _first_s(self) -> dict[str, float]:
+        """Stamp of each robot's first image."""
+        return {name: source.images[0][0] for name, source in self.sources.items()}
+
     def _starts_s(self) -> dict[str, float]:
         """When each robot begins, where all recorded at the same time; recordings of different times begin together."""
-        first_s = {name: source.images[0][0] for name, source in self.sources.items()}
+        first_s = self._first_s()
         last_s = [source.images[-1][0] for source in self.sources.values()]
         together = bool(first_s) and max(first_s.values()) < min(last_s)
         zero_s = min(first_s.values(), default=0.0)

@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 Seen = tuple[dict[str, tuple[int, int]], str | None, int | None, str | None, bool]
 """Logs, map frame, round, leader, and whether it plays: a run goes on while they change."""
 LAUNCHER_EVENTS = "launcher.events.jsonl"
+LEFT_BY_A_KILL = frozenset({"robots", "groundtruth", "events.jsonl", LAUNCHER_EVENTS})
+"""All that a run can have written before its `run.json`."""
 PERIOD_S = 0.25
 UNSETTLED_MAX_S = 120.0
 STOP_NOW_S = 5.0
@@ -120,17 +122,30 @@ def fresh_folder(out: Path, scenario: str, use: MapUse | None = None) -> RunFold
     if use is not None and use.folder.resolve().is_relative_to(out.resolve()):
         raise LaunchError(f"{out}: holds the map {use.folder}, which is only read; choose another --out")
     if out.exists() and any(out.iterdir()):
-        if not (out / "run.json").exists() and not (out / "robots").is_dir():  # which a run that was killed leaves
+        if not _is_run(out):
             raise LaunchError(f"{out}: is not empty and not an earlier run; choose another --out")
         before = _scenario_of(out)
         if before != scenario:
             aside = out.with_name(f"{out.name}.before")
-            shutil.rmtree(aside, ignore_errors=True)
+            if aside.exists():
+                if not _is_run(aside):
+                    raise LaunchError(
+                        f"{out}: holds a run of another scenario, and {aside} is no run: choose another --out"
+                    )
+                shutil.rmtree(aside)
             out.rename(aside)
             logger.warning("%s: held a run of %s, which is kept as %s", out, before or "no known scenario", aside)
         else:
             shutil.rmtree(out)
     return RunFolder.create(out)
+
+
+def _is_run(path: Path) -> bool:
+    """Whether a path is a folder with a run, or with what a run leaves that was killed before it said which it is."""
+    if not path.is_dir():
+        return False
+    names = {entry.name for entry in path.iterdir()}
+    return "run.json" in names or ("robots" in names and names <= LEFT_BY_A_KILL)
 
 
 def _scenario_of(run: Path) -> str | None:
