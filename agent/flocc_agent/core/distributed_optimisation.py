@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from flocc_agent.core.closure_choices import FAILURES_MAX, Choosing, ClosureChoices, used_closures
 from flocc_agent.core.coming_apart import SILENT_S, ComingApart, beyond
 from flocc_agent.core.correction_evidence import way_m
+from flocc_agent.core.distrust import DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S
 from flocc_agent.core.effects import Effect, Report, StepConsensus, Unicast
 from flocc_agent.core.own_part import (
     ConsensusProblem,
@@ -54,9 +55,6 @@ OVERTAKEN_S = 5.0
 """A message that is older than the last one by its number is new by its time after so long: its sender began again."""
 VAIN_STEPS_MAX, NEARER_RATIO = 40, 0.9
 """After so many steps that brought a robot no nearer to its neighbours it rests all the same."""
-DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
-"""How long neighbours are not heard with whom it came apart, or whose word led to what the own log contradicts: the
-first time, and at most."""
 
 
 class GraphSource(Protocol):

@@ -10,7 +10,8 @@ from flocc_protocol.ids import LogId
 from flocc_protocol.messages import Heartbeat
 
 DISTRUSTED_FIRST_S, DISTRUSTED_MAX_S = 60.0, 3600.0
-"""How long a leader whose signed correction cannot be true is not followed: the first time, and at most."""
+"""How long a leader whose signed correction cannot be true is not followed: the first time, and at most. In distributed
+mode, how long neighbours are not heard with whom a robot came apart, or whose word its own log contradicts."""
 OVERTAKEN_PERIOD_S = 1.0
 
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from flocc_agent.core.coming_apart import CONTACTS, SILENT_S
 from flocc_agent.core.distributed_optimisation import (
     DELIVER_PERIOD_S,
-    DISTRUSTED_FIRST_S,
     VAIN_STEPS_MAX,
     DistributedOptimisation,
 )
+from flocc_agent.core.distrust import DISTRUSTED_FIRST_S
 from flocc_agent.core.effects import ChooseClosures, Effect, Report, StepConsensus, Unicast
 from flocc_agent.core.own_part import Apart, ConsensusState, ConsensusStep, ToldPoses
 from flocc_agent.core.parameters import DistributedParameters
