@@ -40,9 +40,9 @@ def test_as_poses_come_the_same_jump_is_found_as_in_a_file(seed: int) -> None:
 
 
 def test_a_pause_is_one_of_odometry_and_not_of_photographs_or_of_the_camera() -> None:
-    every_minute: Float = np.arange(20) * 60.0
-    usual: Float = np.arange(20) * 0.1
-    paused: Float = usual + 15.0 * (np.arange(20) >= 12)
+    every_minute = np.array([60.0 * k for k in range(20)])
+    usual = np.array([0.1 * k for k in range(20)])
+    paused = np.array([0.1 * k + 15.0 * (k >= 12) for k in range(20)])
     assert pauses(every_minute).tolist() == pauses(usual).tolist() == []
     assert pauses(paused).tolist() == [12]
     for counts in (True, False):
