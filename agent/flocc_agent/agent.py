@@ -32,7 +32,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_watch import look_at_network, say_how_others_are_found
-from flocc_agent.runtime.new_journeys import began_anew, last_body
+from flocc_agent.runtime.new_journeys import began_anew, last_body, last_keyframe
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
 from flocc_agent.runtime.recording import Recording
@@ -500,7 +500,8 @@ class Agent:
 
     async def _play(self, recording: Recording) -> None:
         source = self.config.source
-        resumed = len(self._started.robot.gossip.logs[self.log]) > 0
+        last = last_keyframe(self._started.robot)
+        last_stamp_s = None if last is None else last.stamp_s
 
         async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
@@ -512,7 +513,7 @@ class Agent:
             except BadMeasurement as error:
                 logger.warning("robot %s: %s; left out", self.config.name, error)
 
-        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, last_stamp_s)
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter
