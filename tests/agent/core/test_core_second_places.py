@@ -55,7 +55,7 @@ class Team:
 
 def ahead(turned_rad: float) -> Float:
     """A camera's rotation that looks along y, or to its left."""
-    return so3_exp(np.array([0.0, 0.0, turned_rad])) @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+    return np.asarray(so3_exp(np.array([0.0, 0.0, turned_rad])) @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]))
 
 
 def joined(*closures: tuple[int, int]) -> Team:
