@@ -87,6 +87,10 @@ class Withdrawals:
         """Whether a keyframe's robot took it back, once or more."""
         return self._needed(keyframe) > 0
 
+    def is_final(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe's robot took it back for good: nothing that is judged of it counts."""
+        return self._needed(keyframe) >= NEVER
+
     def _needed(self, keyframe: KeyframeId) -> int:
         """Which of its robot's withdrawals a judgement must have known."""
         said = self._said.get((keyframe.log, keyframe.log), ())
