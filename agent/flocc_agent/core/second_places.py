@@ -91,7 +91,7 @@ class Join:
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class FoundBeside:
     """What is beside a join, each pair some keyframes from the next.
 
     Attributes:
@@ -168,7 +168,7 @@ def stretch_of(between: Between, join: Join, log: int, count: int) -> range:
     return range(max(int(ends.min()) - REACH, 0), min(int(ends.max()) + REACH + 1, count))
 
 
-def beside(between: Between, join: Join, around: tuple[Stretch, Stretch], refused: Int) -> Beside:
+def beside(between: Between, join: Join, around: tuple[Stretch, Stretch], refused: Int) -> FoundBeside:
     """What a join foretells, and what was found there.
 
     Args:
@@ -188,7 +188,7 @@ def beside(between: Between, join: Join, around: tuple[Stretch, Stretch], refuse
     return _told(pairs[order], between.ends[list(join.rows)], refused)
 
 
-def _told(pairs: Int, closed: Int, refused: Int) -> Beside:
+def _told(pairs: Int, closed: Int, refused: Int) -> FoundBeside:
     """Of pairs in their order, those that say something each."""
     taken: list[Int] = []
     wanted: list[tuple[int, int]] = []
@@ -205,7 +205,7 @@ def _told(pairs: Int, closed: Int, refused: Int) -> Beside:
             refused = refused[~of_pair]
         else:
             wanted.append((int(pair[0]), int(pair[1])))
-    return Beside(closed_pairs, refused_pairs, tuple(wanted))
+    return FoundBeside(closed_pairs, refused_pairs, tuple(wanted))
 
 
 def _chords_m(T: Float) -> Float:

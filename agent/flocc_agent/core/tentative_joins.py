@@ -35,7 +35,7 @@ SECOND_PLACE = "held until another one agrees with it at a second place, because
 """How the reason begins why a closure is doubted."""
 
 
-class Track(Protocol):
+class KnownOdometry(Protocol):
     """Odometry of one log."""
 
     def __len__(self) -> int: ...
@@ -66,7 +66,7 @@ NOTHING = Tentative()
 class TentativeJoins:
     """All pairs of logs."""
 
-    def __init__(self, closures: ClosureTable, track: Callable[[LogId], Track | None]) -> None:
+    def __init__(self, closures: ClosureTable, track: Callable[[LogId], KnownOdometry | None]) -> None:
         """Start with nothing refused.
 
         Args:
@@ -124,7 +124,7 @@ class TentativeJoins:
         return Tentative(doubted, tuple(asked), len(known) == len(every))
 
     def _doubt(
-        self, logs: Logs, between: Between, join: Join, low: Track, high: Track
+        self, logs: Logs, between: Between, join: Join, low: KnownOdometry, high: KnownOdometry
     ) -> tuple[str, tuple[tuple[int, int], ...]]:
         """Why a join of one place is doubted, empty where it is not; and what is to be asked for."""
         against = contradicting(between, join)
@@ -144,7 +144,7 @@ class TentativeJoins:
         packed = np.setdiff1d(np.array(self._refused.of_logs(*logs), dtype=np.int64), closed)
         return np.stack([packed // (INDEX_MAX + 1), packed % (INDEX_MAX + 1)], axis=1)
 
-    def _between(self, closures: Sequence[CandidatePair], low: Track, high: Track) -> Between:
+    def _between(self, closures: Sequence[CandidatePair], low: KnownOdometry, high: KnownOdometry) -> Between:
         T, has_length = self._closures.said(closures)
         ends = np.array([[pair.low.index, pair.high.index] for pair in closures])
         steps_m = float(np.mean([_step_m(track, ends[:, n]) for n, track in enumerate((low, high))]))
@@ -161,7 +161,7 @@ def _seen_twice(logs: Logs, between: Between, other: int, row: int, end: int) ->
     return SECOND_PLACE + what
 
 
-def _step_m(track: Track, indices: NDArray[np.int64]) -> float:
+def _step_m(track: KnownOdometry, indices: NDArray[np.int64]) -> float:
     """How far apart a log's keyframes are around some of them, in the mean."""
     first = max(int(indices.min()) - 1, 0)
     stretch = _stretch(track, range(first, min(int(indices.max()) + 2, first + CLOSURES_MAX, len(track))))
@@ -169,5 +169,5 @@ def _step_m(track: Track, indices: NDArray[np.int64]) -> float:
     return float(steps_m.mean()) if len(steps_m) else 0.0
 
 
-def _stretch(track: Track, keyframes: range) -> Stretch:
+def _stretch(track: KnownOdometry, keyframes: range) -> Stretch:
     return Stretch(keyframes.start, track.poses(keyframes))
