@@ -7,7 +7,6 @@ row costs itself.
 """
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from flocc_agent.runtime.columns import (
 from flocc_agent.runtime.dated_rows import dated
 from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, oddity, possible, spikes
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
+from flocc_agent.runtime.spare_columns import comment_notes, spare_notes
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
 from flocc_agent.runtime.text_tables import RecordingError, Table, is_number, read_table
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE, Trajectory
@@ -134,6 +134,7 @@ def read_poses(path: Path, form: str | None = None, otherwise: str | None = None
     if columns is None:
         return _matrices(table)
     values, lines, notes = _values(table, columns)
+    notes = (*notes, *comment_notes(table))
     values[:, 1:4] *= columns.metres
     q = values[:, 4:8] / np.linalg.norm(values[:, 4:8], axis=1, keepdims=True)
     T = np.tile(np.eye(4), (len(q), 1, 1))
@@ -320,7 +321,7 @@ def _wanted(columns: Columns) -> list[int]:
 
 def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], tuple[str, ...]]:
     """Stamp and pose of each row that is whole, its line, and what was left out."""
-    _refuse_mixed(table, columns)
+    spare = spare_notes(table, columns.spare)
     wanted = _wanted(columns)
     good, lines, damaged = [], [], []
     count = max(_usual_count(table), max(wanted) + 1)
@@ -341,31 +342,16 @@ def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], t
         values[:, 0] += values[:, -1] * 1e-9
     note = f"{table.path}: {len(damaged)} of {len(table.rows)} rows were left out, the first at line "
     told = (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
-    return values, np.array(lines), (*told, *_moved(table, columns))
+    return values, np.array(lines), (*told, *_moved(table, columns), *spare)
 
 
 def _moved(table: Table, columns: Columns) -> tuple[str, ...]:
     """Which frame the poses move, where a column says it: the camera's mounting must be on that."""
-    index = next((index for name, index in columns.labels if "child_frame" in name), None)
+    index = next((index for name, index in columns.spare if "child_frame" in name), None)
     moved = {fields[index] for _, fields in table.rows[:200] if index is not None and len(fields) > index} - {""}
     return (
         (f"{table.path}: poses are of {min(moved)}: the camera's mounting (T_body_camera) is on that",) if moved else ()
     )
-
-
-def _refuse_mixed(table: Table, columns: Columns) -> None:
-    """Refuse a table in which the poses of several bodies alternate.
-
-    Raises:
-        RecordingError: A column that says what a pose is of says several things, each of many rows.
-    """
-    for name, index in columns.labels:
-        found = Counter(fields[index] for _, fields in table.rows if len(fields) > index)
-        if 1 < len(found) <= len(table.rows) / 2:
-            several = ", ".join(sorted(found)[:4])
-            raise RecordingError(
-                f"{table.path}: holds poses of {len(found)} different {name} ({several}); keep the rows of one of them"
-            )
 
 
 def _damage(fields: list[str], columns: Columns) -> str | None:
@@ -412,10 +398,11 @@ def _matrices(table: Table) -> Poses:
         alone = ", and poses without stamps cannot be left out" if count in (12, 16) else ""
         raise RecordingError(f"{table.path}:{damaged[0]}: {fault}{damaged[0]}{alone}")
     if count in (12, 16):
-        return Poses(None, np.array(poses), np.array(lines))
+        return Poses(None, np.array(poses), np.array(lines), comment_notes(table))
     unit, notes = _unit(np.array(stamps), Columns(0, ()), None, table.path)
     told = (f"{table.path}: {fault}{damaged[0]}; they were left out",) if damaged else ()
-    return Poses(np.array(stamps) * UNITS_S[unit], np.array(poses), np.array(lines), (*told, *notes))
+    told = (*told, *notes, *comment_notes(table))
+    return Poses(np.array(stamps) * UNITS_S[unit], np.array(poses), np.array(lines), told)
 
 
 def _unit(stamps: Float, columns: Columns, form: str | None, path: Path) -> tuple[str, tuple[str, ...]]:

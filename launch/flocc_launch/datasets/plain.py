@@ -105,15 +105,15 @@ def expected_files(path: Path) -> str:
 
 def taken_file(path: Path, stems: tuple[str, ...]) -> Path | None:
     """The trajectory that is read of a folder under one of the names, or None."""
-    return next(iter(_trajectory_files(path, stems)), None)
+    return next(iter(trajectory_files(path, stems)), None)
 
 
 def has_trajectory(path: Path) -> bool:
     """Whether a trajectory of one of the plain names stands in a folder."""
-    return any(_trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
+    return any(trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
 
 
-def _trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
+def trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
     """Files of one of the names, whatever their capitals; a link to nowhere is one, and its reader says so."""
     there = {entry.name.lower(): entry for entry in sorted(path.iterdir())} if path.is_dir() else {}
     names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
@@ -123,7 +123,7 @@ def _trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
 def _first_trajectory(
     path: Path, stems: tuple[str, ...], form: str | None, stamps_s: list[float] | None
 ) -> tuple[Trajectory | None, tuple[str, ...]]:
-    files = _trajectory_files(path, stems)
+    files = trajectory_files(path, stems)
     if not files:
         return None, ()
     trajectory, notes = read_trajectory(files[0], form, stamps_s)
@@ -212,6 +212,13 @@ def _stamped_by_order(path: Path, trajectory: Trajectory | None) -> tuple[Stampe
     if trajectory is None:
         raise DatasetError(
             f"{folder}: the images have no stamps ({files[0].name}): name them by seconds, or list them in "
+            f"{path / 'images.txt'} with lines 'stamp_s relative/path'"
+        )
+    shapes = sorted({re.sub(r"\d+", "#", file.stem) for file in files})
+    if len(shapes) > 1:
+        raise DatasetError(
+            f"{folder}: the names of the images neither say stamps that flocc reads nor count alike "
+            f"({files[0].name}, {files[-1].name}), so that nothing says which pose is of which; list them in "
             f"{path / 'images.txt'} with lines 'stamp_s relative/path'"
         )
     images = tuple(zip((float(stamp_s) for stamp_s in trajectory.stamps_s), files, strict=False))

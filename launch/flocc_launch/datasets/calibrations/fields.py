@@ -134,9 +134,10 @@ def _matters(key: str, value: Any) -> bool:
 
 
 def _could_be_a_pose(value: Any) -> bool:
-    """Whether a value is as many numbers as a position or a rotation or both, or names their axes."""
+    """Whether a value is as many numbers as a position or a rotation or both, names their axes, or holds such a one."""
     if isinstance(value, dict):
-        return {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
+        named = {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
+        return named or any(_could_be_a_pose(each) and not _says_nothing(each) for each in value.values())
     if not isinstance(value, list):
         return False
     try:
