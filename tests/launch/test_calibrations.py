@@ -458,6 +458,7 @@ INNER = "width: 640\n  height: 480\n  fx: 400\n  fy: 401\n  cx: 320\n  cy: 240\n
     [
         "extrinsic:\n  x: 1.7\n  y: 0.1\n  z: 1.2\n  pitch: 0.03\n",
         "distortion:\n  k1: -0.28\n  k2: 0.07\n  p1: 0\n  p2: 0\n",
+        "imu_to_cam: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",
         "sits:\n  where: [0.1, 0.2, 0.3]\n",
     ],
 )

@@ -46,7 +46,7 @@ _REVERSED = re.compile(
 """A pose of the fixed frame in the moving one: `q_cw_x`, `p_BW_y`, `t_world_to_cam_z`."""
 _REVERSED_WORDS = re.compile(
     r"(?:^|_)(?:t_?[bci][wg]|t_?(?:cam|camera|body|imu)_?(?:world|global)|w2c"
-    r"|(?:world|global)_?(?:to|2)_?(?:cam|camera|body|imu))(?:_|$)"
+    r"|(?:world|global)_?(?:to|2)_?(?:cam|camera|body|imu)|(?:cam|camera|body|imu)_from_(?:world|global|map))(?:_|$)"
 )
 """The same in a comment, whose words mean less: `T_body_world`, `world to camera`."""
 _JPL = re.compile(r"(?:^|_)jpl(?:_|$)")

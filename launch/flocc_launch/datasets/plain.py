@@ -35,6 +35,7 @@ TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 OF_PHONES = ("arcore", "arkit", "arposes")
 PHONE_AXES = "T_body_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
 TRAJECTORY_SUFFIXES = (".tum", ".txt", ".csv")
+BY_ORDER = "the names of the images were taken to count them only: each has the stamp of the pose in the same place"
 UNUSUAL = ("dates, read as UTC", "seconds and their fraction", *(f"{name} gives them" for name in TIMES))
 """Readings of names that a note tells."""
 
@@ -64,6 +65,7 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     if images is None:
         images, faults = _stamped_by_order(path, odometry or truth)
     read_how = (f"{path}: the names of the images say their stamps as {how}",) if how in UNUSUAL else ()
+    read_how = (f"{path}: {BY_ORDER}",) if by_order else read_how
     lens = camera_file(path, images)
     _see_phone_axes(path, lens)
     notes = (*read_how, *notes)

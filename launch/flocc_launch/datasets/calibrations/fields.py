@@ -128,7 +128,11 @@ def _matters(key: str, value: Any) -> bool:
         return plain(value) not in HARMLESS_UNITS
     if isinstance(value, str) and not re.search(r"model|type|distort|lens|fisheye", name):
         return False
-    if HARMLESS.match(name) or _says_nothing(value):
+    if _says_nothing(value):
+        return False
+    if re.search(r"cam", name) and re.search(r"imu|body|base", name) and _could_be_a_pose(value):
+        return True
+    if HARMLESS.match(name):
         return False
     return bool(_MATTERS.search(name)) or _could_be_a_pose(value)
 
