@@ -22,7 +22,7 @@ TOO_FAST = f"lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
 TOO_FAST_ASKED = ": is the length in metres, and the stamp in its unit?"
 STRAY_STEPS_MIN = 20.0
 JOINED_MAX, JOINED_ROWS_MIN = 8, 3
-"""Trajectories one behind the other in a file, and the rows that each has; more parts, or shorter ones, are disorder."""
+"""Trajectories one behind the other in a file, and the rows that each has; more, or shorter ones, are disorder."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
