@@ -66,8 +66,8 @@ def solved_alone(part: ConsensusPart) -> Float:
         weights=np.ones(len(own)),
     )
     cost = np.inf
-    for _ in range(ALONE_STEPS_MAX):
-        alone.step()
+    for number in range(ALONE_STEPS_MAX):
+        alone.step(number + 1)
         before, cost = cost, alone.merit()
         if before - cost <= ALONE_TOLERANCE_RATIO * cost:
             break

@@ -10,9 +10,13 @@ dual variable biases. What is different is the penalty, and with it the form of 
   but by that neighbour (`force`, in the pose's own tangent, so that frames may turn). Both replace the target and the
   dual of ADMM: the receiver minimises `f(x) + force . d + penalty(x, T)` with d from T to x. At rest all d are zero and
   forces are opposite, whatever the penalty is; a message that is lost costs time only, the newest one counts.
-- The penalty is the geometric mean of how stiff both robots hold the shared poses (`shared_stiffness`), told in short
-  after a few steps, in editions: either side uses the newest one that both have told, and none before that. While
-  penalties differ, robots drive each other away: with a penalty of one side alone they came apart for good.
+- The penalty is the geometric mean of how stiff both robots hold the shared poses (`shared_stiffness`). The higher
+  robot tells how stiff it holds them after a few steps; the lower one makes the penalty, numbered by its step, and says
+  with each word by which one it was said. The higher robot answers by the penalty of the word that it heard last, or
+  has not heard it. So no robot gets an answer to its own answer that was made by another penalty, whatever is lost,
+  late or said twice. Where that happens they drive each other away: of robots that hold the poses with stiffnesses a
+  and b, one returns `(W - b) / (W + a)` of an error and the other `(V - a) / (V + b)`, together below one for W = V,
+  but without bound else.
 - What is heard replaces only a part of what was heard before (`RELAXATION`): the rest keeps its pull at the same poses.
   One half is ADMM, a whole one need not come to rest.
 
@@ -38,14 +42,13 @@ from flocc_agent.core.own_part import Apart, ToldPoses
 from flocc_agent.core.pose_graph import LoopClosure, Trajectory
 from flocc_agent.geometry import inverse, poses_from_tq, quaternions
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.shared_poses import STIFFNESS_EDITIONS
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STIFFNESS_AFTER = (5, 12)
-"""After which steps a robot says how stiff it holds its shared poses: first by a guess of its other neighbours, then by
-what they said; dense graphs are at rest before the second."""
+"""After which steps the higher robot says how stiff it holds what both share: first by a guess of its other neighbours,
+then by what they said; dense graphs are at rest before the second. The lower one makes no penalty before the first."""
 STIFFNESS_SAME = 0.05
 """One that differs by less, in its factors, is not said: a penalty need not be exact, only the same on both sides."""
 RELAXATION = 0.8
@@ -71,15 +74,15 @@ class Tidings:
     Attributes:
         T: (S, 4, 4) where it has them, in the common frame.
         force: (S, 6) gradient there of all that it knows from elsewhere; rotation first, in the pose's own tangent.
-        known: Newest edition of the receiver's stiffness that it has; 0 for none.
-        edition: Of the stiffness that comes with it; 0 for none.
-        stiffness: How stiff it holds the shared poses by all but the receiver; None where the receiver has it.
+        known: Number of the receiver's stiffness, or of its penalty, that it has; 0 for none.
+        number: Of the penalty by which this is said, or of how stiff the higher robot holds them; 0 for none.
+        stiffness: That one; None where the receiver has it.
     """
 
     T: Float
     force: Float
     known: int = 0
-    edition: int = 0
+    number: int = 0
     stiffness: SharedStiffness | None = None
 
     def told(self) -> ToldPoses:
@@ -87,7 +90,7 @@ class Tidings:
         origin = self.T[0, :3, 3]
         rows = np.concatenate([self.T[:, :3, 3] - origin, quaternions(self.T[:, :3, :3]), self.force], axis=1)
         stiffness = np.zeros(0) if self.stiffness is None else self.stiffness.packed()
-        return ToldPoses(origin, _single(rows), self.known, self.edition, _single(stiffness))
+        return ToldPoses(origin, _single(rows), self.known, self.number, _single(stiffness))
 
     @staticmethod
     def of(told: ToldPoses, count: int) -> "Tidings":
@@ -102,7 +105,7 @@ class Tidings:
         T = poses_from_tq(rows[:, :7])
         T[:, :3, 3] += told.base_m
         stiffness = SharedStiffness.unpacked(told.stiffness, count) if len(told.stiffness) else None
-        read = Tidings(T, rows[:, 7:], told.known, told.edition, stiffness)
+        read = Tidings(T, rows[:, 7:], told.known, told.number, stiffness)
         read.check(count)
         return read
 
@@ -116,11 +119,23 @@ class Tidings:
             raise ValueError(f"{len(self.T)} poses and {len(self.force)} forces are not {count} shared poses")
         if not (np.all(np.isfinite(self.T)) and np.all(np.isfinite(self.force))):
             raise ValueError("shared poses or forces are not finite")
-        editions = STIFFNESS_EDITIONS
-        if max(self.known, self.edition) > editions or (self.edition > 0) != (self.stiffness is not None):
-            raise ValueError(f"edition {self.edition} of the stiffness of shared poses is not one of {editions}")
         if self.stiffness is not None:
+            if not self.number:
+                raise ValueError("the stiffness of shared poses has no number")
             self.stiffness.check(count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Numbered:
+    """How stiff shared poses are held: by one robot of a pair alone, or by the penalty of both.
+
+    Attributes:
+        number: Step of the robot that made it; no other one of the pair has it.
+        stiffness: As it travels.
+    """
+
+    number: int
+    stiffness: SharedStiffness
 
 
 @dataclass(slots=True, eq=False)
@@ -135,12 +150,12 @@ class PairedRobot:
         penalty: (6S, 6S) sparse information by which they are held to T.
         T: (S, 4, 4) where the neighbour said that it has them; None before it was heard.
         force: (6S,) what it asks for there besides the penalty.
-        ours: Own stiffness by edition.
-        theirs: The neighbour's by edition.
-        known: Newest own edition that the neighbour has.
+        ours: What this robot made: the penalty if it is the lower one, else how stiff it holds the poses.
+        theirs: What the neighbour made.
+        mean_of: Number of what the higher robot said that is in the lower one's penalty.
+        known: Number of the own one that the neighbour has.
         steps: Own steps since both share these poses.
         edition: Of the list of these poses.
-        stiffened: Edition of both stiffnesses of which the penalty is made; 0 for none.
     """
 
     lower: bool
@@ -150,12 +165,22 @@ class PairedRobot:
     penalty: csc_array
     T: Float | None = None
     force: Float = field(default_factory=lambda: np.zeros(0))
-    ours: dict[int, SharedStiffness] = field(default_factory=dict)
-    theirs: dict[int, SharedStiffness] = field(default_factory=dict)
+    ours: Numbered | None = None
+    theirs: Numbered | None = None
+    mean_of: int = 0
     known: int = 0
     steps: int = 0
     edition: int = 0
-    stiffened: int = 0
+
+    @property
+    def version(self) -> int:
+        """Number of the penalty; 0 where it is of the closures alone."""
+        return _number(self.ours if self.lower else self.theirs)
+
+    @property
+    def information(self) -> Float:
+        """(S, 2) of the closures at each pose, of rotation and translation."""
+        return np.asarray(np.einsum("sbb->sb", self.closures)[:, [0, 3]])
 
     def pull(self, T: Float) -> Float:
         """Gradient (6S,) where the shared poses are at `T`."""
@@ -171,29 +196,74 @@ class PairedRobot:
         apart = self._apart(T)
         mean = float(apart @ self.penalty @ apart) / max(len(apart), 1)
         furthest_m = float(np.linalg.norm(apart.reshape(-1, 6)[:, 3:], axis=1).max(initial=0.0))
-        return Apart(furthest_m, mean / (ALLOWED if self.stiffened else ALLOWED_UNKNOWN))
+        return Apart(furthest_m, mean / (ALLOWED if self.version else ALLOWED_UNKNOWN))
 
-    def hear(self, told: Tidings) -> None:
-        """Take a part of what the neighbour said in the place of what it said before."""
+    def hear(self, told: Tidings, here: Float) -> None:
+        """Take a part of what the neighbour said in the place of what it said before.
+
+        What a lower robot said by a penalty that is not here counts for nothing; it is told which one is.
+
+        Args:
+            told: It.
+            here: (S, 4, 4) where the shared poses are.
+        """
+        self.known = told.known
+        said = None if told.stiffness is None else Numbered(told.number, told.stiffness)
+        if self.lower:
+            self.theirs = said or self.theirs
+        elif said is not None or not told.number:
+            self._hold_by(said, here)
+        if not self.lower and told.number != self.version:
+            return
         force = told.force.ravel()
         if self.T is not None:
             force = RELAXATION * force + (1.0 - RELAXATION) * self.pull(told.T)
-        self.T, self.force, self.known = told.T, force, told.known
-        if told.stiffness is not None:
-            self.theirs[told.edition] = told.stiffness
+        self.T, self.force = told.T, force
 
-    def stiffen(self, T: Float) -> None:
-        """Choose the penalty by what both said of their stiffness; the pull at `T`, where the poses are, stays."""
-        common = max(self.ours.keys() & self.theirs.keys(), default=None)
-        if common is None or common == self.stiffened:
+    @property
+    def is_asked(self) -> bool:
+        """Whether it is to be found how stiff this robot holds the poses."""
+        if not self.lower:
+            return self.steps in STIFFNESS_AFTER
+        return _number(self.theirs) != self.mean_of and self.steps >= STIFFNESS_AFTER[0]
+
+    def stiffen(self, stiffness: SharedStiffness, number: int, here: Float) -> None:
+        """Take how stiff this robot holds the poses: the lower one makes the penalty of that.
+
+        Args:
+            stiffness: It.
+            number: Of the step after which that was found.
+            here: (S, 4, 4) where the shared poses are.
+
+        Raises:
+            ValueError: What the neighbour told has no mean with it.
+        """
+        if self.lower:
+            assert self.theirs is not None, "the penalty is the mean of both"
+            self.mean_of = self.theirs.number
+            stiffness = geometric_mean(stiffness, self.theirs.stiffness)
+        made = Numbered(number, stiffness.told(len(self.keyframes)))
+        made.stiffness.check(len(self.keyframes))
+        if self.ours is not None and not made.stiffness.differs(self.ours.stiffness) > STIFFNESS_SAME:
             return
-        pull = None if self.T is None else self.pull(T)
-        both = (self.ours[common], self.theirs[common])
-        stiffness = geometric_mean(*(both if self.lower else both[::-1]))
-        self.penalty = csc_array(stiffness.matrix() + _diagonal(ANCHORING, self.closures))
-        self.stiffened = common
+        if self.lower:
+            self._hold_by(made, here)
+        else:
+            self.ours = made
+
+    def _hold_by(self, made: Numbered | None, here: Float) -> None:
+        """Use another penalty, or that of the closures alone; the pull where the poses are stays."""
+        if _number(made) == self.version:
+            return
+        pull = None if self.T is None else self.pull(here)
+        anchors = _diagonal(ANCHORING if made else ANCHORING_UNKNOWN, self.closures)
+        self.penalty = anchors if made is None else csc_array(made.stiffness.matrix() + anchors)
+        if self.lower:
+            self.ours = made
+        else:
+            self.theirs = made
         if pull is not None:
-            self.force = pull - self.penalty @ self._apart(T)
+            self.force = pull - self.penalty @ self._apart(here)
 
     def _apart(self, T: Float) -> Float:
         """Tangents (6S,) from where the neighbour has the shared poses to `T`."""
@@ -228,8 +298,15 @@ class ConsensusPart:
         """Poses (N, 4, 4) of the own keyframes in the common frame."""
         return self.state.poses()[: self.own]
 
-    def step(self) -> None:
-        """One Gauss-Newton step, shortened where it leads up, down the own cost and what neighbours ask for."""
+    def step(self, number: int) -> dict[LogId, str]:
+        """One Gauss-Newton step, shortened where it leads up, down the own cost and what neighbours ask for.
+
+        Args:
+            number: Of the step: higher than any before.
+
+        Returns:
+            Neighbours who told a stiffness that cannot be, and why; it counts for nothing.
+        """
         H, gradient = self._normal()
         T = self.state.poses()
         for neighbour in self._heard():
@@ -237,26 +314,24 @@ class ConsensusPart:
         delta = -_factor(H).solve(gradient)
         if np.all(np.isfinite(delta)):
             self.state = self._shortened(delta, self.merit(self.state))
-        told: dict[LogId, SharedStiffness] = {}
-        for other, neighbour in self.neighbours.items():
+        for neighbour in self.neighbours.values():
             neighbour.steps += 1
-            if neighbour.steps in STIFFNESS_AFTER:
-                told[other] = self._stiffness(other)
-        for other, stiffness in told.items():
-            neighbour = self.neighbours[other]
-            before = neighbour.ours.get(max(neighbour.ours, default=0))
-            if before is None or stiffness.differs(before) > STIFFNESS_SAME:
-                neighbour.ours[STIFFNESS_AFTER.index(neighbour.steps) + 1] = stiffness
-                neighbour.stiffen(self.state.poses()[neighbour.index])
+        asked = [other for other, neighbour in self.neighbours.items() if neighbour.is_asked]
+        refused: dict[LogId, str] = {}
+        for other, stiffness in {other: self._stiffness(other) for other in asked}.items():
+            try:
+                self.neighbours[other].stiffen(stiffness, number, self._shared(other))
+            except (ValueError, np.linalg.LinAlgError) as error:
+                refused[other] = str(error)
+        return refused
 
     def tell(self, other: LogId) -> Tidings:
         """What a neighbour hears after this step."""
         neighbour = self.neighbours[other]
-        T = self.state.poses()[neighbour.index]
+        T, ours = self._shared(other), neighbour.ours
         force = np.zeros((len(T), 6)) if neighbour.T is None else -neighbour.pull(T).reshape(-1, 6)
-        newest = max(neighbour.ours, default=0)
-        edition = newest if newest > neighbour.known else 0
-        return Tidings(T, force, max(neighbour.theirs, default=0), edition, neighbour.ours.get(edition))
+        stiffness = None if ours is None or ours.number == neighbour.known else ours.stiffness
+        return Tidings(T, force, _number(neighbour.theirs), _number(ours), stiffness)
 
     def hear(self, other: LogId, told: Tidings) -> None:
         """Take what a neighbour said.
@@ -264,16 +339,16 @@ class ConsensusPart:
         Raises:
             ValueError: It cannot be; nothing has changed.
         """
-        neighbour = self.neighbours[other]
-        told.check(len(neighbour.index))
-        neighbour.hear(told)
-        if told.stiffness is not None:
-            neighbour.stiffen(self.state.poses()[neighbour.index])
+        told.check(len(self.neighbours[other].index))
+        self.neighbours[other].hear(told, self._shared(other))
 
     def apart(self, other: LogId) -> Apart:
         """How far a neighbour that was heard is."""
-        neighbour = self.neighbours[other]
-        return neighbour.apart(self.state.poses()[neighbour.index])
+        return self.neighbours[other].apart(self._shared(other))
+
+    def _shared(self, other: LogId) -> Float:
+        """Where it has (S, 4, 4) the poses that it shares with a neighbour."""
+        return self.state.poses()[self.neighbours[other].index]
 
     def _heard(self) -> list[PairedRobot]:
         return [neighbour for neighbour in self.neighbours.values() if neighbour.T is not None]
@@ -287,7 +362,7 @@ class ConsensusPart:
         H = csc_array(H + coo_array((floating, (rows, rows)), shape=H.shape))
         units = np.zeros((H.shape[0], len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
-        return stiffness_of(_factor(H).solve(units)[rows], self.state.poses()[neighbour.index])
+        return stiffness_of(_factor(H).solve(units)[rows], self._shared(other))
 
     def merit(self, state: State | None = None) -> float:
         """What a step lowers: the own cost, and what neighbours ask for; where it stands, or elsewhere."""
@@ -382,6 +457,10 @@ def paired(lower: bool, keyframes: Sequence[KeyframeId], information: Float, edi
     unplaced = np.zeros(len(keyframes), dtype=np.int64)
     penalty = _diagonal(ANCHORING_UNKNOWN, closures)
     return PairedRobot(lower, tuple(keyframes), unplaced, closures, penalty, edition=edition)
+
+
+def _number(made: Numbered | None) -> int:
+    return 0 if made is None else made.number
 
 
 def _with_copies(

@@ -33,7 +33,7 @@ from flocc_agent.core.own_part import (
     SharedWith,
     ToldPoses,
 )
-from flocc_agent.core.pair_exchange import SharedPair, ToldFrame, asking_for_list, told_by, with_stiffness
+from flocc_agent.core.pair_exchange import SharedPair, ToldFrame, asking_for_list, told_by
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.peer_budgets import Muted
 from flocc_agent.core.plausibility import HELD_BACK_S
@@ -181,7 +181,7 @@ class DistributedOptimisation:
         if message.anchor == self.anchor and not self._is_back:
             self._take_origin(message)
             if before is None or message.step > before.step:
-                pair.heard = with_stiffness(message, pair.heard)
+                pair.heard = message
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
         self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
@@ -425,7 +425,7 @@ class DistributedOptimisation:
         """Whether a message moved something since the last one."""
         if (message.edition, message.anchor, message.known) != (before.edition, before.anchor, before.known):
             return True
-        if message.stiffness_edition:
+        if len(message.stiffness.numpy()):
             return True
         apart = message.rows.numpy()[:, :7] - before.rows.numpy()[:, :7]
         apart[:, :3] += message.base_m.numpy() - before.base_m.numpy()
@@ -564,6 +564,7 @@ class DistributedOptimisation:
                 owned=tuple(each for each in self._owned() if self._is_known(each.closure)),
                 shared=shared,
                 T_alone=self._T_alone,
+                number=self.number,
                 anchored=anchor == self._own,
                 origin=origin,
                 move_to=moves_to,

@@ -38,6 +38,7 @@ class Sweeps:
         self.parts = begun(graph, config)
         self.payload_bytes = 0
         self.refused = 0
+        self.sweeps = 0
         self._loss_ratio = loss_ratio
         self._rng = np.random.default_rng(seed)
 
@@ -48,8 +49,9 @@ class Sweeps:
 
     def sweep(self) -> None:
         """Every robot does a step, one after the other, and tells its neighbours."""
+        self.sweeps += 1
         for log, part in self.parts.items():
-            part.step()
+            part.step(self.sweeps)
             for other in part.neighbours:
                 told = part.tell(other).told()
                 self.payload_bytes += told.size_bytes
