@@ -9,9 +9,9 @@ from flocc_agent.backend.consensus import (
     ConsensusPart,
     PartBeginning,
     information_by_keyframe,
-    paired,
     part_of,
 )
+from flocc_agent.backend.consensus_pair import paired
 from flocc_agent.backend.edges import state_of, taken
 from flocc_agent.backend.problem import initial_scale
 from flocc_agent.config import BackendConfig

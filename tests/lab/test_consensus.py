@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flocc_agent.backend.consensus import STIFFNESS_AFTER, ConsensusPart, Tidings
+from flocc_agent.backend.consensus import ConsensusPart
+from flocc_agent.backend.consensus_pair import STIFFNESS_AFTER, Tidings
 from flocc_agent.backend.edges import residuals, state_of
 from flocc_agent.backend.optimiser import optimise
 from flocc_agent.backend.problem import build

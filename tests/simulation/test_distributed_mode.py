@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flocc_agent.backend import consensus
-from flocc_agent.backend.consensus import PairedRobot, Tidings
+from flocc_agent.backend.consensus_pair import PairedRobot, Tidings
 from flocc_agent.config import BackendConfig, BackendMode, Formulation
 from flocc_launch.doctor import diagnose
 from flocc_launch.runs.run_folder import RunFolder

@@ -11,15 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.consensus import (
-    ConsensusPart,
-    PairedRobot,
-    PartBeginning,
-    Tidings,
-    information_by_keyframe,
-    paired,
-    part_of,
-)
+from flocc_agent.backend.consensus import ConsensusPart, PartBeginning, information_by_keyframe, part_of
+from flocc_agent.backend.consensus_pair import PairedRobot, Tidings, paired
 from flocc_agent.backend.measured import measured_odometry
 from flocc_agent.backend.problem import initial_scale
 from flocc_agent.backend.screening import first_not_rigid

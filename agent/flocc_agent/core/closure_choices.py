@@ -1,7 +1,8 @@
 """Which closures are right, in distributed mode: decided before robots agree on anything, from logs alone.
 
 Each robot has its own log solved, and as the lower robot of a pair both logs together, with the whole back end; one
-choice is under way at a time. A choice is made anew when the logs show more closures than it was made of.
+choice is under way at a time. A choice is made anew when the logs show other closures than it was made of: more, or
+none of those that were taken back.
 """
 
 from collections import Counter
@@ -20,7 +21,8 @@ from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 Shown = tuple[int, int, int]
-"""Closures between two robots, within the lower and within the higher one: of which a choice was made."""
+"""What names the closures between two robots, within the lower and within the higher one, of which a choice was made; 0
+where there are none."""
 
 FAILURES_MAX = 6
 
@@ -73,15 +75,16 @@ class ClosureChoices:
 
     def look(self, graph: PoseGraph) -> None:
         """Take in what the logs show now: by the other robot, and the own log by its own name."""
-        ends = Counter(tuple(sorted((c.query.log, c.match.log))) for c in graph.closures)
-        within = {low: count for (low, high), count in ends.items() if low == high}
-        own = within.get(self._own, 0)
-        shown = {
-            high: (count, own, within.get(high, 0))
-            for (low, high), count in sorted(ends.items())
-            if low == self._own != high
+        names: Counter[tuple[LogId, LogId]] = Counter()
+        for closure in graph.closures:
+            low, high = sorted((closure.query.log, closure.match.log))
+            names[low, high] ^= _name(closure)
+        own = names[self._own, self._own]
+        others = {high for low, high in names if low == self._own} | set(self._choices)
+        self._shown = {
+            other: (names[self._own, other], own, names[other, other]) if other != self._own else (0, own, 0)
+            for other in sorted(others)
         }
-        self._shown = {**shown, self._own: (0, own, 0)} if own else shown
 
     def deadline(self) -> float:
         """When the next choice begins, or the one under way is given up; never where all that is shown was chosen."""
@@ -143,6 +146,11 @@ class ClosureChoices:
     def _due_s(self) -> float:
         due = (max(self._not_before_s, choice.not_before_s) for _, choice in self._open())
         return min(due, default=float("inf"))
+
+
+def _name(closure: LoopClosure) -> int:
+    """What tells one closure from another, and from another measurement between the same keyframes."""
+    return hash((closure.query, closure.match, np.asarray(closure.T_query_match_unscaled).tobytes()))
 
 
 def used_closures(

@@ -384,6 +384,10 @@ class DistributedOptimisation:
             return
         self._graph = graph
         self._choices.look(graph)
+        for lower, pair in self._pairs.items():
+            if lower < self._own and not self._bears_out(lower, pair.keyframes):
+                pair.edition, pair.keyframes = 0, ()  # closures of it were taken back
+                pair.heard = pair.told = None
         self._has_news = True
 
     def _look_at_s(self) -> float:
@@ -404,18 +408,22 @@ class DistributedOptimisation:
         listed = tuple(message.keyframes)
         if message.edition <= pair.edition or not listed or listed[-1] >= len(self._trajectory):
             return False
-        tied = {
-            own.index
-            for c in self._graph.closures
-            for own, other in ((c.query, c.match), (c.match, c.query))
-            if own.log == self._own and other.log == sender
-        }
-        if not tied.issuperset(listed):
+        if not self._bears_out(sender, listed):
             return False
         pair.edition, pair.keyframes, pair.information = message.edition, listed, message.information
         pair.heard = pair.told = None
         self._has_news = True
         return True
+
+    def _bears_out(self, other: LogId, listed: tuple[int, ...]) -> bool:
+        """Whether closures here tie all of these own keyframes to another robot."""
+        tied = {
+            own.index
+            for c in self._graph.closures
+            for own, there in ((c.query, c.match), (c.match, c.query))
+            if own.log == self._own and there.log == other
+        }
+        return tied.issuperset(listed)
 
     def _take_origin(self, message: SharedPoses) -> None:
         if self.anchor != self._own and message.origin_step > self._origin_step:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import align
-from flocc_agent.backend.consensus import ConsensusPart, Tidings
+from flocc_agent.backend.consensus import ConsensusPart
+from flocc_agent.backend.consensus_pair import Tidings
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import PoseGraph, Trajectory
 from flocc_lab.consensus_graphs import part_of_graph, solved_alone

@@ -28,7 +28,7 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
 )
 from flocc_agent.core.reports import CAME_APART, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose7
+from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import SHARED_MAX, SharedPoses
@@ -51,6 +51,7 @@ class Source:
     seen: tuple[tuple[KeyframeId, KeyframeId], ...] = SEEN
     revision: int = 1
     length: int = 4
+    shift_m: float = 0.0
 
     @property
     def keyframes(self) -> int:
@@ -58,7 +59,8 @@ class Source:
 
     def graph(self) -> PoseGraph:
         trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], self.length, axis=0)) for log in (A, B, C)}
-        return PoseGraph(trajectories, tuple(LoopClosure(query, match, np.eye(4)) for query, match in self.seen))
+        T = pose(np.eye(3), np.array([self.shift_m, 0.0, 0.0]))
+        return PoseGraph(trajectories, tuple(LoopClosure(query, match, T) for query, match in self.seen))
 
 
 @dataclass
@@ -265,6 +267,54 @@ def test_a_pair_is_chosen_anew_when_its_closures_change_but_not_at_once() -> Non
     effects, _ = bench.turn(PARAMETERS.choose_s + 0.2)
     assert told(effects)["c"].keyframes == (0, 2)
     assert told(effects)["c"].edition > edition
+
+
+def test_closures_that_were_taken_back_are_used_no_more_and_others_in_their_place_are_chosen() -> None:
+    within = (KeyframeId(B, 0), KeyframeId(B, 2))
+    bench = Bench(Source(seen=(SEEN[1], within)))
+    bench.turn(0.0)
+    bench.turn(0.2)
+    bench.turn(0.4)
+    assert {each.ends for each in bench.b._owned()} == {SEEN[1], within}
+    instead = (KeyframeId(C, 1), KeyframeId(B, 3))
+    bench.source.seen = (instead, within)
+    bench.source.revision += 1
+    for now in (10.0, 10.2, 10.4):
+        bench.turn(now)
+    assert {each.ends for each in bench.b._owned()} == {instead, within}
+    bench.source.seen = ()
+    bench.source.revision += 1
+    for now in (20.0, 20.2, 20.4, 20.6):
+        _, asked = bench.turn(now)
+    assert bench.b._owned() == ()
+    assert bench.b.shares_with() == ()
+    assert [job.problem.shared for job in asked] == [{}] * len(asked)
+    assert bench.b.has_chosen
+
+
+def test_another_measurement_between_the_same_keyframes_is_chosen_anew() -> None:
+    bench = Bench().shares()
+    bench.source.shift_m = 1.0
+    bench.source.revision += 1
+    assert len(choices(bench.turn(PARAMETERS.choose_s + 1.0)[0])) == 1
+
+
+def test_a_list_that_its_own_logs_bear_out_no_more_is_dropped_by_the_higher_robot() -> None:
+    bench = Bench(Source(seen=(SEEN[0],)))
+    bench.turn(0.0)
+    bench.b.on_shared_poses(A, said(A, 2, 7, (1,)), 0.3)
+    bench.turn(0.5, aligned=True)
+    assert bench.b.shares_with() == (A,)
+    bench.source.seen = ()
+    bench.source.revision += 1
+    _, (job,) = bench.turn(2.0)
+    assert bench.b.shares_with() == ()
+    assert job.problem.shared == {}
+    assert bench.b.anchor == B
+    (asks,) = told(bench.b.on_shared_poses(A, said(A, 4, 7), 2.1)).values()
+    assert asks.edition == 0
+    bench.b.on_shared_poses(A, said(A, 5, 8, (1,)), 2.2)
+    assert bench.b.shares_with() == ()
 
 
 def test_a_failed_or_overdue_choice_is_made_again_after_a_growing_pause() -> None:
