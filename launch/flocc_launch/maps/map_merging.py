@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import PerceptionConfig, validated
 from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.descriptor_rows import direction
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.interfaces import OdometryPair, Perception
 from flocc_agent.core.judgement import judged
 from flocc_agent.core.parameters import CoreParameters
-from flocc_agent.core.place_recognition import direction
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapManifest
