@@ -129,6 +129,13 @@ class PlaceRecognition:
             return None
         return run_agreement(one[0] @ other[0].T, one[1], other[1])
 
+    def similarity(self, pair: CandidatePair) -> float | None:
+        """How alike two keyframes are; None where a descriptor is not held, or theirs are of different lengths."""
+        found = self._around(pair.low, 0), self._around(pair.high, 0)
+        if found[0] is None or found[1] is None or found[0][0].shape[1] != found[1][0].shape[1]:
+            return None
+        return float(found[0][0][0] @ found[1][0][0])
+
     def _around(self, keyframe: KeyframeId, reach: int) -> tuple[Floats, int] | None:
         number = self._numbers.get(keyframe.log)
         if number is None:
