@@ -46,6 +46,8 @@ BEYOND_PX = 10
 GRADIENT_MIN = 1.25
 """Grey levels a pixel, root mean square in a window along the shift, below which noise decides."""
 MOVED_MIN_M = 0.05
+DRIFT_RATIO = 0.05
+"""Odometry may be off by so much of the way and of the turns between two pictures: who is back sees the same again."""
 SAME_NCC = 0.97
 SAME_SHARE = 0.95
 CELLS_MIN = 12
@@ -64,7 +66,7 @@ TESTS_MAX = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Picture:
-    """A reduced picture, what its windows have, and how the camera stood."""
+    """A reduced picture, what its windows have, how the camera stood, and its way to there in m and rad."""
 
     grey: Float32
     mean: Float32
@@ -73,6 +75,7 @@ class _Picture:
     gradient: tuple[Float32, Float32]
     squares: tuple[Float32, Float32, Float32]
     T_odom_camera: Float
+    way: tuple[float, float]
 
 
 class OverlayFinder:
@@ -89,6 +92,8 @@ class OverlayFinder:
         self._rays = np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
         self._focal_px = camera.fx * factor
         self._earlier: deque[_Picture] = deque(maxlen=EARLIER_MAX)
+        self._T_odom_last: Float | None = None
+        self._path_m = self._turned_rad = 0.0
         self._tests = np.zeros(grid_x.shape)
         self._stayed = np.zeros(grid_x.shape)
 
@@ -99,6 +104,10 @@ class OverlayFinder:
             grey: (H, W) of the whole picture.
             T_odom_camera: (4, 4) where the camera was, by odometry, metres.
         """
+        T_last = np.eye(4) if self._T_odom_last is None else between(self._T_odom_last, T_odom_camera)
+        self._T_odom_last = T_odom_camera
+        self._path_m += float(np.linalg.norm(T_last[:3, 3]))
+        self._turned_rad += angle_rad(T_last[:3, :3])
         now = self._picture(grey, T_odom_camera)
         repeats = any(self._is_same(now, earlier) for earlier in self._earlier)
         if not repeats:
@@ -128,7 +137,8 @@ class OverlayFinder:
         has_corners = (deviation > CONTRAST_MIN) & (corners > CORNER_MIN)
         right, down = _fine_gradient(reduced)
         squares = self._averaged(right * right), self._averaged(right * down), self._averaged(down * down)
-        return _Picture(reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera)
+        way = self._path_m, self._turned_rad
+        return _Picture(reduced, mean, deviation, has_corners, (right, down), squares, T_odom_camera, way)
 
     def _test(self, now: _Picture, earlier: _Picture) -> None:
         """Add how much of each cell stays between two pictures, of those that the motion must have moved."""
@@ -165,7 +175,7 @@ class OverlayFinder:
         return np.asarray((rays[..., :2] / depth - self._rays[..., :2]) * self._focal_px)
 
     def _is_same(self, now: _Picture, earlier: _Picture) -> bool:
-        if not self._moved(between(now.T_odom_camera, earlier.T_odom_camera)):
+        if not self._moved(now, earlier):
             return False
         corners = now.has_corners & earlier.has_corners
         either = now.has_corners | earlier.has_corners
@@ -173,9 +183,12 @@ class OverlayFinder:
             return False
         return float(np.mean(self._similarity(now, earlier)[corners] > SAME_NCC)) > SAME_SHARE
 
-    def _moved(self, T: Float) -> bool:
-        """Whether the robot did move, so that two pictures cannot be the same."""
-        return float(np.linalg.norm(T[:3, 3])) > MOVED_MIN_M or angle_rad(T[:3, :3]) * self._focal_px > SHIFT_MIN_PX
+    def _moved(self, now: _Picture, earlier: _Picture) -> bool:
+        """Whether the robot is elsewhere by more than odometry drifts on the way: two pictures cannot be one then."""
+        T = between(now.T_odom_camera, earlier.T_odom_camera)
+        drift_m, drift_rad = (DRIFT_RATIO * abs(b - a) for a, b in zip(earlier.way, now.way, strict=True))
+        is_away = float(np.linalg.norm(T[:3, 3])) > MOVED_MIN_M + drift_m
+        return is_away or angle_rad(T[:3, :3]) * self._focal_px > SHIFT_MIN_PX + drift_rad * self._focal_px
 
     def _similarity(self, now: _Picture, earlier: _Picture) -> Float32:
         """Normalised cross-correlation of the windows at the same pixels."""
