@@ -20,7 +20,7 @@ from flocc_launch.scenarios.scenario import FaultKind, Scenario, SensorsScenario
 from flocc_launch.simulation.coverage import Coverage, CoverageWatch
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
-from flocc_launch.simulation.generator import FAMILIES, ROBOTS_MAX, calm_s, drawn_scenario
+from flocc_launch.simulation.generator import FAMILIES, LENGTHS_M, ROBOTS_MAX, WALKS, calm_s, drawn_scenario
 from flocc_launch.simulation.hardships import Hardship, HardshipKind, drawn_hardships, endure
 from flocc_launch.simulation.invariants import Invariant, InvariantWatch, Violation
 from flocc_launch.simulation.rigid_alignment import align
@@ -32,6 +32,8 @@ from flocc_launch.simulation.virtual_playback import Playback
 LIVENESS_S = 60.0
 LOOK_S = 2.5
 SEEDS_PER_TASK = 8
+WALKS_KEPT = 4 * WALKS * len(LENGTHS_M)
+"""All walks of small swarms, with and without sensors and noise."""
 SEPARATING = {FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.LOSS, FaultKind.MUTE, FaultKind.LEAVE}
 
 
@@ -174,7 +176,7 @@ def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     return {name: drawn[name] for name in scenario.names()}
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=WALKS_KEPT)
 def _walked(tracks: str, keyframes: str, sensors: str | None, noiseless: bool) -> dict[str, Playback]:
     """Playbacks of walks, drawn once for all seeds that share them; the parameters are JSON."""
     scenario = Scenario(

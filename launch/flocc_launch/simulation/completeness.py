@@ -1,7 +1,7 @@
 """Complete: nothing that should be found, registered or solved is left out."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -21,7 +21,7 @@ from flocc_launch.simulation.swarm import Swarm
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord
+from flocc_protocol.records import KeyframeRecord, RejectionRecord
 
 MARGIN = 1e-4
 """Similarities that differ by less may be ordered either way."""
@@ -39,6 +39,7 @@ class Complete:
     _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
     _captured: Counter[tuple[str, int]] = field(default_factory=Counter)
     _recorded: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _held: dict[str, "_Held"] = field(default_factory=lambda: defaultdict(_Held))
 
     def step(self, step: Step) -> Iterator[str]:
         """Note keyframes that were taken and recorded; pairs that are refused unseen for no reason."""
@@ -46,16 +47,27 @@ class Complete:
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
         for effect in step.effects:
             if isinstance(effect, Report) and isinstance(effect.fact, ClosureRejected) and effect.fact.reason == TOLD:
-                yield from _spared_too_early(step.station, CandidatePair.of(effect.fact.query, effect.fact.match))
+                yield from self._spared_too_early(step.station, CandidatePair.of(effect.fact.query, effect.fact.match))
             if isinstance(effect, PersistRecord) and effect.log == step.station.log:
                 record = decoded(effect.data)
                 if isinstance(record, KeyframeRecord):
                     self._recorded[life] += 1
                     self._describe(effect.data, record)
                 elif isinstance(record, RejectionRecord) and record.reason == UNLIKELY:
-                    seen = _refused_and_seen(step.station)
+                    seen = self._held_by(step.station).refused_seen
                     if seen < REFUSED_MIN:
                         yield f"{step.station.name} refuses {record.query} {record.match} unseen, {seen} were seen"
+
+    def _held_by(self, station: Station) -> "_Held":
+        held = self._held[station.name]
+        held.read(core(station).gossip.logs)
+        return held
+
+    def _spared_too_early(self, station: Station, pair: CandidatePair) -> Iterator[str]:
+        enough = core(station).closures_enough
+        beside = _closures_beside(self._held_by(station).closures, pair)
+        if not enough or beside < enough:
+            yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
 
     def _describe(self, data: bytes, record: KeyframeRecord) -> None:
         if record.descriptor is not None:
@@ -108,6 +120,7 @@ class Complete:
         }
 
 
+ClosuresByLogs = dict[tuple[LogId, LogId], set[CandidatePair]]
 Described = tuple[LogId, dict[int, NDArray[np.float32]]]
 
 
@@ -139,37 +152,57 @@ def resolved_pairs(logs: Iterable[LogCopy]) -> set[CandidatePair]:
     return {CandidatePair.of(record.query, record.match) for copy in logs for _, record in copy.judgements()}
 
 
-def closures_by_logs(logs: Iterable[LogCopy]) -> dict[tuple[LogId, LogId], set[CandidatePair]]:
+def closures_by_logs(logs: Iterable[LogCopy]) -> ClosuresByLogs:
     """Closures by the two logs that they join."""
-    found: dict[tuple[LogId, LogId], set[CandidatePair]] = defaultdict(set)
-    for record in (record for copy in logs for record in copy.other_records()):
-        if isinstance(record, ClosureRecord):
-            pair = CandidatePair.of(record.query, record.match)
-            found[pair.low.log, pair.high.log].add(pair)
-    return found
+    held = _Held()
+    for copy in logs:
+        held.take(copy)
+    return held.closures
 
 
-def _closures_beside(closures: dict[tuple[LogId, LogId], set[CandidatePair]], pair: CandidatePair) -> int:
+@dataclass(slots=True)
+class _Held:
+    """What the logs that a robot holds say of pairs; of a log that grew only what is new is looked at.
+
+    Attributes:
+        closures: By the two logs that they join.
+        refused_seen: How many pairs were refused that had been seen.
+    """
+
+    closures: ClosuresByLogs = field(default_factory=lambda: defaultdict(set))
+    refused_seen: int = 0
+    _read: dict[LogId, tuple[LogCopy, int]] = field(default_factory=dict)
+
+    def read(self, logs: Mapping[LogId, LogCopy]) -> None:
+        """Take in what came since; from the beginning where a log is held no more, or another version of it."""
+        if any(logs.get(log) is not copy for log, (copy, _) in self._read.items()):
+            self.closures.clear()
+            self.refused_seen = 0
+            self._read.clear()
+        for log, copy in logs.items():
+            _, first = self._read.get(log, (copy, 0))
+            self.take(copy, first)
+            self._read[log] = copy, len(copy)
+
+    def take(self, copy: LogCopy, first: int = 0) -> None:
+        """Take in a log's judgements from a number on."""
+        for _, record in copy.judgements(first):
+            if isinstance(record, RejectionRecord):
+                self.refused_seen += record.reason != UNLIKELY
+            else:
+                pair = CandidatePair.of(record.query, record.match)
+                self.closures[pair.low.log, pair.high.log].add(pair)
+
+
+def _closures_beside(closures: ClosuresByLogs, pair: CandidatePair) -> int:
     """Closures of the same stretches of two ways."""
     of_logs = closures.get((pair.low.log, pair.high.log), set())
     return sum(is_beside(pair, other, STRETCH) for other in of_logs)
 
 
-def _spared_too_early(station: Station, pair: CandidatePair) -> Iterator[str]:
-    held = core(station)
-    beside, enough = _closures_beside(closures_by_logs(held.gossip.logs.values()), pair), held.closures_enough
-    if not enough or beside < enough:
-        yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
-
-
 def _second(values: NDArray[np.float32], but: int) -> float:
     """The highest value at another place."""
     return float(np.delete(values, but).max(initial=-1.0))
-
-
-def _refused_and_seen(station: Station) -> int:
-    records = (record for copy in core(station).gossip.logs.values() for record in copy.other_records())
-    return sum(isinstance(record, RejectionRecord) and record.reason != UNLIKELY for record in records)
 
 
 def _unsolved(leader: Station) -> Iterator[str]:
