@@ -139,7 +139,8 @@ def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> lis
     """All invariants; two robots may register one pair only where they could not hear each other for a while.
 
     Nobody counts on a name under which two robots run. A robot that an older disk makes number keyframes twice has
-    others register images of one with the place of the other, until it is told: then the truth is not asked for.
+    others register images of one with the place of the other, until it is told: then the truth is not asked for. Where
+    closures are wrong for a while, robots that know of it and robots that do not doubt each other.
     """
     separating = any(fault.kind in SEPARATING for fault in scenario.faults)
     links = [scenario.radio, *scenario.radio.overrides]
@@ -148,7 +149,7 @@ def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> lis
     doubles = {hardship.robot for hardship in hardships if hardship.kind is HardshipKind.TWIN}
     classes = {name: -1 if name in doubles else scenario.robot(name).compute_class for name in scenario.names()}
     told_twice = any(hardship.kind is HardshipKind.OLDER for hardship in hardships)
-    honest = all(hardship.kind is not HardshipKind.LIAR for hardship in hardships)
+    honest = all(hardship.kind not in (HardshipKind.LIAR, HardshipKind.OVERLAY) for hardship in hardships)
     distributed = scenario.backend.mode is BackendMode.DISTRIBUTED
     return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes, honest, distributed)
 

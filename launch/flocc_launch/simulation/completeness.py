@@ -9,19 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.effects import PersistRecord, Report
-from flocc_agent.core.events import KeyframeCaptured
+from flocc_agent.core.events import KeyframeCaptured, KeyframeEncoded
 from flocc_agent.core.known_sets import is_beside
 from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.prospects import REFUSED_MIN, UNLIKELY
 from flocc_agent.core.reports import ClosureRejected
 from flocc_agent.core.spared import STRETCH, TOLD
+from flocc_agent.core.withdrawals import Withdrawals
 from flocc_launch.simulation.invariants import Step, core, groups
 from flocc_launch.simulation.rightness import component_of
 from flocc_launch.simulation.swarm import Swarm
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import KeyframeRecord, RejectionRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord, WithdrawalRecord
 
 MARGIN = 1e-4
 """Similarities that differ by less may be ordered either way."""
@@ -39,12 +40,15 @@ class Complete:
     _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
     _captured: Counter[tuple[str, int]] = field(default_factory=Counter)
     _recorded: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _noticed: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _withdrawn: Counter[tuple[str, int]] = field(default_factory=Counter)
     _held: dict[str, "_Held"] = field(default_factory=lambda: defaultdict(_Held))
 
     def step(self, step: Step) -> Iterator[str]:
         """Note keyframes that were taken and recorded; pairs that are refused unseen for no reason."""
         life = step.station.name, step.station.life
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
+        self._noticed[life] += isinstance(step.event, KeyframeEncoded) and step.event.withdrawn is not None
         for effect in step.effects:
             if isinstance(effect, Report) and isinstance(effect.fact, ClosureRejected) and effect.fact.reason == TOLD:
                 yield from self._spared_too_early(step.station, CandidatePair.of(effect.fact.query, effect.fact.match))
@@ -53,6 +57,8 @@ class Complete:
                 if isinstance(record, KeyframeRecord):
                     self._recorded[life] += 1
                     self._describe(effect.data, record)
+                elif isinstance(record, WithdrawalRecord):
+                    self._withdrawn[life] += record.log == effect.log
                 elif isinstance(record, RejectionRecord) and record.reason == UNLIKELY:
                     seen = self._held_by(step.station).refused_seen
                     if seen < REFUSED_MIN:
@@ -75,12 +81,14 @@ class Complete:
             self._descriptors[data] = values / np.linalg.norm(values)
 
     def lacking(self, swarm: Swarm) -> Iterator[str]:
-        """Keyframes without a record or a place in the leader's solution, and pairs that nobody registered."""
+        """Keyframes without a record or a place in the leader's solution; withdrawals and pairs without a record."""
         for group in groups(swarm):
             for station in group:
                 life = station.name, station.life
                 if self._captured[life] > self._recorded[life]:
                     yield f"{station.name} recorded {self._recorded[life]} of {self._captured[life]} keyframes"
+                if self._noticed[life] > self._withdrawn[life]:
+                    yield f"{station.name} withdrew {self._withdrawn[life]} of {self._noticed[life]} times"
                 if core(station).election.leading and core(station).distributed is None:
                     yield from _unsolved(station)
             yield from self._unregistered(swarm, group)
@@ -94,8 +102,9 @@ class Complete:
             log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
         }
         copies = _all_copies(swarm, group)
-        resolved = resolved_pairs(copies)
-        told = closures_by_logs(copies)
+        withdrawals = core(group[0]).assembly.withdrawals
+        resolved = resolved_pairs(copies, withdrawals)
+        told = closures_by_logs(copy for _, copy in copies)
         partnered = {(end, pair.other(end).log) for pair in resolved for end in (pair.low, pair.high)}
         came_back = {station.log for station in group if station.life > 1}
         for one, other in combinations(known, 2):
@@ -106,6 +115,8 @@ class Complete:
                 both = {(pair.low, pair.high.log), (pair.high, pair.low.log)} <= partnered
                 if pair in resolved or (both and came_back & {one, other}):
                     continue
+                if any(withdrawals.is_withdrawn(end) and end.log not in writers for end in (pair.low, pair.high)):
+                    continue  # whoever made its latent anew is not here
                 enough = swarm.scenario.core.loop_closing.closures_enough
                 if not enough or _closures_beside(told, pair) < enough:
                     yield f"nobody registered {pair.low} {pair.high}, which look alike"
@@ -137,19 +148,24 @@ def _alike(one: Described, other: Described, threshold: float) -> Iterator[Candi
             yield CandidatePair.of(KeyframeId(low, lefts[i]), KeyframeId(high, rights[j]))
 
 
-def _all_copies(swarm: Swarm, group: list[Station]) -> list[LogCopy]:
+def _all_copies(swarm: Swarm, group: list[Station]) -> list[tuple[LogId, LogCopy]]:
     """Of each log the copy of one robot; of those of which two versions were seen the copies of all."""
     return [
-        copy
+        (log, copy)
         for station in group
         for log, copy in core(station).gossip.logs.items()
         if station is group[0] or log in swarm.forked
     ]
 
 
-def resolved_pairs(logs: Iterable[LogCopy]) -> set[CandidatePair]:
-    """Pairs of which some log has a record."""
-    return {CandidatePair.of(record.query, record.match) for copy in logs for _, record in copy.judgements()}
+def resolved_pairs(logs: Iterable[tuple[LogId, LogCopy]], withdrawals: Withdrawals) -> set[CandidatePair]:
+    """Pairs of which some log has a record; closures of what was withdrawn since do not count, refusals do."""
+    judged = (
+        (log, number, CandidatePair.of(record.query, record.match), isinstance(record, ClosureRecord))
+        for log, copy in logs
+        for number, record in copy.judgements()
+    )
+    return {pair for log, number, pair, is_closure in judged if not is_closure or withdrawals.counts(log, number, pair)}
 
 
 def closures_by_logs(logs: Iterable[LogCopy]) -> ClosuresByLogs:
