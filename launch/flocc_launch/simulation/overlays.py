@@ -32,19 +32,21 @@ class Overlay:
 
     is_there: bool = False
     shown: set[KeyframeId] = field(default_factory=set)
-    _first: dict[LogId, int] = field(default_factory=dict)
+    _unnoticed: set[LogId] = field(default_factory=set)
     _clean: dict[bytes, bytes] = field(default_factory=dict)
 
     def look(self, keyframe: KeyframeId, looked: KeyframeLook) -> KeyframeLook:
-        """What became of a keyframe's image with this on the camera; the first one without it withdraws the others."""
+        """What became of a keyframe's image with this on the camera; the first one without it withdraws all before."""
         if self.is_there and looked.latent is not None:
             self.shown.add(keyframe)
-            self._first.setdefault(keyframe.log, keyframe.index)
+            self._unnoticed.add(keyframe.log)
             spoilt = moved_latent(looked.latent, OFF_M)
             self._clean[spoilt] = looked.latent
             return replace(looked, latent=spoilt)
-        first = self._first.pop(keyframe.log, keyframe.index)
-        return looked if first == keyframe.index else replace(looked, hidden=HIDDEN, withdrawn=keyframe.index - first)
+        if keyframe.log not in self._unnoticed:
+            return looked
+        self._unnoticed.discard(keyframe.log)
+        return replace(looked, hidden=HIDDEN, withdrawn=keyframe.index)
 
     def without(self, latent: bytes, hidden: Mask) -> bytes:  # noqa: ARG002 - as perception's own does
         """Take it out of a latent."""
