@@ -27,6 +27,7 @@ from flocc_agent.core.log_copy import EncodedRecords, _Block
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.offers import Offers
+from flocc_agent.core.own_log import OwnLog
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.plausibility import Doubts
 from flocc_agent.core.prospects import Prospect, Prospects
@@ -199,7 +200,7 @@ def _without_the_last_keyframe(graph: Any) -> Any:
 def _drops_every_second_keyframe(original: Callable[..., Any]) -> Callable[..., Any]:
     taken: dict[int, int] = {}
 
-    def broken(self: Robot, event: Any) -> Any:
+    def broken(self: OwnLog, event: Any) -> Any:
         taken[id(self)] = taken.get(id(self), 0) + 1
         return original(self, event) if taken[id(self)] % 2 else []
 
@@ -363,7 +364,7 @@ MUTANTS = (
     # keyframes and places
     Mutant("no candidates", PlaceRecognition, "on_keyframes", always([])),
     Mutant("candidates of own keyframes only", PlaceRecognition, "_among_own", always([])),
-    Mutant("every second keyframe is dropped", Robot, "_on_captured", _drops_every_second_keyframe),
+    Mutant("every second keyframe is dropped", OwnLog, "on_captured", _drops_every_second_keyframe),
     Mutant("the graph has other odometry than was recorded", GraphAssembly, "_add_keyframe", _moves_keyframes),
     # rounds
     Mutant("rounds only on new closures", Rounds, "_grown", always(0)),
@@ -415,7 +416,7 @@ MUTANTS = (
     Mutant("all pairs tell nothing new", Spared, "is_told", always(True)),
     Mutant("two closures are enough", Spared, "__init__", _has_enough_with_two),
     # keyframes taken back
-    Mutant("nothing is taken back", Robot, "_withdraw", always([])),
+    Mutant("nothing is taken back", OwnLog, "_withdraw", always([])),
     Mutant("what was taken back counts", Withdrawals, "counts", always(True)),
     Mutant("pairs of what was taken back stay as they are", Withdrawals, "asks_again", always(False)),
     Mutant("judgements name no withdrawal that they know of", Withdrawals, "unsaid", always([])),
