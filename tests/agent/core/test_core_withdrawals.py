@@ -129,8 +129,9 @@ def test_who_knows_a_keyframe_knows_what_was_taken_back_with_it() -> None:
     keyframes = [record.index for record in log if isinstance(record, KeyframeRecord)]
     withdrawn_at = next(k for k, record in enumerate(log) if isinstance(record, WithdrawalRecord))
     assert keyframes == list(range(TOLD_WITH + 1))
-    assert isinstance(log[withdrawn_at + 1], KeyframeRecord)
-    assert log[withdrawn_at + 1].index == TOLD_WITH
+    following = log[withdrawn_at + 1]
+    assert isinstance(following, KeyframeRecord)
+    assert following.index == TOLD_WITH
 
 
 def test_what_nothing_can_make_better_is_not_registered_again() -> None:
