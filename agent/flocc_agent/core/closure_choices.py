@@ -2,10 +2,10 @@
 
 Each robot has its own log solved, and as the lower robot of a pair both logs together, with the whole back end; one
 choice is under way at a time. A choice is made anew when the logs show other closures than it was made of: more, or
-none of those that were taken back.
+fewer where keyframes were taken back, or some that are doubted now.
 """
 
-from collections import Counter
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -21,8 +21,8 @@ from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 Shown = tuple[int, int, int]
-"""What names the closures between two robots, within the lower and within the higher one, of which a choice was made; 0
-where there are none."""
+"""What closures between two robots say, within the lower and within the higher one: of which a choice was made."""
+NONE_SHOWN = 0
 
 FAILURES_MAX = 6
 
@@ -75,16 +75,18 @@ class ClosureChoices:
 
     def look(self, graph: PoseGraph) -> None:
         """Take in what the logs show now: by the other robot, and the own log by its own name."""
-        names: Counter[tuple[LogId, LogId]] = Counter()
-        for closure in graph.closures:
-            low, high = sorted((closure.query.log, closure.match.log))
-            names[low, high] ^= _name(closure)
-        own = names[self._own, self._own]
-        others = {high for low, high in names if low == self._own} | set(self._choices)
-        self._shown = {
-            other: (names[self._own, other], own, names[other, other]) if other != self._own else (0, own, 0)
-            for other in sorted(others)
+        said: dict[tuple[LogId, LogId], int] = {}
+        for c in graph.closures:
+            low, high = sorted((c.query.log, c.match.log))
+            said[low, high] = _sum_of(c, said.get((low, high), NONE_SHOWN))
+        chosen = {other for other, choice in self._choices.items() if choice.shown is not None}
+        others = {high for low, high in said if low == self._own} | chosen
+        own = said.get((self._own, self._own), NONE_SHOWN)
+        shown = {
+            high: (said.get((self._own, high), NONE_SHOWN), own, said.get((high, high), NONE_SHOWN))
+            for high in sorted(others - {self._own})
         }
+        self._shown = {**shown, self._own: (NONE_SHOWN, own, NONE_SHOWN)} if self._own in others else shown
 
     def deadline(self) -> float:
         """When the next choice begins, or the one under way is given up; never where all that is shown was chosen."""
@@ -148,9 +150,10 @@ class ClosureChoices:
         return min(due, default=float("inf"))
 
 
-def _name(closure: LoopClosure) -> int:
-    """What tells one closure from another, and from another measurement between the same keyframes."""
-    return hash((closure.query, closure.match, np.asarray(closure.T_query_match_unscaled).tobytes()))
+def _sum_of(closure: LoopClosure, before: int) -> int:
+    """A checksum of what closures say, one after the other."""
+    said = f"{closure.query} {closure.match} {closure.doubt}".encode()
+    return zlib.crc32(said + closure.T_query_match_unscaled.tobytes(), before)
 
 
 def used_closures(

@@ -417,12 +417,12 @@ class DistributedOptimisation:
         return True
 
     def _bears_out(self, other: LogId, listed: tuple[int, ...]) -> bool:
-        """Whether closures here tie all of these own keyframes to another robot."""
+        """Whether closures here that nothing doubts tie all of these own keyframes to another robot."""
         tied = {
             own.index
             for c in self._graph.closures
             for own, there in ((c.query, c.match), (c.match, c.query))
-            if own.log == self._own and there.log == other
+            if own.log == self._own and there.log == other and not c.doubt
         }
         return tied.issuperset(listed)
 

@@ -51,6 +51,7 @@ class Source:
     seen: tuple[tuple[KeyframeId, KeyframeId], ...] = SEEN
     revision: int = 1
     length: int = 4
+    doubt: str = ""
     shift_m: float = 0.0
 
     @property
@@ -60,7 +61,8 @@ class Source:
     def graph(self) -> PoseGraph:
         trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], self.length, axis=0)) for log in (A, B, C)}
         T = pose(np.eye(3), np.array([self.shift_m, 0.0, 0.0]))
-        return PoseGraph(trajectories, tuple(LoopClosure(query, match, T) for query, match in self.seen))
+        closures = tuple(LoopClosure(query, match, T, doubt=self.doubt) for query, match in self.seen)
+        return PoseGraph(trajectories, closures)
 
 
 @dataclass
@@ -267,6 +269,19 @@ def test_a_pair_is_chosen_anew_when_its_closures_change_but_not_at_once() -> Non
     effects, _ = bench.turn(PARAMETERS.choose_s + 0.2)
     assert told(effects)["c"].keyframes == (0, 2)
     assert told(effects)["c"].edition > edition
+
+
+@pytest.mark.parametrize("doubt", ["", "it may be a twin"])
+def test_closures_that_are_taken_back_or_doubted_are_shared_no_more(doubt: str) -> None:
+    bench = Bench().shares()
+    bench.b.on_shared_poses(A, said(B, 2, 7, (1,)), 0.3)
+    assert bench.b._pairs[A].keyframes
+    assert bench.b._pairs[C].keyframes
+    bench.source.seen, bench.source.doubt = SEEN if doubt else (), doubt
+    bench.source.revision += 1
+    bench.turn(PARAMETERS.choose_s, ClosureState.EXCLUDED)
+    bench.turn(PARAMETERS.choose_s + 0.2, ClosureState.EXCLUDED)
+    assert bench.b._pairs[A].keyframes == bench.b._pairs[C].keyframes == ()
 
 
 def test_closures_that_were_taken_back_are_used_no_more_and_others_in_their_place_are_chosen() -> None:
