@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from flocc_lab.graph_family.family_campaign import run, table
-from flocc_lab.graph_family.family_spec import drawn
+from flocc_lab.graph_family.family_spec import Lengths, drawn
 from flocc_lab.graph_family.methods import Method, flocc, methods, settings
 
 
@@ -15,8 +15,9 @@ def main() -> None:
     options = parsed(sys.argv[1:])
     chosen = chosen_methods(options.methods.split(",") if options.methods else [], options.set, options.earlier)
     seeds = range(options.first, options.first + options.draws)
-    small = [seed for seed in seeds if sum(drawn(seed).keyframes) <= options.keyframes_max]
-    verdicts = run(small, chosen, options.rows, options.limit_s)
+    specs = [spec for spec in map(drawn, seeds) if sum(spec.keyframes) <= options.keyframes_max]
+    wanted = [spec.seed for spec in specs if options.lengths in (None, spec.lengths.value)]
+    verdicts = run(wanted, chosen, options.rows, options.limit_s)
     sys.stdout.write(table([v for v in verdicts if v.method in chosen]) + "\n")
 
 
@@ -26,6 +27,8 @@ def parsed(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--draws", type=int, default=60, help="number of graphs")
     parser.add_argument("--first", type=int, default=1, help="seed of the first graph")
     parser.add_argument("--keyframes-max", type=int, default=10**9, help="leave out graphs with more keyframes")
+    lengths = [kind.value for kind in Lengths]
+    parser.add_argument("--lengths", choices=lengths, help="only graphs whose closures are known so far")
     parser.add_argument("--methods", default="flocc", help="names with commas between them; empty: all")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="flocc so changed, too")
     parser.add_argument("--earlier", type=Path, help="another checkout, whose default runs beside")
