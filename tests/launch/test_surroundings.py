@@ -204,6 +204,8 @@ def until(true: Callable[[], bool], timeout_s: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 def test_an_agent_lives_through_a_full_disk_and_records_again(tmp_path: Path, small_disk: Path) -> None:
     config, log = tmp_path / "agent.toml", tmp_path / "log"
@@ -270,6 +272,7 @@ def test_operators_on_an_interface_that_does_not_exist_hear_of_it(
     agent = tmp_path / "agent.toml"
     agent.write_text('name = "r1"\nswarm = "alone"\n[transport]\ninterface = "wlan7"\n')
     monkeypatch.setattr(zenoh_admin, "SCOUT_S", 0.1)
+    monkeypatch.setattr(zenoh_admin, "FIND_TIMEOUTS", 0.1)
     assert run(monkeypatch, *words, "--config", str(agent)) == 2
     assert "the interface 'wlan7' does not exist; there is lo" in capsys.readouterr().err
 
