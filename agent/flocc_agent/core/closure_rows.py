@@ -122,27 +122,28 @@ class ClosureTable:
         if of_pair is None:
             of_pair = self._of_pair[key] = array("Q"), array("I")
         numbers, rows = of_pair
-        packed = pair_number(pair)
+        packed, row = pair_number(pair), len(self._rows)
+        logs = key if key[0] != key[1] else key[:1]
         at, is_there = place_of(numbers, packed)
         if is_there:
             held = rows[at]
             if self._order(log, number, pair) >= self._order(*self._registered(held), pair):
                 return False
-            for each in set(key):
+            for each in logs:
                 self._of_log[each].remove(held)
             self._built.pop(held, None)
-            rows[at] = len(self._rows)
+            rows[at] = row
         else:
             numbers.insert(at, packed)
-            rows.insert(at, len(self._rows))
+            rows.insert(at, row)
             self._count += 1
-            for end in (pair.low, pair.high):
-                self._count_end(end)
-        for each in set(key):
+            self._count_end(pair.low)
+            self._count_end(pair.high)
+        for each in logs:
             of_log = self._of_log.get(each)
             if of_log is None:
                 of_log = self._of_log[each] = array("I")
-            of_log.append(len(self._rows))
+            of_log.append(row)
         self._rows.append(self._packed(log, number, closure))
         return True
 
@@ -222,9 +223,11 @@ class ClosureTable:
         counts = self._ends.get(keyframe.log)
         if counts is None:
             counts = self._ends[keyframe.log] = array("H")
-        if keyframe.index >= len(counts):
-            counts.extend([0] * (keyframe.index + 1 - len(counts)))
-        counts[keyframe.index] = min(counts[keyframe.index] + 1, COUNT_MAX)
+        index = keyframe.index
+        if index >= len(counts):
+            counts.extend([0] * (index + 1 - len(counts)))
+        if counts[index] < COUNT_MAX:
+            counts[index] += 1
 
     def links(self) -> list[tuple[LogId, LogId]]:
         """Pairs of logs with closures between them, or within one."""
@@ -300,7 +303,7 @@ class ClosureTable:
             *closure.T_query_match_unscaled,
             closure.match_ratio,
             scale or 0.0,
-            *(NO_COVARIANCE if triangle is None else triangle.numpy().tolist()),
+            *(NO_COVARIANCE if triangle is None else triangle.floats()),
         )
 
     def _registered(self, row: int) -> tuple[LogId, int]:
