@@ -6,7 +6,6 @@ finite and within its limits from construction on: what cannot be received canno
 
 import math
 from dataclasses import dataclass
-from struct import unpack
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ ARRAY_BYTES_MAX = 48 * 1024
 DIMENSIONS_MAX = 3
 SCALE_MAX = 1e30
 _NUMPY = {"f8": "<f8", "f4": "<f4", "f2": "<f2", "i1": "|i1", "u1": "|u1", "u4": "<u4"}
-_STRUCT = {"f8": "d", "f4": "f", "f2": "e", "i1": "b", "u1": "B", "u4": "I"}
 _ITEM_BYTES = {dtype: np.dtype(name).itemsize for dtype, name in _NUMPY.items()}
 _ALWAYS_FINITE = frozenset({"i1", "u1", "u4"})
 
@@ -70,11 +68,6 @@ class Array:
     def numpy(self) -> NDArray[np.float64]:
         """Values as float64, scaled."""
         return self._stored().astype(np.float64) * self.scale
-
-    def floats(self) -> tuple[float, ...]:
-        """The same one after the other; of few values in a fraction of the time that an array takes."""
-        values = unpack(f"<{len(self.data) // _ITEM_BYTES[self.dtype]}{_STRUCT[self.dtype]}", self.data)
-        return tuple([value * self.scale for value in values])
 
     def _stored(self) -> NDArray[Any]:
         return np.frombuffer(self.data, dtype=_NUMPY[self.dtype]).reshape(self.shape)

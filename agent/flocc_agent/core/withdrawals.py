@@ -36,7 +36,7 @@ class Withdrawals:
     def __init__(self) -> None:
         self._said: dict[tuple[LogId, LogId], list[_Said]] = {}
         self._told_of: set[LogId] = set()
-        """Logs of which some log says that keyframes are withdrawn; hardly any are, and every judgement is looked at."""
+        """Logs of which some log says that keyframes are withdrawn: few of them, while every judgement is looked at."""
         self._judged_anew: dict[CandidatePair, int] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
