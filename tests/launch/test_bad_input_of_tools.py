@@ -210,6 +210,7 @@ def test_a_page_on_a_port_in_use_is_one_sentence(
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.parametrize(("command", "said"), [("doctor", "nobody is there: in 1.5 s no agent"), ("view", "no ")])
 def test_a_swarm_that_nobody_answers_for_is_one_sentence(
     command: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

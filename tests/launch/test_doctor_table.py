@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from tests.launch import synthetic_run
 from tests.launch.synthetic_run import Synthetic
-from tests.launch.test_doctor import PAIR, SETUPS, Story, corrections_lost
+from tests.launch.test_doctor import PAIR, SETUPS, Story, closures_not_connecting, corrections_lost
 from tests.launch.test_ground_truth import lifted, truth_of
 from tests.launch.test_status import apart, pair, row
 
 from flocc_agent.config import PerceptionConfig, TransportConfig
 from flocc_agent.core.reports import CAME_APART
+from flocc_agent.core.tentative_joins import SECOND_PLACE
 from flocc_agent.geometry import pose_from_tq, so3_exp, tq_from_pose
 from flocc_agent.runtime.robot_result import ClosureKnown
 from flocc_agent.runtime.trajectory import write_tum
@@ -32,10 +33,11 @@ from flocc_launch.runs.run_folder import RunFolder
 from flocc_launch.setup import cache
 
 PAGE = Path(__file__).parents[2] / "docs/doctor.md"
+HELD_CLOSURE = f"closure r1/3 - r2/5: {SECOND_PLACE}of 5 places where r1 and r2 would be side by side 3 do not match"
 KINDS = {"well": Severity.GOOD, "blocks": Severity.BLOCKS, "hinders": Severity.HINDERS, "note": Severity.NOTE}
 OF = {
-    "run": ("diagnose", "steps", "general", "cameras"),
-    "swarm": ("live", "live_steps", "cameras"),
+    "run": ("diagnose", "steps", "held_joins", "general", "cameras"),
+    "swarm": ("live", "live_steps", "held_joins", "cameras"),
     "machine": ("installation", "network_check"),
 }
 
@@ -104,6 +106,11 @@ def hanging() -> Story:
     return story
 
 
+def held_join() -> Story:
+    story = closures_not_connecting()
+    return story.say(14.5, "r1", "optimised", term=1, round=4, components=[["r1"], ["r2"]], warnings=[HELD_CLOSURE])
+
+
 def looking_alike(elsewhere: str = "r2/25", apart: str = "r2/8", step_m: float = -1.0) -> Story:
     """Two robots that are joined at one place and walk apart; a closure puts the first one's keyframe elsewhere."""
     story = merged()
@@ -145,6 +152,7 @@ STORIES: dict[str, Callable[[], Story]] = {
     "camera": doubting("of a later version", 2.0),
     "merged": merged,
     "places-alike": looking_alike,
+    "join-held": held_join,
     "merged-doubtfully": doubting("mounting", 179.9, "180 degrees about z (forward)", withheld=True),
     "unknown": lambda: corrections_lost().say(
         13.1, "r2", "correction", term=1, round=2, map_frame="map/r2", T_map_odom=[0.0] * 3 + [0.0, 0.0, 0.0, 1.0]
@@ -193,6 +201,7 @@ SWARMS = {
     "no-descriptors": apart(logs={"r1": [9, 1]}, peer_logs={"r2": [9, 1]}),
     "low-similarity": apart(best_similarities={"r2": 0.41}),
     "registrations-rejected": apart(pairs=[pair(rejected=3, best_ratio=0.21)]),
+    "join-held": apart(pairs=[pair(accepted=3)], solver={"components": [["r1"], ["r2"]], "warnings": [HELD_CLOSURE]}),
     "closures-not-connecting": apart(pairs=[pair(accepted=3)], solver={"components": [["r1"], ["r2"]]}),
     "merged-doubtfully": [row("r1", "r2"), row("r2", "r1", camera=[doubt("mounting", 179.9, True)])],
     "focal-length": [row("r1", "r2", camera=[doubt("focal length", 0.8)]), row("r2", "r1")],

@@ -46,6 +46,7 @@ from flocc_launch.simulation.simulate import simulate
 from flocc_launch.swarm.launching import launch
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.records import ClosureRecord, RejectionRecord, WithdrawalRecord, decode_record, encode_record
 
 
 @pytest.fixture(scope="module")
@@ -331,9 +332,20 @@ def test_a_team_that_never_found_itself_adds_nothing(block: Path, tmp_path: Path
 
 def test_maps_of_teams_that_never_met_become_one(block: Path, tmp_path: Path) -> None:
     mission(tmp_path / "run", AGAIN, lives={"r1": 7})
+    other = LogId("r1", 7)
+    taken_back = WithdrawalRecord(other, 0, 3, is_final=True)
+    with closing(sqlite3.connect(tmp_path / "run/robots/r1/store/robot.sqlite")) as store, store:
+        (count,) = store.execute("SELECT COUNT(*) FROM records WHERE log = ?", (str(other),)).fetchone()
+        store.execute(PUT_RECORD, row("records", str(other), count, encode_record(taken_back)))
     save_map(tmp_path / "run", tmp_path / "other")
     merged = merge_maps(block, tmp_path / "other", tmp_path / "both", clock_ms=lambda: 5)
     opened = MapFolder.open(tmp_path / "both")
+    first_said, *later = (decode_record(data) for data in opened.records[LogId(MERGER, 5)])
+    assert first_said == taken_back
+    judged = [record for record in later if isinstance(record, ClosureRecord | RejectionRecord)]
+    assert len(judged) == len(later)
+    ends = {end for record in judged for end in (record.query, record.match) if end.log == other}
+    assert min(end.index for end in ends) >= 3, "what was taken back for good is not looked at"
     assert opened.manifest.frame == "map/r1"
     assert [entry.log for entry in opened.manifest.logs] == ["r1", "r2", "r1~7", f"{MERGER}~5"]
     assert merged.closures >= 10

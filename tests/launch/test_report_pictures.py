@@ -23,7 +23,7 @@ from flocc_agent.core.registration import Registration
 from flocc_agent.geometry import pose_from_tq, so3_exp, tq_from_pose
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.recording import Frame, Recording
-from flocc_launch.report.album import EMPTY, PAIR_SIDE_PX, album_of
+from flocc_launch.report.album import EMPTY, PAIR_SIDE_PX, Album, album_of
 from flocc_launch.report.evaluate import evaluate
 from flocc_launch.report.finish import finish
 from flocc_launch.report.paper_figures import PlotError, write_plots
@@ -46,6 +46,16 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
         yield RunFolder.open(place / "run")
 
 
+@pytest.fixture(scope="module")
+def loaded(seen: RunFolder) -> LoadedRun:
+    return load(seen)
+
+
+@pytest.fixture(scope="module")
+def album(seen: RunFolder, loaded: LoadedRun) -> Album:
+    return album_of(seen, loaded)
+
+
 def test_every_link_leads_to_something_on_the_page(seen: RunFolder) -> None:
     html = (seen.path / "report.html").read_text()
     parser = Balance()
@@ -57,8 +67,8 @@ def test_every_link_leads_to_something_on_the_page(seen: RunFolder) -> None:
     assert not re.search(r"https?://|<script|<link|@import|url\(|src=", re.sub(r"base64,[^\"]*", "", html))
 
 
-def test_a_closure_on_the_map_opens_its_two_keyframes(seen: RunFolder) -> None:
-    album, html = album_of(seen, load(seen)), (seen.path / "report.html").read_text()
+def test_a_closure_on_the_map_opens_its_two_keyframes(seen: RunFolder, album: Album) -> None:
+    html = (seen.path / "report.html").read_text()
     assert album.pairs
     for each in album.pairs:
         sheet = re.search(rf'<section id="{re.escape(each.name)}".*?</section>', html, re.S)
@@ -75,9 +85,7 @@ def difference(frame: Frame, shown: NDArray[Any]) -> float:
     return float(np.abs(shown.astype(float) - whole).mean())
 
 
-def test_a_keyframe_shows_the_picture_of_its_stamp(seen: RunFolder) -> None:
-    loaded = load(seen)
-    album = album_of(seen, loaded)
+def test_a_keyframe_shows_the_picture_of_its_stamp(seen: RunFolder, loaded: LoadedRun, album: Album) -> None:
     for keyframe, picture in list(album.pictures.items())[:4]:
         path = seen.recording(keyframe.log.robot)
         assert path is not None
@@ -93,9 +101,7 @@ def test_a_keyframe_shows_the_picture_of_its_stamp(seen: RunFolder) -> None:
     assert sorted(map(b64decode, held)) == sorted(picture.jpeg for picture in album.pictures.values())
 
 
-def test_the_lines_are_what_the_front_end_verifies(seen: RunFolder) -> None:
-    loaded = load(seen)
-    album = album_of(seen, loaded)
+def test_the_lines_are_what_the_front_end_verifies(seen: RunFolder, loaded: LoadedRun, album: Album) -> None:
     each = next(each for each in album.pairs if each.fate is Fate.ACCEPTED)
     perception, ends = build_perception(PerceptionConfig()), []
     for keyframe in (each.pair.query, each.pair.match):
@@ -191,7 +197,7 @@ def test_views_are_even_along_the_way_and_not_in_time() -> None:
 def test_figures_are_written_as_png_and_svg(seen: RunFolder, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     run = Path(shutil.copytree(seen.path, tmp_path / "run"))
-    said = evaluate(run, plot=True)
+    said = evaluate(run, plot=True, pairs_max=0)
     names = [f"{name}.{kind}" for name in ("trajectories", "errors") for kind in ("png", "svg")]
     assert [line for line in said.splitlines() if line.startswith("figure: ")] == [
         f"figure: {(run / name).resolve()}" for name in names
@@ -201,7 +207,7 @@ def test_figures_are_written_as_png_and_svg(seen: RunFolder, tmp_path: Path) -> 
         assert drawn is not None
         assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 50
     before = [(run / name).read_bytes() for name in names]
-    evaluate(run, plot=True)
+    evaluate(run, plot=True, pairs_max=0)
     assert [(run / name).read_bytes() for name in names] == before, "not the same figures"
 
 
@@ -215,10 +221,10 @@ def test_a_run_without_anything_to_draw_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_sheet_fits_a_phone(seen: RunFolder, tmp_path: Path) -> None:
+def test_a_sheet_fits_a_phone(seen: RunFolder, album: Album, tmp_path: Path) -> None:
     """In headless Chromium, whose window is no narrower than 500 px: so in a frame of 390."""
     shutil.copy(seen.path / "report.html", tmp_path)
-    name = album_of(seen, load(seen)).pairs[0].name
+    name = album.pairs[0].name
     script = (
         "let page = this.contentDocument, root = page.documentElement, sheet = page.querySelector('.sheet:target'),"
         "tall = sheet.querySelector('svg.tall').getBoundingClientRect(), flat = sheet.querySelector('svg.flat');"

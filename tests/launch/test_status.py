@@ -73,6 +73,7 @@ def test_an_agents_answer_is_read_and_a_strange_one_is_shown_as_such() -> None:
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 def test_a_swarm_that_nobody_is_in_is_one_sentence() -> None:
     config = TransportConfig(control_listen=("tcp/127.0.0.1:0",), multicast=False)
     with pytest.raises(StatusError, match=r"swarm nobody: nobody is there: in 0\.6 s no agent"):
@@ -164,11 +165,13 @@ def test_checkpoints_are_asked_for_only_where_perception_needs_them(tmp_path: Pa
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 def test_two_zenoh_peers_find_each_other_through_a_third() -> None:
     assert network_check.by_gossip(TransportConfig())
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 def test_two_zenoh_peers_of_this_machine_find_each_other() -> None:
     assert network_check.two_peers(TransportConfig(), by_multicast=False)
 

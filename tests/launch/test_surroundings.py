@@ -204,6 +204,8 @@ def until(true: Callable[[], bool], timeout_s: float = 60.0) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 def test_an_agent_lives_through_a_full_disk_and_records_again(tmp_path: Path, small_disk: Path) -> None:
     config, log = tmp_path / "agent.toml", tmp_path / "log"

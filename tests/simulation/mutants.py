@@ -27,6 +27,7 @@ from flocc_agent.core.log_copy import EncodedRecords, _Block
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.offers import Offers
+from flocc_agent.core.own_log import OwnLog
 from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.plausibility import Doubts
 from flocc_agent.core.prospects import Prospect, Prospects
@@ -198,7 +199,7 @@ def _without_the_last_keyframe(graph: Any) -> Any:
 def _drops_every_second_keyframe(original: Callable[..., Any]) -> Callable[..., Any]:
     taken: dict[int, int] = {}
 
-    def broken(self: Robot, event: Any) -> Any:
+    def broken(self: OwnLog, event: Any) -> Any:
         taken[id(self)] = taken.get(id(self), 0) + 1
         return original(self, event) if taken[id(self)] % 2 else []
 
@@ -362,7 +363,7 @@ MUTANTS = (
     # keyframes and places
     Mutant("no candidates", PlaceRecognition, "on_keyframes", always([])),
     Mutant("candidates of own keyframes only", PlaceRecognition, "_among_own", always([])),
-    Mutant("every second keyframe is dropped", Robot, "_on_captured", _drops_every_second_keyframe),
+    Mutant("every second keyframe is dropped", OwnLog, "on_captured", _drops_every_second_keyframe),
     Mutant("the graph has other odometry than was recorded", GraphAssembly, "_add_keyframe", _moves_keyframes),
     # rounds
     Mutant("rounds only on new closures", Rounds, "_grown", always(0)),

@@ -15,11 +15,11 @@ from flocc_agent.core.log_copy import EncodedRecords
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.offers import Offers
+from flocc_agent.core.own_log import OwnLog
 from flocc_agent.core.place_recognition import Candidate
 from flocc_agent.core.pose_graph import GraphSolution
 from flocc_agent.core.pulls import Pulls
 from flocc_agent.core.restored import Restored
-from flocc_agent.core.robot import Robot
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
 from flocc_launch.simulation.campaign import run_checked
 from flocc_launch.simulation.disk import Disk
@@ -154,16 +154,16 @@ def test_a_disk_that_forgets_what_was_published_is_noticed(monkeypatch: pytest.M
 
 
 def test_a_robot_that_sends_before_it_writes_loses_what_it_published(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = Robot._append
+    original = OwnLog.append
 
-    def hasty(self: Robot, record: Any, now: float) -> list[Effect]:
+    def hasty(self: OwnLog, record: Any, now: float) -> list[Effect]:
         effects = original(self, record, now)
         return [
             *(e for e in effects if isinstance(e, Broadcast)),
             *(e for e in effects if not isinstance(e, Broadcast)),
         ]
 
-    monkeypatch.setattr(Robot, "_append", hasty)
+    monkeypatch.setattr(OwnLog, "append", hasty)
     cuts = tuple(
         Fault(at_s=t + dt, kind=kind, robots=("r1",), value=value)
         for t in range(4, 24, 2)

@@ -19,7 +19,7 @@ def later(number: int) -> UnknownRecord:
 
 def write(robots: Robots, name: str, record: Record) -> None:
     """Let a robot of a later version append a record of its own kind."""
-    robots.carry_out(name, robots.cores[name]._append(record, robots.now_s))
+    robots.carry_out(name, robots.cores[name].own_log.append(record, robots.now_s))
 
 
 def logs(robot: Robot) -> dict[str, tuple[int, int]]:

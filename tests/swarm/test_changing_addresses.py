@@ -14,7 +14,7 @@ from tests.swarm.robots import RobotProcess, agent_configs, neighbours, reached
 
 from flocc_agent.config import TransportConfig
 
-pytestmark = [pytest.mark.swarm, pytest.mark.root, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.root, pytest.mark.slow]
 
 NAMES = ("r1", "r2")
 MEET_S = 25.0

@@ -56,6 +56,7 @@ def text_of(html: str) -> str:
 
 
 @pytest.mark.swarm
+@pytest.mark.beside
 @pytest.mark.slow
 def test_a_browser_sees_the_new_leader_the_partition_and_the_merged_map(tmp_path: Path) -> None:
     faults = [

@@ -11,7 +11,7 @@ from tests.swarm.robots import RobotProcess, agent_configs, frames, leaders, log
 
 from flocc_launch.swarm.chaos_orders import disturb, parse_order
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 NAMES = ("r1", "r2", "r3")
 LEADER_TIMEOUT_S = 3.0

@@ -57,7 +57,7 @@ async def write(agent: Agent, number: int) -> None:
 
     def handle(event: Event, now: float) -> list[Effect]:
         del vars(robot)["handle"]
-        return [*robot._append(record, now), *robot.handle(event, now)]
+        return [*robot.own_log.append(record, now), *robot.handle(event, now)]
 
     vars(robot)["handle"] = handle
     await reached(lambda: "handle" not in vars(robot), agent.status)

@@ -91,6 +91,7 @@ async def test_a_cable_pulled_for_30_s_splits_the_swarm_and_heals(tmp_path: Path
             assert frames(robots) == {"map/r1"}
 
 
+@pytest.mark.beside
 async def test_20_percent_packet_loss_loses_no_record(tmp_path: Path) -> None:
     needs_namespaces("iptables")
     with hosts(3) as machines:
@@ -109,6 +110,7 @@ async def test_20_percent_packet_loss_loses_no_record(tmp_path: Path) -> None:
             assert leaders(robots) == {"r1"}
 
 
+@pytest.mark.beside
 async def test_a_one_way_link_is_survived(tmp_path: Path) -> None:
     """r2 no longer hears r3; both still hear r1, through which records keep flowing."""
     needs_namespaces("iptables")
@@ -125,6 +127,7 @@ async def test_a_one_way_link_is_survived(tmp_path: Path) -> None:
             assert leaders(robots) == {"r1"}
 
 
+@pytest.mark.beside
 async def test_a_robot_moves_to_another_host(tmp_path: Path) -> None:
     """r1, whom everybody dials, comes back from its disk at an address that nobody has on the roster."""
     needs_namespaces()

@@ -14,7 +14,7 @@ import pytest
 from tests.agent.runtime.loopback import loopback_configs
 from tests.swarm.robots import RobotProcess, agent_configs, frames, logs_equal, neighbours, reached
 
-pytestmark = [pytest.mark.swarm, pytest.mark.slow]
+pytestmark = [pytest.mark.swarm, pytest.mark.beside, pytest.mark.slow]
 
 BEFORE = "4849a15"
 """The first state with protocol 5, which the next one must go on with; older ones speak 4, and robots of two protocols

@@ -131,6 +131,8 @@ def held_closures(
     """
     if config.formulation is Formulation.BASE or config.solver not in (Solver.GNC_TLS, Solver.GNC_GM):
         return {}
+    doubted = {k: f"closure {c.query} - {c.match}: {c.doubt}" for k, c in closures.items() if c.doubt}
+    closures = {k: c for k, c in closures.items() if k not in doubted}
     ways = {log: Way.of(trajectory, config) for log, trajectory in trajectories.items()}
     of_pairs = measured_by_pair(ways, {k: c for k, c in closures.items() if c.support == 1}, config)
     bound, bound_of_one = (float(chdtri(freedom, 1.0 - config.inlier_probability)) for freedom in (6.0, 1.0))
@@ -143,7 +145,7 @@ def held_closures(
             k = int(of_pair.closures.ids[n])
             named = f"closure {closures[k].query} - {closures[k].match}"
             held[k] = f"{named}: held until another one agrees with it, because {reason}"
-    return held
+    return held | doubted
 
 
 def measured_by_pair(

@@ -5,7 +5,7 @@ other places of robots and scales of their odometry. A round that follows one cl
 all that was used together with it from where the round before ended, by the chains between closures: one or two linear
 systems, in which everything moves. A whole round follows where what is new demands it: where a closure that was used
 disagrees, or one that was not agrees; where a second new closure is turned away at one place; and in any case when
-enough is new. A single closure that disagrees is turned away until then.
+enough is new, or a closure that counted is doubted. A single closure that disagrees is turned away until then.
 """
 
 from collections.abc import Mapping, Sequence
@@ -64,6 +64,8 @@ def settled_round(graph: PoseGraph, config: BackendConfig, initial: GraphSolutio
     if not _is_small(graph, config, last):
         return None
     seen = {(c.query, c.match): c for c in last.closures}
+    if any(closure.doubt and _counts(seen, closure) for closure in graph.closures):
+        return None
     news = _news(graph, seen, config)
     if news is None:
         return None

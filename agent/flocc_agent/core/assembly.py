@@ -7,6 +7,7 @@ numbers, and become matrices when somebody wants them.
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
 from struct import Struct
 
@@ -18,10 +19,12 @@ from flocc_agent.core.cold_storage import ColdPieces, RowPieces
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.measured_records import MeasuredRecords
 from flocc_agent.core.parameters import KEYFRAMES_HELD
-from flocc_agent.core.pose_graph import MeasuredFactor, PoseGraph, Trajectory, groups_of
+from flocc_agent.core.pose_graph import LoopClosure, MeasuredFactor, PoseGraph, Trajectory, groups_of
 from flocc_agent.core.pulls import remember
+from flocc_agent.core.registration import ODOMETRY_CORRESPONDENCES_MIN
 from flocc_agent.core.saved_map import SavedMap
 from flocc_agent.core.spared import AGREE_LENGTHS, AGREE_RATIO, AGREE_STEPS, Foretold
+from flocc_agent.core.tentative_joins import TentativeJoins
 from flocc_agent.core.withdrawals import Withdrawals
 from flocc_agent.geometry import between, inverse, pose7, pose_from_tq, poses_from_tq
 from flocc_protocol.codec import Pose7
@@ -79,6 +82,11 @@ class _Odometry:
         found = np.concatenate([self._matrices[:known], poses_from_tq(rows)])
         self._matrices = np.empty((0, 4, 4)) if self._poses.is_cold else found
         return found
+
+    def poses(self, indices: Sequence[int]) -> Float:
+        """`T_odom_keyframe` (K, 4, 4) of some keyframes."""
+        rows = b"".join(self._poses.row(index) for index in indices)
+        return poses_from_tq(np.frombuffer(rows).reshape(-1, 7))
 
     def pose(self, index: int) -> Float:
         """`T_odom_keyframe` (4, 4)."""
@@ -147,6 +155,7 @@ class GraphAssembly:
         self._odometry: dict[LogId, _Odometry] = {}
         self.withdrawals = Withdrawals()
         self._closures = ClosureTable(cold_closures, closures_built_max, self.withdrawals.rank)
+        self._tentative = TentativeJoins(self._closures, self._odometry.get)
         self._reads_all = True
         self._early: dict[KeyframeId, int] = {}
         self._measured = MeasuredRecords()
@@ -175,8 +184,8 @@ class GraphAssembly:
                 self._add_keyframe(new.log, record)
             case ClosureRecord():
                 return self._add_closure(new, record)
-            case RejectionRecord(query, match):
-                self.withdrawals.on_judged(new.log, new.number, CandidatePair.of(query, match))
+            case RejectionRecord():
+                self._add_rejection(new, record)
             case WithdrawalRecord():
                 return self._withdraw(new, record)
             case LatentRecord():
@@ -276,7 +285,17 @@ class GraphAssembly:
         measured = self._measured.factors(self._odometry, self._known)
         unread = {KeyframeId(log, index) for log, odometry in self._odometry.items() for index in odometry.unread}
         closures = self._closures.closures(lambda log: len(trajectories.get(log, ())), unread)
-        return PoseGraph(trajectories, tuple(closures), measured=measured, saved=self._saved)
+        return PoseGraph(trajectories, tuple(map(self._doubted, closures)), measured=measured, saved=self._saved)
+
+    def _doubted(self, closure: LoopClosure) -> LoopClosure:
+        """A closure, with why it is doubted where it is."""
+        pair = CandidatePair.of(closure.query, closure.match)
+        why = self._tentative.of(pair.low.log, pair.high.log).doubted.get(pair)
+        return closure if why is None else replace(closure, doubt=why)
+
+    def asked(self, pair: CandidatePair) -> tuple[CandidatePair, ...]:
+        """Pairs that would tell whether the joins of a pair's two logs are right."""
+        return self._tentative.of(pair.low.log, pair.high.log).asked
 
     def _trajectory(self, log: LogId) -> Trajectory:
         T_odom_keyframe = self._odometry[log].matrices()
@@ -307,15 +326,26 @@ class GraphAssembly:
         if not self.withdrawals.counts(new.log, new.number, pair):
             return [pair]
         if self._closures.add(new.log, new.number, record):
+            self._tentative.on_closure(pair)
             self.revision += 1
             self._await((record.query, record.match))
         return []
+
+    def _add_rejection(self, new: NewRecord, record: RejectionRecord) -> None:
+        """A pair that was registered in vain says something of the joins of its logs, where there was much to see."""
+        pair = CandidatePair.of(record.query, record.match)
+        self.withdrawals.on_judged(new.log, new.number, pair)
+        counts = self.withdrawals.counts(new.log, new.number, pair)
+        if counts and record.odometry_correspondences >= ODOMETRY_CORRESPONDENCES_MIN:
+            self._tentative.on_refused(pair)
+            self.revision += bool(self._tentative.of(pair.low.log, pair.high.log).doubted)
 
     def _withdraw(self, new: NewRecord, record: WithdrawalRecord) -> list[CandidatePair]:
         """A robot took keyframes back: the pairs of closures that leave the graph."""
         if not self.withdrawals.add(new.log, new.number, record):
             return []
         gone = self._closures.take_out(record.log, record.first, record.end, self.withdrawals.counts)
+        self._tentative.on_withdrawn(record.log, record.first, record.end, self.withdrawals.is_judged_anew)
         self.revision += bool(gone)
         return gone
 

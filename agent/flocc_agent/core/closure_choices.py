@@ -1,10 +1,11 @@
 """Which closures are right, in distributed mode: decided before robots agree on anything, from logs alone.
 
 Each robot has its own log solved, and as the lower robot of a pair both logs together, with the whole back end; one
-choice is under way at a time. A choice is made anew when the logs show more closures than it was made of.
+choice is under way at a time. A choice is made anew when the logs show other closures than it was made of: more, or
+fewer where keyframes were taken back, or some that are doubted now.
 """
 
-from collections import Counter
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -20,7 +21,8 @@ from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
 Shown = tuple[int, int, int]
-"""Closures between two robots, within the lower and within the higher one: of which a choice was made."""
+"""What closures between two robots say, within the lower and within the higher one: of which a choice was made."""
+NONE_SHOWN = 0
 
 FAILURES_MAX = 6
 
@@ -73,15 +75,18 @@ class ClosureChoices:
 
     def look(self, graph: PoseGraph) -> None:
         """Take in what the logs show now: by the other robot, and the own log by its own name."""
-        ends = Counter(tuple(sorted((c.query.log, c.match.log))) for c in graph.closures)
-        within = {low: count for (low, high), count in ends.items() if low == high}
-        own = within.get(self._own, 0)
+        said: dict[tuple[LogId, LogId], int] = {}
+        for c in graph.closures:
+            low, high = sorted((c.query.log, c.match.log))
+            said[low, high] = _sum_of(c, said.get((low, high), NONE_SHOWN))
+        chosen = {other for other, choice in self._choices.items() if choice.shown is not None}
+        others = {high for low, high in said if low == self._own} | chosen
+        own = said.get((self._own, self._own), NONE_SHOWN)
         shown = {
-            high: (count, own, within.get(high, 0))
-            for (low, high), count in sorted(ends.items())
-            if low == self._own != high
+            high: (said.get((self._own, high), NONE_SHOWN), own, said.get((high, high), NONE_SHOWN))
+            for high in sorted(others - {self._own})
         }
-        self._shown = {**shown, self._own: (0, own, 0)} if own else shown
+        self._shown = {**shown, self._own: (NONE_SHOWN, own, NONE_SHOWN)} if self._own in others else shown
 
     def deadline(self) -> float:
         """When the next choice begins, or the one under way is given up; never where all that is shown was chosen."""
@@ -143,6 +148,12 @@ class ClosureChoices:
     def _due_s(self) -> float:
         due = (max(self._not_before_s, choice.not_before_s) for _, choice in self._open())
         return min(due, default=float("inf"))
+
+
+def _sum_of(closure: LoopClosure, before: int) -> int:
+    """A checksum of what closures say, one after the other."""
+    said = f"{closure.query} {closure.match} {closure.doubt}".encode()
+    return zlib.crc32(said + closure.T_query_match_unscaled.tobytes(), before)
 
 
 def used_closures(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.cold_storage import ColdPieces, RowPieces
-from flocc_agent.core.known_sets import pair_number, place_of
+from flocc_agent.core.known_sets import pair_number, pair_of, place_of
 from flocc_agent.core.parameters import KEYFRAMES_HELD
 from flocc_agent.core.pose_graph import LoopClosure
 from flocc_agent.geometry import inverse, poses_from_tq, symmetric
@@ -54,6 +54,7 @@ WHERE = Struct("<8I3d")
 """Of a row: what comes before the rotation."""
 SCALE_AT = ROW.fields["scale"][1] if ROW.fields is not None else 0
 COUNT_MAX = 2**16 - 1
+LENGTH_MIN = 1e-9
 Rank = Callable[[LogId, int, CandidatePair], int]
 Counts = Callable[[LogId, int, CandidatePair], bool]
 NO_COVARIANCE = bytes(4 * UPPER_TRIANGLE)
@@ -162,7 +163,7 @@ class ClosureTable:
 
     def _of_stretch(self, logs: tuple[LogId, LogId], log: LogId, first: int, end: int) -> list[CandidatePair]:
         numbers, _ = self._of_pair[logs]
-        pairs = (_pair_of(logs, number) for number in numbers)
+        pairs = (pair_of(logs, number) for number in numbers)
         ends = ((pair, (pair.low, pair.high)) for pair in pairs)
         return [pair for pair, both in ends if any(k.log == log and first <= k.index < end for k in both)]
 
@@ -197,7 +198,7 @@ class ClosureTable:
         numbers, rows = of_pair
         found: list[CandidatePair] = []
         for k in range(bisect_left(numbers, max(pair.low.index - reach, 0) * (INDEX_MAX + 1)), len(numbers)):
-            other = _pair_of((pair.low.log, pair.high.log), numbers[k])
+            other = pair_of((pair.low.log, pair.high.log), numbers[k])
             if other.low.index > pair.low.index + reach:
                 break
             if abs(other.high.index - pair.high.index) <= reach and self._tie(pair.low.log, rows[k]).length_m > 0.0:
@@ -211,13 +212,26 @@ class ClosureTable:
 
     def poses(self, closures: Sequence[CandidatePair]) -> Float:
         """What closures say, T_low_high (K, 4, 4) in metres by their first scale; without one no translation."""
+        T, has_length = self.said(closures)
+        T[~has_length, :3, 3] = 0.0
+        return T
+
+    def said(self, closures: Sequence[CandidatePair]) -> tuple[Float, NDArray[np.bool_]]:
+        """What closures say, T_low_high (K, 4, 4), and whether in metres; else the translation is 1 long."""
         rows = np.frombuffer(b"".join(self._rows.row(self._row(closure)) for closure in closures), dtype=ROW)
         T = poses_from_tq(rows["T"])
-        T[:, :3, 3] *= rows["scale"][:, None]
+        lengths = np.linalg.norm(T[:, :3, 3], axis=1)
+        has_length = (rows["has_scale"] > 0) & (rows["scale"] * lengths > 0.0)
+        T[:, :3, 3] *= np.where(has_length, rows["scale"], 1.0 / np.maximum(lengths, LENGTH_MIN))[:, None]
         queries = [KeyframeId(self._logs[row["query_log"]], int(row["query"])) for row in rows]
         back = [query != closure.low for query, closure in zip(queries, closures, strict=True)]
         T[back] = inverse(T[back])
-        return T
+        return T, has_length
+
+    def of_logs(self, low: LogId, high: LogId) -> list[CandidatePair]:
+        """Those between two logs, or within one, in the order of their pairs."""
+        of_pair = self._of_pair.get((low, high))
+        return [] if of_pair is None else [pair_of((low, high), number) for number in of_pair[0]]
 
     def _row(self, pair: CandidatePair) -> int:
         numbers, rows = self._of_pair[pair.low.log, pair.high.log]
@@ -335,9 +349,3 @@ def _float32(values: Array) -> bytes:
     if values.dtype == "f4":
         return values.data
     return np.clip(values.numpy(), -FLOAT32_MAX, FLOAT32_MAX).astype("<f4").tobytes()
-
-
-def _pair_of(logs: tuple[LogId, LogId], number: int) -> CandidatePair:
-    """The pair of two logs that a number stands for."""
-    low, high = divmod(number, INDEX_MAX + 1)
-    return CandidatePair(KeyframeId(logs[0], low), KeyframeId(logs[1], high))

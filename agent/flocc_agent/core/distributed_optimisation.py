@@ -383,8 +383,17 @@ class DistributedOptimisation:
         if self._own not in graph.trajectories:
             return
         self._graph = graph
+        self._drop_unborne()
         self._choices.look(graph)
         self._has_news = True
+
+    def _drop_unborne(self) -> None:
+        """Share nothing more with a lower robot where no closure that counts leads to it any more."""
+        counting = [c for c in self._graph.closures if not c.doubt]
+        tied = {log for c in counting for log in (c.query.log, c.match.log) if self._own in (c.query.log, c.match.log)}
+        for other, pair in self._pairs.items():
+            if other < self._own and other not in tied:
+                pair.keyframes, pair.information, pair.heard, pair.told = (), None, None, None
 
     def _look_at_s(self) -> float:
         """When it is time to take in what the logs gained; never where they gained nothing."""

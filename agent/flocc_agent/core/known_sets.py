@@ -6,7 +6,7 @@ objects take some 200 and 300. A table of pairs is bounded, and finds those of t
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
@@ -16,6 +16,12 @@ from flocc_protocol.messages import CandidatePair
 def pair_number(pair: CandidatePair) -> int:
     """A pair of keyframes of two known logs as one number; numbers are in the order of the pairs."""
     return pair.low.index * (INDEX_MAX + 1) + pair.high.index
+
+
+def pair_of(logs: tuple[LogId, LogId], number: int) -> CandidatePair:
+    """The pair of two logs that a number stands for."""
+    low, high = divmod(number, INDEX_MAX + 1)
+    return CandidatePair(KeyframeId(logs[0], low), KeyframeId(logs[1], high))
 
 
 def place_of(numbers: "array[int]", number: int) -> tuple[int, bool]:
@@ -45,6 +51,17 @@ class PairSet:
     def discard(self, pair: CandidatePair) -> None:
         """Leave a pair out, where it is there."""
         _take_out(self._of_logs.get((pair.low.log, pair.high.log)), pair_number(pair))
+
+    def of_logs(self, low: LogId, high: LogId) -> "array[int]":
+        """Numbers of the pairs of two logs, in their order."""
+        return self._of_logs.get((low, high), array("Q"))
+
+    def keep_of_stretch(self, log: LogId, first: int, end: int, stays: Callable[[CandidatePair], bool]) -> None:
+        """Of the pairs with a keyframe of a log, from one to before another, keep those that are to stay."""
+        for logs in [logs for logs in self._of_logs if log in logs]:
+            pairs = ((number, pair_of(logs, number)) for number in self._of_logs[logs])
+            kept = [number for number, pair in pairs if not _is_of_stretch(pair, log, first, end) or stays(pair)]
+            self._of_logs[logs] = array("Q", kept)
 
 
 class KeyframeSet:
@@ -120,6 +137,10 @@ def is_beside(pair: CandidatePair, other: CandidatePair, reach: int) -> bool:
     """Whether two pairs of the same two logs are of the same stretches."""
     low, high = abs(pair.low.index - other.low.index), abs(pair.high.index - other.high.index)
     return low <= reach and high <= reach
+
+
+def _is_of_stretch(pair: CandidatePair, log: LogId, first: int, end: int) -> bool:
+    return any(each.log == log and first <= each.index < end for each in (pair.low, pair.high))
 
 
 def _put(numbers: "array[int]", number: int) -> None:

@@ -36,6 +36,8 @@ REGISTRATION_TIMEOUT_S = 120.0
 """A registration that gave no answer for this long is tried again; networks on a CPU need much of it."""
 ASLEEP_S = 10.0
 """A robot that was not woken for so long slept, and so did its workers: registrations have so much more time."""
+ASKED_ORDER = 1.0
+"""A pair that is asked for comes before all others, however alike it is."""
 UNLIKELY_AT_ONCE_MAX = 16
 """Pairs that are refused unseen in one step: each is a record, and a burst of them would hold up others."""
 
@@ -136,6 +138,22 @@ class LoopClosing:
             fact = CandidateFound(query=candidate.pair.low, match=candidate.pair.high, similarity=similarity)
             effects.append(Report(fact))
             self._assign(candidate, now)
+        return effects
+
+    def on_asked(self, candidates: Iterable[Candidate], now: float) -> list[Effect]:
+        """Pairs that would tell whether two ways are joined rightly: they come before all others, each once."""
+        effects: list[Effect] = []
+        for candidate in candidates:
+            pair, similarity = candidate.pair, candidate.similarity
+            if self._front_ends.are_apart(pair) or not self._prospects.ask(pair):
+                continue
+            if self._prospects.was_refused_unseen(pair):
+                self._prospects.on_settled(pair)
+                self._resolved.discard(pair)
+            if not self._knows(pair):
+                fact = CandidateFound(query=pair.low, match=pair.high, similarity=round(similarity, 4))
+                effects.append(Report(fact))
+                self._assign(Candidate(pair, ASKED_ORDER), now)
         return effects
 
     def on_offer(self, offer: CandidateOffer, now: float) -> None:

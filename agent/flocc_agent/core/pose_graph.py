@@ -54,6 +54,7 @@ class LoopClosure:
         metric: The translation is in metres and no scale is estimated.
         support: How many closures it counts as where maps are joined; a single visual one may be wrong.
         weight: How much of its information counts: less where what it shows is known to have changed.
+        doubt: Why it counts only where others agree with it; else empty.
     """
 
     query: KeyframeId
@@ -65,6 +66,7 @@ class LoopClosure:
     metric: bool = False
     support: int = 1
     weight: float = 1.0
+    doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,8 @@ agreement is worth, this swarm's registrations tell: a pair is unlikely where th
 agree just a bit better were all refused, so that no threshold depends on place or descriptor. Such a pair is held for
 `HOLD_S`, since later keyframes may agree, and then refused by a record. Nothing is cut for good: one unlikely pair in
 `PROBED_EVERY` is registered all the same, and what lies beside a closure is taken up again. A pair whose latents are
-here is registered in any case.
+here is registered in any case, and so is one that would tell whether two ways are joined rightly
+(`second_places.py`).
 """
 
 import zlib
@@ -34,6 +35,7 @@ TAUGHT_BY_OTHERS_MAX = 128
 """Pairs of others teach as long as fewer are known; then own ones do, so that a robot's work does not grow with the
 pairs of its team."""
 UNLIKELY_MAX = 4000
+ASKED_MAX = 1000
 
 Agreement = Callable[[CandidatePair], float | None]
 """How well the surroundings of two keyframes agree, -1 to 1; None where too little is known of them."""
@@ -61,6 +63,7 @@ class Prospects:
         self._closures = PairSet()
         self._unlikely: PairTable[bool] = PairTable(UNLIKELY_MAX)
         self._held_since_s: dict[CandidatePair, float] = {}
+        self._asked: PairTable[bool] = PairTable(ASKED_MAX)
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -69,6 +72,7 @@ class Prospects:
             "judged": (len(self._fresh) + len(self._judged), 2 * JUDGED_MAX),
             "unlikely": self._unlikely.size(),
             "held": (len(self._held_since_s), UNLIKELY_MAX),
+            "asked": self._asked.size(),
         }
 
     def on_judged(self, pair: CandidatePair, is_closure: bool, is_own: bool = True) -> list[CandidatePair]:
@@ -104,6 +108,18 @@ class Prospects:
         self._held_since_s.pop(pair, None)
         self._found.pop(pair, None)
 
+    def ask(self, pair: CandidatePair) -> bool:
+        """A pair is to be registered in any case; False where that was said before. One refused unseen has a chance."""
+        if pair in self._asked:
+            return False
+        self._asked.put(pair, True)
+        self._held_since_s.pop(pair, None)
+        return True
+
+    def was_refused_unseen(self, pair: CandidatePair) -> bool:
+        """Whether no record says more of a pair than that it was refused unseen."""
+        return pair in self._unlikely
+
     def due_s(self, now: float) -> float:
         """When the next pair has been held long enough."""
         return next((s + HOLD_S for s in self._held_since_s.values() if s + HOLD_S > now), float("inf"))
@@ -121,7 +137,7 @@ class Prospects:
         return Prospect.UNLIKELY if self._is_unlikely(pair) else Prospect.LIKELY
 
     def _is_unlikely(self, pair: CandidatePair) -> bool:
-        if is_probe(pair):
+        if pair in self._asked or is_probe(pair):
             return False
         if pair not in self._found:
             remember(self._found, pair, self._rounded(pair), UNLIKELY_MAX)

@@ -11,7 +11,7 @@ from flocc_agent.core.giving_up import LOOK_PERIOD_S, expendable
 from flocc_agent.core.gossip import Gossip, NewRecord
 from flocc_agent.core.log_copy import BLOCK_RECORDS
 from flocc_agent.core.loop_closing import LoopClosing
-from flocc_agent.core.place_recognition import PlaceRecognition
+from flocc_agent.core.place_recognition import Candidate, PlaceRecognition
 from flocc_agent.core.reports import ClosureWithdrawn, FrontEndsDiffer
 from flocc_agent.core.restored import Restored
 from flocc_protocol.arrays import Array
@@ -50,6 +50,7 @@ class RecordIntake:
         effects: list[Effect] = []
         filled: list[tuple[LogId, int]] = []
         uncounted: list[CandidatePair] = []
+        judged: dict[tuple[LogId, LogId], CandidatePair] = {}
         for new in new_records:
             uncounted += self._assembly.add(new)
             if (new.number + 1) % BLOCK_RECORDS == 0:
@@ -65,19 +66,34 @@ class RecordIntake:
                 case LatentRecord(index):
                     self._closing.latents.names.add(KeyframeId(new.log, index), new.number)
                 case ClosureRecord(query, match):
-                    self._closing.on_closure(CandidatePair.of(query, match), now)
+                    pair = CandidatePair.of(query, match)
+                    judged[pair.low.log, pair.high.log] = pair
+                    self._closing.on_closure(pair, now)
                 case RejectionRecord(query, match, reason, _, odometry_correspondences):
+                    pair = CandidatePair.of(query, match)
+                    judged[pair.low.log, pair.high.log] = pair
                     was_seen = odometry_correspondences > 0
-                    if self._closing.on_rejection(CandidatePair.of(query, match), reason, was_seen):
+                    if self._closing.on_rejection(pair, reason, was_seen):
                         effects += self._front_ends_differ(query.log, match.log)
                 case _:
                     pass  # what was measured, and what a later version says, concerns the graph only
         for pair in uncounted:
             effects += self._uncounted(pair, now)
         effects += self._recognise(described, now) if described else []
+        for pair in judged.values():
+            effects += self._ask(pair, now)
         for log, number in filled:
             self._lend_rows(log, number // BLOCK_RECORDS)
         return effects
+
+    def _ask(self, judged: CandidatePair, now: float) -> list[Effect]:
+        """Have pairs registered that would tell whether an own way and another one are joined rightly."""
+        if self._own not in (judged.low.log, judged.high.log):
+            return []
+        asked = [pair for pair in self._assembly.asked(judged) if all(map(self._may_match, (pair.low, pair.high)))]
+        likeness = ((pair, self._recognition.similarity(pair)) for pair in asked)
+        found = [Candidate(pair, similarity) for pair, similarity in likeness if similarity is not None]
+        return self._closing.on_asked(found, now) if found else []
 
     def _uncounted(self, pair: CandidatePair, now: float) -> list[Effect]:
         """A closure does not count: its pair is registered once more, where latents were made anew."""

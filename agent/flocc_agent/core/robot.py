@@ -15,7 +15,7 @@ from flocc_agent.core.comparing import Comparisons
 from flocc_agent.core.corrections import Corrections
 from flocc_agent.core.distributed_optimisation import STEPS_AFTER_RESTART, DistributedOptimisation
 from flocc_agent.core.distrust import Distrust
-from flocc_agent.core.effects import Broadcast, DropLog, Effect, Encode, Optimise, Report, Unicast
+from flocc_agent.core.effects import Broadcast, DropLog, Effect, Optimise, Report, Unicast
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.events import (
     LATENT_FALSE,
@@ -37,26 +37,16 @@ from flocc_agent.core.events import (
     Measured,
     MessageReceived,
     PairRegistered,
-    Withdrawn,
 )
 from flocc_agent.core.gossip import Gossip, Sealer
 from flocc_agent.core.in_map import InMap
-from flocc_agent.core.judgement import judged, told
+from flocc_agent.core.judgement import judged
 from flocc_agent.core.latents import Peer
 from flocc_agent.core.log_copy import BLOCK_RECORDS
 from flocc_agent.core.loop_closing import LoopClosing
-from flocc_agent.core.measurements import (
-    WAITING_MAX,
-    BadMeasurement,
-    Measurement,
-    belongs_to,
-    measurement_refused,
-    measurement_report,
-    record_of,
-)
 from flocc_agent.core.neighbours import Neighbours
 from flocc_agent.core.own_heartbeat import OwnHeartbeat
-from flocc_agent.core.own_keyframes import OwnKeyframes
+from flocc_agent.core.own_log import OwnLog
 from flocc_agent.core.parameters import CoreParameters
 from flocc_agent.core.peer_budgets import AnswerBudget, Muted
 from flocc_agent.core.place_recognition import PlaceRecognition
@@ -66,10 +56,8 @@ from flocc_agent.core.registration import Registration, RegistrationFailed
 from flocc_agent.core.reports import (
     ClosureRejected,
     EncodingFailed,
-    KeyframeTaken,
     LatentArrived,
     LatentFailed,
-    LatentLost,
     LogGivenUp,
     NeighbourDown,
     PeerRefused,
@@ -79,7 +67,6 @@ from flocc_agent.core.reports import (
 from flocc_agent.core.restored import Restored
 from flocc_agent.core.rounds import Rounds, solution_report
 from flocc_agent.core.spared import TOLD
-from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId, Term
 from flocc_protocol.messages import (
     Answer,
@@ -102,12 +89,8 @@ from flocc_protocol.messages import (
     SharedPoses,
 )
 from flocc_protocol.records import (
-    ClosureRecord,
-    KeyframeRecord,
-    LatentRecord,
     Record,
     RejectionRecord,
-    WithdrawalRecord,
 )
 
 NOBODY = -1
@@ -138,7 +121,6 @@ class Robot:
         self._boot = boot
         self._parameters = parameters
         self._beat = OwnHeartbeat(now)
-        self._own_keyframes = OwnKeyframes()
         self.neighbours = Neighbours(log, boot, parameters.neighbours)
         held = parameters.memory.keyframes_held
         cold_records = None if cold is None else ColdPieces(cold, max(1, held // BLOCK_RECORDS))
@@ -168,6 +150,8 @@ class Robot:
         )
         self.closing.latents.names.record_at = self._record_at
         self._intake = RecordIntake(log, self.gossip, self.assembly, self.recognition, self.closing, restored)
+        has_keys = sealer is not None
+        self.own_log = OwnLog(log, self.gossip, self.assembly, self._intake, has_keys=has_keys)
         self.in_map = None if restored.saved is None else InMap(restored.saved, now)
         self.corrections = Corrections(
             log,
@@ -239,10 +223,6 @@ class Robot:
             self.rounds.deadline() if self.distributed is None else self.distributed.deadline(),
         )
 
-    def keyframes_given(self) -> int:
-        """Own keyframes that were captured, recorded or not: the next one's number."""
-        return self.gossip.logs[self.log].keyframes + len(self._own_keyframes)
-
     @property
     def closures_enough(self) -> int:
         """Agreeing closures of two stretches beside which no more pairs are registered; 0: all are."""
@@ -253,7 +233,7 @@ class Robot:
         neighbours = (len(self.neighbours.names()), self._parameters.neighbours.neighbours_max)
         return {
             "neighbours": neighbours,
-            **self._own_keyframes.sizes(),
+            **self.own_log.sizes(),
             **self.gossip.sizes(),
             **self.comparisons.sizes(),
             **self.closing.sizes(),
@@ -273,13 +253,13 @@ class Robot:
             case MessageReceived(envelope):
                 return self._on_message(envelope, now)
             case KeyframeCaptured():
-                return self._on_captured(event)
+                return self.own_log.on_captured(event)
             case KeyframeEncoded(keyframe, descriptor, doubts, sha256, withdrawn):
                 self.closing.on_held(keyframe)
-                return [*map(Report, doubts), *self._on_encoded(keyframe, descriptor, now, sha256, withdrawn)]
+                return [*map(Report, doubts), *self.own_log.on_encoded(keyframe, descriptor, now, sha256, withdrawn)]
             case KeyframeEncodingFailed(keyframe, reason, doubts, withdrawn):
                 reports = [*map(Report, doubts), Report(EncodingFailed(keyframe=keyframe, reason=reason))]
-                return [*reports, *self._on_encoded(keyframe, None, now, withdrawn=withdrawn)]
+                return [*reports, *self.own_log.on_encoded(keyframe, None, now, withdrawn=withdrawn)]
             case LatentFetched(keyframe, holder):
                 self.closing.on_fetched(keyframe, now)
                 return [Report(LatentArrived(keyframe=keyframe, holder=holder))]
@@ -288,7 +268,7 @@ class Robot:
             case PairRegistered(pair, result):
                 return self._on_registered(pair, result, now)
             case LatentMissing(pair, keyframe):
-                return self._reject_lost(self.closing.on_latent_missing(pair, keyframe), keyframe, now)
+                return self.own_log.reject_lost(self.closing.on_latent_missing(pair, keyframe), keyframe, now)
             case GraphOptimised():
                 return self._on_optimised(event, now)
             case GraphOptimisationFailed(term=term) if term == self._own_term:
@@ -299,7 +279,7 @@ class Robot:
             case ClosuresChosen() | ChoiceFailed() | ConsensusStepped() | ConsensusStepFailed():
                 return [] if self.distributed is None else self._on_agreeing(self.distributed, event, now)
             case Measured(measurement, index):
-                return self._on_measured(measurement, index, now)
+                return self.own_log.on_measured(measurement, index, now)
             case Leaving():
                 return self.election.leave()
 
@@ -375,7 +355,7 @@ class Robot:
         self.closing.on_peer(sender.robot, Peer(helps, heartbeat.load, holds, sender))
         self.closing.on_wants(sender.robot, heartbeat.wants, now)
         for keyframe, pair in self.closing.on_lost_elsewhere(heartbeat.lost, now) if heartbeat.lost else ():
-            effects += self._reject_lost([pair], keyframe, now)
+            effects += self.own_log.reject_lost([pair], keyframe, now)
         return effects
 
     def _on_correction(self, sender: LogId, message: LogCorrection, now: float) -> list[Effect]:
@@ -453,81 +433,15 @@ class Robot:
             self.closing.on_false_latent(keyframe, holder)
         report = Report(LatentFailed(keyframe=keyframe, holder=holder, reason=reason))
         lost = reason == LATENT_UNKNOWN and holder == keyframe.log.robot
-        return [report, *self._reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now)]
-
-    def _reject_lost(self, pairs: list[CandidatePair], keyframe: KeyframeId, now: float) -> list[Effect]:
-        """Pairs whose latent exists no more are rejected, so that nobody waits for them."""
-        effects: list[Effect] = [Report(LatentLost(keyframe=keyframe))] if pairs else []
-        for pair in pairs:
-            record = RejectionRecord(pair.low, pair.high, "a latent was lost", 0, 0)
-            effects += [*self._append(record, now), Report(told(record, self.log))]
-        return effects
+        return [
+            report,
+            *self.own_log.reject_lost(self.closing.on_latent_lost(keyframe, now) if lost else [], keyframe, now),
+        ]
 
     def _has(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe's record is here; of others anybody can speak."""
         copy = self.gossip.logs.get(keyframe.log)
         return copy is not None and keyframe.index < copy.keyframes
-
-    def _on_captured(self, event: KeyframeCaptured) -> list[Effect]:
-        index = self.keyframes_given()
-        self._own_keyframes.captured(index, event.stamp_s, event.T_odom_camera)
-        return [Encode(KeyframeId(self.log, index), event.image, event.T_odom_camera)]
-
-    def _on_encoded(
-        self,
-        keyframe: KeyframeId,
-        descriptor: Array | None,
-        now: float,
-        sha256: bytes = b"",
-        withdrawn: Withdrawn | None = None,
-    ) -> list[Effect]:
-        """Append the records of all keyframes that are ready, in the order of capture, and what was measured there.
-
-        A keyframe that failed to encode has a record all the same, with its odometry: measurements need no more.
-        """
-        self._own_keyframes.encoded(keyframe.index, descriptor, sha256, withdrawn)
-        effects: list[Effect] = []
-        for ready in self._own_keyframes.ready():
-            record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
-            effects += self._append(record, now)
-            effects.append(_keyframe_report(self.log, record))
-            if self._has_keys and ready.sha256:
-                effects += self._append(LatentRecord(ready.index, ready.sha256), now)
-            if ready.withdrawn is not None:
-                effects += self._withdraw(ready.index, ready.withdrawn, now)
-            for measurement in self._own_keyframes.take_measured(ready.index):
-                effects += self._append_measurement(measurement, KeyframeId(self.log, ready.index), now)
-        return effects
-
-    def _withdraw(self, end: int, withdrawn: Withdrawn, now: float) -> list[Effect]:
-        """Take the keyframes before one back, after the log said what their latents are now, where it says so."""
-        effects: list[Effect] = []
-        for index, sha256 in enumerate(withdrawn.sha256, end - len(withdrawn.sha256)):
-            if self._has_keys and sha256:
-                effects += self._append(LatentRecord(index, sha256), now)
-        first = max(end - withdrawn.count, 0)
-        if first < end:
-            effects += self._append(WithdrawalRecord(self.log, first, end, withdrawn.is_final), now)
-        return effects
-
-    def _on_measured(self, measurement: Measurement, index: int, now: float) -> list[Effect]:
-        """Append what was measured at a recorded keyframe; what belongs to a later one waits for its record."""
-        keyframe = belongs_to(measurement, self.log, index)
-        recorded = self.gossip.logs[self.log].keyframes
-        if keyframe.index < recorded:
-            return self._append_measurement(measurement, keyframe, now)
-        if keyframe.index >= max(self.keyframes_given(), 1):
-            return [measurement_refused(measurement, keyframe, "there is no such keyframe")]
-        if self._own_keyframes.keep(measurement, keyframe.index):
-            return []
-        return [measurement_refused(measurement, keyframe, f"{WAITING_MAX} others wait for this keyframe")]
-
-    def _append_measurement(self, measurement: Measurement, keyframe: KeyframeId, now: float) -> list[Effect]:
-        try:
-            record = record_of(measurement, keyframe)
-        except BadMeasurement as error:
-            return [measurement_refused(measurement, keyframe, str(error))]
-        return [*self._append(record, now), measurement_report(measurement, keyframe)]
 
     def _on_registered(
         self, pair: CandidatePair, result: Registration | RegistrationFailed, now: float
@@ -539,8 +453,7 @@ class Robot:
         roles = self.closing.roles(pair)
         if roles is None or self.closing.is_outdated(pair):
             return []
-        record = judged(*roles, result, self._parameters.loop_closing)
-        return [*self._append(record, now), Report(told(record, self.log))]
+        return self.own_log.judge(judged(*roles, result, self._parameters.loop_closing), now)
 
     @property
     def _own_term(self) -> Term:
@@ -559,16 +472,6 @@ class Robot:
 
     def _record_at(self, log: LogId, number: int) -> Record:
         return self.gossip.logs[log].records[number]
-
-    def _append(self, record: Record, now: float) -> list[Effect]:
-        """Append a record to the own log; before a judgement, what it knows of withdrawn keyframes."""
-        said: list[Effect] = []
-        if isinstance(record, ClosureRecord | RejectionRecord):
-            pair = CandidatePair.of(record.query, record.match)
-            for known in self.assembly.withdrawals.unsaid(self.log, pair):
-                said += self._append(known, now)
-        new, effects, batch = self.gossip.append(record)
-        return [*said, *effects, Broadcast(Records((batch,))), *self._intake.take([new], now)]
 
     def _make_room(self, wanting: LogId, now: float) -> list[Effect]:
         """Give up a log that nothing refers to, where one is asked for that has no room."""
@@ -670,15 +573,14 @@ class Robot:
         """Let the machines act on what changed."""
         effects = self.closing.tick(now)
         for pair in self.closing.take_unlikely():
-            record = RejectionRecord(pair.low, pair.high, UNLIKELY, 0, 0)
-            effects += [*self._append(record, now), Report(told(record, self.log))]
+            effects += self.own_log.judge(RejectionRecord(pair.low, pair.high, UNLIKELY, 0, 0), now)
         for pair in self.closing.take_told():
             effects.append(Report(ClosureRejected(query=pair.low, match=pair.high, by=self.log.robot, reason=TOLD)))
         for keyframe in self.closing.own_lost():
             if self._has(keyframe):
                 pairs = self.closing.on_latent_lost(keyframe, now)
                 known = [pair for pair in pairs if self._has(pair.low) and self._has(pair.high)]
-                effects += self._reject_lost(known, keyframe, now)
+                effects += self.own_log.reject_lost(known, keyframe, now)
         if self.distributed is not None:
             return [*effects, *self._optimise_together(self.distributed, now)]
         self.rounds.on_term(self.election.term if self.election.leading else None)
@@ -692,8 +594,3 @@ class Robot:
             return effects
         published, why = self.corrections.publish_own(component, distributed.number)
         return [*effects, distributed.report(), *published, *distributed.on_judged(why, now)]
-
-
-def _keyframe_report(log: LogId, record: KeyframeRecord) -> Report:
-    keyframe = KeyframeId(log, record.index)
-    return Report(KeyframeTaken(keyframe=keyframe, stamp_s=record.stamp_s, T_odom_body=record.T_odom_camera))

@@ -72,8 +72,14 @@ class Withdrawals:
 
     def asks_again(self, pair: CandidatePair) -> bool:
         """Whether a pair whose closure does not count is to be registered once more."""
-        needed = sum(self._needed(end) for end in (pair.low, pair.high))
-        return self._judged_anew.get(pair, 0) < needed < NEVER
+        return not self.is_judged_anew(pair) and self._needed_of(pair) < NEVER
+
+    def is_judged_anew(self, pair: CandidatePair) -> bool:
+        """Whether some judgement of a pair counts, though keyframes were taken back."""
+        return self._judged_anew.get(pair, 0) >= self._needed_of(pair)
+
+    def _needed_of(self, pair: CandidatePair) -> int:
+        return sum(self._needed(end) for end in (pair.low, pair.high))
 
     def unsaid(self, author: LogId, pair: CandidatePair) -> list[WithdrawalRecord]:
         """What a log must say before it judges a pair anew: withdrawals of both ends' logs that it did not repeat."""
@@ -87,6 +93,10 @@ class Withdrawals:
     def is_withdrawn(self, keyframe: KeyframeId) -> bool:
         """Whether a keyframe's robot took it back, once or more."""
         return self._needed(keyframe) > 0
+
+    def is_final(self, keyframe: KeyframeId) -> bool:
+        """Whether a keyframe's robot took it back for good: nothing that is judged of it counts."""
+        return self._needed(keyframe) >= NEVER
 
     def _tells_of(self, pair: CandidatePair) -> bool:
         return pair.low.log in self._told_of or pair.high.log in self._told_of

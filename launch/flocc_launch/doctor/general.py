@@ -14,10 +14,12 @@ from flocc_agent.core.reports import (
     PeerRefused,
     RoundSolved,
 )
+from flocc_agent.core.tentative_joins import SECOND_PLACE
 from flocc_agent.runtime.event_lines import Reported, of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.cameras import doubted_cameras
 from flocc_launch.doctor.finding import APART_ADVICE, Finding, Severity
+from flocc_launch.runs.alike_places import ADVICE
 from flocc_launch.runs.closure_table import Pair
 from flocc_launch.runs.ground_truth import frame_sentences, other_clocks
 from flocc_launch.runs.loaded_run import LoadedRun
@@ -49,6 +51,7 @@ REASONS_LEFT = (
 
 SOLVER_ADVICE = {
     "measures lengths": "Calibrate what it takes lengths from: wheel radius, stereo baseline, camera height.",
+    SECOND_PLACE: ADVICE,
     "held until another one agrees": "If it is right, pass the place again; if not, nothing is to be done.",
     "look the same": "Look at the pictures of both places in the report; a fix, a tag or a known start decides.",
     "the distance between robots": "Let them meet side by side as well as ahead, or measure a length: fix, tag, range.",

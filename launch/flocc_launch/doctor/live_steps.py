@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from flocc_agent.runtime.status import PairStatus
 from flocc_launch.dashboard.status_table import RobotStatus
 from flocc_launch.doctor.finding import Finding, Severity, blocked
+from flocc_launch.doctor.held_joins import join_held
 from flocc_launch.doctor.merge_evidence import held_records
 from flocc_launch.runs.plain_numbers import number
 
@@ -109,6 +110,9 @@ def solver_dropped_closures(rows: Rows, a: RobotStatus, b: RobotStatus) -> Findi
         return None
     if not all(any(robot in part for part in parts) for robot in (a.robot, b.robot)):
         return None
+    held = join_held(solver.warnings, a.robot, b.robot)
+    if held is not None:
+        return held
     warned = f" The solver warns: {solver.warnings[0]}." if solver.warnings else ""
     return Finding(
         "closures-not-connecting",

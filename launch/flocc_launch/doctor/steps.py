@@ -10,6 +10,7 @@ from flocc_agent.core.reports import LatentFailed, NameTaken, PeerRefused, Round
 from flocc_agent.runtime.event_lines import of_kind
 from flocc_agent.runtime.facts import AgentDied
 from flocc_launch.doctor.finding import ONE_WAY_ADVICE, Finding, blocked, kept_apart
+from flocc_launch.doctor.held_joins import join_held
 from flocc_launch.doctor.merge_evidence import (
     best_similarity,
     components_join,
@@ -238,6 +239,12 @@ def optimised_nothing(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     )
 
 
+def held_join(loaded: LoadedRun, a: str, b: str) -> Finding | None:
+    """The closures between them are of one place, and what is beside it says that it may be another one."""
+    last = of_kind(loaded.events, RoundSolved)[-1].fact
+    return None if components_join(last.components, a, b) else join_held(last.warnings, a, b)
+
+
 def solver_dropped_closures(loaded: LoadedRun, a: str, b: str) -> Finding | None:
     """The solver had the closures and used none of them."""
     last = of_kind(loaded.events, RoundSolved)[-1].fact
@@ -285,6 +292,7 @@ STEPS: tuple[Step, ...] = (
     rejected_all,
     followed_nobody,
     optimised_nothing,
+    held_join,
     solver_dropped_closures,
     lost_corrections,
 )

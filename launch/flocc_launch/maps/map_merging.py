@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import PerceptionConfig, validated
 from flocc_agent.core.assembly import GraphAssembly
+from flocc_agent.core.descriptor_rows import direction
 from flocc_agent.core.gossip import NewRecord
 from flocc_agent.core.interfaces import OdometryPair, Perception
 from flocc_agent.core.judgement import judged
 from flocc_agent.core.parameters import CoreParameters
-from flocc_agent.core.place_recognition import direction
 from flocc_agent.geometry import pose_from_tq
 from flocc_agent.perception.backends import build_perception
 from flocc_agent.runtime.map_folder import BadMap, MapFolder, MapManifest
@@ -30,13 +30,23 @@ from flocc_launch.maps.map_saving import back_end_of, latents_of, optics_of
 from flocc_launch.maps.solving import SolvedMap, solved_map
 from flocc_launch.maps.writing import MapContent, check_target, write_map
 from flocc_protocol.ids import KeyframeId, LogId
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, Record, WithdrawalRecord, encode_record
+from flocc_protocol.messages import CandidatePair
+from flocc_protocol.records import (
+    ClosureRecord,
+    KeyframeRecord,
+    Record,
+    RejectionRecord,
+    WithdrawalRecord,
+    encode_record,
+)
 
 MERGER = "map-merge"
 """Robot name of the log that holds the closures between maps."""
 REGISTRATIONS_MAX = 300
 ENOUGH = 40
 """Closures after which no further pair is registered."""
+ASKED_MAX = 100
+"""Pairs beside closures of one place that are registered besides."""
 NAMED_MAX = 3
 
 Descriptors = NDArray[np.float32]
@@ -85,10 +95,10 @@ def merge_maps(
     threshold = limits.place_recognition.similarity_threshold
     candidates = [pair for pair in pairs if pair.similarity >= threshold][:REGISTRATIONS_MAX]
     perception = perception_of(a)
-    closures, registered = _closures(a, b, candidates, perception, limits, progress)
-    joining = LogId(MERGER, clock_ms())
-    said: list[Record] = [*_withdrawals(a, b), *closures] if closures else []
-    records = tuple(map(encode_record, said))
+    judging = Judging((a, b), LogId(MERGER, clock_ms()), perception, limits)
+    judging.judge(candidates, progress)
+    closures, registered, joining = judging.closures, judging.registered, judging.log
+    records = tuple(map(encode_record, judging.said)) if closures else ()
     logs = {**a.records, **b.records, **({joining: records} if records else {})}
     back_end = back_end_of(a)
     solved = solved_map(f"{first} and {second}", logs, a.saved(), config=back_end)
@@ -194,59 +204,101 @@ def _best(similarities: Descriptors, count: int) -> Iterator[tuple[int, int]]:
 # Which of them are the same
 
 
+class Judging:
+    """Pairs of two maps that are registered, and what is said of them in a log of its own.
+
+    Closures of one place may be of two that look alike, as with robots: pairs beside them are registered, too, and said
+    where they are refused. What is finally withdrawn has no latent worth a look.
+
+    Attributes:
+        log: The log that joins the maps.
+        said: Its records: what was withdrawn, since who judges it says so first, closures, refusals beside them.
+        registered: How many pairs were.
+    """
+
+    def __init__(
+        self, opened: tuple[MapFolder, MapFolder], log: LogId, perception: Perception, limits: CoreParameters
+    ) -> None:
+        """Take in the logs of both maps."""
+        self.log = log
+        self.said: list[Record] = []
+        self.registered = 0
+        self._opened = opened
+        self._perception = perception
+        self._limits = limits
+        self._assembly = GraphAssembly()
+        self._judged: dict[CandidatePair, ClosureRecord | RejectionRecord | None] = {}
+        for each in opened:
+            for own, records in each.records.items():
+                for number, data in enumerate(records):
+                    self._assembly.add(NewRecord(own, number, opened_record(data)[0]))
+        for record in _withdrawals(*opened):
+            self._say(record)
+
+    @property
+    def closures(self) -> list[ClosureRecord]:
+        """Those that were found."""
+        return [record for record in self.said if isinstance(record, ClosureRecord)]
+
+    def judge(self, candidates: Sequence[LikePair], progress: Progress) -> None:
+        """Register candidates until there are closures enough, and then pairs that tell whether these are right."""
+        for number, pair in enumerate(candidates):
+            if len(self.closures) >= ENOUGH:
+                break
+            progress(number, len(candidates))
+            record = self._record(CandidatePair.of(pair.first, pair.second))
+            if isinstance(record, ClosureRecord):
+                self._say(record)
+        while self.registered < REGISTRATIONS_MAX + ASKED_MAX and (asked := self._asked()):
+            for both in asked:
+                beside = self._record(both)
+                if beside is not None:
+                    self._say(beside)
+
+    def _asked(self) -> list[CandidatePair]:
+        """Pairs beside closures that are of one place, of which nothing was said yet."""
+        joined = {(pair.low.log, pair.high.log): pair for pair in map(_pair_of, self.closures)}
+        asked = [pair for each in joined.values() for pair in self._assembly.asked(each)]
+        said = {_pair_of(record) for record in self.said if isinstance(record, ClosureRecord | RejectionRecord)}
+        return [pair for pair in asked if pair not in said and (pair not in self._judged or self._judged[pair])]
+
+    def _say(self, record: Record) -> None:
+        self._assembly.add(NewRecord(self.log, len(self.said), record))
+        self.said.append(record)
+
+    def _record(self, pair: CandidatePair) -> ClosureRecord | RejectionRecord | None:
+        """The record of a pair; None where a latent is missing, or taken back for good."""
+        if pair not in self._judged:
+            final = any(map(self._assembly.withdrawals.is_final, (pair.low, pair.high)))
+            self._judged[pair] = None if final else self._register(pair)
+            self.registered += self._judged[pair] is not None
+        return self._judged[pair]
+
+    def _register(self, pair: CandidatePair) -> ClosureRecord | RejectionRecord | None:
+        """The query is whichever has an odometry pair with a latent, of the first map where both have."""
+        a, b = self._opened
+        first, second = (pair.low, pair.high) if pair.low.log in a.records else (pair.high, pair.low)
+        for query, match, of_query, of_match in ((first, second, a, b), (second, first, b, a)):
+            neighbour = self._assembly.odometry_pair(query)
+            latents = [of_query.latent(query), of_match.latent(match)]
+            beside = None if neighbour is None else of_query.latent(neighbour[0])
+            if neighbour is None or beside is None or latents[0] is None or latents[1] is None:
+                continue
+            T_neighbour_query = pose_from_tq(np.array(neighbour[1]))
+            odometry = OdometryPair(beside, T_neighbour_query, f"{neighbour[0]} {query}")
+            result = self._perception.register(latents[0], latents[1], odometry)
+            return judged(query, match, result, self._limits.loop_closing)
+        return None
+
+
+def _pair_of(record: ClosureRecord | RejectionRecord) -> CandidatePair:
+    return CandidatePair.of(record.query, record.match)
+
+
 def _withdrawals(*opened: MapFolder) -> list[WithdrawalRecord]:
-    """What robots of the maps took back: their latents here are those made anew, and who judges them says so first."""
+    """What robots of the maps took back: their latents here are those made anew."""
     records = ((log, opened_record(data)[0]) for each in opened for log, rows in each.records.items() for data in rows)
     return [record for log, record in records if isinstance(record, WithdrawalRecord) and record.log == log]
-
-
-def _closures(
-    a: MapFolder,
-    b: MapFolder,
-    candidates: Sequence[LikePair],
-    perception: Perception,
-    limits: CoreParameters,
-    progress: Progress,
-) -> tuple[list[ClosureRecord], int]:
-    """Closures between the maps, and how many pairs were registered for them."""
-    assembly = GraphAssembly()
-    for opened in (a, b):
-        for log, records in opened.records.items():
-            for number, data in enumerate(records):
-                assembly.add(NewRecord(log, number, opened_record(data)[0]))
-    found: list[ClosureRecord] = []
-    registered = 0
-    for number, pair in enumerate(candidates):
-        if len(found) >= ENOUGH:
-            break
-        progress(number, len(candidates))
-        record = _registered(pair, (a, b), assembly, perception, limits)
-        registered += record is not None
-        if isinstance(record, ClosureRecord):
-            found.append(record)
-    return found, registered
-
-
-def _registered(
-    pair: LikePair,
-    opened: tuple[MapFolder, MapFolder],
-    assembly: GraphAssembly,
-    perception: Perception,
-    limits: CoreParameters,
-) -> object | None:
-    """The record of one pair; None where a latent is missing. The query is whichever has an odometry pair with one."""
-    a, b = opened
-    for query, match, of_query, of_match in ((pair.first, pair.second, a, b), (pair.second, pair.first, b, a)):
-        neighbour = assembly.odometry_pair(query)
-        latents = [of_query.latent(query), of_match.latent(match)]
-        beside = None if neighbour is None else of_query.latent(neighbour[0])
-        if neighbour is None or beside is None or latents[0] is None or latents[1] is None:
-            continue
-        T_neighbour_query = pose_from_tq(np.array(neighbour[1]))
-        odometry = OdometryPair(beside, T_neighbour_query, f"{neighbour[0]} {query}")
-        result = perception.register(latents[0], latents[1], odometry)
-        return judged(query, match, result, limits.loop_closing)
-    return None
 
 
 def _check_joined(

@@ -169,3 +169,17 @@ def test_the_variance_of_a_direction_grows_with_the_square_of_its_length() -> No
     np.testing.assert_allclose(found.length_m, [20.0, 1.0])
     np.testing.assert_allclose(found.translation, [0.02**2 * 20.0**2, 0.02**2])
     np.testing.assert_allclose(found.translation_at(np.array([10.0, 10.0])), [0.02**2 * 30.0**2, 0.02**2])
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_closures_that_are_doubted_join_nothing_and_count_where_others_agree(every: bool) -> None:
+    member = two_robots()
+    across = [c for c in member.graph.closures if {c.query.log, c.match.log} == {FIRST, SECOND}]
+    of_one_place = across if every else across[:5]
+    closures = [replace(c, doubt="it may be a twin") if c in of_one_place else c for c in member.graph.closures]
+    found = optimise(PoseGraph(member.graph.trajectories, closures), settings())
+    assert isinstance(found, GraphSolution)
+    states = {result.state for result, c in zip(found.closures, closures, strict=True) if c.doubt}
+    assert states == {ClosureState.EXCLUDED if every else ClosureState.USED}
+    assert len(found.components) == (2 if every else 1)
+    assert any("it may be a twin" in warning for warning in found.warnings) == every

@@ -134,3 +134,12 @@ def test_a_new_robot_and_much_that_is_new_are_solved_whole(drawn: GeneratedGraph
     assert solved(replace(graph, trajectories=more), first).whole is None
     started = replace(first, closures=(), iterations=0)
     assert solved(replace(graph, closures=graph.closures[:20]), started).whole is None
+
+
+def test_a_closure_that_counted_and_is_doubted_now_opens_the_map(drawn: GeneratedGraph, first: GraphSolution) -> None:
+    graph = at(drawn, LATER)
+    used = {(r.query, r.match) for r in first.closures if r.state is ClosureState.USED}
+    n = next(n for n, c in enumerate(graph.closures) if (c.query, c.match) in used)
+    closures = [replace(c, doubt="it may be a twin") if k == n else c for k, c in enumerate(graph.closures)]
+    assert solved(graph, first).whole is first
+    assert solved(PoseGraph(graph.trajectories, closures), first).whole is None

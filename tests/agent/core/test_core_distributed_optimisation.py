@@ -51,6 +51,7 @@ class Source:
     seen: tuple[tuple[KeyframeId, KeyframeId], ...] = SEEN
     revision: int = 1
     length: int = 4
+    doubt: str = ""
 
     @property
     def keyframes(self) -> int:
@@ -58,7 +59,8 @@ class Source:
 
     def graph(self) -> PoseGraph:
         trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], self.length, axis=0)) for log in (A, B, C)}
-        return PoseGraph(trajectories, tuple(LoopClosure(query, match, np.eye(4)) for query, match in self.seen))
+        closures = tuple(LoopClosure(query, match, np.eye(4), doubt=self.doubt) for query, match in self.seen)
+        return PoseGraph(trajectories, closures)
 
 
 @dataclass
@@ -265,6 +267,19 @@ def test_a_pair_is_chosen_anew_when_its_closures_change_but_not_at_once() -> Non
     effects, _ = bench.turn(PARAMETERS.choose_s + 0.2)
     assert told(effects)["c"].keyframes == (0, 2)
     assert told(effects)["c"].edition > edition
+
+
+@pytest.mark.parametrize("doubt", ["", "it may be a twin"])
+def test_closures_that_are_taken_back_or_doubted_are_shared_no_more(doubt: str) -> None:
+    bench = Bench().shares()
+    bench.b.on_shared_poses(A, said(B, 2, 7, (1,)), 0.3)
+    assert bench.b._pairs[A].keyframes
+    assert bench.b._pairs[C].keyframes
+    bench.source.seen, bench.source.doubt = SEEN if doubt else (), doubt
+    bench.source.revision += 1
+    bench.turn(PARAMETERS.choose_s, ClosureState.EXCLUDED)
+    bench.turn(PARAMETERS.choose_s + 0.2, ClosureState.EXCLUDED)
+    assert bench.b._pairs[A].keyframes == bench.b._pairs[C].keyframes == ()
 
 
 def test_a_failed_or_overdue_choice_is_made_again_after_a_growing_pause() -> None:

@@ -6,10 +6,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from flocc_agent.core.descriptor_rows import comparable
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.log_copy import decoded
 from flocc_agent.core.parameters import CoreParameters, PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import comparable
 from flocc_agent.core.robot import Robot
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import LogId

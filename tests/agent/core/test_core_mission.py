@@ -16,11 +16,12 @@ import pytest
 from numpy.typing import NDArray
 
 from flocc_agent.core.cold_storage import ColdPieces
+from flocc_agent.core.descriptor_rows import comparable
 from flocc_agent.core.effects import Unicast
 from flocc_agent.core.events import MessageReceived
 from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.parameters import CoreParameters, MemoryParameters, PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import PlaceRecognition, comparable
+from flocc_agent.core.place_recognition import PlaceRecognition
 from flocc_agent.core.robot import Robot
 from flocc_agent.runtime.page_file import PageFile
 from flocc_protocol.arrays import Array

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from flocc_agent.core.descriptor_rows import THINNED_AT_ONCE, direction
 from flocc_agent.core.log_copy import BLOCK_RECORDS, LogCopy
 from flocc_agent.core.parameters import PlaceRecognitionParameters
-from flocc_agent.core.place_recognition import THINNED_AT_ONCE, Found, PlaceRecognition, direction
+from flocc_agent.core.place_recognition import Found, PlaceRecognition
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.records import KeyframeRecord, encode_record
