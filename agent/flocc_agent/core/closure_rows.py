@@ -276,6 +276,10 @@ class ClosureTable:
         found = [self._built.get(row) or others[row] for row in numbers]
         return [c for c in found if c.query not in unread and c.match not in unread] if unread else found
 
+    def forget_built(self) -> None:
+        """Nobody asks for the graph's closures for now: they are built anew when somebody does."""
+        self._built.clear()
+
     def _in_order(self, counts: Callable[[LogId], int]) -> NDArray[np.intp]:
         """Rows of pairs whose keyframes are below the counts of their logs, in the order of the pairs."""
         columns: list[tuple[NDArray[np.int64], ...]] = []
