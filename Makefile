@@ -13,6 +13,7 @@ SHELL := /bin/bash
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
+UNIT_JOBS ?= 3
 DRAWS ?= 300
 LIMIT_S ?= 3600
 MISSION_MINUTES ?= 480
@@ -50,14 +51,15 @@ contracts:
 	$(BIN)/lint-imports
 
 # Two workers run live swarms that measure nothing in time, which mostly wait; what only computes takes the rest of the
-# two cores beside them, at the lowest priority. Live swarms that measure get the machine to themselves. What fails of a
+# two cores beside them, at the lowest priority, with a worker more than cores: unit tests wait too, for processes, timers
+# and disks. Live swarms that measure get the machine to themselves. What fails of a
 # live swarm is tried once more, alone, since the machine itself may stall; all is printed. To find the live ones, only
 # the files that name their mark are read: reading all of them takes 20 s of CPU in each of three processes.
 LIVE := swarm and not scenarios
 LIVE_FILES = $$(grep -rlE "mark\.swarm" tests --include="test_*.py")
 tests:
 	@mkdir -p build; set -o pipefail; status=0; live=0; export OMP_NUM_THREADS=1; \
-	set -m; nice -n 19 $(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal -o cache_dir=.pytest_cache/unit -m "not swarm" > build/pytest.txt 2>&1 & unit=$$!; set +m; \
+	set -m; nice -n 19 $(BIN)/python -m pytest -q -n $(UNIT_JOBS) --dist worksteal -o cache_dir=.pytest_cache/unit -m "not swarm" > build/pytest.txt 2>&1 & unit=$$!; set +m; \
 	trap 'kill -- -$$unit 2>/dev/null' EXIT; \
 	rm -f build/pytest-swarm-again.txt; \
 	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m "$(LIVE) and beside" $(LIVE_FILES) | tee build/pytest-beside.txt || live=1; \

@@ -448,3 +448,25 @@ def test_where_a_camera_of_several_sits_is_read(tmp_path: Path, name: str, text:
 def test_a_lens_that_a_second_key_changes_is_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(DatasetError, match=said):
         read(tmp_path, text, "camera.json")
+
+
+INNER = "width: 640\n  height: 480\n  fx: 400\n  fy: 401\n  cx: 320\n  cy: 240\n"
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        "extrinsic:\n  x: 1.7\n  y: 0.1\n  z: 1.2\n  pitch: 0.03\n",
+        "distortion:\n  k1: -0.28\n  k2: 0.07\n  p1: 0\n  p2: 0\n",
+        "imu_to_cam: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",
+        "sits:\n  where: [0.1, 0.2, 0.3]\n",
+    ],
+)
+def test_a_map_beside_that_of_the_camera_is_no_less_read(tmp_path: Path, beside: str) -> None:
+    with pytest.raises(DatasetError, match=beside.partition(":")[0]):
+        read(tmp_path, f"intrinsic:\n  {INNER}{beside}", "camera.yaml")
+
+
+def test_a_map_beside_that_of_the_camera_that_says_nothing_is_named(tmp_path: Path) -> None:
+    lens = read(tmp_path, f"Camera:\n  {INNER}Feature:\n  scale_factor: 1.2\n", "camera.yaml")
+    assert any("not used: Feature" in note for note in lens.notes)

@@ -803,3 +803,20 @@ def test_times_that_are_none_are_refused(tmp_path: Path, lines: list[str], said:
     (path / "times.txt").write_text("\n".join(lines) + "\n")
     with pytest.raises(DatasetError, match=said):
         read_source(path)
+
+
+def test_names_that_neither_say_stamps_nor_count_alike_give_no_order(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "p")
+    for k, file in enumerate(sorted((path / "images").iterdir())):
+        file.rename(path / "images" / f"{1_700_000_000_000_000_000 + 100_000_000 * k:016x}.jpg")
+    with pytest.raises(DatasetError, match="nothing says which pose is of which"):
+        read_source(path)
+
+
+def test_what_lies_beside_the_files_that_are_read_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_plain(tmp_path / "p")
+    for name in ("extrinsics.txt", "calib.txt", "given.tum"):
+        (path / name).write_text((path / "groundtruth.tum").read_text())
+    convert(path, tmp_path / "out", odometry=path / "given.tum")
+    assert f"{path}: not used: calib.txt, extrinsics.txt" in caplog.text
+    assert info(tmp_path / "out").notes == ()

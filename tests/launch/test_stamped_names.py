@@ -72,6 +72,7 @@ def test_numbers_of_images_are_no_stamps(written: Callable[[int], str]) -> None:
         (lambda k: f"20231114_2213{k:02d}_{k:03d}", "can be their fraction or count images"),
         (lambda k: f"20231114_2213{k:02d}_{k}", "can be their fraction or count images"),
         (lambda k: f"20231114_2213{k // 2:02d}" + "_1" * (k % 2), "can be their fraction or count images"),
+        (lambda k: f"{ZERO_S + k}.25_{ZERO_S + k}.75", "hold 2 numbers with a point, 1700000000.25 and 1700000000.75"),
         (lambda k: f"{10**10 + 4 * k}", "can be seconds or milliseconds"),
         (lambda k: f"cut_00_{k // 30:02d}_{2 * (k % 30):02d}.500", "can be minutes or count cameras"),
     ],

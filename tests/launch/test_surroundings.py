@@ -272,6 +272,7 @@ def test_operators_on_an_interface_that_does_not_exist_hear_of_it(
     agent = tmp_path / "agent.toml"
     agent.write_text('name = "r1"\nswarm = "alone"\n[transport]\ninterface = "wlan7"\n')
     monkeypatch.setattr(zenoh_admin, "SCOUT_S", 0.1)
+    monkeypatch.setattr(zenoh_admin, "FIND_TIMEOUTS", 0.1)
     assert run(monkeypatch, *words, "--config", str(agent)) == 2
     assert "the interface 'wlan7' does not exist; there is lo" in capsys.readouterr().err
 

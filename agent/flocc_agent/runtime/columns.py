@@ -1,7 +1,8 @@
 """What the columns of a trajectory mean, by the line that names them: `timestamp [ns], p_RS_R_x [m], ..., q_RS_w []`.
 
-Names differ from tool to tool, but say the same: a group (position, quaternion) and an axis. What is not understood is
-not used, and a header that names something twice, or only a part, is refused by its reader.
+Names differ from tool to tool, but say the same: a group (position, quaternion) and an axis. A header that names
+something twice, or only a part, is refused by its reader; what is not understood is kept by name, so that the reader
+accounts for it (`spare_columns`).
 """
 
 import re
@@ -45,7 +46,7 @@ _REVERSED = re.compile(
 """A pose of the fixed frame in the moving one: `q_cw_x`, `p_BW_y`, `t_world_to_cam_z`."""
 _REVERSED_WORDS = re.compile(
     r"(?:^|_)(?:t_?[bci][wg]|t_?(?:cam|camera|body|imu)_?(?:world|global)|w2c"
-    r"|(?:world|global)_?(?:to|2)_?(?:cam|camera|body|imu))(?:_|$)"
+    r"|(?:world|global)_?(?:to|2)_?(?:cam|camera|body|imu)|(?:cam|camera|body|imu)_from_(?:world|global|map))(?:_|$)"
 )
 """The same in a comment, whose words mean less: `T_body_world`, `world to camera`."""
 _JPL = re.compile(r"(?:^|_)jpl(?:_|$)")
@@ -54,11 +55,9 @@ _STEPS = re.compile(
     r"(?:^|_)(?:(?:relative|incremental|delta|frame_to_frame)_(?:pose|transform|motion|odometry)s?)(?:_|$)"
 )
 _OPENGL = re.compile(r"(?:^|_)(?:open_?gl|z_backwards?|y_up)(?:_|$)")
-_LABEL = re.compile(
-    r"(.*[._/])?(child_frame(_id)?|frame_id|(device|vehicle|sensor|marker|tag|body|object|track|map)(_?id)?"
-    r"|robot(_id|_name)?|id)"
-)
-"""Columns that say what a row's pose is of; a number of its own in each row says nothing."""
+_LENGTHS = re.compile(r"(?:^|_)(?:in_(?:mm|cm|ft|inch|inches)|(?:milli|centi|kilo)met(?:er|re)s?|feet)(?:_|$)")
+_WORLD_FIRST = re.compile(r"(?:^|_)kapture_format(?:_|$)")
+"""Forms that hold the pose of the world in the sensor without saying it in each name."""
 _PX4 = ("timestamp_sample", "q_offset[")
 """What a header of PX4's logs has, as `ulog2csv` writes it: arrays x y z and w x y z, stamps in microseconds."""
 _OTHER_PARTS = ("cov", "twist", "veloc", "accel", "gyro", "bias", "sigma", "std", "error", "imu", "mag")
@@ -80,7 +79,7 @@ class Columns:
         unit: What the stamp is in, one of `UNITS_S`, or None where nothing says so.
         nanoseconds: Column of the nanoseconds that are added to the stamp's seconds, or None.
         metres: What one unit of the position is.
-        labels: Names and columns of words that say what a pose is of, such as `child_frame_id`.
+        spare: Names and columns of all others, such as `child_frame_id` or `status`.
     """
 
     stamp: int | None
@@ -88,7 +87,7 @@ class Columns:
     unit: str | None = None
     nanoseconds: int | None = None
     metres: float = 1.0
-    labels: tuple[tuple[str, int], ...] = ()
+    spare: tuple[tuple[str, int], ...] = ()
 
 
 class HeaderError(ValueError):
@@ -108,6 +107,10 @@ def contradiction(comment: str) -> str | None:
         return "the axes are said to be left-handed: write poses of right-handed ones"
     if _STEPS.search(words):
         return "the poses are said to be from one to the next: write them in one fixed frame"
+    if _WORLD_FIRST.search(words):
+        return "kapture's poses are of the world in the sensor: invert them"
+    if (length := _LENGTHS.search(words)) is not None:
+        return f"positions are said to be in another unit than metres ({length[0].strip('_')}): write them in metres"
     if _OPENGL.search(words):
         return "the axes are said to be OpenGL's (y up, z backwards): turn the poses, or give T_body_camera"
     return None
@@ -150,14 +153,19 @@ def columns_of(header: str, count: int | None = None) -> Columns | None:
     turned = next((n for n, r in zip(names, roles, strict=True) if r in POSE_COLUMNS and _is_reversed(n)), None)
     if turned is not None:
         raise HeaderError(f"the header gives the pose of the world in the body or camera ({turned}): invert the poses")
-    labels = tuple((_bare(name), k) for k, name in enumerate(names) if _LABEL.fullmatch(_bare(name)))
+    spare = tuple((_bare(name), k) for k, (name, role) in enumerate(zip(names, roles, strict=True)) if role is None)
     stamp = roles.index("stamp")
     split = roles.index("nanoseconds") if "nanoseconds" in roles else None
     unit = "seconds" if split is not None else _unit(names[stamp])
     metres = {_metres(names[roles.index(axis)]) for axis in "xyz"}
     if len(metres) > 1:
         raise HeaderError("the header gives positions in several units")
-    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split, metres.pop(), labels)
+    return Columns(stamp, tuple(roles.index(role) for role in POSE_COLUMNS), unit, split, metres.pop(), spare)
+
+
+def names_columns(header: str) -> bool:
+    """Whether a line names columns of a trajectory, well or badly."""
+    return sum(_role(name) is not None for name in _names(_px4_named(header))) >= ROLES_MIN
 
 
 def begins_with_stamp(header: str) -> bool:

@@ -7,9 +7,8 @@ row costs itself.
 """
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +24,10 @@ from flocc_agent.runtime.columns import (
     contradiction,
 )
 from flocc_agent.runtime.dated_rows import dated
-from flocc_agent.runtime.pose_limits import SPEED_MAX_M_S, breaks, oddity, possible, spikes
+from flocc_agent.runtime.pose_limits import oddity
 from flocc_agent.runtime.quaternion_order import clear_order, rotations
+from flocc_agent.runtime.row_order import DAMAGED_RATIO_MAX, Poses, in_order
+from flocc_agent.runtime.spare_columns import comment_notes, spare_notes
 from flocc_agent.runtime.stamp_units import are_counted, plausible_units, since_1970
 from flocc_agent.runtime.text_tables import RecordingError, Table, is_number, read_table
 from flocc_agent.runtime.trajectory import QUATERNION_NORM_TOLERANCE, Trajectory
@@ -45,35 +46,13 @@ FORMS = {
 }
 """Names for `--trajectory-format`; any other value is itself a line that names the columns."""
 MATRIX_FORM = "kitti"
-DAMAGED_RATIO_MAX = 0.2
-JUMPS = "jump away from those on both sides"
-TOO_FAST = f"lie out of reach of the others (faster than {SPEED_MAX_M_S:g} m/s)"
-TOO_FAST_ASKED = ": is the length in metres, and the stamp in its unit?"
 POSITION_MAX_M = 1e8
 NUMBER_MAX = 1e20
 """More than nanoseconds since 1970."""
 ROWS_TRIED_MAX = 2000
-STRAY_STEPS_MIN = 20.0
 SAID_STEP_MAX_S = 600.0
 """Stamps whose steps would be longer are not in the unit that is said."""
 WAY_OUT = "name the columns in a first line such as '# timestamp tx ty tz qx qy qz qw', or with --trajectory-format"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Poses:
-    """What a file of poses holds.
-
-    Attributes:
-        stamps_s: (N,) seconds, or None where the form has no stamps; not sorted.
-        T_fixed_body: (N, 4, 4), metres.
-        lines: (N,) line of each.
-        notes: What was left out or concluded, one sentence each.
-    """
-
-    stamps_s: Float | None
-    T_fixed_body: Float
-    lines: NDArray[np.int64]
-    notes: tuple[str, ...] = ()
 
 
 def read_trajectory(
@@ -105,7 +84,7 @@ def read_trajectory(
                 f"{path}: has {len(poses.lines)} poses without stamps, but there are {len(stamps_s)} images"
             )
         poses = replace(poses, stamps_s=np.array(stamps_s, dtype=float))
-    return _in_order(poses, path)
+    return in_order(poses, path)
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -134,6 +113,7 @@ def read_poses(path: Path, form: str | None = None, otherwise: str | None = None
     if columns is None:
         return _matrices(table)
     values, lines, notes = _values(table, columns)
+    notes = (*notes, *comment_notes(table))
     values[:, 1:4] *= columns.metres
     q = values[:, 4:8] / np.linalg.norm(values[:, 4:8], axis=1, keepdims=True)
     T = np.tile(np.eye(4), (len(q), 1, 1))
@@ -320,7 +300,7 @@ def _wanted(columns: Columns) -> list[int]:
 
 def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], tuple[str, ...]]:
     """Stamp and pose of each row that is whole, its line, and what was left out."""
-    _refuse_mixed(table, columns)
+    spare = spare_notes(table, columns.spare)
     wanted = _wanted(columns)
     good, lines, damaged = [], [], []
     count = max(_usual_count(table), max(wanted) + 1)
@@ -341,31 +321,16 @@ def _values(table: Table, columns: Columns) -> tuple[Float, NDArray[np.int64], t
         values[:, 0] += values[:, -1] * 1e-9
     note = f"{table.path}: {len(damaged)} of {len(table.rows)} rows were left out, the first at line "
     told = (f"{note}{damaged[0][0]}: {damaged[0][1]}",) if damaged else ()
-    return values, np.array(lines), (*told, *_moved(table, columns))
+    return values, np.array(lines), (*told, *_moved(table, columns), *spare)
 
 
 def _moved(table: Table, columns: Columns) -> tuple[str, ...]:
     """Which frame the poses move, where a column says it: the camera's mounting must be on that."""
-    index = next((index for name, index in columns.labels if "child_frame" in name), None)
+    index = next((index for name, index in columns.spare if "child_frame" in name), None)
     moved = {fields[index] for _, fields in table.rows[:200] if index is not None and len(fields) > index} - {""}
     return (
         (f"{table.path}: poses are of {min(moved)}: the camera's mounting (T_body_camera) is on that",) if moved else ()
     )
-
-
-def _refuse_mixed(table: Table, columns: Columns) -> None:
-    """Refuse a table in which the poses of several bodies alternate.
-
-    Raises:
-        RecordingError: A column that says what a pose is of says several things, each of many rows.
-    """
-    for name, index in columns.labels:
-        found = Counter(fields[index] for _, fields in table.rows if len(fields) > index)
-        if 1 < len(found) <= len(table.rows) / 2:
-            several = ", ".join(sorted(found)[:4])
-            raise RecordingError(
-                f"{table.path}: holds poses of {len(found)} different {name} ({several}); keep the rows of one of them"
-            )
 
 
 def _damage(fields: list[str], columns: Columns) -> str | None:
@@ -412,10 +377,11 @@ def _matrices(table: Table) -> Poses:
         alone = ", and poses without stamps cannot be left out" if count in (12, 16) else ""
         raise RecordingError(f"{table.path}:{damaged[0]}: {fault}{damaged[0]}{alone}")
     if count in (12, 16):
-        return Poses(None, np.array(poses), np.array(lines))
+        return Poses(None, np.array(poses), np.array(lines), comment_notes(table))
     unit, notes = _unit(np.array(stamps), Columns(0, ()), None, table.path)
     told = (f"{table.path}: {fault}{damaged[0]}; they were left out",) if damaged else ()
-    return Poses(np.array(stamps) * UNITS_S[unit], np.array(poses), np.array(lines), (*told, *notes))
+    told = (*told, *notes, *comment_notes(table))
+    return Poses(np.array(stamps) * UNITS_S[unit], np.array(poses), np.array(lines), told)
 
 
 def _unit(stamps: Float, columns: Columns, form: str | None, path: Path) -> tuple[str, tuple[str, ...]]:
@@ -440,82 +406,3 @@ def _unit(stamps: Float, columns: Columns, form: str | None, path: Path) -> tupl
 
 def _duration_s(stamps: Float) -> float:
     return float(np.max(stamps) - np.min(stamps))
-
-
-def _strays(stamps_s: Float) -> NDArray[np.bool_]:
-    """Rows whose stamp is far ahead, while the row behind goes on where the row before was."""
-    found = np.zeros(len(stamps_s), dtype=bool)
-    if len(stamps_s) < 4:
-        return found
-    before, here, after = stamps_s[:-2], stamps_s[1:-1], stamps_s[2:]
-    step_s = float(np.median(np.abs(np.diff(stamps_s))))
-    found[1:-1] = (here - before > STRAY_STEPS_MIN * step_s) & (after < here) & (after > before)
-    return found
-
-
-def _in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
-    """A trajectory of poses; those that go back in time are left out and counted."""
-    stamps_s, T, lines, notes = poses.stamps_s, poses.T_fixed_body, poses.lines, list(poses.notes)
-    assert stamps_s is not None
-    if len(stamps_s) > 2 and np.all(np.diff(stamps_s) <= 0) and stamps_s[0] > stamps_s[-1]:
-        stamps_s, T, lines = stamps_s[::-1], T[::-1], lines[::-1]
-        notes.append(f"{path}: rows stand in reversed order of time, and were turned round")
-    stray = _strays(stamps_s)
-    if np.any(stray):
-        first = int(np.argmax(stray))
-        note = f"{np.count_nonzero(stray)} rows with a stamp far ahead of those around them were left out"
-        notes.append(f"{path}:{lines[first]}: {note}")
-        stamps_s, T, lines = stamps_s[~stray], T[~stray], lines[~stray]
-    highest_s = np.maximum.accumulate(stamps_s)
-    later = np.concatenate([[True], stamps_s[1:] > highest_s[:-1]])
-    back = np.concatenate([[False], stamps_s[1:] < highest_s[:-1]])
-    if np.any(back):
-        first = int(np.argmax(back))
-        where = f"time goes backwards, from {highest_s[first - 1]:.6f} s to {stamps_s[first]:.6f} s"
-        count = int(np.count_nonzero(back))
-        if count > DAMAGED_RATIO_MAX * len(stamps_s):
-            raise RecordingError(
-                f"{path}:{lines[first]}: {where}; {np.count_nonzero(back)} rows of {len(stamps_s)} lie before"
-            )
-        notes.append(f"{path}:{lines[first]}: {where}; {np.count_nonzero(back)} rows were left out")
-    moved = later & ~back
-    differ = ~moved & ~back
-    if np.any(differ):
-        index = np.nonzero(differ)[0]
-        unlike = sum(not np.allclose(T[k], T[k - 1], atol=1e-6) for k in index[:10000])
-        if unlike > DAMAGED_RATIO_MAX * len(stamps_s):
-            raise RecordingError(
-                f"{path}:{lines[index[0]]}: {unlike} of {len(stamps_s)} rows have the stamp of the row before, "
-                f"{stamps_s[index[0]]:.6f} s, and another pose; write stamps with all their digits"
-            )
-        if unlike:
-            notes.append(f"{path}: {unlike} rows repeat a stamp with another pose; the first of each was taken")
-    stamps_s, T, lines = stamps_s[moved], T[moved], lines[moved]
-    good = possible(stamps_s, T[:, :3, 3])
-    if not np.all(good):
-        notes.append(_left_out(path, lines[~good], len(lines), TOO_FAST, TOO_FAST_ASKED))
-    stamps_s, T, lines = stamps_s[good], T[good], lines[good]
-    odd = spikes(T[:, :3, 3])
-    if np.any(odd):
-        notes.append(_left_out(path, lines[odd], len(lines), JUMPS))
-    stamps_s, T, lines = stamps_s[~odd], T[~odd], lines[~odd]
-    anew = breaks(stamps_s, T)
-    if np.any(anew):
-        more = f" (and at {np.count_nonzero(anew) - 1} other rows)" if np.count_nonzero(anew) > 1 else ""
-        notes.append(
-            f"{path}:{lines[np.argmax(anew)]}: the pose jumps and goes on from there{more}; it is taken as motion: "
-            "where odometry began anew, cut the file and convert the parts apart"
-        )
-    return Trajectory(stamps_s, T), tuple(notes)
-
-
-def _left_out(path: Path, lines: NDArray[np.int64], count: int, what: str, asked: str = "") -> str:
-    """Say how many poses are no use, and what is wrong with them.
-
-    Raises:
-        RecordingError: They are too many; what is asked then stands behind.
-    """
-    fault = f"{path}:{lines[0]}: {len(lines)} of {count} poses {what}"
-    if len(lines) > DAMAGED_RATIO_MAX * count:
-        raise RecordingError(fault + asked)
-    return f"{fault} and were left out"

@@ -2,8 +2,7 @@
 
 import logging
 import math
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from flocc_launch.datasets.names import robot_names
 from flocc_launch.datasets.picture_check import seen_faults
 from flocc_launch.datasets.plain import ODOMETRY_STEMS, TRUTH_STEMS, expected_files, taken_file
 from flocc_launch.datasets.source import DatasetError, Source
+from flocc_launch.datasets.unread import unused
 from flocc_launch.datasets.video import (
     WHAT_ODOMETRY,
     convert_video,
@@ -42,12 +42,6 @@ from flocc_protocol.errors import FloccError
 
 logger = logging.getLogger(__name__)
 
-USED_NAMES = re.compile(
-    r"(odometry|trajectory|poses|vio|groundtruth|gt|ground_truth|traj|images|rgb|times|source|odometry_made)"
-    r"\.(tum|txt|csv)$|state_groundtruth|mocap0|camera|calib|intrinsics|sensor|transforms\.json$|sparse$|frame-",
-    re.IGNORECASE,
-)
-"""Names of what readers use beside images."""
 COUNTS_FOR = {
     "--format": ("folder",),
     "--image-topic": ("bag",),
@@ -132,23 +126,10 @@ def info(path: Path, format_name: str | None = None, form: str | None = None) ->
         truth_poses=len(source.truth) if source.truth else None,
         length_m=travelled.length_m() if travelled else None,
         faults=(*source.faults, *_missing(source), *_mask_faults(source), *_seen(source, form is not None)),
-        notes=(*source.notes, *_unused(source)),
+        notes=(*source.notes, *unused(source)),
         odometry_file=taken_file(path, ODOMETRY_STEMS) if source.odometry else None,
         truth_file=taken_file(path, TRUTH_STEMS) if source.truth else None,
     )
-
-
-def _unused(source: Source) -> list[str]:
-    """What lies in a data set's folder and is not used, in one sentence."""
-    root = source.path / "mav0" if (source.path / "mav0").is_dir() else source.path
-    used = {file.relative_to(root).parts[0] for _, file in source.images if file.is_relative_to(root)}
-    others = [
-        entry.name
-        for entry in sorted(root.iterdir())
-        if entry.name[0] != "." and entry.name not in {*used, MASK} and not USED_NAMES.match(entry.name)
-    ]
-    more = f" and {len(others) - 8} more" if len(others) > 8 else ""
-    return [f"{root}: not used: {', '.join(others[:8])}{more}"] if others else []
 
 
 def _mask_faults(source: Source) -> list[str]:
@@ -400,7 +381,7 @@ def convert(
         return out
     own_form = form if odometry is None else None
     source = _viewed(read_source(path, format_name, camera, own_form, time_offset_s), view_deg)
-    _tell(source)
+    _tell(source, camera, odometry)
     identity = _identity(
         f"convert time_offset_s={time_offset_s}" if time_offset_s else "convert", path, source, drift, seed
     )
@@ -463,7 +444,7 @@ def split(
         DatasetError: Nothing can be used, there are fewer images than robots, or a part was bad; the good one is kept.
     """
     source = _viewed(read_source(path, format_name, camera, form), view_deg)
-    _tell(source)
+    _tell(source, camera)
     _see_pictures(source, None, form is not None)
     if not 1 <= robots <= len(source.images) // 2:
         raise DatasetError(f"{path}: {len(source.images)} images cannot be cut into {robots} robots")
@@ -506,9 +487,14 @@ def _viewed(source: Source, view_deg: float | None) -> Source:
     return replace(source, lens=replace(source.lens, view_rad=math.radians(view_deg)))
 
 
-def _tell(source: Source) -> None:
-    """Log what was left out or concluded; a conversion goes on."""
-    for note in source.notes:
+def _tell(source: Source, *given: Path | None) -> None:
+    """Log what was left out or concluded, and what lies there unread; a conversion goes on."""
+    _log(source.notes)
+    _log(unused(source, *given))
+
+
+def _log(notes: Iterable[str]) -> None:
+    for note in notes:
         logger.warning("%s", note)
 
 
@@ -520,7 +506,7 @@ def _see_pictures(source: Source, given: Trajectory | None, is_settled: bool) ->
     """
     trajectory = given or source.odometry or source.truth
     if trajectory is not None:
-        _tell(replace(source, notes=seen_faults(source, trajectory, is_settled)))
+        _log(seen_faults(source, trajectory, is_settled))
 
 
 def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
@@ -535,7 +521,7 @@ def _seen(source: Source, is_settled: bool) -> tuple[str, ...]:
 def _given_odometry(source: Source, path: Path, form: str | None, time_offset_s: float) -> Trajectory:
     read, notes = read_trajectory(path, form, [stamp_s for stamp_s, _ in source.images])
     given = read.later(time_offset_s)
-    _tell(replace(source, notes=notes))
+    _log(notes)
     check_times(source, given, path)
     return given.relative_to_first()
 

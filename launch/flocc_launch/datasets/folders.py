@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from flocc_agent.geometry import inverse
 from flocc_agent.lenses import CameraModel
 from flocc_agent.runtime.pose_limits import spikes
+from flocc_agent.runtime.row_order import DAMAGED_RATIO_MAX
 from flocc_agent.runtime.text_tables import RecordingError, number_lines, text_lines
 from flocc_agent.runtime.trajectory import Trajectory, checked_pose
-from flocc_agent.runtime.trajectory_text import DAMAGED_RATIO_MAX, read_trajectory
+from flocc_agent.runtime.trajectory_text import read_trajectory
 from flocc_launch.datasets.files import (
     camera_file,
     image_files,

@@ -35,6 +35,7 @@ TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 OF_PHONES = ("arcore", "arkit", "arposes")
 PHONE_AXES = "T_body_camera = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]"
 TRAJECTORY_SUFFIXES = (".tum", ".txt", ".csv")
+BY_ORDER = "the names of the images were taken to count them only: each has the stamp of the pose in the same place"
 UNUSUAL = ("dates, read as UTC", "seconds and their fraction", *(f"{name} gives them" for name in TIMES))
 """Readings of names that a note tells."""
 
@@ -64,6 +65,7 @@ def read_plain(path: Path, form: str | None = None) -> Source:
     if images is None:
         images, faults = _stamped_by_order(path, odometry or truth)
     read_how = (f"{path}: the names of the images say their stamps as {how}",) if how in UNUSUAL else ()
+    read_how = (f"{path}: {BY_ORDER}",) if by_order else read_how
     lens = camera_file(path, images)
     _see_phone_axes(path, lens)
     notes = (*read_how, *notes)
@@ -105,15 +107,15 @@ def expected_files(path: Path) -> str:
 
 def taken_file(path: Path, stems: tuple[str, ...]) -> Path | None:
     """The trajectory that is read of a folder under one of the names, or None."""
-    return next(iter(_trajectory_files(path, stems)), None)
+    return next(iter(trajectory_files(path, stems)), None)
 
 
 def has_trajectory(path: Path) -> bool:
     """Whether a trajectory of one of the plain names stands in a folder."""
-    return any(_trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
+    return any(trajectory_files(path, stems) for stems in (ODOMETRY_STEMS, TRUTH_STEMS))
 
 
-def _trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
+def trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
     """Files of one of the names, whatever their capitals; a link to nowhere is one, and its reader says so."""
     there = {entry.name.lower(): entry for entry in sorted(path.iterdir())} if path.is_dir() else {}
     names = [f"{stem}{suffix}" for stem in stems for suffix in TRAJECTORY_SUFFIXES]
@@ -123,7 +125,7 @@ def _trajectory_files(path: Path, stems: tuple[str, ...]) -> list[Path]:
 def _first_trajectory(
     path: Path, stems: tuple[str, ...], form: str | None, stamps_s: list[float] | None
 ) -> tuple[Trajectory | None, tuple[str, ...]]:
-    files = _trajectory_files(path, stems)
+    files = trajectory_files(path, stems)
     if not files:
         return None, ()
     trajectory, notes = read_trajectory(files[0], form, stamps_s)
@@ -212,6 +214,13 @@ def _stamped_by_order(path: Path, trajectory: Trajectory | None) -> tuple[Stampe
     if trajectory is None:
         raise DatasetError(
             f"{folder}: the images have no stamps ({files[0].name}): name them by seconds, or list them in "
+            f"{path / 'images.txt'} with lines 'stamp_s relative/path'"
+        )
+    shapes = sorted({re.sub(r"\d+", "#", file.stem) for file in files})
+    if len(shapes) > 1:
+        raise DatasetError(
+            f"{folder}: the names of the images neither say stamps that flocc reads nor count alike "
+            f"({files[0].name}, {files[-1].name}), so that nothing says which pose is of which; list them in "
             f"{path / 'images.txt'} with lines 'stamp_s relative/path'"
         )
     images = tuple(zip((float(stamp_s) for stamp_s in trajectory.stamps_s), files, strict=False))

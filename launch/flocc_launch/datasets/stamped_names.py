@@ -179,6 +179,11 @@ def _one_number(columns: list[tuple[str, ...]], stems: Sequence[str], folder: ob
         _check_clock(decimal[0], folder)
         unit = since_1970(float(decimal[0][0])) or "seconds"
         return [float(word) / round(1 / UNITS_S[unit]) for word in decimal[0]], unit
+    if len(decimal) > 1:
+        raise DatasetError(
+            f"{folder}: names such as {stems[0]} hold {len(decimal)} numbers with a point, {decimal[0][0]} and "
+            f"{decimal[1][0]}, and either can be the stamp; {WAY_OUT}"
+        )
     long = [c for c in columns if all(word.isdigit() and _is_long(word) for word in c) and _varies(c)]
     if not long:
         return None, "numbers of images"

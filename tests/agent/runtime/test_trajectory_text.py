@@ -246,6 +246,14 @@ def test_a_step_back_of_the_clock_costs_the_rows_that_lie_before(tmp_path: Path)
     assert notes[0].endswith("3 rows were left out")
 
 
+@pytest.mark.parametrize("later_s", [-50.0, -0.45])
+def test_trajectories_one_behind_the_other_are_said_to_be_that(tmp_path: Path, later_s: float) -> None:
+    file = tmp_path / "joined.tum"
+    file.write_text(tum(rows()) + tum(rows(zero_s=ZERO_S + later_s)))
+    with pytest.raises(RecordingError, match=r"joined.tum:11: .* 2 trajectories .*\(lines 1 to 10, 11 to 20\)"):
+        read_trajectory(file)
+
+
 @pytest.mark.parametrize("form", ["tum-wxyz", "time[s] x y z qw qx qy qz"])
 def test_a_form_that_is_named_settles_it(tmp_path: Path, form: str) -> None:
     text = w_first(rows(), in_ns=False).replace(",", " ")

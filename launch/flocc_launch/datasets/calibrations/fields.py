@@ -128,15 +128,20 @@ def _matters(key: str, value: Any) -> bool:
         return plain(value) not in HARMLESS_UNITS
     if isinstance(value, str) and not re.search(r"model|type|distort|lens|fisheye", name):
         return False
-    if HARMLESS.match(name) or _says_nothing(value):
+    if _says_nothing(value):
+        return False
+    if re.search(r"cam", name) and re.search(r"imu|body|base", name) and _could_be_a_pose(value):
+        return True
+    if HARMLESS.match(name):
         return False
     return bool(_MATTERS.search(name)) or _could_be_a_pose(value)
 
 
 def _could_be_a_pose(value: Any) -> bool:
-    """Whether a value is as many numbers as a position or a rotation or both, or names their axes."""
+    """Whether a value is as many numbers as a position or a rotation or both, names their axes, or holds such a one."""
     if isinstance(value, dict):
-        return {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
+        named = {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
+        return named or any(_could_be_a_pose(each) and not _says_nothing(each) for each in value.values())
     if not isinstance(value, list):
         return False
     try:

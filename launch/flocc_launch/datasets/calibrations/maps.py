@@ -331,17 +331,21 @@ def _is_of_camera(values: Map) -> bool:
     return isinstance(listed, list) or (isinstance(listed, dict) and "data" in listed)
 
 
+def _holds_camera(value: Any) -> bool:
+    return isinstance(value, dict) and (_is_of_camera(value) or any(map(_holds_camera, value.values())))
+
+
 OF_OTHERS = ("type", "model", "name", "id", "label")
 """Keys that, above a camera's map, are of what it stands in."""
 
 
 def _nested(document: Map, path: tuple[str, ...] = (), above: Map | None = None) -> Cameras:
-    """Maps of cameras inside of others, each with the plain values that stand above it."""
-    own = {key: value for key, value in document.items() if not isinstance(value, dict) and plain(key) not in OF_OTHERS}
+    """Maps of cameras inside of others, each with all that stands above and beside it: nothing is lost unsaid."""
+    own = {key: value for key, value in document.items() if not _holds_camera(value) and plain(key) not in OF_OTHERS}
     around = {**(above or {}), **own}
     found: Cameras = {}
     for key, value in document.items():
-        if not isinstance(value, dict):
+        if not _holds_camera(value):
             continue
         if _is_of_camera(value):
             twice = next((name for name in value if name in around and around[name] != value[name]), None)
