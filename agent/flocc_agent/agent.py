@@ -27,7 +27,7 @@ from flocc_agent.runtime.keyframes import KeyframeSelector
 from flocc_agent.runtime.measurement_file import Stamped
 from flocc_agent.runtime.metrics import MetricsServer
 from flocc_agent.runtime.network_watch import look_at_network, say_how_others_are_found
-from flocc_agent.runtime.new_journeys import began_anew, last_body
+from flocc_agent.runtime.new_journeys import began_anew, last_body, last_keyframe
 from flocc_agent.runtime.operator_answers import OperatorAnswers
 from flocc_agent.runtime.playback import play
 from flocc_agent.runtime.pose_limits import MOUNT_MAX_M, PoseGate, pose_fault
@@ -35,6 +35,7 @@ from flocc_agent.runtime.recording import Recording
 from flocc_agent.runtime.robot_result import RobotResult, write_result
 from flocc_agent.runtime.status import AgentStatus
 from flocc_agent.runtime.store import Store
+from flocc_agent.runtime.unmeasured_steps import StepWatch
 from flocc_agent.runtime.workers import Workers
 from flocc_protocol.errors import FloccError
 from flocc_protocol.ids import KeyframeId, LogId
@@ -110,7 +111,7 @@ class Agent:
         given = np.eye(4) if T_body_camera is None else _mounting(T_body_camera, config.name)
         self._T_body_camera = self._recording.T_body_camera if self._recording else given
         self._selector = KeyframeSelector(config.keyframes)
-        self._gate = PoseGate()
+        self._gate, self._steps = PoseGate(), StepWatch(pauses_count=False)
         self._kept = True
         self._driver: Driver | None = None
         self._store: Store | None = None
@@ -201,7 +202,8 @@ class Agent:
             await self._run
             assert self._store is not None
             self._store.close()
-            self._gate, self._selector = PoseGate(), KeyframeSelector(self.config.keyframes)
+            self._gate, self._steps = PoseGate(), StepWatch(pauses_count=False)
+            self._selector = KeyframeSelector(self.config.keyframes)
             self._driver = await asyncio.to_thread(self._compose)
             await self._begin(self._driver)
         logger.info("robot %s: begins another journey, %s", self.config.name, self.log)
@@ -267,6 +269,7 @@ class Agent:
             raise BadKeyframe(f"robot {self.config.name}: has no camera; give Agent(camera=...)")
         if (fault := self._gate.fault(T_odom_body, stamp_s)) is not None:
             raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {fault}")
+        self._steps.saw(stamp_s, T_odom_body)
 
     async def _add(self, pixels: NDArray[np.uint8], T_odom_body: Float, stamp_s: float) -> None:
         """Take in a keyframe whose pose can be."""
@@ -280,6 +283,13 @@ class Agent:
         except ValueError as error:
             raise BadKeyframe(f"robot {self.config.name}: keyframe at {stamp_s} s: {error}") from error
         self._kept = True
+        if (step := self._steps.of_keyframe(stamp_s)) is not None:
+            logger.warning(
+                "robot %s: its odometry jumped before %.3f s; loop closures decide where it was",
+                self.config.name,
+                stamp_s,
+            )
+            self._started.add_measurement(step.in_camera(self._T_body_camera), stamp_s)
 
     def add_fix(self, position_m: Float, covariance_m2: Float, stamp_s: float | None = None) -> None:
         """Give the agent an absolute position of the camera: `add_measurement(Fix(position_m, covariance_m2))`.
@@ -460,7 +470,8 @@ class Agent:
 
     async def _play(self, recording: Recording) -> None:
         source = self.config.source
-        resumed = len(self._started.robot.gossip.logs[self.log]) > 0
+        last = last_keyframe(self._started.robot)
+        last_stamp_s = None if last is None else last.stamp_s
 
         async def add(image: Image, T_odom_body: Float, stamp_s: float) -> None:
             await self._started.add_keyframe(image, T_odom_body @ self._T_body_camera, stamp_s)
@@ -472,7 +483,7 @@ class Agent:
             except BadMeasurement as error:
                 logger.warning("robot %s: %s; left out", self.config.name, error)
 
-        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, resumed)
+        await play(recording, source, self._selector, add, measure, self._clock_s, self._on_position, last_stamp_s)
 
     def _adapter(self, config: Ros2Config) -> "Ros2Adapter":
         from flocc_agent.runtime.ros2.adapter import Host, Ros2Adapter

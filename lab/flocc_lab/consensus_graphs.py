@@ -9,9 +9,9 @@ from flocc_agent.backend.consensus import (
     ConsensusPart,
     PartBeginning,
     information_by_keyframe,
-    paired,
     part_of,
 )
+from flocc_agent.backend.consensus_pair import paired
 from flocc_agent.backend.edges import state_of, taken
 from flocc_agent.backend.problem import initial_scale
 from flocc_agent.config import BackendConfig
@@ -66,8 +66,8 @@ def solved_alone(part: ConsensusPart) -> Float:
         weights=np.ones(len(own)),
     )
     cost = np.inf
-    for _ in range(ALONE_STEPS_MAX):
-        alone.step()
+    for number in range(ALONE_STEPS_MAX):
+        alone.step(number + 1)
         before, cost = cost, alone.merit()
         if before - cost <= ALONE_TOLERANCE_RATIO * cost:
             break

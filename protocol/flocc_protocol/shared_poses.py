@@ -14,7 +14,6 @@ from flocc_protocol.codec import (
     QUATERNION_NORM_TOLERANCE,
     Kinds,
     Pose7,
-    integer,
     sequence,
     struct,
 )
@@ -24,8 +23,6 @@ SHARED_MAX = 200
 """Poses that one pair of robots shares at most."""
 KNOTS_MAX = 16
 """Of these, whose stiffness is told as a whole."""
-STIFFNESS_EDITIONS = 2
-"""How often a robot tells how stiff it holds one list of shared poses."""
 _ROW = 13
 
 
@@ -52,9 +49,10 @@ class SharedPoses:
         base_m: (3,) float64, from which positions are told.
         rows: (S, 13) float32 of each pose position (m), quaternion w x y z, and force: the gradient, rotation first, in
             the pose's own tangent, of all that the sender knows but by the receiver.
-        known: Newest edition of the receiver's stiffness that the sender has, of this list; 0 for none.
-        stiffness_edition: Of the sender's stiffness that comes with it; 0 for none.
-        stiffness: (N,) float32 as `backend/shared_stiffness.py` packs it; empty for none.
+        known: `stiffness_number` of the receiver that the sender has, of this list; 0 for none.
+        stiffness_number: From the lower robot: of the penalty by which this is said. From the higher one: of how stiff
+            it holds the poses. The step after which its sender made it; 0 for none.
+        stiffness: (N,) float32 as `backend/shared_stiffness.py` packs it; empty where the receiver has it.
     """
 
     anchor: LogId
@@ -67,7 +65,7 @@ class SharedPoses:
     base_m: Array
     rows: Array
     known: int
-    stiffness_edition: int
+    stiffness_number: int
     stiffness: Array
 
     def __post_init__(self) -> None:
@@ -83,8 +81,8 @@ class SharedPoses:
             raise ValueError("a list of shared poses has two float32 informations for each of them")
         if np.any(self.information.numpy() <= 0.0):
             raise ValueError("information of closures is positive")
-        told = stiffness_numbers(count) if self.stiffness_edition else 0
-        if (self.stiffness.dtype, self.stiffness.shape) != ("f4", (told,)):
+        told = stiffness_numbers(count) if self.stiffness_number else 0
+        if self.stiffness.dtype != "f4" or self.stiffness.shape not in ((0,), (told,)):
             raise ValueError(f"the stiffness of {count} poses has {told} float32 numbers")
         rows = self.rows.numpy()
         norms = np.linalg.norm(rows[:, 3:7], axis=1)
@@ -95,8 +93,6 @@ class SharedPoses:
     def __len__(self) -> int:
         return self.rows.shape[0]
 
-
-_EDITION = integer(0, STIFFNESS_EDITIONS)
 
 CODECS: Kinds = {
     "shared-poses": (
@@ -112,8 +108,8 @@ CODECS: Kinds = {
             information=ARRAY,
             base_m=ARRAY,
             rows=ARRAY,
-            known=_EDITION,
-            stiffness_edition=_EDITION,
+            known=COUNT,
+            stiffness_number=COUNT,
             stiffness=ARRAY,
         ),
     )

@@ -247,6 +247,13 @@ def test_the_figures_that_show_it_stand_in_the_sentence(tmp_path: Path) -> None:
     assert "below R_thr 0.3" in rejected.sentence
     (similar,) = blocking(low_similarity().write(tmp_path / "similar"))
     assert "below the threshold of 0.1, the best was 0.07" in similar.sentence
+    (silent,) = blocking(leader_silent().write(tmp_path / "silent"))
+    assert silent.sentence.startswith("The leader server died: nothing was optimised after the first closure")
+    cut = leader_silent()
+    cut.events = [e for e in cut.events if e["event"] != "agent_died"]
+    (ended,) = blocking(cut.say(12.0, "server", "agent_stopped").write(tmp_path / "cut"))
+    assert ended.sentence.startswith("The leader server was stopped at 12.0 s: nothing was optimised")
+    assert ended.advice == "Let the run go on: it ended before a round."
     (latent,) = blocking(latents().write(tmp_path / "latent"))
     assert "no answer in 10 s" in latent.sentence
 

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from flocc_launch.swarm.launching import LaunchError, fresh_folder
+from flocc_agent.runtime.database import hold_lock
+from flocc_launch.runs.run_folder import RunFolder, RunFolderError
+from flocc_launch.swarm import fresh_folder as fresh
 
 
 def held(path: Path, scenario: str | None) -> Path:
@@ -18,8 +20,14 @@ def held(path: Path, scenario: str | None) -> Path:
     return path
 
 
+def taken(path: Path) -> RunFolder:
+    with fresh.fresh_folder(path, "town") as folder:
+        assert folder.path == path
+    return folder
+
+
 def test_a_run_of_the_same_scenario_is_replaced(tmp_path: Path) -> None:
-    fresh_folder(held(tmp_path / "run", "town"), "town")
+    taken(held(tmp_path / "run", "town"))
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert list((tmp_path / "run/robots").iterdir()) == []
 
@@ -29,7 +37,7 @@ def test_any_other_run_is_kept_beside_it_and_said(
     tmp_path: Path, earlier: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.WARNING):
-        fresh_folder(held(tmp_path / "run", earlier), "town")
+        taken(held(tmp_path / "run", earlier))
     assert (tmp_path / "run.before/robots/r1/store").read_text() == "a mission"
     assert list((tmp_path / "run/robots").iterdir()) == []
     assert f"held a run of {earlier or 'no known scenario'}, which is kept as {tmp_path / 'run.before'}" in caplog.text
@@ -37,14 +45,14 @@ def test_any_other_run_is_kept_beside_it_and_said(
 
 def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("three years")
-    with pytest.raises(LaunchError, match="is not empty and not an earlier run"):
-        fresh_folder(tmp_path, "town")
+    with pytest.raises(RunFolderError, match="is not empty and not an earlier run"):
+        taken(tmp_path)
 
 
 def test_a_folder_of_ones_own_that_has_robots_in_it_is_no_killed_run(tmp_path: Path) -> None:
     (held(tmp_path / "data", None) / "notes.txt").write_text("mine")
-    with pytest.raises(LaunchError, match="is not empty and not an earlier run"):
-        fresh_folder(tmp_path / "data", "town")
+    with pytest.raises(RunFolderError, match="is not empty and not an earlier run"):
+        taken(tmp_path / "data")
     assert (tmp_path / "data/robots/r1/store").read_text() == "a mission"
 
 
@@ -52,7 +60,32 @@ def test_what_stands_where_a_run_would_be_kept_is_not_deleted_unless_it_is_one(t
     run = held(tmp_path / "run", "field")
     (tmp_path / "run.before").mkdir()
     (tmp_path / "run.before/thesis.tex").write_text("three years")
-    with pytest.raises(LaunchError, match=r"run\.before is no run: choose another --out"):
-        fresh_folder(run, "town")
+    with pytest.raises(RunFolderError, match=r"run\.before is no run: choose another --out"):
+        taken(run)
     assert (tmp_path / "run.before/thesis.tex").exists()
     assert (run / "robots/r1/store").exists()
+
+
+def test_a_folder_in_which_a_run_is_going_on_is_refused_before_anything_in_it_is_touched(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with fresh.fresh_folder(run, "town"):
+        (run / "robots/r1").mkdir()
+        for scenario in ("town", "field"):
+            with pytest.raises(RunFolderError, match="run: a run is going on in it"), fresh.fresh_folder(run, scenario):
+                pass
+        assert (run / "robots/r1").is_dir()
+        assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    taken(run)
+    assert not (run / "lock").exists()
+
+
+def test_an_agent_that_outlived_its_launcher_keeps_its_folder(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    taken(run)
+    agent = hold_lock(run / "robots/r1/store/lock")
+    assert agent is not None
+    with pytest.raises(RunFolderError, match="run: a run is going on in it"):
+        taken(run)
+    agent.close()
+    taken(run)
+    assert not (run / "robots/r1").exists()

@@ -691,6 +691,8 @@ def test_distributed_mode_and_the_quick_optimiser_know_no_maps(block: Path, tmp_
 def test_runs_that_hold_no_store_or_no_keyframe_give_no_map(tmp_path: Path, first: Path) -> None:
     with pytest.raises(BadMap, match="holds no robot's store"):
         save_map(tmp_path, tmp_path / "map")
+    with pytest.raises(BadMap, match="nowhere: there is no such folder"):
+        save_map(tmp_path / "nowhere", tmp_path / "map")
     with pytest.raises(NotSolved, match=r"has no map map/r9; there are map/r1"):
         save_map(first, tmp_path / "map", frame="map/r9")
     (tmp_path / "mine").mkdir()

@@ -11,15 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flocc_agent.backend.consensus import (
-    ConsensusPart,
-    PairedRobot,
-    PartBeginning,
-    Tidings,
-    information_by_keyframe,
-    paired,
-    part_of,
-)
+from flocc_agent.backend.consensus import ConsensusPart, PartBeginning, information_by_keyframe, part_of
+from flocc_agent.backend.consensus_pair import PairedRobot, Tidings, paired
 from flocc_agent.backend.measured import measured_odometry
 from flocc_agent.backend.problem import initial_scale
 from flocc_agent.backend.screening import first_not_rigid
@@ -97,7 +90,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
     refused = _heard(part, problem.shared)
     heard = [other for other, shared in problem.shared.items() if shared.told is not None and other not in refused]
     before, apart = part.T, {other: part.apart(other) for other in heard}
-    part.step()
+    refused |= part.step(problem.number)
     after = _state_of(part, problem)
     origin = _origin(problem, after.T)
     poses = part.state.poses()
@@ -108,7 +101,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
         inverse(origin) @ after.T,
         origin,
         {other: part.tell(other).told() for other in part.neighbours},
-        information,
+        {other: neighbour.information for other, neighbour in part.neighbours.items() if neighbour.lower},
         float(np.abs(after.T - before).max()),
         max(gaps, default=0.0),
         part.own_cost(),
@@ -154,17 +147,18 @@ def _neighbour(
 ) -> PairedRobot:
     """What is known of a neighbour; where poses are listed anew, those that stay are pulled as before."""
     shared, held = problem.shared[other], state.pairs.get(other)
+    same = held if held is not None and held.edition == shared.edition else None
     told = information[other] if problem.log < other else shared.information
     assert told is not None, "who does not own closures was told their information"
-    neighbour = paired(problem.log < other, shared.keyframes, told, shared.edition)
+    said = told if same is None else same.information
+    neighbour = paired(problem.log < other, shared.keyframes, said, shared.edition)
     if held is None or held.T is None:
-        same = held is not None and held.edition == shared.edition
-        return replace(held, ours=dict(held.ours), theirs=dict(held.theirs)) if held is not None and same else neighbour
+        return neighbour if same is None else replace(same)
     T_held = _poses_of(problem.log, state, held.keyframes)
     if shared.forgotten and T_held is not None and float(np.abs(T_held - held.T).max()) > AGREED:
         return neighbour
-    if held.edition == shared.edition:
-        return replace(held, ours=dict(held.ours), theirs=dict(held.theirs))
+    if same is not None:
+        return replace(same)
     T = _poses_of(problem.log, state, shared.keyframes)
     kept = [(k, held.keyframes.index(each)) for k, each in enumerate(shared.keyframes) if each in held.keyframes]
     if T is None or T_held is None or not kept:

@@ -2,7 +2,8 @@
 
 Few closures between two maps do not tell how exact they are. Where their errors are larger than stated, the first one
 swings the other map about, the next one seems wrong, and one alone joins nothing: both maps are lost to each other. So
-they are asked once more, with larger errors, and believed only where all of them agree then.
+they are asked once more, with larger errors, and believed only where all of them agree then. Those without a length say
+less, and two wrong ones may agree so far by chance: there must be one more of them.
 """
 
 from collections.abc import Mapping
@@ -34,7 +35,12 @@ def less_exact(whole: Filtered, parted: Filtered, config: BackendConfig) -> dict
     for of_robots in _across(whole.taking_part, parted.groups):
         every = [k for ids in of_robots for k in ids]
         is_stated = all(k not in whole.held and whole.closures[k].covariance is not None for k in every)
-        if is_stated and len(every) >= whole.closures_min and all(_agree(whole, ids, config) for ids in of_robots):
+        without_length = not all(whole.taking_part[k].metric for k in every)
+        if (
+            is_stated
+            and len(every) >= whole.closures_min + without_length
+            and all(_agree(whole, ids, config) for ids in of_robots)
+        ):
             found |= {k: _less_exact(whole.closures[k]) for k in every}
     return found
 

@@ -49,6 +49,10 @@ class SharedStiffness:
         ties = self.ties[:, _LOWER_6[0], _LOWER_6[1]]
         return np.concatenate([self.knots[np.tril_indices(len(self.knots))], ties.ravel(), self.tied.ravel()])
 
+    def told(self, count: int) -> "SharedStiffness":
+        """As others read it, who are told it in single precision."""
+        return SharedStiffness.unpacked(self.packed().astype(np.float32).astype(float), count)
+
     @staticmethod
     def unpacked(numbers: Float, count: int) -> "SharedStiffness":
         """Read what `packed` wrote of so many poses.

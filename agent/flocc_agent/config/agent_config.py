@@ -54,7 +54,8 @@ class SourceConfig(Section):
     """Where keyframes come from when no program feeds the agent."""
 
     recording: Path | None = None
-    """Folder of images, odometry and camera (docs/data-sets.md), played by its stamps; None: the program's own."""
+    """Folder of images, odometry and camera (docs/data-sets.md), played by its stamps, after a restart from the
+    last keyframe on; None: the program's own."""
     rate: float = Field(1.0, gt=0)
     """Playback speed relative to the stamps."""
     start_s: float = Field(0.0, ge=0)

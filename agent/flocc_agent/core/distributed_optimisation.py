@@ -33,7 +33,7 @@ from flocc_agent.core.own_part import (
     SharedWith,
     ToldPoses,
 )
-from flocc_agent.core.pair_exchange import SharedPair, ToldFrame, asking_for_list, told_by, with_stiffness
+from flocc_agent.core.pair_exchange import SharedPair, ToldFrame, asking_for_list, told_by
 from flocc_agent.core.parameters import DistributedParameters
 from flocc_agent.core.peer_budgets import Muted
 from flocc_agent.core.plausibility import HELD_BACK_S
@@ -181,7 +181,7 @@ class DistributedOptimisation:
         if message.anchor == self.anchor and not self._is_back:
             self._take_origin(message)
             if before is None or message.step > before.step:
-                pair.heard = with_stiffness(message, pair.heard)
+                pair.heard = message
                 self._has_news |= before is None or not self._rests() or self._says_more(message, before)
         self._has_news |= message.anchor < self.anchor or (self._is_back and message.anchor == self.anchor)
         return []
@@ -383,17 +383,12 @@ class DistributedOptimisation:
         if self._own not in graph.trajectories:
             return
         self._graph = graph
-        self._drop_unborne()
         self._choices.look(graph)
+        for lower, pair in self._pairs.items():
+            if lower < self._own and not self._bears_out(lower, pair.keyframes):
+                pair.edition, pair.keyframes = 0, ()  # closures of it were taken back
+                pair.heard = pair.told = None
         self._has_news = True
-
-    def _drop_unborne(self) -> None:
-        """Share nothing more with a lower robot where no closure that counts leads to it any more."""
-        counting = [c for c in self._graph.closures if not c.doubt]
-        tied = {log for c in counting for log in (c.query.log, c.match.log) if self._own in (c.query.log, c.match.log)}
-        for other, pair in self._pairs.items():
-            if other < self._own and other not in tied:
-                pair.keyframes, pair.information, pair.heard, pair.told = (), None, None, None
 
     def _look_at_s(self) -> float:
         """When it is time to take in what the logs gained; never where they gained nothing."""
@@ -413,18 +408,22 @@ class DistributedOptimisation:
         listed = tuple(message.keyframes)
         if message.edition <= pair.edition or not listed or listed[-1] >= len(self._trajectory):
             return False
-        tied = {
-            own.index
-            for c in self._graph.closures
-            for own, other in ((c.query, c.match), (c.match, c.query))
-            if own.log == self._own and other.log == sender
-        }
-        if not tied.issuperset(listed):
+        if not self._bears_out(sender, listed):
             return False
         pair.edition, pair.keyframes, pair.information = message.edition, listed, message.information
         pair.heard = pair.told = None
         self._has_news = True
         return True
+
+    def _bears_out(self, other: LogId, listed: tuple[int, ...]) -> bool:
+        """Whether closures here that nothing doubts tie all of these own keyframes to another robot."""
+        tied = {
+            own.index
+            for c in self._graph.closures
+            for own, there in ((c.query, c.match), (c.match, c.query))
+            if own.log == self._own and there.log == other and not c.doubt
+        }
+        return tied.issuperset(listed)
 
     def _take_origin(self, message: SharedPoses) -> None:
         if self.anchor != self._own and message.origin_step > self._origin_step:
@@ -434,7 +433,7 @@ class DistributedOptimisation:
         """Whether a message moved something since the last one."""
         if (message.edition, message.anchor, message.known) != (before.edition, before.anchor, before.known):
             return True
-        if message.stiffness_edition:
+        if len(message.stiffness.numpy()):
             return True
         apart = message.rows.numpy()[:, :7] - before.rows.numpy()[:, :7]
         apart[:, :3] += message.base_m.numpy() - before.base_m.numpy()
@@ -573,6 +572,7 @@ class DistributedOptimisation:
                 owned=tuple(each for each in self._owned() if self._is_known(each.closure)),
                 shared=shared,
                 T_alone=self._T_alone,
+                number=self.number,
                 anchored=anchor == self._own,
                 origin=origin,
                 move_to=moves_to,

@@ -25,15 +25,15 @@ class ToldPoses:
     Attributes:
         base_m: (3,) from which positions are told.
         rows: (S, 13) position (m), quaternion w x y z, force (rotation first, in the pose's own tangent).
-        known: Newest edition of the receiver's stiffness that the sender has; 0 for none.
-        edition: Of the sender's stiffness that comes with it; 0 for none.
-        stiffness: (N,) it; empty for none.
+        known: Number of the receiver's penalty or stiffness that the sender has; 0 for none.
+        number: Of the penalty by which a lower robot says this, or of a higher one's stiffness; 0 for none.
+        stiffness: (N,) it; empty where the receiver has it.
     """
 
     base_m: Float
     rows: Float
     known: int = 0
-    edition: int = 0
+    number: int = 0
     stiffness: Float = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -99,6 +99,7 @@ class ConsensusProblem:
         owned: Closures that it uses: within it, and those between it and higher robots.
         shared: Of every robot with which it shares poses.
         T_alone: (N, 4, 4) where its first keyframes begin, in its own frame; odometry follows them.
+        number: Of the step; later ones have higher ones.
         anchored: The part is the anchor's, once moved: its first keyframe's odometry says where the map frame lies.
         origin: (4, 4) where the map frame lies among the poses, as last heard; of the frame that is moved to, if any.
         move_to: A robot, and what it told in another frame into which the part is to be moved first; else None.
@@ -110,6 +111,7 @@ class ConsensusProblem:
     owned: tuple[OwnedClosure, ...]
     shared: Mapping[LogId, SharedWith]
     T_alone: Float
+    number: int
     anchored: bool
     origin: Float | None = None
     move_to: tuple[LogId, ToldPoses] | None = None

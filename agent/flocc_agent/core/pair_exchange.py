@@ -1,6 +1,6 @@
 """What two robots tell each other of the poses that both have, in distributed mode: `shared-poses`, there and back."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,8 +63,7 @@ class SharedPair:
         assert told is not None
         has_list = self.said is not None and self.said.edition == self.edition
         information = self.information if is_lower and not has_list else None
-        is_known = has_list and self.said is not None and self.said.known >= told.edition
-        edition = 0 if is_known else told.edition
+        is_known = has_list and self.said is not None and self.said.known == told.number
         return SharedPoses(
             frame.anchor,
             frame.number,
@@ -76,8 +75,8 @@ class SharedPair:
             Array.of(told.base_m, "f8"),
             Array.of(told.rows),
             told.known,
-            edition,
-            Array.of(told.stiffness if edition else np.zeros(0)),
+            told.number,
+            Array.of(np.zeros(0) if is_known else told.stiffness),
         )
 
 
@@ -88,14 +87,7 @@ def asking_for_list(frame: ToldFrame) -> SharedPoses:
     return SharedPoses(frame.anchor, frame.number, pose7(frame.origin), 0, 0, (), information, base_m, rows, 0, 0, none)
 
 
-def with_stiffness(message: SharedPoses, unread: SharedPoses | None) -> SharedPoses:
-    """A message with the stiffness of one before it that no step has taken, where it has none itself."""
-    if unread is None or message.stiffness_edition or unread.edition != message.edition:
-        return message
-    return replace(message, stiffness_edition=unread.stiffness_edition, stiffness=unread.stiffness)
-
-
 def told_by(message: SharedPoses) -> ToldPoses:
     """What a message tells, as numbers."""
     stiffness = message.stiffness.numpy()
-    return ToldPoses(message.base_m.numpy(), message.rows.numpy(), message.known, message.stiffness_edition, stiffness)
+    return ToldPoses(message.base_m.numpy(), message.rows.numpy(), message.known, message.stiffness_number, stiffness)

@@ -1,11 +1,12 @@
 """Place recognition: cosine similarity of descriptors, best match per keyframe, threshold (Sec. III-A)."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.closed_partners import ClosedPartners
 from flocc_agent.core.descriptor_rows import NOTHING, Descriptor, DescriptorRows, Floats, comparable
 from flocc_agent.core.parameters import KEYFRAMES_HELD, PlaceRecognitionParameters
 from flocc_protocol.arrays import Array
@@ -26,7 +27,7 @@ class Candidate:
 
 
 Found = tuple[KeyframeId, Candidate]
-"""A new keyframe and a candidate that it gave."""
+"""A keyframe and a candidate that it gave."""
 
 
 class PlaceRecognition:
@@ -65,6 +66,7 @@ class PlaceRecognition:
         self._own_rows: DescriptorRows | None = None
         self._others: dict[int, DescriptorRows] = {}
         self._forgotten: set[int] = set()
+        self._closed_partners = ClosedPartners(parameters.similarity_threshold)
         self.refused = 0
 
     @property
@@ -195,7 +197,18 @@ class PlaceRecognition:
         self._best = np.maximum(best, self._best).tolist()
         for number in np.flatnonzero(best >= self._parameters.similarity_threshold).tolist():
             found += self._candidates(keyframe, number, others, similarities)
+        for log in self._closed & self._numbers.keys():
+            found += self._of_closed(log, keyframe.index, others, similarities)
         return _sorted(found)
+
+    def _of_closed(self, log: LogId, index: int, rows: DescriptorRows, similarities: Floats) -> Iterator[Found]:
+        """Candidates that keyframes of a closed log give, which this robot's way led on from at its so manieth one."""
+        number = self._numbers[log]
+        places = rows.places(number)
+        partners = self._closed_partners.found(number, rows.indices[places], similarities[places], index)
+        for given, own, similarity in partners:
+            giver = KeyframeId(log, given)
+            yield giver, Candidate(CandidatePair.of(KeyframeId(self._own, own), giver), similarity)
 
     def _among_own(self, keyframes: Sequence[tuple[KeyframeId, Descriptor]]) -> list[Found]:
         """Candidates of other robots' keyframes with this robot's."""

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 
 from flocc_agent.core.geodesy import Place, direction_of, up_at
 from flocc_agent.core.measurement_text import measurement_of
-from flocc_agent.core.measurements import BadMeasurement, Fix, GeodeticFix, Measurement, MetricClosure, StartPose
+from flocc_agent.core.measurements import (
+    BadMeasurement,
+    Fix,
+    GeodeticFix,
+    Measurement,
+    MetricClosure,
+    OdometryCovariance,
+    StartPose,
+)
 from flocc_agent.runtime.text_tables import RecordingError
 from flocc_protocol.ids import KeyframeId, LogId
 
@@ -79,6 +87,14 @@ class RecordedMeasurements:
         """What belongs to a frame that is a keyframe."""
         fixes = [position_at(positions, stamp_s) for positions in self.positions]
         return (*self.seen.get(stamp_s, ()), *(fix for fix in fixes if fix is not None))
+
+    def with_steps(self, steps: Mapping[float, OdometryCovariance]) -> "RecordedMeasurements":
+        """The same with how exact odometry is up to these frames, where the recording does not say so itself."""
+        seen = dict(self.seen)
+        for stamp_s, step in steps.items():
+            if not any(isinstance(each.measurement, OdometryCovariance) for each in seen.get(stamp_s, ())):
+                seen[stamp_s] = (*seen.get(stamp_s, ()), Stamped(stamp_s, step))
+        return replace(self, seen=seen, kept=self.kept | steps.keys())
 
 
 NOTHING = RecordedMeasurements({}, frozenset())

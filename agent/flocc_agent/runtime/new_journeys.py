@@ -15,12 +15,16 @@ ELSEWHERE_M, ELSEWHERE_RAD = 2.0, 0.6
 """The last keyframe before lies so far from there; a robot that stopped where it began goes on with its log."""
 
 
+def last_keyframe(robot: Robot) -> KeyframeRecord | None:
+    """The last keyframe of the robot's own log; None where it has none."""
+    records = reversed(robot.gossip.logs[robot.log].records)
+    return next((record for record in records if isinstance(record, KeyframeRecord)), None)
+
+
 def last_body(robot: Robot, T_body_camera: Float) -> Float | None:
     """`T_odom_body` (4, 4) at the last keyframe of the robot's own log; None where it has none."""
-    for record in reversed(robot.gossip.logs[robot.log].records):
-        if isinstance(record, KeyframeRecord):
-            return np.asarray(pose_from_tq(np.array(record.T_odom_camera)) @ inverse(T_body_camera))
-    return None
+    last = last_keyframe(robot)
+    return None if last is None else np.asarray(pose_from_tq(np.array(last.T_odom_camera)) @ inverse(T_body_camera))
 
 
 def began_anew(T_odom_before: Float | None, T_odom_body: Float) -> bool:

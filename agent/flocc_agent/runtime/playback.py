@@ -36,7 +36,7 @@ async def play(
     add_measurement: AddMeasurement,
     clock_s: Callable[[], float],
     on_position: Callable[[Float], None],
-    resumed: bool = False,
+    last_stamp_s: float | None = None,
 ) -> None:
     """Play frames when they are due; late ones are played at once, none is skipped but what cannot be read.
 
@@ -48,13 +48,22 @@ async def play(
         add_measurement: Takes what was measured at the keyframe with this stamp.
         clock_s: Seconds since the start of the run.
         on_position: Takes the true position (3,) of each frame, where it is known, for emulated range.
-        resumed: The agent was restarted: frames that were due before now are skipped.
+        last_stamp_s: Of the last keyframe that the robot's log has: the agent was restarted, and goes on after it.
+            Frames that were due before now are skipped then, unless the run's clock began anew as well.
     """
     first_s = recording.frames[0].stamp_s
-    started_s = clock_s()
-    for frame in recording.frames:
-        wanted_s = due_s(frame.stamp_s, first_s, config)
-        if resumed and wanted_s < started_s - READY_S:
+    started_s, waits_s = clock_s(), 0.0
+    frames = recording.frames
+    if last_stamp_s is not None:
+        frames = tuple(frame for frame in frames if frame.stamp_s > last_stamp_s)
+        if not frames:
+            logger.warning("%s: was played to its end before, and is not played again", recording.path)
+        elif due_s(last_stamp_s, first_s, config) > started_s:
+            waits_s = due_s(frames[0].stamp_s, first_s, config) - started_s
+            logger.info("%s: goes on at %.3f s, after the last keyframe of the log", recording.path, frames[0].stamp_s)
+    for frame in frames:
+        wanted_s = due_s(frame.stamp_s, first_s, config) - waits_s
+        if last_stamp_s is not None and wanted_s < started_s - READY_S:
             continue
         await asyncio.sleep(max(wanted_s - clock_s(), 0.0))
         truth = recording.ground_truth(frame.stamp_s)

@@ -196,5 +196,16 @@ def breaks(stamps_s: Float, T: Float) -> NDArray[np.bool_]:
     return found
 
 
+def is_break(moved_m: float, turned_rad: float, step_s: float, m_per_s: float, rad_per_s: float) -> bool:
+    """Whether a step is one where odometry begins anew, by the speed of the step before alone."""
+
+    def lonely(amount: float, amount_min: float, before: float, rate_min: float) -> bool:
+        rate = amount / step_s
+        return amount > amount_min and rate > BREAK_RATIO * before and rate - before > rate_min
+
+    moved = lonely(moved_m, BREAK_MIN_M, m_per_s, ACCELERATION_MAX_M_PER_S2 * step_s)
+    return moved or lonely(turned_rad, BREAK_MIN_RAD, rad_per_s, TURN_MAX_RAD_S)
+
+
 def _is_number(value: object) -> bool:
     return isinstance(value, Real)

@@ -13,6 +13,8 @@ when they are asked for.
 """
 
 import logging
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 
 from flocc_agent.config import ConfigError, read_toml
 from flocc_agent.core.interfaces import Camera, Image
+from flocc_agent.core.measurements import OdometryCovariance
 from flocc_agent.lenses import CameraModel, LensKind
 from flocc_agent.lenses.lens_names import READ, kind_of
 from flocc_agent.lenses.models import DISTORTION_COUNTS
@@ -32,6 +35,7 @@ from flocc_agent.runtime.straightening import Straightener
 from flocc_agent.runtime.text_tables import RecordingError, text_lines
 from flocc_agent.runtime.trajectory import GAP_MAX_S, Trajectory, checked_pose
 from flocc_agent.runtime.trajectory_text import read_tum
+from flocc_agent.runtime.unmeasured_steps import pauses, unmeasured
 
 __all__ = ["Frame", "Recording", "RecordingError", "read_camera", "read_image_list", "write_camera"]
 
@@ -108,7 +112,8 @@ class Recording:
             )
         model, T_body_camera = read_camera(path / "camera.toml")
         straightener = _straightener(model, path / "camera.toml")
-        frames = _frames(path, read_tum(path / "odometry.tum"))
+        odometry = read_tum(path / "odometry.tum")
+        frames = _frames(path, odometry)
         truth_path = path / "groundtruth.tum"
         truth = read_tum(truth_path) if truth_path.exists() else None
         try:
@@ -118,7 +123,9 @@ class Recording:
         if looked.fault is not None:
             logger.warning("%s", looked.fault)
         good = tuple(frames[k] for k in looked.good)
-        measurements = read_measurements(path / MEASUREMENTS, [frame.stamp_s for frame in good])
+        frames_s = [frame.stamp_s for frame in good]
+        measurements = read_measurements(path / MEASUREMENTS, frames_s)
+        measurements = measurements.with_steps(_unmeasured(path / "odometry.tum", odometry, frames_s))
         hidden = read_mask(path / MASK, straightener)
         camera, needed = straightener.camera, straightener if straightener.is_needed else None
         return cls(path, camera, T_body_camera, good, truth, looked.levels, measurements, hidden, needed)
@@ -229,6 +236,23 @@ def write_camera(path: Path, camera: Camera, T_body_camera: Float) -> None:
         f"distortion = [{distortion}]\nT_body_camera = [\n    {rows},\n]\n",
         encoding="utf-8",
     )
+
+
+def _unmeasured(path: Path, odometry: Trajectory, frames_s: Sequence[float]) -> dict[float, OdometryCovariance]:
+    """How exact odometry is up to those frames before which nobody measured it, by their stamps."""
+    found: dict[float, OdometryCovariance] = {}
+    for k, step in unmeasured(odometry.stamps_s, odometry.T_fixed_body).items():
+        after = bisect_left(frames_s, float(odometry.stamps_s[k]))
+        if 0 < after < len(frames_s):
+            found[frames_s[after]] = step
+    if len(paused := pauses(odometry.stamps_s)):
+        from_s, to_s = odometry.stamps_s[paused[0] - 1], odometry.stamps_s[paused[0]]
+        more = f" (and in {len(paused) - 1} other pauses)" if len(paused) > 1 else ""
+        logger.warning(
+            "%s: says nothing from %.3f s to %.3f s%s; loop closures decide where the robot went meanwhile",
+            *(path, from_s, to_s, more),
+        )
+    return found
 
 
 def _frames(path: Path, odometry: Trajectory) -> tuple[Frame, ...]:

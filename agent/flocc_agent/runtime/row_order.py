@@ -103,8 +103,8 @@ def in_order(poses: Poses, path: Path) -> tuple[Trajectory, tuple[str, ...]]:
     if np.any(anew):
         more = f" (and at {np.count_nonzero(anew) - 1} other rows)" if np.count_nonzero(anew) > 1 else ""
         notes.append(
-            f"{path}:{lines[np.argmax(anew)]}: the pose jumps and goes on from there{more}; it is taken as motion: "
-            "where odometry began anew, cut the file and convert the parts apart"
+            f"{path}:{lines[np.argmax(anew)]}: the pose jumps and goes on from there{more}; where this is "
+            "odometry, it began anew there, and loop closures decide where the robot was"
         )
     return Trajectory(stamps_s, T), tuple(notes)
 

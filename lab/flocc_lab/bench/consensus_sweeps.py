@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.backend.alignment import align
-from flocc_agent.backend.consensus import ConsensusPart, Tidings
+from flocc_agent.backend.consensus import ConsensusPart
+from flocc_agent.backend.consensus_pair import Tidings
 from flocc_agent.config import BackendConfig, Formulation, Solver
 from flocc_agent.core.pose_graph import PoseGraph, Trajectory
 from flocc_lab.consensus_graphs import part_of_graph, solved_alone
@@ -38,6 +39,7 @@ class Sweeps:
         self.parts = begun(graph, config)
         self.payload_bytes = 0
         self.refused = 0
+        self.sweeps = 0
         self._loss_ratio = loss_ratio
         self._rng = np.random.default_rng(seed)
 
@@ -48,8 +50,9 @@ class Sweeps:
 
     def sweep(self) -> None:
         """Every robot does a step, one after the other, and tells its neighbours."""
+        self.sweeps += 1
         for log, part in self.parts.items():
-            part.step()
+            part.step(self.sweeps)
             for other in part.neighbours:
                 told = part.tell(other).told()
                 self.payload_bytes += told.size_bytes

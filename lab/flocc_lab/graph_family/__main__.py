@@ -2,21 +2,31 @@
 
 import argparse
 import sys
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from flocc_lab.graph_family.family_campaign import run, table
 from flocc_lab.graph_family.family_spec import drawn
+from flocc_lab.graph_family.graphs import KnownGraph, member
 from flocc_lab.graph_family.methods import Method, flocc, methods, settings
+from flocc_lab.graph_family.recording_variants import variant
+from flocc_launch.graph_files import read_graph_file
 
 
 def main() -> None:
     """Run the campaign that the command line names and print its table."""
     options = parsed(sys.argv[1:])
     chosen = chosen_methods(options.methods.split(",") if options.methods else [], options.set, options.earlier)
-    seeds = range(options.first, options.first + options.draws)
-    small = [seed for seed in seeds if sum(drawn(seed).keyframes) <= options.keyframes_max]
-    verdicts = run(small, chosen, options.rows, options.limit_s)
+    seeds: Sequence[int] = range(options.first, options.first + options.draws)
+    if options.recordings:
+        files = [read_graph_file(path) for path in options.recordings]
+        graph_of: Callable[[int], KnownGraph] = partial(variant, files=files)
+    else:
+        graph_of = member
+        seeds = [seed for seed in seeds if sum(drawn(seed).keyframes) <= options.keyframes_max]
+    verdicts = run(seeds, chosen, options.rows, options.limit_s, graph_of)
     sys.stdout.write(table([v for v in verdicts if v.method in chosen]) + "\n")
 
 
@@ -26,6 +36,9 @@ def parsed(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--draws", type=int, default=60, help="number of graphs")
     parser.add_argument("--first", type=int, default=1, help="seed of the first graph")
     parser.add_argument("--keyframes-max", type=int, default=10**9, help="leave out graphs with more keyframes")
+    parser.add_argument(
+        "--recordings", type=Path, nargs="+", metavar="FILE", help="variants of labelled recordings (JRL) instead"
+    )
     parser.add_argument("--methods", default="flocc", help="names with commas between them; empty: all")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="flocc so changed, too")
     parser.add_argument("--earlier", type=Path, help="another checkout, whose default runs beside")

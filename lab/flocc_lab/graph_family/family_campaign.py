@@ -5,18 +5,24 @@ Rows go to a file of JSON lines as they come, so that a campaign that was stoppe
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
 
-from flocc_lab.graph_family.graphs import Member, member
+from flocc_lab.graph_family.graphs import KnownGraph, member
 from flocc_lab.graph_family.judge import GraphVerdict, judged
 from flocc_lab.graph_family.methods import Method, MethodAnswer, NoAnswer, oracle
 
 
-def run(seeds: Iterable[int], methods: Mapping[str, Method], rows: Path | None, limit_s: float) -> list[GraphVerdict]:
+def run(
+    seeds: Iterable[int],
+    methods: Mapping[str, Method],
+    rows: Path | None,
+    limit_s: float,
+    graph_of: Callable[[int], KnownGraph] = member,
+) -> list[GraphVerdict]:
     """Judge every method on every seed, until the time is over; rows that the file has are not run again."""
     done = read_rows(rows) if rows is not None else []
     known, began = {(v.seed, v.method) for v in done}, time.monotonic()
@@ -26,7 +32,7 @@ def run(seeds: Iterable[int], methods: Mapping[str, Method], rows: Path | None, 
             continue
         if time.monotonic() - began > limit_s:
             break
-        graph = member(seed)
+        graph = graph_of(seed)
         best = oracle(graph)
         for name, method in missing.items():
             verdict = verdict_of(graph, name, method, best)
@@ -37,7 +43,7 @@ def run(seeds: Iterable[int], methods: Mapping[str, Method], rows: Path | None, 
     return done
 
 
-def verdict_of(graph: Member, name: str, method: Method, best: MethodAnswer) -> GraphVerdict:
+def verdict_of(graph: KnownGraph, name: str, method: Method, best: MethodAnswer) -> GraphVerdict:
     """One answer, judged; a method without an answer fails."""
     try:
         return judged(graph, name, method(graph), best)
@@ -45,8 +51,8 @@ def verdict_of(graph: Member, name: str, method: Method, best: MethodAnswer) -> 
         lost = f"{name}: {error}"
     right = int(np.count_nonzero(graph.is_right))
     of_oracle = judged(graph, name, best, best).oracle_m
-    groups, never = graph.spec.groups, float("inf")
-    return GraphVerdict(graph.spec.seed, name, never, of_oracle, False, 0, right, right, False, True, groups, 0.0, lost)
+    groups, never = graph.groups, float("inf")
+    return GraphVerdict(graph.seed, name, never, of_oracle, False, 0, right, right, False, True, groups, 0.0, lost)
 
 
 def read_rows(path: Path) -> list[GraphVerdict]:

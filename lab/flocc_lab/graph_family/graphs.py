@@ -28,10 +28,19 @@ FALSE_LENGTH_M = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Member:
-    """A graph of the family, its true poses (N, 4, 4) by robot, and which of its closures are right."""
+class KnownGraph:
+    """A graph whose answer is known.
 
-    spec: Spec
+    Attributes:
+        seed: What it was drawn from.
+        groups: Groups of wrong closures that agree with each other.
+        graph: What is to be solved.
+        T_world_keyframe: True poses (N, 4, 4) by log.
+        is_right: Of each closure (L,).
+    """
+
+    seed: int
+    groups: int
     graph: PoseGraph
     T_world_keyframe: Mapping[LogId, Float]
     is_right: NDArray[np.bool_]
@@ -40,6 +49,13 @@ class Member:
         """The same graph without its wrong closures."""
         kept = [c for c, right in zip(self.graph.closures, self.is_right, strict=True) if right]
         return PoseGraph(self.graph.trajectories, kept)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member(KnownGraph):
+    """A graph of the family."""
+
+    spec: Spec
 
 
 def member(seed: int) -> Member:
@@ -63,7 +79,8 @@ def made(spec: Spec) -> Member:
     wrong += [closure for _ in range(groups) for closure in _facade(rng, truth, spec)]
     order = rng.permutation(len(closures) + len(wrong))
     mixed = [*closures, *wrong]
-    return Member(spec, PoseGraph(trajectories, [mixed[k] for k in order]), truth, order < len(closures))
+    graph = PoseGraph(trajectories, [mixed[k] for k in order])
+    return Member(spec.seed, spec.groups, graph, truth, order < len(closures), spec)
 
 
 def stray(rng: np.random.Generator, member: Member) -> LoopClosure:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.geometry import umeyama
-from flocc_lab.graph_family.graphs import Member
+from flocc_lab.graph_family.graphs import KnownGraph
 from flocc_lab.graph_family.methods import MethodAnswer
 from flocc_protocol.ids import LogId
 
@@ -64,13 +64,13 @@ class GraphVerdict:
         return far or self.worse_than_odometry or bool(self.lost)
 
 
-def judged(member: Member, method: str, answer: MethodAnswer, oracle: MethodAnswer) -> GraphVerdict:
+def judged(member: KnownGraph, method: str, answer: MethodAnswer, oracle: MethodAnswer) -> GraphVerdict:
     """Compare an answer with the truth, and that with the oracle's."""
     own, own_oracle, own_odometry = (own_ate_m(member, T) for T in (answer.T_map_keyframe, oracle.T_map_keyframe, None))
     limit_m = max(WORSE_RATIO * own_odometry, own_odometry + WORSE_M)
     frame = {log: n for n, logs in enumerate(answer.groups) for log in logs}
     return GraphVerdict(
-        seed=member.spec.seed,
+        seed=member.seed,
         method=method,
         ate_m=joint_ate_m(member, answer, oracle.groups),
         oracle_m=joint_ate_m(member, oracle, oracle.groups),
@@ -80,23 +80,23 @@ def judged(member: Member, method: str, answer: MethodAnswer, oracle: MethodAnsw
         right=int(np.count_nonzero(member.is_right)),
         worse_than_odometry=own > limit_m and own_oracle <= limit_m,
         warned=bool(answer.warnings),
-        groups=member.spec.groups,
+        groups=member.groups,
         cpu_s=answer.cpu_s,
     )
 
 
-def joint_ate_m(member: Member, answer: MethodAnswer, groups: Iterable[tuple[LogId, ...]]) -> float:
+def joint_ate_m(member: KnownGraph, answer: MethodAnswer, groups: Iterable[tuple[LogId, ...]]) -> float:
     """Root mean square of the positions' errors, each group of logs aligned as one."""
     return _rmse(np.concatenate([_errors_m(member, answer.T_map_keyframe, logs) for logs in groups]))
 
 
-def own_ate_m(member: Member, T: Mapping[LogId, Float] | None) -> float:
+def own_ate_m(member: KnownGraph, T: Mapping[LogId, Float] | None) -> float:
     """The same with each robot aligned on its own; of odometry where no poses are given."""
     poses = T or {log: t.T_odom_keyframe for log, t in member.graph.trajectories.items()}
     return _rmse(np.concatenate([_errors_m(member, poses, (log,)) for log in poses]))
 
 
-def _errors_m(member: Member, T: Mapping[LogId, Float], logs: Iterable[LogId]) -> Float:
+def _errors_m(member: KnownGraph, T: Mapping[LogId, Float], logs: Iterable[LogId]) -> Float:
     names = list(logs)
     source = np.concatenate([T[log][:, :3, 3] for log in names])
     target = np.concatenate([member.T_world_keyframe[log][:, :3, 3] for log in names])

@@ -27,7 +27,7 @@ from flocc_agent.core.pose_graph import (
     components_of,
 )
 from flocc_lab.bench.solver_ratios import between_factors, gnc_with
-from flocc_lab.graph_family.graphs import Member
+from flocc_lab.graph_family.graphs import KnownGraph
 from flocc_protocol.ids import LogId
 
 Float = NDArray[np.float64]
@@ -67,7 +67,7 @@ class MethodAnswer:
     cpu_s: float
 
 
-Method = Callable[[Member], MethodAnswer]
+Method = Callable[[KnownGraph], MethodAnswer]
 
 
 def settings(**changed: Any) -> BackendConfig:
@@ -78,7 +78,7 @@ def settings(**changed: Any) -> BackendConfig:
 def flocc(config: BackendConfig) -> Method:
     """The back end with a configuration."""
 
-    def method(member: Member) -> MethodAnswer:
+    def method(member: KnownGraph) -> MethodAnswer:
         began = time.process_time()
         solution = optimise(member.graph, config)
         return answer_of(solution, time.process_time() - began)
@@ -99,7 +99,7 @@ def answer_of(solution: GraphSolution | OptimisationFailed, cpu_s: float) -> Met
     return MethodAnswer(poses, tuple(c.logs for c in solution.components), used, tuple(solution.warnings), cpu_s)
 
 
-def oracle(member: Member) -> MethodAnswer:
+def oracle(member: KnownGraph) -> MethodAnswer:
     """LM with the right closures alone, from the true poses."""
     graph = member.right_closures()
     logs = tuple(sorted(member.T_world_keyframe))
@@ -111,7 +111,7 @@ def oracle(member: Member) -> MethodAnswer:
     return MethodAnswer(answer.T_map_keyframe, answer.groups, used, answer.warnings, answer.cpu_s)
 
 
-def gtsam_gnc(member: Member) -> MethodAnswer:
+def gtsam_gnc(member: KnownGraph) -> MethodAnswer:
     """GTSAM's `GncLMOptimizer` from the same start, lengths that are free put into the covariances."""
     graph, began = member.graph, time.process_time()
     excluded = screen(graph).excluded
@@ -147,7 +147,7 @@ def earlier(source: Path) -> Method:
     """The default of another checkout, run by this interpreter in a process of its own."""
     paths = os.pathsep.join(str(source / name) for name in ("agent", "protocol", "launch"))
 
-    def method(member: Member) -> MethodAnswer:
+    def method(member: KnownGraph) -> MethodAnswer:
         done = subprocess.run(
             [sys.executable, "-c", EARLIER],
             input=pickle.dumps(member.graph),

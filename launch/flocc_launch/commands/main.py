@@ -223,7 +223,7 @@ def simulate(
     from flocc_launch.scenarios.recordings import recordings
     from flocc_launch.setup.cache import cache_folder
     from flocc_launch.simulation.simulate import simulate as run
-    from flocc_launch.swarm.launching import fresh_folder
+    from flocc_launch.swarm.fresh_folder import fresh_folder
 
     changes = _changes(loss=loss, latency=latency, bandwidth=bandwidth, range_m=range_m, duration=duration, seed=seed)
     read = _read(scenario, changes | _parsed(sets), agents, speech)
@@ -232,8 +232,8 @@ def simulate(
     check_measurable(read, paths)
     if use is not None:
         use.check_fully(read)  # before the earlier run goes
-    fresh_folder(out, read.name, use)
-    show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
+    with fresh_folder(out, read.name, use):
+        show_report(run(read, out, recordings=paths, cache=cache_folder() / "perception", use=use), out, speech)
 
 
 @app.command()

@@ -25,6 +25,7 @@ from flocc_launch.doctor.merge_evidence import (
 from flocc_launch.runs.loaded_run import LoadedRun
 from flocc_launch.runs.plain_numbers import count_of, number, seconds
 from flocc_launch.runs.run_records import setting_number
+from flocc_launch.runs.timeline import End, Following, ends
 
 HEARD_S_MIN = 5.0
 EXAMPLES_MAX = 3
@@ -225,18 +226,29 @@ def optimised_nothing(loaded: LoadedRun, a: str, b: str) -> Finding | None:
             a,
             b,
         )
-    leaders = sorted({f.leader for f in loaded.followings if f.robot in (a, b) and f.to_s >= since_s})
-    died = [robot for robot in leaders if any(e.robot == robot for e in of_kind(loaded.events, AgentDied))]
-    silent = (
-        f"The leader {named(died or leaders)} {'died' if died else 'is silent'}" if leaders else "The last leader left"
-    )
+    led = max((f for f in loaded.followings if f.robot in (a, b) and f.to_s >= since_s), key=_until, default=None)
+    end = None if led is None else ends(loaded.events).get(led.leader)
+    silent = "The last leader left" if led is None else f"The leader {led.leader} {_how(end)}"
     return blocked(
         "leader-silent",
         f"{silent}: nothing was optimised after the first closure between {a} and {b} at {seconds(since_s)}.",
-        "Look at the log of the leader; let the run go on until the others elect another one.",
+        "Let the run go on: it ended before a round."
+        if end is not None and not isinstance(end.fact, AgentDied)
+        else "Look at the log of the leader; let the run go on until the others elect another one.",
         a,
         b,
     )
+
+
+def _until(following: Following) -> float:
+    return following.to_s
+
+
+def _how(end: End | None) -> str:
+    """What became of a leader."""
+    if end is None:
+        return "is silent"
+    return "died" if isinstance(end.fact, AgentDied) else f"was stopped at {seconds(end.t)}"
 
 
 def held_join(loaded: LoadedRun, a: str, b: str) -> Finding | None:

@@ -85,6 +85,8 @@ def store_folders(where: Path) -> list[Path]:
     found += [path.parent for path in sorted(where.glob("robots/*/store/robot.sqlite"))]
     if not found and (where / MANIFEST).is_file():
         raise BadMap(f"{where}: is a map already")
+    if not where.is_dir():
+        raise BadMap(f"{where}: there is no such folder")
     if not found:
         raise BadMap(f"{where}: holds no robot's store (robots/*/store of a run, or the folder of an agent)")
     return found

@@ -54,12 +54,12 @@ def _odometry_made(recordings: Mapping[str, str]) -> dict[str, str]:
 def build(loaded: LoadedRun) -> RunReport:
     """Compute the report of a run."""
     run, tracks = loaded.run, loaded.tracks
-    frames = frames_of(tracks)
     robots = [robot_part(loaded, robot) for robot in loaded.robots]
     by_robot, moments = bytes_by_robot(loaded), moments_of(loaded.events, tracks)
     during = mean_errors(moments, tracks)
     apart = in_separate_frames(tracks)
     living = survivors(tracks, [robot.robot for robot in robots if robot.end == "died"])
+    frames = frames_of(living)
     report = RunReport(
         flocc_version=flocc_version(),
         scenario=run.scenario,
@@ -70,14 +70,14 @@ def build(loaded: LoadedRun) -> RunReport:
         wall_s=run.wall_s,
         robots=list(loaded.robots),
         odometry_made=_odometry_made({robot: at for robot, at in run.recordings.items() if robot not in loaded.barred}),
-        map_frames=frames_of(living),
+        map_frames=frames,
         merged_after_s=merged_after_s(loaded.events, [robot for robot in loaded.robots if robot not in run.servers]),
         closures=closures_part(loaded),
         ate_joint_m=ate_joint_m(living),
         ate_dead_m=ate_dead_m(living, tracks),
         ate_joint_odometry_m=ate_joint_odometry_m(living, aligned=False),
         ate_joint_odometry_aligned_m=ate_joint_odometry_m(living, aligned=True),
-        ate_by_frame_m={frame: ate_in_frame_m(tracks.values(), frame) for frame in frames if not apart},
+        ate_by_frame_m={frame: ate_in_frame_m(living.values(), frame) for frame in frames if not apart},
         ate_m={robot.robot: robot.corrected.ate_m for robot in robots},
         ate_odometry_m={robot.robot: robot.odometry.ate_m for robot in robots},
         iate_m=None if during is None else during.corrected_m,
@@ -126,17 +126,26 @@ def frames_of(tracks: Mapping[str, RobotTrack]) -> list[str]:
 
 
 def ate_dead_m(living: Mapping[str, RobotTrack], tracks: Mapping[str, RobotTrack]) -> dict[str, float]:
-    """Error of each dead robot until it died: placed by the survivors where it was in their map, else by itself."""
-    dead = {robot: track for robot, track in tracks.items() if robot not in living}
-    moved = with_keyframes(living.values())
-    known = ate_joint_m(living) is not None
-    T_world_map = alignment(*zip(*(track.corrected_and_true() for track in moved), strict=True)) if known else np.eye(4)
+    """Error of each dead robot until it died: placed by its map's survivors where there are any, else by itself."""
+    apart = in_separate_frames(tracks)
     errors_m = {}
-    for robot, track in dead.items():
+    for robot, track in tracks.items():
+        if robot in living:
+            continue
         estimate, truth = track.corrected_and_true()
-        shared = known and track.map_frame == moved[0].map_frame
-        errors_m[robot] = unaligned_ate_m([T_world_map @ estimate], [truth]) if shared else ate_m([estimate], [truth])
+        of_map = [] if apart else with_truth_in(living.values(), track.map_frame)
+        if of_map:
+            T_world_map = alignment(*zip(*of_map, strict=True))
+            errors_m[robot] = unaligned_ate_m([T_world_map @ estimate], [truth])
+        else:
+            errors_m[robot] = ate_m([estimate], [truth])
     return {robot: error_m for robot, error_m in errors_m.items() if error_m is not None}
+
+
+def with_truth_in(tracks: Iterable[RobotTrack], frame: str | None) -> list[tuple[Float, Float]]:
+    """Corrected and true poses of the robots in one map frame, of those that have true ones; none where no map is."""
+    pairs = [track.corrected_and_true() for track in tracks if frame is not None and track.map_frame == frame]
+    return [pair for pair in pairs if len(pair[1])]
 
 
 def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:
@@ -152,7 +161,7 @@ def ate_joint_m(tracks: Mapping[str, RobotTrack]) -> float | None:
 
 def ate_in_frame_m(tracks: Iterable[RobotTrack], frame: str) -> float | None:
     """Joint ATE of the robots in one map frame."""
-    pairs = [track.corrected_and_true() for track in tracks if track.map_frame == frame]
+    pairs = with_truth_in(tracks, frame)
     return ate_m([estimate for estimate, _ in pairs], [truth for _, truth in pairs])
 
 

@@ -77,7 +77,8 @@ def of_the_dead(report: RunReport) -> str:
     if all(robot.end != "died" for robot in report.robot_details):
         return ""
     dead = (f", {robot} until it died {number(error_m, 'm')}" for robot, error_m in sorted(report.ate_dead_m.items()))
-    return f" of the survivors{''.join(dead)}"
+    whose = " of the survivors" if report.ate_joint_m is not None else ", as the survivors have no map together"
+    return f"{whose}{''.join(dead)}"
 
 
 def judged(met: bool | None) -> str:

@@ -31,6 +31,7 @@ from flocc_launch.scenarios.recordings import recordings
 from flocc_launch.scenarios.scenario import Fault, FaultKind, LinkFault, Scenario, agent_config
 from flocc_launch.setup.credentials import make_keys
 from flocc_launch.swarm.agent_process import Lines, ending_signals, recover_result
+from flocc_launch.swarm.fresh_folder import LAUNCHER_EVENTS, fresh_folder
 from flocc_launch.swarm.processes import AgentProcess, loopback_transports
 from flocc_protocol.errors import FloccError
 
@@ -38,9 +39,6 @@ logger = logging.getLogger(__name__)
 
 Seen = tuple[dict[str, tuple[int, int]], str | None, int | None, str | None, bool]
 """Logs, map frame, round, leader, and whether it plays: a run goes on while they change."""
-LAUNCHER_EVENTS = "launcher.events.jsonl"
-LEFT_BY_A_KILL = frozenset({"robots", "groundtruth", "events.jsonl", LAUNCHER_EVENTS})
-"""All that a run can have written before its `run.json`."""
 PERIOD_S = 0.25
 UNSETTLED_MAX_S = 120.0
 STOP_NOW_S = 5.0
@@ -106,55 +104,9 @@ def launch(
     check_measurable(scenario, paths)
     if use is not None:
         use.check_fully(scenario)  # before the earlier run goes
-    folder = fresh_folder(out, scenario.name, use)
     given = on_watch or (lambda _: None)
-    return asyncio.run(_Launch(scenario, folder, paths, given, secure, served, use, lives).run())
-
-
-def fresh_folder(out: Path, scenario: str, use: MapUse | None = None) -> RunFolder:
-    """An empty run folder; only an earlier run folder is ever replaced, and never one that holds the map in use.
-
-    An earlier run of another scenario is kept beside it: its robots' stores may be all that is left of a mission.
-
-    Raises:
-        LaunchError: Something else stands there, or the map does.
-    """
-    if use is not None and use.folder.resolve().is_relative_to(out.resolve()):
-        raise LaunchError(f"{out}: holds the map {use.folder}, which is only read; choose another --out")
-    if out.exists() and any(out.iterdir()):
-        if not _is_run(out):
-            raise LaunchError(f"{out}: is not empty and not an earlier run; choose another --out")
-        before = _scenario_of(out)
-        if before != scenario:
-            aside = out.with_name(f"{out.name}.before")
-            if aside.exists():
-                if not _is_run(aside):
-                    raise LaunchError(
-                        f"{out}: holds a run of another scenario, and {aside} is no run: choose another --out"
-                    )
-                shutil.rmtree(aside)
-            out.rename(aside)
-            logger.warning("%s: held a run of %s, which is kept as %s", out, before or "no known scenario", aside)
-        else:
-            shutil.rmtree(out)
-    return RunFolder.create(out)
-
-
-def _is_run(path: Path) -> bool:
-    """Whether a path is a folder with a run, or with what a run leaves that was killed before it said which it is."""
-    if not path.is_dir():
-        return False
-    names = {entry.name for entry in path.iterdir()}
-    return "run.json" in names or ("robots" in names and names <= LEFT_BY_A_KILL)
-
-
-def _scenario_of(run: Path) -> str | None:
-    """Whose run a folder holds; None where it does not say so."""
-    try:
-        content = json.loads((run / "run.json").read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return None
-    return content.get("scenario") if isinstance(content, dict) else None
+    with fresh_folder(out, scenario.name, use) as folder:
+        return asyncio.run(_Launch(scenario, folder, paths, given, secure, served, use, lives).run())
 
 
 def check_network() -> None:

@@ -39,7 +39,7 @@ def problem(log: LogId, seen: tuple[int, ...] = (1, 3, 5), edition: int = 1, **c
     information = None if log == A else np.ones((len(seen), 2))
     shared = SharedWith(edition, tuple(KeyframeId(B, k) for k in seen), information)
     begins = ConsensusProblem(
-        log, walk(log), owned(seen) if log == A else (), {other: shared}, np.zeros((0, 4, 4)), anchored=True
+        log, walk(log), owned(seen) if log == A else (), {other: shared}, np.zeros((0, 4, 4)), number=1, anchored=True
     )
     return replace(begins, **changes)  # type: ignore[arg-type]
 

@@ -28,7 +28,7 @@ from flocc_agent.core.pose_graph import (
     Trajectory,
 )
 from flocc_agent.core.reports import CAME_APART, PeerRefused, RoundFailed
-from flocc_agent.geometry import pose7
+from flocc_agent.geometry import pose, pose7
 from flocc_protocol.arrays import Array
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import SHARED_MAX, SharedPoses
@@ -52,6 +52,7 @@ class Source:
     revision: int = 1
     length: int = 4
     doubt: str = ""
+    shift_m: float = 0.0
 
     @property
     def keyframes(self) -> int:
@@ -59,7 +60,8 @@ class Source:
 
     def graph(self) -> PoseGraph:
         trajectories = {log: Trajectory(np.repeat(np.eye(4)[None], self.length, axis=0)) for log in (A, B, C)}
-        closures = tuple(LoopClosure(query, match, np.eye(4), doubt=self.doubt) for query, match in self.seen)
+        T = pose(np.eye(3), np.array([self.shift_m, 0.0, 0.0]))
+        closures = tuple(LoopClosure(query, match, T, doubt=self.doubt) for query, match in self.seen)
         return PoseGraph(trajectories, closures)
 
 
@@ -282,6 +284,54 @@ def test_closures_that_are_taken_back_or_doubted_are_shared_no_more(doubt: str) 
     assert bench.b._pairs[A].keyframes == bench.b._pairs[C].keyframes == ()
 
 
+def test_closures_that_were_taken_back_are_used_no_more_and_others_in_their_place_are_chosen() -> None:
+    within = (KeyframeId(B, 0), KeyframeId(B, 2))
+    bench = Bench(Source(seen=(SEEN[1], within)))
+    bench.turn(0.0)
+    bench.turn(0.2)
+    bench.turn(0.4)
+    assert {each.ends for each in bench.b._owned()} == {SEEN[1], within}
+    instead = (KeyframeId(C, 1), KeyframeId(B, 3))
+    bench.source.seen = (instead, within)
+    bench.source.revision += 1
+    for now in (10.0, 10.2, 10.4):
+        bench.turn(now)
+    assert {each.ends for each in bench.b._owned()} == {instead, within}
+    bench.source.seen = ()
+    bench.source.revision += 1
+    for now in (20.0, 20.2, 20.4, 20.6):
+        _, asked = bench.turn(now)
+    assert bench.b._owned() == ()
+    assert bench.b.shares_with() == ()
+    assert [job.problem.shared for job in asked] == [{}] * len(asked)
+    assert bench.b.has_chosen
+
+
+def test_another_measurement_between_the_same_keyframes_is_chosen_anew() -> None:
+    bench = Bench().shares()
+    bench.source.shift_m = 1.0
+    bench.source.revision += 1
+    assert len(choices(bench.turn(PARAMETERS.choose_s + 1.0)[0])) == 1
+
+
+def test_a_list_that_its_own_logs_bear_out_no_more_is_dropped_by_the_higher_robot() -> None:
+    bench = Bench(Source(seen=(SEEN[0],)))
+    bench.turn(0.0)
+    bench.b.on_shared_poses(A, said(A, 2, 7, (1,)), 0.3)
+    bench.turn(0.5, aligned=True)
+    assert bench.b.shares_with() == (A,)
+    bench.source.seen = ()
+    bench.source.revision += 1
+    _, (job,) = bench.turn(2.0)
+    assert bench.b.shares_with() == ()
+    assert job.problem.shared == {}
+    assert bench.b.anchor == B
+    (asks,) = told(bench.b.on_shared_poses(A, said(A, 4, 7), 2.1)).values()
+    assert asks.edition == 0
+    bench.b.on_shared_poses(A, said(A, 5, 8, (1,)), 2.2)
+    assert bench.b.shares_with() == ()
+
+
 def test_a_failed_or_overdue_choice_is_made_again_after_a_growing_pause() -> None:
     bench = Bench()
     (choice,) = choices(bench.b.tick(0.0))
@@ -429,27 +479,16 @@ def test_what_a_step_found_of_an_older_list_is_not_told_of_the_new_one() -> None
     assert told(bench.b.on_step(job.number, step(job), 1.1)) == {}
 
 
-def test_a_stiffness_that_no_step_has_read_is_not_lost_to_the_next_message() -> None:
-    bench = Bench().shares()
-    edition = told(bench.b._said())["c"].edition
-    stiffness = Array.of(np.ones(stiffness_numbers(1)))
-    bench.b.on_shared_poses(C, replace(said(B, 3, edition), stiffness_edition=1, stiffness=stiffness), 0.3)
-    bench.b.on_shared_poses(C, said(B, 4, edition, shift_m=1.0), 0.35)
-    _, (job,) = bench.turn(0.5)
-    heard = job.problem.shared[C].told
-    assert heard is not None
-    assert (heard.edition, len(heard.stiffness), heard.rows[0, 0]) == (1, stiffness_numbers(1), 1.0)
-
-
 def test_a_stiffness_that_the_neighbour_has_is_not_told_again() -> None:
     bench = Bench().shares()
     edition = told(bench.b._said())["c"].edition
-    stiff = {C: ToldPoses(np.zeros(3), rows(1), edition=1, stiffness=np.ones(stiffness_numbers(1)))}
+    stiff = {C: ToldPoses(np.zeros(3), rows(1), number=1, stiffness=np.ones(stiffness_numbers(1)))}
     bench.b._has_news = True
     effects, _ = bench.turn(1.0, told=stiff)
-    assert told(effects)["c"].stiffness_edition == 1
+    assert len(told(effects)["c"].stiffness.numpy())
     bench.b.on_shared_poses(C, replace(said(B, 3, edition), known=1), 1.1)
-    assert told(bench.b._said())["c"].stiffness_edition == 0
+    (said_again,) = told(bench.b._said()).values()
+    assert (said_again.stiffness_number, len(said_again.stiffness.numpy())) == (1, 0)
 
 
 def test_a_neighbour_that_fell_silent_is_forgotten_by_a_step_of_its_own() -> None:

@@ -168,3 +168,28 @@ def test_rows_that_are_others_than_those_held_here_are_not_taken() -> None:
     recognition.lend(OTHERS[0], [], rows[:0])
     (held,) = recognition._others.values()
     assert held._lent == []
+
+
+def test_keyframes_of_a_closed_log_find_their_best_partners_too() -> None:
+    """A robot comes into a map: what the map's keyframes would have found among its own, had they come later."""
+    keyframes = drawn(32)
+    closed, own = ([each for each in keyframes if each[0].log == log] for log in (OTHERS[0], OWN))
+    parameters = PlaceRecognitionParameters(similarity_threshold=0.6)
+    in_map = PlaceRecognition(OWN, parameters, closed=frozenset({OTHERS[0]}))
+    in_map.on_keyframes(closed)
+    given = [each for keyframe in own for each in in_map.on_keyframes([keyframe])]
+    later = PlaceRecognition(OWN, parameters)
+    later.on_keyframes(own[:-1])  # of the last one nobody knows yet whether the next one is more similar
+    best = {(k, c.pair.other(k)) for k, c in later.on_keyframes(closed)}
+    both_ways = {(k, c.pair.other(k)) for k, c in given}
+    assert len(best) > KEYFRAMES / 2
+    assert best <= both_ways | {(k, own[-2][0]) for k, _ in closed}  # nor of the one before, where they rise
+    givers = [(k, c) for k, c in given if k.log != OWN]
+    assert len({(k, c.pair) for k, c in givers}) == len(givers)
+    for giver in {k for k, _ in givers}:
+        similarities = [c.similarity for k, c in givers if k == giver]
+        assert similarities == sorted(set(similarities))
+    by_themselves = {(k, c.pair.other(k)) for k, c in given if k.log == OWN}
+    alone = PlaceRecognition(OWN, parameters)
+    alone.on_keyframes(closed)
+    assert by_themselves == {(k, c.pair.other(k)) for each in own for k, c in alone.on_keyframes([each])}

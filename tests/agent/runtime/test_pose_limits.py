@@ -168,4 +168,4 @@ def test_a_jump_that_goes_on_is_said_with_its_row(tmp_path: Path) -> None:
     trajectory, notes = read_trajectory(tmp_path / "odometry.tum")
     assert len(trajectory) == 12
     (note,) = notes
-    assert "odometry.tum:7: the pose jumps and goes on from there; it is taken as motion" in note
+    assert "odometry.tum:7: the pose jumps and goes on from there; where this is odometry, it began anew there" in note

@@ -224,8 +224,11 @@ class Ros2Adapter:
         message = self._types.read(posed.payload, hearing.image_type())
         image = await asyncio.to_thread(eye.image, message)
         await self._host.add_keyframe(image, posed.T_odom_body @ T_body_camera, posed.stamp_ns * 1e-9)
-        step = hearing.covariances.of_keyframe(posed.stamp_ns, posed.T_odom_body)
-        if step is not None:
+        told = hearing.covariances.of_keyframe(posed.stamp_ns, posed.T_odom_body)
+        unmeasured = hearing.steps.of_keyframe(posed.stamp_ns * 1e-9)
+        if unmeasured is not None:
+            logger.warning("odometry paused or jumped; loop closures decide where the robot was")
+        if (step := unmeasured or told) is not None:
             self._host.add_measurement(step.in_camera(T_body_camera), posed.stamp_ns * 1e-9)
         if self._config.fix_topic:
             self._fixes.add_keyframe(posed.stamp_ns * 1e-9)

@@ -31,6 +31,7 @@ from flocc_agent.runtime.ros2.types import (
     MessageTypes,
     header_of,
 )
+from flocc_agent.runtime.unmeasured_steps import StepWatch
 
 Float = NDArray[np.float64]
 
@@ -82,6 +83,7 @@ class Hearing:
         self._compared_ns: int | None = None
         self._were_apart = False
         self.covariances = StepCovariances()
+        self.steps = StepWatch(pauses_count=True)
         self.heard = Counter[str]()
         self.subscribed: dict[str, Topic] = {}
         self.eye: Eye | None = None
@@ -150,6 +152,7 @@ class Hearing:
         if not self.synchroniser.add_odometry(*sample):
             self.complain("odometry", BACK_IN_TIME if sample[0] else WITHOUT_STAMP)
             return False
+        self.steps.saw(sample[0] * 1e-9, sample[1])
         self.covariances.add(sample[0], np.reshape(message.pose.covariance, (6, 6)))
         return True
 

@@ -1,0 +1,44 @@
+"""Errors of robots that died: placed by those that outlived them in their map, whoever else is elsewhere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flocc_agent.geometry import pose, so3_exp
+from flocc_agent.runtime.trajectory import Trajectory
+from flocc_launch.report.build import ate_dead_m
+from flocc_launch.runs.tracks import RobotTrack
+
+Float = NDArray[np.float64]
+
+OFF_M = 0.5
+
+
+def way(robot: str, frame: str | None, off_m: float = 0.0, at_m: float = 0.0) -> RobotTrack:
+    """An arc, whose estimate in the map is turned as maps are, and beside the truth by `off_m`."""
+    T_world: Float = np.array(
+        [pose(so3_exp(np.array([0.0, 0.0, a])), np.array([at_m + np.cos(a), np.sin(a), 0.2 * a])) for a in range(5)]
+    )
+    T_map_world = pose(so3_exp(np.array([0.0, 0.0, 1.0])), np.array([3.0, -2.0, 0.0]))
+    T_map = T_map_world @ pose(np.eye(3), np.array([off_m, 0.0, 0.0])) @ T_world
+    every = np.full(len(T_world), frame is not None)
+    stamps_s = np.arange(len(T_world), dtype=np.float64)
+    true, truth = np.ones(len(T_world), dtype=bool), Trajectory(stamps_s, T_world)
+    return RobotTrack(robot, 0, frame, stamps_s, T_world, every, T_map, true, T_world, truth)
+
+
+@pytest.mark.parametrize("elsewhere", ["map/r4", None])
+def test_the_survivors_of_its_own_map_place_a_dead_robot_whoever_is_elsewhere(elsewhere: str | None) -> None:
+    survivors = {"r1": way("r1", "map/r1"), "r4": way("r4", elsewhere, at_m=100.0)}
+    dead = {"r2": way("r2", "map/r1", OFF_M, at_m=2.0)}
+    assert ate_dead_m(survivors, survivors | dead) == {"r2": pytest.approx(OFF_M)}
+
+
+def test_a_dead_robot_that_nobody_outlived_in_its_map_is_aligned_alone() -> None:
+    survivors = {"r1": way("r1", "map/r1"), "r4": way("r4", None, at_m=100.0)}
+    for frame in ("map/r2", "map/r1"):
+        alone = survivors | {"r1": replace(survivors["r1"], map_frame="map/r0")}
+        assert ate_dead_m(alone, alone | {"r2": way("r2", frame, OFF_M)}) == {"r2": pytest.approx(0.0, abs=1e-9)}
+    assert ate_dead_m(survivors, survivors | {"r2": way("r2", None, OFF_M)}) == {}
