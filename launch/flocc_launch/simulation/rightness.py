@@ -129,8 +129,13 @@ def _is_good(result: Registration) -> bool:
 
 
 def untrue(swarm: Swarm) -> Iterator[str]:
-    """In a swarm without noise: closures of a leader's graph, and poses that robots apply, that are not the truth."""
+    """In a swarm without noise: closures of a leader's graph, and poses that robots apply, that are not the truth.
+
+    Where a robot had no keyframe any more by which to notice what was on its camera, nobody can know.
+    """
     for group in groups(swarm):
+        if any(_unnoticed(swarm, station) for station in group):
+            continue
         frames: dict[LogId, Float] = {}
         for station in group:
             if core(station).election.leading:
@@ -170,6 +175,15 @@ def _untrue_closures(swarm: Swarm, leader: Station) -> Iterator[str]:
     for closure in core(leader).assembly.graph().closures:
         if _apart(_metric(closure), between(truth(closure.query), truth(closure.match)), TRUE_M, TRUE_RAD):
             yield f"{leader.name} has a closure {closure.query} {closure.match} that is not true"
+
+
+def _unnoticed(swarm: Swarm, station: Station) -> bool:
+    """Whether a robot knows keyframes that show what is not the scene, and were never withdrawn."""
+    overlays = (each.workers.overlay for each in swarm.stations.values())
+    shown = (keyframe for overlay in overlays if overlay is not None for keyframe in overlay.shown)
+    logs, withdrawals = core(station).gossip.logs, core(station).assembly.withdrawals
+    known = (k for k in shown if k.log in logs and k.index < logs[k.log].keyframes)
+    return any(not withdrawals.is_withdrawn(keyframe) for keyframe in known)
 
 
 def _metric(closure: LoopClosure) -> Float:
