@@ -5,7 +5,7 @@ and the whole part moves into another frame. What is kept between two steps is k
 whatever part comes next. Forces live in the poses' own tangents and need not be moved; targets move with the part.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,10 +20,13 @@ from flocc_agent.config import BackendConfig
 from flocc_agent.core.own_part import ConsensusProblem, ConsensusState, ConsensusStep, SharedWith, ToldPoses
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed
 from flocc_agent.geometry import inverse, nearest_rotation, pose
+from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.ids import KeyframeId, LogId
 
 Float = NDArray[np.float64]
 
+OUTSIDE_M = 0.5 * COORDINATE_MAX
+"""No pose is farther from where its frame begins."""
 AGREED = 0.05
 """Two robots agree on a pose that they have no farther from each other, in metres or entries of a rotation."""
 
@@ -67,10 +70,30 @@ def consensus_step(config: BackendConfig, problem: ConsensusProblem) -> Consensu
     broken = first_not_rigid(np.asarray(problem.trajectory.T_odom_keyframe))
     if broken is not None:
         return OptimisationFailed(f"robot {problem.log}: odometry of keyframe {broken} is not rigid")
-    try:
-        return _stepped(config, problem)
-    except (np.linalg.LinAlgError, RuntimeError, FloatingPointError) as error:
-        return OptimisationFailed(str(error).strip().split("\n")[0])
+    reason = ""
+    for left_out, attempt in _attempts(problem):
+        try:
+            step = _stepped(config, attempt)
+        except (np.linalg.LinAlgError, RuntimeError, FloatingPointError, ValueError) as error:
+            reason = reason or str(error).strip().split("\n")[0]
+        else:
+            return replace(step, refused={**step.refused, **dict.fromkeys(left_out, reason)})
+    return OptimisationFailed(reason)
+
+
+def _attempts(problem: ConsensusProblem) -> Iterator[tuple[tuple[LogId, ...], ConsensusProblem]]:
+    """The problem, and for where it has no step: without what one neighbour told, or all told, or ever told."""
+    yield (), problem
+    told = tuple(other for other, shared in problem.shared.items() if shared.told is not None)
+    moves_to = () if problem.move_to is None else (problem.move_to[0],)
+    named = tuple(dict.fromkeys((*told, *moves_to)))
+    for left_out in [*((other,) for other in named if len(named) > 1), named]:
+        shared = {other: replace(s, told=None) if other in left_out else s for other, s in problem.shared.items()}
+        move_to = None if problem.move_to is None or problem.move_to[0] in left_out else problem.move_to
+        yield left_out, replace(problem, shared=shared, move_to=move_to)
+    if isinstance(problem.state, PartState):
+        shared = {other: replace(s, told=None) for other, s in problem.shared.items()}
+        yield named, replace(problem, shared=shared, move_to=None, state=replace(problem.state, pairs={}))
 
 
 def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
@@ -91,6 +114,8 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
     heard = [other for other, shared in problem.shared.items() if shared.told is not None and other not in refused]
     before, apart = part.T, {other: part.apart(other) for other in heard}
     refused |= part.step(problem.number)
+    told = {other: part.tell(other).told() for other in part.neighbours}
+    _require_within_map(part, told)
     after = _state_of(part, problem)
     origin = _origin(problem, after.T)
     poses = part.state.poses()
@@ -100,7 +125,7 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
         after,
         inverse(origin) @ after.T,
         origin,
-        {other: part.tell(other).told() for other in part.neighbours},
+        told,
         {other: neighbour.information for other, neighbour in part.neighbours.items() if neighbour.lower},
         float(np.abs(after.T - before).max()),
         max(gaps, default=0.0),
@@ -109,6 +134,20 @@ def _stepped(config: BackendConfig, problem: ConsensusProblem) -> ConsensusStep:
         refused,
         apart,
     )
+
+
+def _require_within_map(part: ConsensusPart, told: Mapping[LogId, ToldPoses]) -> None:
+    """Refuse a step that leads where no pose can be, or to forces that cannot be said.
+
+    Raises:
+        ValueError: It does.
+    """
+    poses = part.state.poses()
+    numbers = [told_poses.rows for told_poses in told.values()]
+    if not all(np.all(np.isfinite(each)) for each in (poses, *numbers)):
+        raise ValueError("it leads to poses or forces that are not finite")
+    if float(np.abs(poses[:, :3, 3]).max(initial=0.0)) > OUTSIDE_M:
+        raise ValueError("it leads out of the map")
 
 
 def _extended(T: Float, T_odom: Float) -> Float:

@@ -220,6 +220,7 @@ class DistributedOptimisation:
         self._repeat_pause_s = self._parameters.repeat_s
         self._repeat_at_s = now + self._repeat_pause_s
         reports = [self._refuse(other, reason) for other, reason in sorted(step.refused.items())]
+        self._leave(step.refused, step.refused, now)
         return [*reports, *self._watch_contacts(step, now), *self._said()]
 
     def on_failed(self, number: int, reason: str, now: float) -> list[Effect]:

@@ -11,7 +11,9 @@ from flocc_agent.config import BackendConfig, Formulation
 from flocc_agent.core.own_part import ConsensusProblem, ConsensusStep, OwnedClosure, SharedWith, ToldPoses
 from flocc_agent.core.pose_graph import LoopClosure, OptimisationFailed, Trajectory
 from flocc_agent.geometry import pose, so3_exp
+from flocc_protocol.codec import COORDINATE_MAX
 from flocc_protocol.ids import KeyframeId, LogId
+from flocc_protocol.shared_poses import stiffness_numbers
 
 Float = NDArray[np.float64]
 
@@ -119,6 +121,47 @@ def test_what_cannot_be_is_refused_by_name_and_changes_nothing() -> None:
     step = stepped(heard(problem(A, state=first.state), replace(told, rows=rows)))
     assert "not finite" in step.refused[B]
     assert np.allclose(step.T_map_keyframe, first.T_map_keyframe, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_whatever_a_neighbour_lies_no_step_leads_out_of_the_map_and_it_is_named_or_alone(seed: int) -> None:
+    """Poses, forces and stiffnesses of any size; what is told in answer can be said."""
+    rng = np.random.default_rng(seed)
+    a = stepped(problem(A))
+    for number in range(2, 9):
+        lie = rng.normal(size=(3, 13)) * 10.0 ** rng.uniform(0.0, (5.0, 5.0, 37.0)[seed % 3])
+        lie[:, 3:7] /= np.linalg.norm(lie[:, 3:7], axis=1, keepdims=True)
+        lie[:, :3] = np.clip(lie[:, :3], -1e5, 1e5)
+        told = ToldPoses(np.zeros(3), lie)
+        if number == 3:
+            stiffness = np.abs(rng.normal(size=stiffness_numbers(3))) * 10.0 ** rng.uniform(-30.0, 30.0)
+            told = replace(told, number=1, stiffness=stiffness)
+        a = stepped(heard(problem(A, state=a.state, number=number), told))
+        assert np.all(np.isfinite(a.T_map_keyframe))
+        assert float(np.abs(a.T_map_keyframe[:, :3, 3]).max()) <= COORDINATE_MAX
+        assert np.all(np.isfinite(np.float32(a.told[B].rows)))
+        assert set(a.refused) <= {B}
+
+
+def test_only_the_neighbour_is_named_whose_word_leads_out_of_the_map() -> None:
+    C = LogId("c")
+    ((_, shared),) = problem(A).shared.items()
+    T = pose(np.eye(3), np.array([0.0, 2.0, 0.0]))
+    with_c = OwnedClosure(LoopClosure(KeyframeId(A, 2), KeyframeId(C, 2), T, metric=True), 1.0, None, T)
+    of_c = SharedWith(1, (KeyframeId(C, 2),), None)
+    both = problem(A, shared={B: shared, C: of_c}, owned=(*owned((1, 3, 5)), with_c))
+    first = stepped(both)
+    lie = first.told[C].rows.copy()
+    lie[:, 7:] = 1e37
+    heard_both = {
+        B: replace(shared, told=first.told[B]),
+        C: replace(of_c, told=replace(first.told[C], rows=lie)),
+    }
+    step = stepped(replace(both, shared=heard_both, state=first.state, number=2))
+    assert list(step.refused) == [C]
+    assert isinstance(step.state, PartState)
+    assert step.state.pairs[B].T is not None
+    assert step.state.pairs[C].T is None
 
 
 def test_odometry_that_is_not_rigid_is_said() -> None:

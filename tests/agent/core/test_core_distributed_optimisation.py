@@ -396,6 +396,11 @@ def test_who_tells_what_cannot_be_is_named() -> None:
     bench.b._has_news = True
     effects, _ = bench.turn(1.0, refused={C: "no stiffness"})
     assert reasons(effects) == ["shared poses: no stiffness"]
+    bench.b.on_shared_poses(C, said(B, 30, 1), 1.1)
+    bench.b._has_news = True
+    assert [job.problem.shared for job in bench.turn(3.0)[1]] == [{}]
+    bench.b._has_news = True
+    assert [list(job.problem.shared) for job in bench.turn(1.0 + DISTRUSTED_FIRST_S)[1]] == [[C]]
 
 
 def test_what_its_own_log_contradicts_for_long_makes_it_go_on_alone() -> None:
