@@ -23,7 +23,7 @@ HURRIED_PERIOD_S = 0.5
 HURRY_MAX_S = 2.0
 """A meeting hurries rounds for one period, but no longer than this: a long period is somebody's wish to save work."""
 GRAPH_KEPT_S = 30.0
-"""So long a robot that leads no more keeps what it built of the graph, a kilobyte a closure: it may lead again soon."""
+"""So long a robot that leads no more keeps what it built of the graph, objects for each closure: it may lead again."""
 
 
 class Rounds:
