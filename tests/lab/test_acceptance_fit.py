@@ -49,6 +49,17 @@ def test_a_rule_of_the_other_scenes_is_what_judges_a_scene() -> None:
     assert found["hard"]["fitted"]["wrong"] == 0
 
 
+def test_a_pair_of_which_less_is_known_needs_no_less() -> None:
+    """Of scenes that hold no wrong pair without a scale the fit would ask for next to nothing there."""
+    pairs = rows("a", 6, wrong_up_to=90)
+    made = [row for row in pairs if row.is_right or row.evidence.has_scale]  # type: ignore[attr-defined]
+
+    rule = fit.fitted(made, 1.15)
+
+    assert rule.without_scale.alone >= rule.with_scale.alone > fit.ALONE[0]
+    assert rule.without_scale.agreeing >= rule.with_scale.agreeing
+
+
 def test_the_neighbour_is_not_heard_where_the_rule_does_not_ask_it() -> None:
     contradicted = Evidence(100, 0.1, True, 0.001, OdometryNeighbour.CONTRADICTS)
     row = Row("a", 0, 1, True, 10.0, 100, 1000, contradicted, True)

@@ -468,5 +468,6 @@ def test_a_map_beside_that_of_the_camera_is_no_less_read(tmp_path: Path, beside:
 
 
 def test_a_map_beside_that_of_the_camera_that_says_nothing_is_named(tmp_path: Path) -> None:
-    lens = read(tmp_path, f"Camera:\n  {INNER}Feature:\n  scale_factor: 1.2\n", "camera.yaml")
-    assert any("not used: Feature" in note for note in lens.notes)
+    beside = "Feature:\n  scale_factor: 1.2\nmapping:\n  bound: [[-2.9, 8.9], [-3.2, 5.5], [-3.5, 3.3]]\n"
+    lens = read(tmp_path, f"Camera:\n  {INNER}{beside}", "camera.yaml")
+    assert any("not used: Feature, mapping" in note for note in lens.notes)

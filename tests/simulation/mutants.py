@@ -22,7 +22,7 @@ from flocc_agent.core.effects import Broadcast, Deliver, PersistCorrection, Pers
 from flocc_agent.core.election import LeaderElection
 from flocc_agent.core.gossip import Gossip
 from flocc_agent.core.known_sets import KeyframeSet
-from flocc_agent.core.latents import Latents, Reach
+from flocc_agent.core.latents import Latents, Reach, ToldNowAndThen
 from flocc_agent.core.log_copy import EncodedRecords, _Block
 from flocc_agent.core.loop_closing import LoopClosing
 from flocc_agent.core.neighbours import Neighbours
@@ -37,6 +37,7 @@ from flocc_agent.core.reports import LogForked
 from flocc_agent.core.robot import Robot
 from flocc_agent.core.rounds import Rounds
 from flocc_agent.core.spared import Spared
+from flocc_agent.core.withdrawals import Withdrawals
 from flocc_agent.geometry import inverse, pose, pose7, pose_from_tq
 from flocc_launch.simulation.campaign import run_seed
 from flocc_protocol.arrays import Array
@@ -378,6 +379,7 @@ MUTANTS = (
     Mutant("a better robot never takes over", LeaderElection, "_prefers", _follows_whoever_came_first),
     Mutant("nobody is preferred", LeaderElection, "_prefers", always(False)),
     Mutant("a leader that stands still is followed for ever", LeaderElection, "_refresh", _follows_for_ever),
+    Mutant("what is proven of counters is not learned", LeaderElection, "_learn_counter", always([])),
     # neighbours and heartbeats
     Mutant("heartbeats ten times as often", Robot, "_heartbeat", _beats_ten_times),
     Mutant("nobody is ever lost", Neighbours, "tick", lambda _: _hears_for_ever),
@@ -396,6 +398,7 @@ MUTANTS = (
     Mutant("nobody fetches a latent", Latents, "fetch", always([])),
     Mutant("offers are not told", Offers, "tell", afterwards(lambda _: [])),
     Mutant("pairs of robots that are gone stay open", Offers, "_takeover_at_s", always(float("inf"))),
+    Mutant("wishes and offers of latents are not told", ToldNowAndThen, "due", always(())),
     Mutant("latents out of reach are not asked for", Latents, "wants", always(())),
     Mutant("a resolved pair is registered again", LoopClosing, "on_resolved", lambda _: lambda *_a: None),
     # what may be believed
@@ -412,6 +415,13 @@ MUTANTS = (
     # spared pairs
     Mutant("all pairs tell nothing new", Spared, "is_told", always(True)),
     Mutant("two closures are enough", Spared, "__init__", _has_enough_with_two),
+    # keyframes taken back
+    Mutant("nothing is taken back", OwnLog, "_withdraw", always([])),
+    Mutant("what was taken back counts", Withdrawals, "counts", always(True)),
+    Mutant("pairs of what was taken back stay as they are", Withdrawals, "asks_again", always(False)),
+    Mutant("judgements name no withdrawal that they know of", Withdrawals, "unsaid", always([])),
+    Mutant("latents made anew are not fetched again", Latents, "on_withdrawn", always(None)),
+    Mutant("registrations of old latents count", LoopClosing, "is_outdated", always(False)),
     # logs in pieces
     Mutant("a block gives its next record", _Block, "record", _gives_the_next_record, in_pieces=True),
     Mutant(

@@ -1,9 +1,22 @@
 """Campaigns: seeds that hold, replay exactly, and shrink."""
 
+from unittest.mock import patch
+
 import pytest
 
+from flocc_agent.core.reports import ClosureWithdrawn
+from flocc_agent.core.withdrawals import Withdrawals
 from flocc_launch.scenarios.scenario import Fault, FaultKind, Scenario
-from flocc_launch.simulation.campaign import Campaign, SeedOutcome, campaign, prepared, run_checked, run_seed, shrink
+from flocc_launch.simulation.campaign import (
+    Campaign,
+    SeedOutcome,
+    campaign,
+    is_noiseless,
+    prepared,
+    run_checked,
+    run_seed,
+    shrink,
+)
 from flocc_launch.simulation.coverage import table
 from flocc_launch.simulation.generator import FAMILIES, FAULTS_END_S, calm_s, drawn_scenario
 from flocc_launch.simulation.hardships import CLOCK_STEP_MAX_S, Hardship, HardshipKind, drawn_hardships
@@ -83,6 +96,28 @@ def test_a_fetch_is_given_up_by_the_clock_of_its_robot() -> None:
     step = Hardship(HardshipKind.CLOCK, "r5", 14.789, 18.061, 2)
     full = Hardship(HardshipKind.FULL, "r3", 16.593, 17.762, 116)
     assert run_checked(drawn_scenario(99450020), [step, full]).violations == ()
+
+
+def test_something_gets_onto_a_camera_in_a_fifth_of_the_seeds() -> None:
+    drawn = [each for seed in range(500) for each in drawn_hardships(seed, ["r1", "r2"], FAULTS_END_S)]
+    assert 70 < sum(each.kind is HardshipKind.OVERLAY for each in drawn) < 130
+
+
+def test_what_a_camera_with_something_on_it_showed_is_registered_anew() -> None:
+    scenario, overlay = drawn_scenario(99960002), Hardship(HardshipKind.OVERLAY, "r1", 1.0, 9.0)
+    assert is_noiseless(scenario)
+    swarm = prepared(scenario, [overlay])
+    swarm.run_until(FAULTS_END_S)
+    taken_back = [told.fact for told in swarm.told if isinstance(told.fact, ClosureWithdrawn)]
+    assert taken_back
+    assert all(fact.again for fact in taken_back)
+    assert run_checked(scenario, [overlay]).violations == ()
+
+
+def test_a_closure_of_what_a_robot_took_back_is_no_true_one() -> None:
+    overlay = Hardship(HardshipKind.OVERLAY, "r1", 1.0, 9.0)
+    with patch.object(Withdrawals, "counts", lambda *_: True):
+        assert [v.invariant for v in run_checked(drawn_scenario(99960002), [overlay]).violations] == ["right"]
 
 
 def test_a_large_family_has_20_robots_and_ten_minutes_with_faults_to_their_end() -> None:

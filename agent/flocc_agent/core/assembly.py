@@ -85,8 +85,14 @@ class _Odometry:
 
     def poses(self, indices: Sequence[int]) -> Float:
         """`T_odom_keyframe` (K, 4, 4) of some keyframes."""
-        rows = b"".join(self._poses.row(index) for index in indices)
-        return poses_from_tq(np.frombuffer(rows).reshape(-1, 7))
+        return poses_from_tq(self._rows(indices))
+
+    def positions_m(self, indices: Sequence[int]) -> Float:
+        """Where they were (K, 3)."""
+        return self._rows(indices)[:, :3]
+
+    def _rows(self, indices: Sequence[int]) -> Float:
+        return np.frombuffer(b"".join(self._poses.row(index) for index in indices)).reshape(-1, 7)
 
     def pose(self, index: int) -> Float:
         """`T_odom_keyframe` (4, 4)."""
@@ -128,7 +134,6 @@ class GraphAssembly:
 
     Attributes:
         keyframes: Number of keyframes of all logs but those of an opened map, which are solved already.
-        revision: Grows when a solution is out of date: a new log, closure or fix, or a keyframe that one waited for.
         withdrawals: Which keyframes were taken back; closures of them do not count.
     """
 
@@ -150,7 +155,7 @@ class GraphAssembly:
         self._cold = cold
         self._cold_closures = cold_closures
         self.keyframes = 0
-        self.revision = 0
+        self._revision = 0
         self._saved = saved
         self._odometry: dict[LogId, _Odometry] = {}
         self.withdrawals = Withdrawals()
@@ -165,6 +170,11 @@ class GraphAssembly:
     def closures(self) -> int:
         """Number of closures, each pair once."""
         return len(self._closures)
+
+    @property
+    def revision(self) -> int:
+        """Grows when a solution is out of date: a new log, closure, fix or doubt, or a keyframe that one waited for."""
+        return self._revision + self._tentative.changes()
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Tables with their maximum."""
@@ -193,7 +203,7 @@ class GraphAssembly:
             case UnknownRecord():
                 self._reads_all = False
             case _:
-                self.revision += 1
+                self._revision += 1
                 self._await(self._measured.add(new, record))
         return []
 
@@ -233,7 +243,7 @@ class GraphAssembly:
         odometry = self._odometry.pop(log, None)
         if odometry is not None:
             self.keyframes -= len(odometry)
-            self.revision += 1
+            self._revision += 1
         for keyframe in [keyframe for keyframe in self._odometry_pairs if keyframe.log == log]:
             del self._odometry_pairs[keyframe]
 
@@ -289,13 +299,18 @@ class GraphAssembly:
 
     def _doubted(self, closure: LoopClosure) -> LoopClosure:
         """A closure, with why it is doubted where it is."""
-        pair = CandidatePair.of(closure.query, closure.match)
-        why = self._tentative.of(pair.low.log, pair.high.log).doubted.get(pair)
+        low, high = sorted((closure.query, closure.match))
+        doubted = self._tentative.of(low.log, high.log).doubted
+        why = doubted.get(CandidatePair(low, high)) if doubted else None
         return closure if why is None else replace(closure, doubt=why)
 
     def asked(self, pair: CandidatePair) -> tuple[CandidatePair, ...]:
-        """Pairs that would tell whether the joins of a pair's two logs are right."""
+        """Pairs that would tell whether the tentative joins of a pair's two logs are right."""
         return self._tentative.of(pair.low.log, pair.high.log).asked
+
+    def forget_built(self) -> None:
+        """Nobody asks for the graph for now: keep nothing of it that can be made anew."""
+        self._closures.forget_built()
 
     def _trajectory(self, log: LogId) -> Trajectory:
         T_odom_keyframe = self._odometry[log].matrices()
@@ -317,7 +332,7 @@ class GraphAssembly:
         self.keyframes += self._saved is None or log not in self._saved.closed
         awaited = bool(self._early) and self._early.pop(KeyframeId(log, len(odometry) - 1), 0) > 0
         awaited |= self._measured.awaited(log.robot, record.stamp_s)
-        self.revision += awaited or len(odometry) == 1
+        self._revision += awaited or len(odometry) == 1
 
     def _add_closure(self, new: NewRecord, record: ClosureRecord) -> list[CandidatePair]:
         """A closure, for the graph where it counts; else its pair."""
@@ -327,7 +342,7 @@ class GraphAssembly:
             return [pair]
         if self._closures.add(new.log, new.number, record):
             self._tentative.on_closure(pair)
-            self.revision += 1
+            self._revision += 1
             self._await((record.query, record.match))
         return []
 
@@ -338,7 +353,6 @@ class GraphAssembly:
         counts = self.withdrawals.counts(new.log, new.number, pair)
         if counts and record.odometry_correspondences >= ODOMETRY_CORRESPONDENCES_MIN:
             self._tentative.on_refused(pair)
-            self.revision += bool(self._tentative.of(pair.low.log, pair.high.log).doubted)
 
     def _withdraw(self, new: NewRecord, record: WithdrawalRecord) -> list[CandidatePair]:
         """A robot took keyframes back: the pairs of closures that leave the graph."""
@@ -346,7 +360,7 @@ class GraphAssembly:
             return []
         gone = self._closures.take_out(record.log, record.first, record.end, self.withdrawals.counts)
         self._tentative.on_withdrawn(record.log, record.first, record.end, self.withdrawals.is_judged_anew)
-        self.revision += bool(gone)
+        self._revision += bool(gone)
         return gone
 
     def _await(self, keyframes: Iterable[KeyframeId]) -> None:

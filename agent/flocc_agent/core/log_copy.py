@@ -146,7 +146,11 @@ class EncodedRecords(Sequence[bytes]):
         end = self._end
         count = end[0] * BLOCK_RECORDS + len(end[1])
         if isinstance(index, slice):
-            return [self._at(k, end) for k in range(*index.indices(count))]
+            first, last, step = index.indices(count)
+            newest = end[0] * BLOCK_RECORDS
+            if first >= newest and step == 1:
+                return end[1][first - newest : last - newest]
+            return [self._at(k, end) for k in range(first, last, step)]
         if not -count <= index < count:
             raise IndexError(f"record {index} of {count}")
         return self._at(index % count, end)
@@ -275,9 +279,9 @@ class LogCopy:
         others = (data for data in self.encoded if data[CODE_AT] != KEYFRAME_CODE)
         return (kept(decoded(data[: len(data) - self._seal_bytes])) for data in others)
 
-    def judgements(self) -> Iterator[tuple[int, ClosureRecord | RejectionRecord]]:
-        """Closures and rejections with the numbers of their records; others are not decoded."""
-        for number, data in enumerate(self.encoded):
+    def judgements(self, first: int = 0) -> Iterator[tuple[int, ClosureRecord | RejectionRecord]]:
+        """Closures and rejections with the numbers of their records, from a number on; others are not decoded."""
+        for number, data in enumerate(self.encoded[first:] if first else self.encoded, first):
             if data[CODE_AT] in JUDGEMENT_CODES:
                 record = kept(decoded(data[: len(data) - self._seal_bytes]))
                 if isinstance(record, ClosureRecord | RejectionRecord):

@@ -72,13 +72,13 @@ class OwnLog:
         self._keyframes.encoded(keyframe.index, descriptor, sha256, withdrawn)
         effects: list[Effect] = []
         for ready in self._keyframes.ready():
+            if ready.withdrawn is not None:  # first, since pairs of this keyframe take the scale from the one before
+                effects += self._withdraw(ready.index, ready.withdrawn, now)
             record = KeyframeRecord(ready.index, ready.stamp_s, ready.T_odom_camera, ready.descriptor)
             effects += self.append(record, now)
             effects.append(_keyframe_report(self._log, record))
             if self._has_keys and ready.sha256:
                 effects += self.append(LatentRecord(ready.index, ready.sha256), now)
-            if ready.withdrawn is not None:
-                effects += self._withdraw(ready.index, ready.withdrawn, now)
             for measurement in self._keyframes.take_measured(ready.index):
                 effects += self._append_measurement(measurement, KeyframeId(self._log, ready.index), now)
         return effects

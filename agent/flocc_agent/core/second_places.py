@@ -6,9 +6,9 @@ two ways run side by side with cameras that look the same way, and there picture
 a keyframe that was registered with two of one robot which odometry puts far apart shows that its place is not the only
 one of its kind.
 
-So closures that agree and are of one place are a *tentative* join. Its owners ask for pairs beside it, a few at a time
-and the nearest first, and until closures of a second place agree with it, it is doubted where most of what is beside it
-was registered and refused, or where another closure puts one end of it elsewhere. All of it follows from logs alone.
+So as long as no closures of two places agree, two logs are joined *tentatively*. Their owners ask for pairs beside the
+closures, a few at a time and the nearest first, and the join is doubted where most of what is beside it was registered
+and refused, or where another closure puts one end of it elsewhere. All of it follows from logs alone.
 """
 
 from dataclasses import dataclass
@@ -37,13 +37,16 @@ SPACING = 2
 """Keyframes between two pairs that say something each."""
 REFUSED_MIN = 3
 """Fewer refused pairs beside a join say nothing."""
-ASKED_AT_ONCE = 4
 SEEN_TWICE = 2.0
 """Times as far apart as both closures reach; scales by Eq. (6) are off by a tenth or two, odometry by less."""
 DRIFT_RATIO = 0.1
 """Of the way between two keyframes, by which odometry may be off besides."""
 ACCIDENT_RATIO = 0.1
 """More closures that contradict a join than this part of its own are no accident: one in a hundred is wrong."""
+AGREE_TIMES_MAX = 3.0
+"""Rotations may differ by so many times more at most where odometry carries them far."""
+FIRM_MIN = 3
+"""Closures that agree of more than one place."""
 CLOSURES_MAX = 128
 """Between two logs; more are of more than one place."""
 
@@ -58,7 +61,7 @@ class Between:
         T_high: (K, 4, 4) of the higher log's.
         T_low_high: (K, 4, 4) what they say, metric; as long as a step where they have no length.
         has_length: (K,) whether they have one.
-        steps_m: How far apart keyframes of both logs are, in the mean.
+        steps_m: (K,) how far apart keyframes of both logs are around each, in the mean.
     """
 
     ends: Int
@@ -66,7 +69,7 @@ class Between:
     T_high: Float
     T_low_high: Float
     has_length: Bool
-    steps_m: float
+    steps_m: Float
 
     @property
     def lengths_m(self) -> Float:
@@ -110,9 +113,9 @@ class FoundBeside:
         return self.refused >= REFUSED_MIN and self.refused > self.closed
 
 
-def joins_of(between: Between) -> list[Join]:
+def joins_of(between: Between, agree: Bool) -> list[Join]:
     """Closures by groups that agree with one of theirs, the largest first."""
-    agree, left = agreement(between), np.ones(len(between.ends), dtype=bool)
+    left = np.ones(len(between.ends), dtype=bool)
     joins: list[Join] = []
     while np.any(left):
         middle = int(((agree & left[None, :]).sum(axis=1) * left).argmax())
@@ -132,14 +135,19 @@ def agreement(between: Between) -> Bool:
     lengths_m, carried_m = between.lengths_m, _chords_m(T_low) + _chords_m(T_high)
     each_m = np.where(between.has_length, AGREE_LENGTHS, 1.0) * lengths_m + AGREE_STEPS * between.steps_m
     may_m = each_m[:, None] + each_m[None, :] + AGREE_RATIO * carried_m
-    may_rad = np.minimum(AGREE_RAD * (1.0 + AGREE_RATIO * carried_m), np.pi)
+    may_rad = AGREE_RAD * np.minimum(1.0 + AGREE_RATIO * carried_m, AGREE_TIMES_MAX)
     return np.asarray((cosines >= np.cos(may_rad)) & (apart_m <= may_m)) | np.eye(len(T), dtype=bool)
 
 
-def is_of_one_place(between: Between, join: Join) -> bool:
-    """Whether the closures of a join are of one small stretch, of either log."""
-    ends = between.ends[list(join.rows)]
-    return bool(np.ptp(ends, axis=0).min() <= PLACE_KEYFRAMES)
+def is_firm(between: Between, agree: Bool) -> bool:
+    """Whether closures that agree with one of them are of more than one place, of both logs.
+
+    More closures leave that true, so that it does not depend on their order.
+    """
+    first = np.where(agree[..., None], between.ends[None], np.iinfo(np.int64).max).min(axis=1)
+    last = np.where(agree[..., None], between.ends[None], -1).max(axis=1)
+    places = (last - first).min(axis=1) > PLACE_KEYFRAMES
+    return bool(np.any(places & (agree.sum(axis=1) >= FIRM_MIN)))
 
 
 def contradicting(between: Between, join: Join) -> list[tuple[int, int, int]]:
@@ -155,7 +163,8 @@ def contradicting(between: Between, join: Join) -> list[tuple[int, int, int]]:
         apart_m = np.stack([_from_m(T, own, other) for T in (between.T_low, between.T_high)], axis=1)
         near_m, far_m, far = apart_m, apart_m[:, ::-1], keyframes[:, ::-1]
         reach_m = (lengths_m[own] + lengths_m[other])[:, None] + near_m
-        elsewhere = far_m > SEEN_TWICE * reach_m + DRIFT_RATIO * between.steps_m * far
+        steps_m = np.maximum(between.steps_m[own], between.steps_m[other])[:, None]
+        elsewhere = far_m > SEEN_TWICE * reach_m + DRIFT_RATIO * steps_m * far
         rows, ends = np.nonzero((keyframes <= STRETCH) & (far > STRETCH) & elsewhere)
         if len(rows):
             found.append((other, own[int(rows[0])], int(ends[0])))
@@ -181,7 +190,7 @@ def beside(between: Between, join: Join, around: tuple[Stretch, Stretch], refuse
     T_there = between.T_low[k] @ between.T_low_high[k] @ inverse(between.T_high[k]) @ high.T
     apart_m = np.linalg.norm(low.T[:, None, :3, 3] - T_there[None, :, :3, 3], axis=2)
     cosines = low.T[:, :3, 2] @ T_there[:, :3, 2].T
-    i, j = np.nonzero((apart_m <= BESIDE_STEPS * between.steps_m) & (cosines >= np.cos(BESIDE_RAD)))
+    i, j = np.nonzero((apart_m <= BESIDE_STEPS * between.steps_m[k]) & (cosines >= np.cos(BESIDE_RAD)))
     pairs = np.stack([i + low.first, j + high.first], axis=1)
     from_middle = np.abs(pairs - between.ends[k]).max(axis=1)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], np.round(apart_m[i, j], 3), from_middle))

@@ -1,6 +1,8 @@
 """Which joins of two logs are doubted, and for which pairs their owners ask: kept for the logs that a robot holds.
 
-What is known of two logs is looked through again when a closure or a refusal between them became known, or left.
+What is known of two logs is looked through again when a closure or a refusal between them became known, or left, and
+somebody asks: who leads, or one of the two for the pairs that it is to ask for. Once closures of more than one place
+agree nothing is looked at any more.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,17 +16,18 @@ from flocc_agent.core.closure_rows import ClosureTable
 from flocc_agent.core.known_sets import PairSet, pair_number
 from flocc_agent.core.second_places import (
     ACCIDENT_RATIO,
-    ASKED_AT_ONCE,
     CLOSURES_MAX,
     Between,
     Join,
     Stretch,
+    agreement,
     beside,
     contradicting,
-    is_of_one_place,
+    is_firm,
     joins_of,
     stretch_of,
 )
+from flocc_agent.core.spared import STRETCH
 from flocc_protocol.ids import INDEX_MAX, KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
 
@@ -44,6 +47,10 @@ class KnownOdometry(Protocol):
         """`T_odom_keyframe` (K, 4, 4) of some keyframes."""
         ...
 
+    def positions_m(self, indices: Sequence[int]) -> Float:
+        """Where they were (K, 3)."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Tentative:
@@ -51,8 +58,8 @@ class Tentative:
 
     Attributes:
         doubted: Closures that are held, and why.
-        asked: Pairs whose registration would tell most.
-        is_whole: Whether all closures' keyframes were known.
+        asked: Pairs whose registration would tell more, the most useful first.
+        is_whole: Whether all of the closures' keyframes were known.
     """
 
     doubted: dict[CandidatePair, str] = field(default_factory=dict)
@@ -77,24 +84,48 @@ class TentativeJoins:
         self._track = track
         self._refused = PairSet()
         self._found: dict[Logs, Tentative] = {}
+        self._joined: set[Logs] = set()
+        self._firm: set[Logs] = set()
+        self._open: dict[Logs, frozenset[CandidatePair]] = {}
+        self._changes = 0
 
     def on_closure(self, pair: CandidatePair) -> None:
         """A closure came."""
-        self._found.pop((pair.low.log, pair.high.log), None)
+        logs = pair.low.log, pair.high.log
+        if pair.low.log != pair.high.log and logs not in self._firm:
+            self._joined.add(logs)
+            self._found.pop(logs, None)
 
     def on_refused(self, pair: CandidatePair) -> None:
         """A pair was registered in vain."""
-        if pair.low.log != pair.high.log:
-            self._refused.add(pair)
-            self._found.pop((pair.low.log, pair.high.log), None)
+        logs = pair.low.log, pair.high.log
+        if pair.low.log == pair.high.log:
+            return
+        self._refused.add(pair)
+        if self.is_tentative(*logs):
+            found = self._found.pop(logs, None)
+            self._open.setdefault(logs, frozenset() if found is None else frozenset(found.doubted))
 
     def on_withdrawn(self, log: LogId, first: int, end: int, counts: Callable[[CandidatePair], bool]) -> None:
         """Keyframes of a log were taken back: of what was refused of them, some may count still."""
         self._refused.keep_of_stretch(log, first, end, counts)
         self._found = {logs: found for logs, found in self._found.items() if log not in logs}
+        self._firm = {logs for logs in self._firm if log not in logs}
+
+    def is_tentative(self, low: LogId, high: LogId) -> bool:
+        """Whether two logs are joined, and as far as is known not by closures of more than one place."""
+        return (low, high) in self._joined and (low, high) not in self._firm
+
+    def changes(self) -> int:
+        """How often refusals changed what is doubted; looked at by who solves, and only then."""
+        before, self._open = self._open, {}
+        self._changes += sum(self.of(*logs).doubted.keys() != doubted for logs, doubted in before.items())
+        return self._changes
 
     def of(self, low: LogId, high: LogId) -> Tentative:
         """What is known of the joins of two logs."""
+        if not self.is_tentative(low, high):
+            return NOTHING
         found = self._found.get((low, high))
         if found is None:
             found = self._look((low, high))
@@ -103,25 +134,29 @@ class TentativeJoins:
         return found
 
     def _look(self, logs: Logs) -> Tentative:
-        tracks = self._track(logs[0]), self._track(logs[1])
-        if logs[0] == logs[1] or tracks[0] is None or tracks[1] is None:
-            return NOTHING
-        low, high = tracks[0], tracks[1]
+        low, high = self._track(logs[0]), self._track(logs[1])
         every = self._closures.of_logs(*logs)
-        if not 0 < len(every) <= CLOSURES_MAX:
+        if len(every) > CLOSURES_MAX:
+            self._firm.add(logs)
             return NOTHING
-        known = [pair for pair in every if pair.low.index < len(low) and pair.high.index < len(high)]
-        if not known:
+        if low is None or high is None:
             return Tentative(is_whole=False)
+        known = [pair for pair in every if pair.low.index < len(low) and pair.high.index < len(high)]
+        is_whole = len(known) == len(every)
+        if len(known) < 2:
+            return Tentative(is_whole=is_whole)
         between = self._between(known, low, high)
+        agree = agreement(between)
+        if is_firm(between, agree):
+            self._firm.add(logs)
+            return NOTHING
         doubted: dict[CandidatePair, str] = {}
         asked: list[CandidatePair] = []
-        for join in joins_of(between):
-            if is_of_one_place(between, join):
-                why, wanted = self._doubt(logs, between, join, low, high)
-                asked += [CandidatePair(KeyframeId(logs[0], i), KeyframeId(logs[1], j)) for i, j in wanted]
-                doubted |= {known[row]: why for row in join.rows} if why else {}
-        return Tentative(doubted, tuple(asked), len(known) == len(every))
+        for join in joins_of(between, agree):
+            why, wanted = self._doubt(logs, between, join, low, high)
+            asked += [CandidatePair(KeyframeId(logs[0], i), KeyframeId(logs[1], j)) for i, j in wanted]
+            doubted |= {known[row]: why for row in join.rows} if why else {}
+        return Tentative(doubted, tuple(asked), is_whole and min(len(low), len(high)) > STRETCH)
 
     def _doubt(
         self, logs: Logs, between: Between, join: Join, low: KnownOdometry, high: KnownOdometry
@@ -136,7 +171,7 @@ class TentativeJoins:
         found = beside(between, join, (next(around), next(around)), self._refused_of(logs))
         robots, places = f"{logs[0].robot} and {logs[1].robot}", found.closed + found.refused
         why = f"{SECOND_PLACE}of {places} places where {robots} would be side by side {found.refused} do not match"
-        return (why if found.is_against else ""), found.open[:ASKED_AT_ONCE]
+        return (why if found.is_against else ""), found.open
 
     def _refused_of(self, logs: Logs) -> NDArray[np.int64]:
         """Keyframes (R, 2) of pairs of two logs that were refused; where another record says closure, that counts."""
@@ -147,8 +182,8 @@ class TentativeJoins:
     def _between(self, closures: Sequence[CandidatePair], low: KnownOdometry, high: KnownOdometry) -> Between:
         T, has_length = self._closures.said(closures)
         ends = np.array([[pair.low.index, pair.high.index] for pair in closures])
-        steps_m = float(np.mean([_step_m(track, ends[:, n]) for n, track in enumerate((low, high))]))
-        T[~has_length, :3, 3] *= steps_m
+        steps_m = (_steps_m(low, ends[:, 0]) + _steps_m(high, ends[:, 1])) / 2.0
+        T[~has_length, :3, 3] *= steps_m[~has_length, None]
         T_low, T_high = low.poses(ends[:, 0].tolist()), high.poses(ends[:, 1].tolist())
         return Between(ends, T_low, T_high, T, has_length, steps_m)
 
@@ -161,12 +196,12 @@ def _seen_twice(logs: Logs, between: Between, other: int, row: int, end: int) ->
     return SECOND_PLACE + what
 
 
-def _step_m(track: KnownOdometry, indices: NDArray[np.int64]) -> float:
-    """How far apart a log's keyframes are around some of them, in the mean."""
-    first = max(int(indices.min()) - 1, 0)
-    stretch = _stretch(track, range(first, min(int(indices.max()) + 2, first + CLOSURES_MAX, len(track))))
-    steps_m = np.linalg.norm(np.diff(stretch.T[:, :3, 3], axis=0), axis=1)
-    return float(steps_m.mean()) if len(steps_m) else 0.0
+def _steps_m(track: KnownOdometry, indices: NDArray[np.int64]) -> Float:
+    """How far apart a log's keyframes are up to each of some (K,), in the mean; of its first ones up to a later one."""
+    first = np.maximum(indices - STRETCH, 0)
+    last = np.minimum(np.maximum(indices, STRETCH), len(track) - 1)
+    t_m = track.positions_m([*first.tolist(), *last.tolist()]).reshape(2, -1, 3)
+    return np.asarray(np.linalg.norm(t_m[1] - t_m[0], axis=1) / np.maximum(last - first, 1))
 
 
 def _stretch(track: KnownOdometry, keyframes: range) -> Stretch:

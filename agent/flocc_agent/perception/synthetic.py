@@ -173,6 +173,17 @@ def pose_image(T_world_camera: Float, keyframe_key: str) -> Image:
     return Image(pixels, Camera(IMAGE_WIDTH, 1, 100.0, 100.0, IMAGE_WIDTH / 2, 0.5))
 
 
+def moved_latent(latent: bytes, by_m: float) -> bytes:
+    """A latent that says its camera stood further to its right than it did: what a camera with something on it gives.
+
+    Raises:
+        BadLatent: It is no synthetic latent.
+    """
+    T_world_camera, key = _unpacked(latent)
+    T_world_camera[:3, 3] += by_m * T_world_camera[:3, 0]
+    return _packed(T_world_camera, key, len(latent))
+
+
 def _packed(T_world_camera: Float, keyframe_key: str, bytes_min: int) -> bytes:
     """Serialise a pose and a key, padded with zeros."""
     key = keyframe_key.encode()

@@ -31,8 +31,8 @@ WRONG_COST = 50
 """Right pairs that one wrong pair outweighs in the fit: at most 2 % wrong among the pairs that a step adds."""
 MARGINS = (1.15, 1.25, 1.35, 1.5)
 """A wrong pair counts with this many times its correspondences and certainty: another scene's may have more. The first
-that keeps at most `WRONG_RATIO_MAX` wrong ones of the scenes left out is taken."""
-WRONG_RATIO_MAX = 0.01
+that keeps at most `WRONG_RATIO_MAX` wrong ones of the scenes left out, and one of each scene, is taken."""
+WRONG_RATIO_MAX, WRONG_OF_SCENE_MAX = 0.01, 1
 RATIOS = (0.2, 0.25, 0.3, 0.4, 0.5, 10.0)
 RATIO_MIN = 0.3
 """The paper's rule, for comparison."""
@@ -52,10 +52,9 @@ def fitted(rows: Sequence[AcceptanceRow], margin: float) -> Acceptance:
     """The rule that fits these rows: the ratio first, then each kind of what it leaves."""
     posed = [(row, row.evidence) for row in rows if row.evidence is not None]
     ratio_min = max(RATIOS, key=lambda ratio: (ratio_score(rows, ratio, margin), ratio))
-    with_scale, without_scale = (
-        best_needed([row for row, e in posed if e.has_scale is has_scale and not has_ratio(row, ratio_min)], margin)
-        for has_scale in (True, False)
-    )
+    left = [(row, e.has_scale) for row, e in posed if not has_ratio(row, ratio_min)]
+    with_scale = best_needed([row for row, has_scale in left if has_scale], margin)
+    without_scale = best_needed([row for row, has_scale in left if not has_scale], margin, no_less=with_scale)
     return Acceptance(with_scale, without_scale, ratio_min)
 
 
@@ -71,12 +70,20 @@ def has_ratio(row: AcceptanceRow, ratio_min: float) -> bool:
     return row.evidence is not None and row.correspondences >= RATIO_CORRESPONDENCES_MIN and ratio >= ratio_min
 
 
-def best_needed(rows: Sequence[AcceptanceRow], margin: float) -> Needed:
-    """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high."""
+def best_needed(rows: Sequence[AcceptanceRow], margin: float, no_less: Needed | None = None) -> Needed:
+    """The numbers for one kind of pair that keep the most right ones, wrong ones outweighing many; ties go high.
+
+    Args:
+        rows: Of that kind.
+        margin: With how many times their evidence wrong ones count.
+        no_less: What another kind needs of which more is known: a pair without a third view that agrees has not shown
+            as much, and scenes without places that look alike do not tell that.
+    """
     table = AcceptanceTable(rows, margin)
     scored = [
         (table.score(needed), needed.alone, needed.agreeing, -needed.rotation_sigma_max_rad, needed)
         for needed in choices()
+        if no_less is None or (needed.alone >= no_less.alone and needed.agreeing >= no_less.agreeing)
     ]
     return max(scored, key=lambda entry: entry[:4])[4]
 
@@ -141,8 +148,10 @@ def chosen_margin(rows: Sequence[AcceptanceRow]) -> tuple[float, dict[str, Kept]
     left_out: dict[str, Kept] = {}
     for margin in MARGINS:
         left_out = leave_one_out(rows, margin)
-        wrong = sum(found.wrong for found in left_out.values())
-        if wrong <= WRONG_RATIO_MAX * sum(found.right + found.wrong for found in left_out.values()):
+        found = list(left_out.values())
+        wrong, kept_all = sum(each.wrong for each in found), sum(each.right + each.wrong for each in found)
+        is_each_few = all(each.wrong <= WRONG_OF_SCENE_MAX for each in found)
+        if is_each_few and wrong <= WRONG_RATIO_MAX * kept_all:
             break
     return margin, left_out
 

@@ -15,6 +15,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from flocc_agent.core.second_places import BESIDE_RAD, BESIDE_STEPS, DRIFT_RATIO, PLACE_KEYFRAMES, SEEN_TWICE
 from flocc_agent.core.spared import STRETCH
 from flocc_agent.geometry import pose_from_tq
 from flocc_launch.runs.closure_table import Pair
@@ -23,18 +24,6 @@ from flocc_protocol.ids import KeyframeId
 
 Float = NDArray[np.float64]
 
-PLACE_KEYFRAMES = 2 * STRETCH
-"""A robot's keyframes from the first to the last of one place."""
-SEEN_TWICE = 2.0
-"""Times as far apart as both closures reach; scales by Eq. (6) are off by a tenth or two, odometry by less."""
-DRIFT_RATIO = 0.1
-"""Of the way between two keyframes, by which odometry may be off besides."""
-
-
-BESIDE_STEPS = 1.5
-"""The map puts two keyframes side by side that are at most so many steps of the robot apart."""
-BESIDE_RAD = float(np.radians(20.0))
-"""And look the same way within this."""
 BESIDE_MIN = 10
 """Fewer keyframes side by side say nothing."""
 NEIGHBOURS = 2

@@ -20,7 +20,7 @@ from flocc_launch.scenarios.scenario import FaultKind, Scenario, SensorsScenario
 from flocc_launch.simulation.coverage import Coverage, CoverageWatch
 from flocc_launch.simulation.eyes import ImageEyes
 from flocc_launch.simulation.fault_schedule import schedule
-from flocc_launch.simulation.generator import FAMILIES, ROBOTS_MAX, calm_s, drawn_scenario
+from flocc_launch.simulation.generator import FAMILIES, LENGTHS_M, ROBOTS_MAX, WALKS, calm_s, drawn_scenario
 from flocc_launch.simulation.hardships import Hardship, HardshipKind, drawn_hardships, endure
 from flocc_launch.simulation.invariants import Invariant, InvariantWatch, Violation
 from flocc_launch.simulation.rigid_alignment import align
@@ -32,6 +32,8 @@ from flocc_launch.simulation.virtual_playback import Playback
 LIVENESS_S = 60.0
 LOOK_S = 2.5
 SEEDS_PER_TASK = 8
+WALKS_KEPT = 4 * WALKS * len(LENGTHS_M)
+"""All walks of small swarms, with and without sensors and noise."""
 SEPARATING = {FaultKind.PARTITION, FaultKind.BLACKOUT, FaultKind.LOSS, FaultKind.MUTE, FaultKind.LEAVE}
 
 
@@ -137,7 +139,8 @@ def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> lis
     """All invariants; two robots may register one pair only where they could not hear each other for a while.
 
     Nobody counts on a name under which two robots run. A robot that an older disk makes number keyframes twice has
-    others register images of one with the place of the other, until it is told: then the truth is not asked for.
+    others register images of one with the place of the other, until it is told: then the truth is not asked for. Where
+    closures are wrong for a while, robots that know of it and robots that do not doubt each other.
     """
     separating = any(fault.kind in SEPARATING for fault in scenario.faults)
     links = [scenario.radio, *scenario.radio.overrides]
@@ -146,7 +149,7 @@ def invariants_of(scenario: Scenario, hardships: Sequence[Hardship] = ()) -> lis
     doubles = {hardship.robot for hardship in hardships if hardship.kind is HardshipKind.TWIN}
     classes = {name: -1 if name in doubles else scenario.robot(name).compute_class for name in scenario.names()}
     told_twice = any(hardship.kind is HardshipKind.OLDER for hardship in hardships)
-    honest = all(hardship.kind is not HardshipKind.LIAR for hardship in hardships)
+    honest = all(hardship.kind not in (HardshipKind.LIAR, HardshipKind.OVERLAY) for hardship in hardships)
     distributed = scenario.backend.mode is BackendMode.DISTRIBUTED
     return all_invariants(separated, is_noiseless(scenario) and not told_twice, classes, honest, distributed)
 
@@ -174,7 +177,7 @@ def _playbacks(scenario: Scenario) -> dict[str, Playback]:
     return {name: drawn[name] for name in scenario.names()}
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=WALKS_KEPT)
 def _walked(tracks: str, keyframes: str, sensors: str | None, noiseless: bool) -> dict[str, Playback]:
     """Playbacks of walks, drawn once for all seeds that share them; the parameters are JSON."""
     scenario = Scenario(

@@ -1,7 +1,7 @@
 """Complete: nothing that should be found, registered or solved is left out."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -9,19 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flocc_agent.core.effects import PersistRecord, Report
-from flocc_agent.core.events import KeyframeCaptured
+from flocc_agent.core.events import KeyframeCaptured, KeyframeEncoded
 from flocc_agent.core.known_sets import is_beside
 from flocc_agent.core.log_copy import LogCopy, decoded
 from flocc_agent.core.prospects import REFUSED_MIN, UNLIKELY
 from flocc_agent.core.reports import ClosureRejected
 from flocc_agent.core.spared import STRETCH, TOLD
+from flocc_agent.core.withdrawals import Withdrawals
 from flocc_launch.simulation.invariants import Step, core, groups
 from flocc_launch.simulation.rightness import component_of
 from flocc_launch.simulation.swarm import Swarm
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import CandidatePair
-from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord
+from flocc_protocol.records import ClosureRecord, KeyframeRecord, RejectionRecord, WithdrawalRecord
 
 MARGIN = 1e-4
 """Similarities that differ by less may be ordered either way."""
@@ -39,23 +40,40 @@ class Complete:
     _descriptors: dict[bytes, NDArray[np.float32]] = field(default_factory=dict)
     _captured: Counter[tuple[str, int]] = field(default_factory=Counter)
     _recorded: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _noticed: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _withdrawn: Counter[tuple[str, int]] = field(default_factory=Counter)
+    _held: dict[str, "_Held"] = field(default_factory=lambda: defaultdict(_Held))
 
     def step(self, step: Step) -> Iterator[str]:
         """Note keyframes that were taken and recorded; pairs that are refused unseen for no reason."""
         life = step.station.name, step.station.life
         self._captured[life] += isinstance(step.event, KeyframeCaptured)
+        self._noticed[life] += isinstance(step.event, KeyframeEncoded) and step.event.withdrawn is not None
         for effect in step.effects:
             if isinstance(effect, Report) and isinstance(effect.fact, ClosureRejected) and effect.fact.reason == TOLD:
-                yield from _spared_too_early(step.station, CandidatePair.of(effect.fact.query, effect.fact.match))
+                yield from self._spared_too_early(step.station, CandidatePair.of(effect.fact.query, effect.fact.match))
             if isinstance(effect, PersistRecord) and effect.log == step.station.log:
                 record = decoded(effect.data)
                 if isinstance(record, KeyframeRecord):
                     self._recorded[life] += 1
                     self._describe(effect.data, record)
+                elif isinstance(record, WithdrawalRecord):
+                    self._withdrawn[life] += record.log == effect.log
                 elif isinstance(record, RejectionRecord) and record.reason == UNLIKELY:
-                    seen = _refused_and_seen(step.station)
+                    seen = self._held_by(step.station).refused_seen
                     if seen < REFUSED_MIN:
                         yield f"{step.station.name} refuses {record.query} {record.match} unseen, {seen} were seen"
+
+    def _held_by(self, station: Station) -> "_Held":
+        held = self._held[station.name]
+        held.read(core(station).gossip.logs)
+        return held
+
+    def _spared_too_early(self, station: Station, pair: CandidatePair) -> Iterator[str]:
+        enough = core(station).closures_enough
+        beside = _closures_beside(self._held_by(station).closures, pair)
+        if not enough or beside < enough:
+            yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
 
     def _describe(self, data: bytes, record: KeyframeRecord) -> None:
         if record.descriptor is not None:
@@ -63,12 +81,14 @@ class Complete:
             self._descriptors[data] = values / np.linalg.norm(values)
 
     def lacking(self, swarm: Swarm) -> Iterator[str]:
-        """Keyframes without a record or a place in the leader's solution, and pairs that nobody registered."""
+        """Keyframes without a record or a place in the leader's solution; withdrawals and pairs without a record."""
         for group in groups(swarm):
             for station in group:
                 life = station.name, station.life
                 if self._captured[life] > self._recorded[life]:
                     yield f"{station.name} recorded {self._recorded[life]} of {self._captured[life]} keyframes"
+                if self._noticed[life] > self._withdrawn[life]:
+                    yield f"{station.name} withdrew {self._withdrawn[life]} of {self._noticed[life]} times"
                 if core(station).election.leading and core(station).distributed is None:
                     yield from _unsolved(station)
             yield from self._unregistered(swarm, group)
@@ -82,8 +102,9 @@ class Complete:
             log: self._described(logs[log]) for log in sorted(logs) if log.robot in robots and log not in swarm.forked
         }
         copies = _all_copies(swarm, group)
-        resolved = resolved_pairs(copies)
-        told = closures_by_logs(copies)
+        withdrawals = core(group[0]).assembly.withdrawals
+        resolved = resolved_pairs(copies, withdrawals)
+        told = closures_by_logs(copy for _, copy in copies)
         partnered = {(end, pair.other(end).log) for pair in resolved for end in (pair.low, pair.high)}
         came_back = {station.log for station in group if station.life > 1}
         for one, other in combinations(known, 2):
@@ -94,6 +115,8 @@ class Complete:
                 both = {(pair.low, pair.high.log), (pair.high, pair.low.log)} <= partnered
                 if pair in resolved or (both and came_back & {one, other}):
                     continue
+                if any(withdrawals.is_withdrawn(end) and end.log not in writers for end in (pair.low, pair.high)):
+                    continue  # whoever made its latent anew is not here
                 enough = swarm.scenario.core.loop_closing.closures_enough
                 if not enough or _closures_beside(told, pair) < enough:
                     yield f"nobody registered {pair.low} {pair.high}, which look alike"
@@ -108,6 +131,7 @@ class Complete:
         }
 
 
+ClosuresByLogs = dict[tuple[LogId, LogId], set[CandidatePair]]
 Described = tuple[LogId, dict[int, NDArray[np.float32]]]
 
 
@@ -124,52 +148,77 @@ def _alike(one: Described, other: Described, threshold: float) -> Iterator[Candi
             yield CandidatePair.of(KeyframeId(low, lefts[i]), KeyframeId(high, rights[j]))
 
 
-def _all_copies(swarm: Swarm, group: list[Station]) -> list[LogCopy]:
+def _all_copies(swarm: Swarm, group: list[Station]) -> list[tuple[LogId, LogCopy]]:
     """Of each log the copy of one robot; of those of which two versions were seen the copies of all."""
     return [
-        copy
+        (log, copy)
         for station in group
         for log, copy in core(station).gossip.logs.items()
         if station is group[0] or log in swarm.forked
     ]
 
 
-def resolved_pairs(logs: Iterable[LogCopy]) -> set[CandidatePair]:
-    """Pairs of which some log has a record."""
-    return {CandidatePair.of(record.query, record.match) for copy in logs for _, record in copy.judgements()}
+def resolved_pairs(logs: Iterable[tuple[LogId, LogCopy]], withdrawals: Withdrawals) -> set[CandidatePair]:
+    """Pairs of which some log has a record; closures of what was withdrawn since do not count, refusals do."""
+    judged = (
+        (log, number, CandidatePair.of(record.query, record.match), isinstance(record, ClosureRecord))
+        for log, copy in logs
+        for number, record in copy.judgements()
+    )
+    return {pair for log, number, pair, is_closure in judged if not is_closure or withdrawals.counts(log, number, pair)}
 
 
-def closures_by_logs(logs: Iterable[LogCopy]) -> dict[tuple[LogId, LogId], set[CandidatePair]]:
+def closures_by_logs(logs: Iterable[LogCopy]) -> ClosuresByLogs:
     """Closures by the two logs that they join."""
-    found: dict[tuple[LogId, LogId], set[CandidatePair]] = defaultdict(set)
-    for record in (record for copy in logs for record in copy.other_records()):
-        if isinstance(record, ClosureRecord):
-            pair = CandidatePair.of(record.query, record.match)
-            found[pair.low.log, pair.high.log].add(pair)
-    return found
+    held = _Held()
+    for copy in logs:
+        held.take(copy)
+    return held.closures
 
 
-def _closures_beside(closures: dict[tuple[LogId, LogId], set[CandidatePair]], pair: CandidatePair) -> int:
+@dataclass(slots=True)
+class _Held:
+    """What the logs that a robot holds say of pairs; of a log that grew only what is new is looked at.
+
+    Attributes:
+        closures: By the two logs that they join.
+        refused_seen: How many pairs were refused that had been seen.
+    """
+
+    closures: ClosuresByLogs = field(default_factory=lambda: defaultdict(set))
+    refused_seen: int = 0
+    _read: dict[LogId, tuple[LogCopy, int]] = field(default_factory=dict)
+
+    def read(self, logs: Mapping[LogId, LogCopy]) -> None:
+        """Take in what came since; from the beginning where a log is held no more, or another version of it."""
+        if any(logs.get(log) is not copy for log, (copy, _) in self._read.items()):
+            self.closures.clear()
+            self.refused_seen = 0
+            self._read.clear()
+        for log, copy in logs.items():
+            _, first = self._read.get(log, (copy, 0))
+            self.take(copy, first)
+            self._read[log] = copy, len(copy)
+
+    def take(self, copy: LogCopy, first: int = 0) -> None:
+        """Take in a log's judgements from a number on."""
+        for _, record in copy.judgements(first):
+            if isinstance(record, RejectionRecord):
+                self.refused_seen += record.reason != UNLIKELY
+            else:
+                pair = CandidatePair.of(record.query, record.match)
+                self.closures[pair.low.log, pair.high.log].add(pair)
+
+
+def _closures_beside(closures: ClosuresByLogs, pair: CandidatePair) -> int:
     """Closures of the same stretches of two ways."""
     of_logs = closures.get((pair.low.log, pair.high.log), set())
     return sum(is_beside(pair, other, STRETCH) for other in of_logs)
 
 
-def _spared_too_early(station: Station, pair: CandidatePair) -> Iterator[str]:
-    held = core(station)
-    beside, enough = _closures_beside(closures_by_logs(held.gossip.logs.values()), pair), held.closures_enough
-    if not enough or beside < enough:
-        yield f"{station.name} spares {pair.low} {pair.high} with {beside} closures beside it"
-
-
 def _second(values: NDArray[np.float32], but: int) -> float:
     """The highest value at another place."""
     return float(np.delete(values, but).max(initial=-1.0))
-
-
-def _refused_and_seen(station: Station) -> int:
-    records = (record for copy in core(station).gossip.logs.values() for record in copy.other_records())
-    return sum(isinstance(record, RejectionRecord) and record.reason != UNLIKELY for record in records)
 
 
 def _unsolved(leader: Station) -> Iterator[str]:

@@ -8,7 +8,7 @@ from flocc_agent.core.effects import Broadcast, Effect, FetchLatent, Register, R
 from flocc_agent.core.events import LatentFetched, LatentFetchFailed
 from flocc_agent.core.latents import BACKLOG_MAX
 from flocc_agent.core.reports import CandidateFound, NameTaken, NeighbourDown, NeighbourUp
-from flocc_launch.simulation.invariants import Step
+from flocc_launch.simulation.invariants import Step, core
 from flocc_launch.simulation.virtual_robot import Station
 from flocc_protocol.ids import KeyframeId, LogId
 from flocc_protocol.messages import (
@@ -79,7 +79,8 @@ class Cheap:
 
     def _fetches(self, step: Step, life: tuple[str, int], fetch: FetchLatent) -> Iterator[str]:
         now_s = step.station.now_s()  # the robot gives a fetch up by its own clock, which may step
-        if fetch.keyframe in step.station.disk.latents and fetch.keyframe not in step.station.unheard:
+        is_here = fetch.keyframe in step.station.disk.latents and fetch.keyframe not in step.station.unheard
+        if is_here and not core(step.station).assembly.withdrawals.is_withdrawn(fetch.keyframe):
             yield f"{life[0]} fetches {fetch.keyframe}, which it holds"
         _, until_s = self._fetching.get((*life, fetch.keyframe), ("", float("-inf")))
         if now_s < until_s - 0.5:

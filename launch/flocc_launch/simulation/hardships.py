@@ -12,13 +12,16 @@ from typing import assert_never
 
 import numpy as np
 
+from flocc_launch.simulation.overlays import Overlay
 from flocc_launch.simulation.swarm import Swarm
 
 HARDSHIPS_MAX = 2
 RATIO = 0.5
 """Share of the seeds that have some."""
-TWIN_RATIO, LIAR_RATIO, CLOCK_RATIO = 0.15, 0.1, 0.1
+TWIN_RATIO, LIAR_RATIO, CLOCK_RATIO, OVERLAY_RATIO = 0.15, 0.1, 0.1, 0.2
 CLOCK_STEP_MAX_S = 7200
+OVERLAY_FROM_S, OVERLAY_LASTS_S = (0.5, 5.0), (4.0, 12.0)
+"""Most robots of small swarms still walk then, and notice with their next keyframe."""
 
 
 class HardshipKind(StrEnum):
@@ -32,6 +35,7 @@ class HardshipKind(StrEnum):
     TWIN = "second robot of its name"
     LIAR = "a leader that lies"
     CLOCK = "a clock that steps"
+    OVERLAY = "something on a camera"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +74,16 @@ def drawn_hardships(seed: int, names: Sequence[str], end_s: float) -> tuple[Hard
         from_s, to_s = _times(rng, end_s)
         step_s = round(math.exp(rng.uniform(0.0, math.log(CLOCK_STEP_MAX_S))))
         drawn.append(Hardship(HardshipKind.CLOCK, str(rng.choice(names)), from_s, to_s, step_s))
+    rng = np.random.default_rng([seed, 7])
+    if rng.uniform() < OVERLAY_RATIO:
+        from_s = round(float(rng.uniform(*OVERLAY_FROM_S)), 3)
+        to_s = round(from_s + float(rng.uniform(*OVERLAY_LASTS_S)), 3)
+        drawn.append(Hardship(HardshipKind.OVERLAY, str(rng.choice(names)), from_s, to_s))
     return tuple(sorted(drawn, key=lambda hardship: hardship.from_s))
 
 
 def _drawn(rng: np.random.Generator, names: Sequence[str], end_s: float) -> Hardship:
-    apart = (HardshipKind.TWIN, HardshipKind.LIAR, HardshipKind.CLOCK)
+    apart = (HardshipKind.TWIN, HardshipKind.LIAR, HardshipKind.CLOCK, HardshipKind.OVERLAY)
     kinds = [kind for kind in HardshipKind if kind not in apart]
     kind = kinds[int(rng.integers(len(kinds)))]
     from_s, to_s = _times(rng, end_s)
@@ -119,5 +128,9 @@ def _enter(swarm: Swarm, hardship: Hardship) -> None:
             at(hardship.to_s, "mend")
         case HardshipKind.CLOCK:
             swarm.agenda.at(hardship.to_s, lambda: station.step_clock(float(hardship.number)))
+        case HardshipKind.OVERLAY:
+            overlay = station.workers.overlay = Overlay()
+            swarm.agenda.at(hardship.from_s, lambda: setattr(overlay, "is_there", True))
+            swarm.agenda.at(hardship.to_s, lambda: setattr(overlay, "is_there", False))
         case _:
             assert_never(hardship.kind)

@@ -31,6 +31,10 @@ class Step:
     effects: list[Effect]
 
 
+Check = Callable[[Step], Iterable[str]]
+"""What is wrong with a step, a sentence each."""
+
+
 @dataclass(frozen=True, slots=True)
 class Invariant:
     """One of DESIGN.md, section 5.
@@ -43,7 +47,7 @@ class Invariant:
     """
 
     name: str
-    step: Callable[[Step], Iterable[str]] | None = None
+    step: Check | None = None
     lacking: Callable[[Swarm], Iterable[str]] | None = None
     wants: frozenset[type] | None = None
 
@@ -74,6 +78,8 @@ class InvariantWatch:
         self.violations: list[Violation] = []
         self._swarm = swarm
         self._steps = [(i.name, i.step, i.wants) for i in invariants if i.step is not None]
+        self._asked: dict[frozenset[type], list[tuple[str, Check]]] = {}
+        """Which of them look at a step with these types of events and effects."""
         self._goals = [(i.name, i.lacking) for i in invariants if i.lacking is not None]
         swarm.observers.append(self._step)
 
@@ -88,10 +94,12 @@ class InvariantWatch:
 
     def _step(self, station: Station, event: Event | None, effects: list[Effect]) -> None:
         step = Step(self._swarm.agenda.now_s, station, event, effects)
-        kinds = {type(event), *map(type, effects)}
-        for name, check, wants in self._steps:
-            if wants is not None and wants.isdisjoint(kinds):
-                continue
+        kinds = frozenset(map(type, (event, *effects)))
+        asked = self._asked.get(kinds)
+        if asked is None:
+            wanted = [(name, check) for name, check, wants in self._steps if wants is None or wants & kinds]
+            asked = self._asked[kinds] = wanted
+        for name, check in asked:
             for detail in check(step):
                 if all(violation.invariant != name for violation in self.violations):
                     self.violations.append(Violation(name, step.at_s, detail))

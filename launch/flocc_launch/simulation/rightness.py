@@ -40,6 +40,7 @@ class Right:
 
     _solutions: dict[tuple[Term, int], GraphSolution] = field(default_factory=dict)
     _roles: dict[tuple[str, CandidatePair], tuple[KeyframeId, KeyframeId]] = field(default_factory=dict)
+    _taken_back: dict[tuple[str, CandidatePair], set[KeyframeId]] = field(default_factory=dict)
     _odometry: dict[tuple[str, int], RecordedOdometry] = field(default_factory=dict)
 
     def step(self, step: Step) -> Iterator[str]:
@@ -49,6 +50,7 @@ class Right:
         for effect in step.effects:
             if isinstance(effect, Register):
                 self._roles[step.station.name, effect.pair] = effect.query, effect.match
+                self._taken_back[step.station.name, effect.pair] = _taken_back(step.station, effect.pair)
             elif isinstance(effect, Deliver):
                 yield from self._delivered(step.station, effect.correction)
         if isinstance(step.event, PairRegistered):
@@ -69,6 +71,8 @@ class Right:
             name = f"{step.station.name} records {record.query} {record.match}"
             if (record.query, record.match) != self._roles.get((step.station.name, event.pair)):
                 yield f"{name}, which it registered the other way round"
+            if _taken_back(step.station, event.pair) != self._taken_back.get((step.station.name, event.pair)):
+                yield f"{name}, a latent of which was made anew meanwhile"
             yield from (f"{name}, {what}" for what in _differs(record, event.result))
 
     def _delivered(self, station: Station, correction: LogCorrection) -> Iterator[str]:
@@ -92,6 +96,11 @@ class Right:
             and (told is None or not _same_covariance(symmetric(told.numpy()), solved))
         ):
             yield f"{name} with another covariance than was solved"
+
+
+def _taken_back(station: Station, pair: CandidatePair) -> set[KeyframeId]:
+    """Keyframes of a pair that their robot took back, as far as a robot knows."""
+    return {end for end in (pair.low, pair.high) if core(station).assembly.withdrawals.is_withdrawn(end)}
 
 
 def _other_poses(correction: LogCorrection, odometry: RecordedOdometry, component: Component) -> Iterator[str]:
@@ -129,8 +138,13 @@ def _is_good(result: Registration) -> bool:
 
 
 def untrue(swarm: Swarm) -> Iterator[str]:
-    """In a swarm without noise: closures of a leader's graph, and poses that robots apply, that are not the truth."""
+    """In a swarm without noise: closures of a leader's graph, and poses that robots apply, that are not the truth.
+
+    Where a robot had no keyframe any more by which to notice what was on its camera, nobody can know.
+    """
     for group in groups(swarm):
+        if any(_unnoticed(swarm, station) for station in group):
+            continue
         frames: dict[LogId, Float] = {}
         for station in group:
             if core(station).election.leading:
@@ -170,6 +184,15 @@ def _untrue_closures(swarm: Swarm, leader: Station) -> Iterator[str]:
     for closure in core(leader).assembly.graph().closures:
         if _apart(_metric(closure), between(truth(closure.query), truth(closure.match)), TRUE_M, TRUE_RAD):
             yield f"{leader.name} has a closure {closure.query} {closure.match} that is not true"
+
+
+def _unnoticed(swarm: Swarm, station: Station) -> bool:
+    """Whether a robot knows keyframes that show what is not the scene, and were never withdrawn."""
+    overlays = (each.workers.overlay for each in swarm.stations.values())
+    shown = (keyframe for overlay in overlays if overlay is not None for keyframe in overlay.shown)
+    logs, withdrawals = core(station).gossip.logs, core(station).assembly.withdrawals
+    known = (k for k in shown if k.log in logs and k.index < logs[k.log].keyframes)
+    return any(not withdrawals.is_withdrawn(keyframe) for keyframe in known)
 
 
 def _metric(closure: LoopClosure) -> Float:

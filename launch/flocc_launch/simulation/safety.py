@@ -18,6 +18,7 @@ from flocc_agent.core.effects import (
 from flocc_agent.core.events import (
     GraphOptimised,
     KeyframeCaptured,
+    KeyframeEncoded,
     LatentFetched,
     LatentFetchFailed,
     MessageReceived,
@@ -87,7 +88,7 @@ def all_invariants(
             "complete",
             step=complete.step,
             lacking=complete.lacking,
-            wants=frozenset({KeyframeCaptured, PersistRecord, Report}),
+            wants=frozenset({KeyframeCaptured, KeyframeEncoded, PersistRecord, Report}),
         ),
         Invariant(
             "right",
@@ -187,7 +188,7 @@ class Once:
     A second registration is excused where the first robot died, or where robots were apart: the one that registers
     took the pair over while the owner in charge, or the first robot, was out of its or an owner's hearing; and two
     robots of one name get what one of them is offered. It never is where the robot holds a record of the pair already,
-    unless that refused it unseen.
+    unless that refused it unseen, or keyframes were withdrawn since; then the pair is registered anew.
 
     Attributes:
         separated: At times robots cannot hear each other.
@@ -221,16 +222,17 @@ class Once:
 
     def _registers(self, step: Step, pair: CandidatePair) -> Iterator[str]:
         station, logs = step.station, core(step.station).gossip.logs
+        withdrawals = core(station).assembly.withdrawals
         name = f"{station.name} registers {pair.low} {pair.high}"
         if any(
-            log in logs and logs[log].encoded[number : number + 1] == [data]
+            log in logs and logs[log].encoded[number : number + 1] == [data] and withdrawals.counts(log, number, pair)
             for log, number, data in self._records[pair]
         ):
             yield f"{name}, of which it holds a record"
         earlier = self._begun[pair]
         self.pairs += not earlier
         self.again += any(registered.by.life == registered.life for registered in earlier)
-        for registered in earlier:
+        for registered in () if withdrawals.asks_again(pair) else earlier:
             if not self._excused(registered, step, pair):
                 yield f"{name} after {registered.by.name}"
         earlier.append(_Registered(station, station.life))

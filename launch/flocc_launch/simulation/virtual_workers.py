@@ -34,6 +34,7 @@ from flocc_agent.geometry import pose_from_tq
 from flocc_agent.runtime.jobs import hide_in_earlier, withdrawn_by
 from flocc_agent.stages import StageTimes
 from flocc_launch.simulation.disk import Disk
+from flocc_launch.simulation.overlays import Overlay
 from flocc_launch.simulation.virtual_playback import Capture
 from flocc_protocol.codec import Pose7
 from flocc_protocol.errors import FloccError
@@ -86,6 +87,7 @@ class VirtualWorkers:
 
     Attributes:
         slowness: Factor on every duration.
+        overlay: Something that gets onto the camera at times; None: nothing does.
         stages: How long what was asked of them takes, on virtual time.
     """
 
@@ -99,6 +101,7 @@ class VirtualWorkers:
         hidden: Mask | None = None,
     ) -> None:
         self.slowness = 1.0
+        self.overlay: Overlay | None = None
         self.stages = StageTimes()
         self._eyes = eyes
         self._hidden = hidden
@@ -138,7 +141,10 @@ class VirtualWorkers:
             looked = self._watch.look(capture, pose_from_tq(np.array(T_odom_camera)))
         except FloccError as error:
             return KeyframeEncodingFailed(keyframe, str(error))
-        hide_in_earlier(keyframe, looked, self._eyes.without, disk)
+        without = self._eyes.without
+        if self.overlay is not None:
+            looked, without = self.overlay.look(keyframe, looked), self.overlay.without
+        hide_in_earlier(keyframe, looked, without, disk)
         withdrawn = withdrawn_by(looked)
         if looked.descriptor is None or looked.latent is None:
             return KeyframeEncodingFailed(keyframe, looked.fault, looked.doubts, withdrawn)

@@ -58,6 +58,7 @@ def test_what_is_no_keyframe_is_found_without_decoding_the_others() -> None:
     rejection = RejectionRecord(KeyframeId(LogId("r1"), 0), KeyframeId(LogId("r2"), 0), "no", 0, 0)
     copy = copied([*DATA[:70], encode_record(rejection), *DATA[70:]])
     assert list(copy.other_records()) == [rejection]
+    assert [list(copy.judgements(first)) for first in (0, 70, 71)] == [[(70, rejection)], [(70, rejection)], []]
 
 
 def test_a_reader_sees_a_prefix_while_the_log_grows() -> None:

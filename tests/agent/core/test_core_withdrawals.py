@@ -123,6 +123,17 @@ def test_closures_of_what_was_taken_back_are_registered_anew_and_all_graphs_agre
     assert len(names) == (2 * TOLD_WITH + 1 if keys else 0)
 
 
+def test_who_knows_a_keyframe_knows_what_was_taken_back_with_it() -> None:
+    """Its pairs take the scale from the keyframe before, whose latent was made anew."""
+    log = list(told(Overlay(), "r1 r2").cores["r2"].gossip.logs[R1].records)
+    keyframes = [record.index for record in log if isinstance(record, KeyframeRecord)]
+    withdrawn_at = next(k for k, record in enumerate(log) if isinstance(record, WithdrawalRecord))
+    assert keyframes == list(range(TOLD_WITH + 1))
+    following = log[withdrawn_at + 1]
+    assert isinstance(following, KeyframeRecord)
+    assert following.index == TOLD_WITH
+
+
 def test_what_nothing_can_make_better_is_not_registered_again() -> None:
     robots = told(Overlay(final=True))
     registered = [effect for at_s, _, effect in robots.done if isinstance(effect, Register) and at_s > 120.0]

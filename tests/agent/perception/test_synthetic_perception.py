@@ -6,8 +6,9 @@ from tests.agent.perception.classical_scenes import camera_at
 from flocc_agent.config import SyntheticConfig
 from flocc_agent.core.interfaces import OdometryPair
 from flocc_agent.core.registration import Registration, RegistrationFailed, RegistrationFailure, match_ratio
-from flocc_agent.geometry import angle_rad, between
-from flocc_agent.perception.synthetic import SyntheticPerception, pose_image
+from flocc_agent.geometry import angle_rad, between, pose
+from flocc_agent.perception.latent import BadLatent
+from flocc_agent.perception.synthetic import SyntheticPerception, moved_latent, pose_image
 
 Float = NDArray[np.float64]
 EXACT = SyntheticConfig(
@@ -156,6 +157,21 @@ def test_an_image_of_a_pose_is_worth_the_pose() -> None:
     assert isinstance(via_image, Registration)
     assert isinstance(direct, Registration)
     np.testing.assert_array_equal(via_image.T_query_match_unscaled, direct.T_query_match_unscaled)
+
+
+def test_a_latent_of_a_camera_with_something_on_it_is_registered_from_where_it_seems_to_be() -> None:
+    perception = SyntheticPerception(EXACT, 10)
+    T = camera_at((1, 2, 3), (0.1, 0.2, 0.3))
+    one_to_the_right = T @ pose(np.eye(3), np.array([1.0, 0.0, 0.0]))
+
+    moved = moved_latent(perception.encode_pose(T, "a/7"), 1.0)
+
+    assert len(moved) == len(perception.encode_pose(T, "a/7"))
+    at_rest = perception.register(perception.encode_pose(one_to_the_right, "b/1"), moved, None)
+    assert isinstance(at_rest, Registration)
+    np.testing.assert_allclose(at_rest.T_query_match_unscaled, np.eye(4), atol=1e-3)
+    with pytest.raises(BadLatent, match="not a synthetic latent"):
+        moved_latent(b"", 1.0)
 
 
 def test_latents_are_padded_to_load_links() -> None:

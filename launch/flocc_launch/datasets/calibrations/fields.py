@@ -79,6 +79,8 @@ _MATTERS = re.compile(
 )
 """Plain names of keys that say something about a camera; one that is not understood is refused."""
 POSE_NUMBERS = (3, 6, 7, 9, 12, 16)
+BOUNDS = 6
+"""Numbers of a box: in settings beside the camera, as many are more often that than a position and angles."""
 HARMLESS_UNITS = ("", "m", "meter", "meters", "metre", "metres", "px", "pixel", "pixels")
 HARMLESS = re.compile(
     r"^(lidar.*|camera(1|2)?(fps|rgb|bf|newwidth|newheight|id|name|label)|imu.*|acc.*|gyr.*|orbextractor.*|viewer.*|stereo.*|"
@@ -141,13 +143,18 @@ def _could_be_a_pose(value: Any) -> bool:
     """Whether a value is as many numbers as a position or a rotation or both, names their axes, or holds such a one."""
     if isinstance(value, dict):
         named = {"x", "y", "z"} <= set(value) or {"roll", "pitch", "yaw"} <= set(value)
-        return named or any(_could_be_a_pose(each) and not _says_nothing(each) for each in value.values())
-    if not isinstance(value, list):
-        return False
+        return named or any(
+            _count(each) != BOUNDS and _could_be_a_pose(each) and not _says_nothing(each) for each in value.values()
+        )
+    return _count(value) in POSE_NUMBERS
+
+
+def _count(value: Any) -> int:
+    """How many numbers a list holds; 0 of anything else."""
     try:
-        return len(flat_numbers(value, "value")) in POSE_NUMBERS
+        return len(flat_numbers(value, "value")) if isinstance(value, list) else 0
     except ValueError:
-        return False
+        return 0
 
 
 def _says_nothing(value: Any) -> bool:
